@@ -498,6 +498,41 @@ def read_journal(path: Path) -> Any:
     from real2sim_server.sweeps.journal import Journal
 
     return Journal(path).rows
+        *map_targets(),
+    ]
+
+
+def map_targets() -> list[Target]:
+    """One for each format of maps, on the small valid file of its tests."""
+    from real2sim_server.maps import MAP_READERS, MapError, read_map
+
+    place = TESTS / "server/maps/test_other_readers.py"
+    spec = importlib.util.spec_from_file_location("written_maps", place)
+    assert spec is not None
+    assert spec.loader is not None
+    written = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(written)
+
+    def target(name: str) -> Target:
+        def sample(folder: Path) -> list[Parts]:
+            return [{"file": getattr(written, f"written_{name}")(folder).read_bytes()}]
+
+        def write(parts: Parts, folder: Path) -> Path:
+            suffix = {"opendrive": "x.xodr", "lanelet2": "x.osm"}.get(
+                name, "log_map_archive_x.json"
+            )
+            path = folder / suffix
+            path.write_bytes(parts["file"])
+            return path
+
+        def read(path: Path) -> None:
+            graph = read_map(path, format=name)
+            graph.nearest(0.0, 0.0)
+            graph.is_drivable([[0.0, 0.0]])
+
+        return Target(f"map_{name}", sample, write, read, (MapError,))
+
+    return [target(reader.name) for reader in MAP_READERS]
 
 
 def spz_as_it_is(folder: Path) -> list[Parts]:

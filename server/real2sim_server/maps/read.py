@@ -7,12 +7,21 @@ from pathlib import Path
 
 from ..scene.errors import SceneError
 from ..scene.lane_graph import LaneGraph
+from .argoverse2 import Argoverse2MapReader
 from .errors import MapError
+from .lanelet2 import Lanelet2Reader
 from .native import NativeMapReader
+from .nuscenes import NuScenesMapReader
 from .opendrive import OpenDriveReader
 from .reader import MapReader
 
-MAP_READERS: list[MapReader] = [NativeMapReader(), OpenDriveReader()]
+MAP_READERS: list[MapReader] = [
+    NativeMapReader(),
+    OpenDriveReader(),
+    Lanelet2Reader(),
+    Argoverse2MapReader(),
+    NuScenesMapReader(),
+]
 """All registered readers; the first that recognises a file reads it."""
 
 

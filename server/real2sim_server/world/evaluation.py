@@ -26,6 +26,7 @@ from .per_object import per_object
 from .scoring import EgoSample, ObjectSamples, ScoringContext
 from .scoring.comfort import comfort_window
 from .scoring.instant import VEHICLES
+from .scoring.road_map import RoadMap
 from .seam import Seam
 
 
@@ -86,6 +87,7 @@ def scoring_context(
         warmup_steps=spec.warmup_us // clock.dt_us,
         background=spec.contact.background,
         reactive=reactive(spec),
+        road_map=RoadMap.of(scene.lanes),
     )
 
 

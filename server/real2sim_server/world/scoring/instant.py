@@ -16,6 +16,7 @@ from ..ego.reference import PlannedTrajectory
 from ..path import Float
 from ..seam import Seam
 from .road_kernels import DENSITY, in_lane, off_road
+from .road_map import RoadMap
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
 """Side of the ego on which a contact began, after nuPlan's collision types."""
@@ -138,6 +139,7 @@ class ScoringContext:
         reactive: whether any other road user sees the ego.
         no_action_impact: impact speed of a run in which the ego does not react [m/s]; None while
             it is not known, 0 where nothing is hit.
+        road_map: of the scene; None: corridor and lanes come from the recorded drive.
     """
 
     dt: float
@@ -158,6 +160,7 @@ class ScoringContext:
     background: bool = False
     reactive: bool = False
     no_action_impact: float | None = None
+    road_map: RoadMap | None = None
 
     @property
     def centre_ahead(self) -> float:
@@ -183,6 +186,8 @@ class ScoringContext:
         many of its quarters, 0 to 4, have their middle on the road."""
         ahead = self.centre_ahead
         x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
+        if self.road_map is not None:
+            return self.road_map.off_road((x, y, ego.yaw), self.ego_size)
         beyond, quarters = off_road(
             (x, y, ego.yaw),
             self.ego_size,
@@ -195,15 +200,44 @@ class ScoringContext:
     def in_lane(self, ego: EgoSample) -> bool:
         """Whether the middle of the ego box is in its own lane, or in one that others drove in the
         ego's direction."""
+        if self.road_map is not None:
+            return self.road_map.in_lane(ego, self.centre_ahead)
         if abs(ego.offset) <= self.lane:
             return True
         ahead = self.centre_ahead
         x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
         return bool(in_lane((x, y, ego.path_yaw), self._lane_points, self.lane))
 
+    def lane_offset(self, ego: EgoSample) -> float:
+        """Distance from the middle of the lane [m], positive to the left: of the map's, else of the
+        route."""
+        return ego.offset if self.road_map is None else self.road_map.lane_offset(ego)
+
+    def way_against(self, ego: EgoSample, way: float, gain: float) -> float:
+        """How much of the ``way`` [m] of a step went against traffic: in oncoming lanes of the map,
+        else what it lost along the route."""
+        if self.road_map is None:
+            return max(-gain, 0.0)
+        return way if self.road_map.is_against(ego, self.centre_ahead) else 0.0
+
+    def limit_at(self, ego: EgoSample) -> float | None:
+        """The speed limit that holds for the ego [m/s]: that of the request, else of the map."""
+        if self.speed_limit is not None or self.road_map is None:
+            return self.speed_limit
+        return self.road_map.speed_limit(ego)
+
+    @property
+    def knows_limits(self) -> bool:
+        """Whether any speed limit is known."""
+        known = self.road_map is not None and self.road_map.knows_limits
+        return self.speed_limit is not None or known
+
     def fields(self) -> dict[str, Any]:
-        """Plain values, for a recording."""
+        """Plain values, for a recording; without a map there is no word of one."""
         plain = {k: getattr(self, k) for k in self.__dataclass_fields__}
+        road_map = plain.pop("road_map")
+        if road_map is not None:
+            plain["road_map"] = road_map.fields()
         return plain | {
             "route": self.route,
             "lanes": list(self.lanes),
@@ -215,9 +249,11 @@ class ScoringContext:
     @classmethod
     def from_fields(cls, fields: dict[str, Any]) -> ScoringContext:
         """The context that :meth:`fields` gave."""
+        road_map = fields.get("road_map")
         return cls(
             **fields
             | {
+                "road_map": None if road_map is None else RoadMap.from_fields(road_map),
                 "lanes": tuple(np.asarray(line) for line in fields["lanes"]),
                 "route": np.asarray(fields["route"]),
                 "expert_s": tuple(fields["expert_s"]),

@@ -27,6 +27,30 @@ CARLA_PENALTIES = {"vru": 0.5, "vehicle": 0.6, "object": 0.65}
 NO_MAP = "no map: corridor and lanes come from the recorded drive"
 
 
+def roads(context: ScoringContext) -> tuple[str, ...]:
+    """What is assumed of the road: that of the scene's map, or what was driven."""
+    if context.road_map is None:
+        return (NO_MAP,)
+    graph = context.road_map.graph
+    accuracy = "" if graph.accuracy is None else f", within {graph.accuracy:g} m"
+    return (f"map: drivable area, lanes and directions of {graph.source}{accuracy}",)
+
+
+def driven_lanes(context: ScoringContext) -> tuple[str, ...]:
+    """What is assumed of lanes."""
+    if context.road_map is None:
+        return ("lanes are those that were driven in the recording",)
+    return roads(context)
+
+
+def lights(context: ScoringContext) -> str:
+    """What is assumed of traffic lights: a map tells where they stand, not what they show."""
+    signals = () if context.road_map is None else context.road_map.graph.signals.values()
+    if any(signal.kind == "traffic_light" for signal in signals):
+        return "TLC: the map's traffic lights show no phases"
+    return "TLC: no traffic lights"
+
+
 # --- terms ------------------------------------------------------------------------------------
 
 
@@ -70,7 +94,7 @@ def nuplan_progress(accumulator: MetricAccumulator, context: ScoringContext) -> 
 
 def speed_limits(accumulator: MetricAccumulator, context: ScoringContext) -> float:
     """SL of nuPlan; 1 where no limit is known."""
-    if context.speed_limit is None:
+    if not context.knows_limits:
         return 1.0
     seconds = max(accumulator.steps * context.dt, context.dt)
     return max(0.0, 1 - accumulator.overspeed / (2.23 * seconds))
@@ -139,7 +163,9 @@ def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue
         "C": float(accumulator.comfort.comfortable),
     }
     value = pdms_so_far(accumulator, context)
-    return MetricValue(value, terms, assumed=(NO_MAP, *assumed_progress(accumulator, context)))
+    return MetricValue(
+        value, terms, assumed=(*roads(context), *assumed_progress(accumulator, context))
+    )
 
 
 @metric("epdms", version="5", sees={*NAVSIM_SEES, "lane", "direction"})
@@ -162,7 +188,7 @@ def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
     }
     weighted = 5 * (terms["EP"] + terms["TTC"]) + 2 * (terms["LK"] + terms["HC"] + terms["EC"])
     multipliers = (terms[name] for name in ("feasible", "NC", "DAC", "DDC", "TLC"))
-    assumed = ("TLC: no traffic lights", NO_MAP, *assumed_progress(accumulator, context))
+    assumed = (lights(context), *roads(context), *assumed_progress(accumulator, context))
     return MetricValue(math.prod(multipliers) * weighted / 16, terms, assumed=assumed)
 
 
@@ -185,7 +211,7 @@ def nuplan_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> fl
 )
 def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC DDC [EP >= 0.2] (5 EP + 5 TTC + 4 SL + 2 C) / 16 (Karnchanachari et al. 2024)."""
-    expert, limit = expert_progress(accumulator, context), context.speed_limit
+    expert = expert_progress(accumulator, context)
     terms = {
         "feasible": feasible(accumulator),
         "NC": nuplan_no_collision(accumulator),
@@ -197,7 +223,8 @@ def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVal
         "C": float(accumulator.comfort.comfortable),
     }
     value = nuplan_so_far(accumulator, context)
-    assumed = (NO_MAP,) if limit is not None else ("SL: no speed limit known", NO_MAP)
+    road = roads(context)
+    assumed = road if context.knows_limits else ("SL: no speed limit known", *road)
     if expert < LEAST_ROUTE:
         assumed = (*assumed, *assumed_progress(accumulator, context))
     return MetricValue(value, terms, assumed=assumed)
@@ -222,7 +249,7 @@ def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVal
         "RC": route_completion(accumulator, context, 0.9),
         "mean": hugsim_mean(accumulator),
     }
-    assumed = (NO_MAP, *assumed_route(accumulator, context))
+    assumed = (*roads(context), *assumed_route(accumulator, context))
     return MetricValue(hugsim_so_far(accumulator, context), terms, assumed=assumed)
 
 
@@ -267,7 +294,7 @@ def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
         terms["infractions_per_km"] = sum(counts.values()) / (accumulator.distance * 1e-3)
     assumed = (
         "no red lights, stop signs, yielding, timeouts",
-        "lanes are those that were driven in the recording",
+        *driven_lanes(context),
         *assumed_route(accumulator, context),
     )
     return MetricValue(carla_so_far(accumulator, context), terms, assumed=assumed)
@@ -280,7 +307,7 @@ def alpasim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVa
     progress, possible = relative_progress(accumulator, context), feasible(accumulator)
     clear = not accumulator.at_fault and not accumulator.off_road
     value = possible * min(progress / 0.8, 1.0) if clear else 0.0
-    assumed = (NO_MAP, *assumed_progress(accumulator, context))
+    assumed = (*roads(context), *assumed_progress(accumulator, context))
     return MetricValue(value, {"feasible": possible, "progress": progress}, assumed=assumed)
 
 

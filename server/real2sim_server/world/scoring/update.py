@@ -93,11 +93,13 @@ def update_accumulator(
     way = math.hypot(ego.x - before.x, ego.y - before.y)
     left_out = _left_out(ego.s - before.s, way)
     gain, cut = ego.s - before.s - left_out, accumulator.cut + left_out
-    backward, oncoming = _against_route(accumulator.backward, max(-gain, 0.0), dt)
-    lane_run = accumulator.lane_run + dt if abs(ego.offset) > LANE_OFFSET else 0.0
+    backward, oncoming = _against_route(
+        accumulator.backward, context.way_against(ego, way, gain), dt
+    )
+    lane_run = accumulator.lane_run + dt if abs(context.lane_offset(ego)) > LANE_OFFSET else 0.0
     backing = ego.speed < 0 and math.cos(ego.yaw - ego.path_yaw) < 0
     tail_first = accumulator.tail_first + (max(gain, 0.0) if backing else 0.0)
-    limit = context.speed_limit
+    limit = context.limit_at(ego)
     distance = accumulator.distance + way
     return evolved(
         accumulator,

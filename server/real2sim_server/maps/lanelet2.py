@@ -1,0 +1,370 @@
+"""Lanelet2 maps as OSM-XML. Source: Poggenhans et al. 2018 and the tagging rules of Lanelet2."""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
+
+from ..geometry.rotation import Float
+from ..scene import Area, Lane, LaneGraph, Signal, StopLine
+from .bounds import between, joined
+from .errors import MapError, damage_named
+from .xml_files import head_of, number, read_xml
+
+EARTH_M = 6_378_137.0
+KINDS: dict[str, LaneKind] = {
+    "road": "driving",
+    "highway": "driving",
+    "play_street": "driving",
+    "emergency_lane": "shoulder",
+    "road_shoulder": "shoulder",
+    "bus_lane": "bus",
+    "bicycle_lane": "bicycle",
+    "walkway": "sidewalk",
+    "shared_walkway": "sidewalk",
+}
+AREAS: dict[str, AreaKind] = {
+    "crosswalk": "crosswalk",
+    "parking": "parking",
+    "freespace": "drivable",
+    "walkway": "sidewalk",
+    "intersection_area": "junction",
+}
+SPEED = re.compile(r"^\s*([0-9.]+)\s*(km/h|kmh|mph|m/s|mps)?\s*$")
+UNITS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0, None: 1 / 3.6}
+
+
+class Lanelet2Reader:
+    """Reads lanelets as lanes; their order, neighbours and junctions follow from shared points and
+    rims, speed limits, lights, stop lines and right of way from regulatory elements.
+
+    Places are ``local_x``, ``local_y`` and ``ele`` of the nodes where they have them; else
+    latitude and longitude about the middle of the file, on a plane (within some centimetres for
+    a few kilometres).
+    """
+
+    name = "lanelet2"
+    expects = "a file .osm of Lanelet2 (XML, root <osm>, relations of type lanelet)"
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it is an OSM file."""
+        return path.is_file() and (path.suffix == ".osm" or b"<osm" in head_of(path))
+
+    def read(self, path: Path) -> LaneGraph:
+        """The map in the frame of the file. Raises MapError: see :class:`~.reader.MapReader`."""
+        root = read_xml(path, "osm")
+        with damage_named(str(path)):
+            osm = _Osm.of(root, str(path))
+            return _graph(osm, path.name)
+
+
+@dataclass
+class _Relation:
+    tags: dict[str, str]
+    members: dict[str, list[tuple[str, str]]]
+
+
+@dataclass
+class _Osm:
+    """A file's nodes as places, ways as node ids, and relations."""
+
+    file: str
+    places: dict[str, Float]
+    ways: dict[str, list[str]]
+    way_tags: dict[str, dict[str, str]]
+    relations: dict[str, _Relation]
+    origin: str = ""
+    way_of: dict[tuple[str, ...], str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, root: ET.Element, file: str) -> _Osm:
+        ways = {
+            w.get("id", ""): [n.get("ref", "") for n in w.findall("nd")]
+            for w in root.findall("way")
+        }
+        places, origin = _places(root.findall("node"), file)
+        for way_id, nodes in ways.items():
+            for node in nodes:
+                if node not in places:
+                    raise MapError(f"{file}: way {way_id} names node {node}, which is not there")
+        relations = {}
+        for element in root.findall("relation"):
+            members: dict[str, list[tuple[str, str]]] = defaultdict(list)
+            for m in element.findall("member"):
+                members[m.get("role", "")].append((m.get("type", ""), m.get("ref", "")))
+            relations[element.get("id", "")] = _Relation(_tags(element), members)
+        tags = {w.get("id", ""): _tags(w) for w in root.findall("way")}
+        way_of = {tuple(nodes): way for way, nodes in ways.items()}
+        return cls(file, places, ways, tags, relations, origin, way_of)
+
+    def line(self, way_id: str) -> Float:
+        """Points [N, 3] of a way."""
+        return np.array([self.places[n] for n in self.ways[way_id]]).reshape(-1, 3)
+
+    def member_ways(self, relation: _Relation, role: str) -> list[str]:
+        """Ways of a role, of those that are there."""
+        named = relation.members.get(role, ())
+        return [ref for kind, ref in named if kind == "way" and ref in self.ways]
+
+
+def _tags(element: ET.Element) -> dict[str, str]:
+    return {t.get("k", ""): t.get("v", "") for t in element.findall("tag")}
+
+
+def _places(nodes: Iterable[ET.Element], file: str) -> tuple[dict[str, Float], str]:
+    """Places of nodes: local ones where every node has them, else on a plane about their middle."""
+    found: dict[str, Float] = {}
+    degrees: dict[str, tuple[float, float, float]] = {}
+    for node in nodes:
+        tags, where = _tags(node), f"{file}: node {node.get('id')}"
+        height = _value(tags.get("ele", "0"), where)
+        if "local_x" in tags and "local_y" in tags:
+            found[node.get("id", "")] = np.array(
+                [_value(tags["local_x"], where), _value(tags["local_y"], where), height]
+            )
+        else:
+            lat, lon = number(node, "lat", where), number(node, "lon", where)
+            if abs(lat) > 89 or abs(lon) > 361:
+                raise MapError(f"{where}: latitude {lat}, longitude {lon}")
+            degrees[node.get("id", "")] = (lat, lon, height)
+    if not degrees:
+        return found, ""
+    if found:
+        raise MapError(f"{file}: some nodes have local_x and local_y, others have not")
+    lat0, lon0 = np.array([(a, b) for a, b, _ in degrees.values()]).mean(axis=0).tolist()
+    scale = math.radians(1) * EARTH_M
+    for name, (lat, lon, height) in degrees.items():
+        x = (lon - lon0) * scale * math.cos(math.radians(lat0))
+        found[name] = np.array([x, (lat - lat0) * scale, height])
+    return found, f"+proj=eqc +lat_ts={lat0!r} +lat_0={lat0!r} +lon_0={lon0!r} +R={EARTH_M}"
+
+
+def _value(text: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) < 1e9:
+        raise MapError(f"{where}: {text[:60]!r} is no number")
+    return value
+
+
+def _graph(osm: _Osm, name: str) -> LaneGraph:
+    lanelets = {k: r for k, r in osm.relations.items() if r.tags.get("type") == "lanelet"}
+    rims = {k: r for k, v in lanelets.items() if (r := _rims(osm, k, v)) is not None}
+    lanes: dict[str, Lane] = {}
+    areas: list[Area] = []
+    index = _Index(rims)
+    for key, (left, right) in rims.items():
+        tags = lanelets[key].tags
+        if tags.get("subtype") == "crosswalk":
+            left_line, right_line = _oriented(osm, left, right)
+            areas.append(Area(key, "crosswalk", np.concatenate([left_line, right_line[::-1]])))
+            continue
+        shape, beside = between(*_oriented(osm, left, right)), index.beside(key)
+        if shape is not None:
+            lanes[key] = Lane(
+                key,
+                KINDS.get(tags.get("subtype", "road"), "other"),
+                *shape,
+                speed_limit=_speed_limit(osm, lanelets[key]),
+                may_change_left=_may_cross(osm, left, "left"),
+                may_change_right=_may_cross(osm, right, "right"),
+                junction="intersection" if "turn_direction" in tags else None,
+                left=beside["left"],
+                right=beside["right"],
+                opposite=beside["opposite"],
+                successors=index.successors(key),
+            )
+    if not lanes:
+        raise MapError(f"{osm.file}: has no lanelets, relations of type lanelet with two rims")
+    areas += [a for k, r in osm.relations.items() if (a := _area(osm, k, r)) is not None]
+    stop_lines, signals = _rules(osm, lanelets, set(lanes))
+    return joined(
+        lanes.values(), areas=areas, stop_lines=stop_lines, signals=signals,
+        source=f"lanelet2 {name}", geo_reference=osm.origin,
+    )  # fmt: skip
+
+
+def _rims(osm: _Osm, key: str, relation: _Relation) -> tuple[list[str], list[str]] | None:
+    """Node ids of both rims, each of one way or several that follow each other."""
+    sides = [_chained(osm, osm.member_ways(relation, side)) for side in ("left", "right")]
+    if any(len(side) < 2 for side in sides):
+        return None
+    left, right = sides
+    # Where rims run against each other the right one is turned round; which way the traffic
+    # goes then follows from the left rim lying to the left.
+    a, b, c, d = (osm.places[n] for n in (left[0], left[-1], right[0], right[-1]))
+    as_they_are = np.linalg.norm(a - c) + np.linalg.norm(b - d)
+    if as_they_are > np.linalg.norm(a - d) + np.linalg.norm(b - c):
+        right = right[::-1]
+    middle = (osm.places[left[0]] + osm.places[right[0]]) / 2
+    ahead = (osm.places[left[-1]] + osm.places[right[-1]]) / 2 - middle
+    across = osm.places[left[0]] - osm.places[right[0]]
+    if np.linalg.norm(across[:2]) < 1e-6:
+        across = osm.places[left[-1]] - osm.places[right[-1]]
+    if ahead[0] * across[1] - ahead[1] * across[0] < 0:
+        left, right = left[::-1], right[::-1]
+    return left, right
+
+
+def _chained(osm: _Osm, ways: list[str]) -> list[str]:
+    """Nodes of ways that share ends, from one end to the other."""
+    if not ways:
+        return []
+    nodes = list(osm.ways[ways[0]])
+    rest = ways[1:]
+    while rest:
+        for way in rest:
+            other = osm.ways[way]
+            if not other:
+                return nodes
+            if other[0] == nodes[-1]:
+                nodes += other[1:]
+            elif other[-1] == nodes[-1]:
+                nodes += other[-2::-1]
+            elif other[-1] == nodes[0]:
+                nodes = other[:-1] + nodes
+            elif other[0] == nodes[0]:
+                nodes = other[:0:-1] + nodes
+            else:
+                continue
+            rest.remove(way)
+            break
+        else:
+            return nodes
+    return nodes
+
+
+def _oriented(osm: _Osm, left: list[str], right: list[str]) -> tuple[Float, Float]:
+    one, other = (np.array([osm.places[n] for n in rim]) for rim in (left, right))
+    return one, other
+
+
+class _Index:
+    """Lanelets by the nodes that they begin at, and by their rims as they run."""
+
+    def __init__(self, rims: dict[str, tuple[list[str], list[str]]]) -> None:
+        self.rims = rims
+        self.starts: dict[tuple[str, str], list[str]] = defaultdict(list)
+        self.left: dict[tuple[str, ...], list[str]] = defaultdict(list)
+        self.right: dict[tuple[str, ...], list[str]] = defaultdict(list)
+        for key, (left, right) in rims.items():
+            self.starts[left[0], right[0]].append(key)
+            self.left[tuple(left)].append(key)
+            self.right[tuple(right)].append(key)
+
+    def successors(self, key: str) -> tuple[str, ...]:
+        """Lanelets that begin where one ends."""
+        left, right = self.rims[key]
+        return tuple(n for n in self.starts.get((left[-1], right[-1]), ()) if n != key)
+
+    def beside(self, key: str) -> dict[str, str | None]:
+        """Neighbours that share a rim."""
+        left, right = (tuple(rim) for rim in self.rims[key])
+        found = {
+            "left": self.right.get(left, ()),
+            "right": self.left.get(right, ()),
+            "opposite": self.left.get(left[::-1], ()),
+        }
+        return {side: next((n for n in names if n != key), None) for side, names in found.items()}
+
+
+def _may_cross(osm: _Osm, rim: list[str], side: str) -> bool:
+    """Whether the mark along a rim lets its lane's traffic over."""
+    way = osm.way_of.get(tuple(rim))
+    turned = way is None
+    way = way or osm.way_of.get(tuple(reversed(rim)))
+    tags = osm.way_tags.get(way, {}) if way else {}
+    if "lane_change" in tags:
+        return tags["lane_change"] in ("yes", "true")
+    kind, subtype = tags.get("type", ""), tags.get("subtype", "")
+    if kind in ("curbstone", "guard_rail", "wall", "fence", "road_border"):
+        return False
+    if subtype == "dashed_solid":  # dashed on the left of the way
+        return (side == "right") != turned
+    if subtype == "solid_dashed":
+        return (side == "left") != turned
+    return not subtype.startswith("solid")
+
+
+def _speed_limit(osm: _Osm, relation: _Relation) -> float | None:
+    texts = [relation.tags.get("speed_limit", "")]
+    for _, ref in relation.members.get("regulatory_element", ()):
+        rule = osm.relations.get(ref)
+        if rule is not None and rule.tags.get("subtype") == "speed_limit":
+            texts.insert(0, rule.tags.get("sign_type", "") or rule.tags.get("limit", ""))
+    for text in texts:
+        found = SPEED.match(text)
+        if found and float(found[1]) > 0:
+            return float(found[1]) * UNITS[found[2]]
+    return None
+
+
+def _area(osm: _Osm, key: str, relation: _Relation) -> Area | None:
+    if relation.tags.get("type") != "multipolygon":
+        return None
+    nodes = _chained(osm, osm.member_ways(relation, "outer"))
+    nodes = nodes[:-1] if len(nodes) > 1 and nodes[0] == nodes[-1] else nodes
+    if len(nodes) < 3:
+        return None
+    kind = AREAS.get(relation.tags.get("subtype", ""), "other")
+    return Area(f"area_{key}", kind, np.array([osm.places[n] for n in nodes]))
+
+
+def _rules(
+    osm: _Osm, lanelets: dict[str, _Relation], lanes: set[str]
+) -> tuple[list[StopLine], list[Signal]]:
+    """Stop lines and signals of regulatory elements, with the lanes that name these."""
+    ruled: dict[str, list[str]] = defaultdict(list)
+    for key, lanelet in lanelets.items():
+        for _, ref in lanelet.members.get("regulatory_element", ()):
+            if key in lanes:
+                ruled[ref].append(key)
+    lines: dict[str, StopLine] = {}
+    signals: dict[str, Signal] = {}
+    for key, rule in osm.relations.items():
+        kind = _signal_kind(rule)
+        if rule.tags.get("type") != "regulatory_element" or kind is None:
+            continue
+        waiting = ruled.get(key, [])
+        if kind == "yield":  # of right of way: those that yield wait
+            waiting = [r for _, r in rule.members.get("yield", ()) if r in lanes]
+        stop = next(iter(osm.member_ways(rule, "ref_line")), None)
+        if stop is not None and len(osm.ways[stop]) >= 2:
+            known = lines.get(stop)
+            both = (*(known.lanes if known else ()), *waiting)
+            lines[stop] = StopLine(stop, osm.line(stop), both)
+        refers = osm.member_ways(rule, "refers") or ([stop] if stop is not None else [])
+        if not refers or not len(osm.ways[refers[0]]):
+            continue
+        line = osm.line(refers[0])
+        x, y, z = line.mean(axis=0).tolist()
+        along = line[-1] - line[0]
+        signals[key] = Signal(
+            key, kind, (x, y, z), math.atan2(along[1], along[0]) - math.pi / 2, tuple(waiting),
+            stop if stop in lines else None,
+        )  # fmt: skip
+    return list(lines.values()), list(signals.values())
+
+
+def _signal_kind(rule: _Relation) -> SignalKind | None:
+    subtype = rule.tags.get("subtype", "")
+    if subtype == "traffic_sign":
+        sign = rule.tags.get("sign_type", "")
+        return "stop" if sign in ("de206", "usR1-1") else "yield" if sign == "de205" else "other"
+    kinds: dict[str, SignalKind] = {
+        "traffic_light": "traffic_light",
+        "right_of_way": "yield",
+        "all_way_stop": "stop",
+    }
+    return kinds.get(subtype)

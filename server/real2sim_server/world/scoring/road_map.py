@@ -1,0 +1,119 @@
+"""What a map tells scores of: the surface of the road, lanes, their directions and limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from real2sim_proto.lanes import SceneLanes
+
+from ...scene import LaneGraph
+from ...scene.io.lane_document import graph_of, lane_document
+from ...scene.lane_graph import DRIVABLE
+
+if TYPE_CHECKING:
+    from .instant import EgoSample
+
+LEAST_BEYOND_M = 0.01
+"""A corner off every lane and area is this far off the road at least."""
+ALONG = 0.5
+"""Cosine of the greatest angle between an ego and the lane that it drives along."""
+
+
+@dataclass(frozen=True, eq=False)
+class RoadMap:
+    """The lanes of a scene as scores ask them.
+
+    Attributes:
+        graph: in the world frame.
+    """
+
+    graph: LaneGraph
+
+    @classmethod
+    def of(cls, graph: LaneGraph | None) -> RoadMap | None:
+        """Of a map; None without one. Lanes made of the recorded drive alone are none: they know of
+        no surface beside what was driven, and scores have that from the recording itself."""
+        return None if graph is None or graph.source == "log" else cls(graph)
+
+    def off_road(
+        self, middle: tuple[float, float, float], size: tuple[float, float, float]
+    ) -> tuple[float, int]:
+        """As :func:`.road_kernels.off_road`: how far the worst corner of a box is off the road
+        [m], and how many of its quarters have their middle on it."""
+        x, y, yaw = middle
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        turn = np.array([[cos, sin], [-sin, cos]])
+        corners = _QUARTERS * [size[0] / 2, size[1] / 2] @ turn
+        places = np.concatenate([corners, corners / 2]) + np.array([x, y])
+        inside = self.graph.is_drivable(places)
+        off = places[:4][~inside[:4]]
+        beyond = max((self._beyond(p[0], p[1]) for p in off.tolist()), default=0.0)
+        return beyond, int(inside[4:].sum())
+
+    def _beyond(self, x: float, y: float) -> float:
+        found = self.graph.nearest(x, y, kinds=DRIVABLE)
+        if found is None:
+            return LEAST_BEYOND_M
+        half = self.graph.lanes[found.lane_id].width(found.s) / 2
+        return max(abs(found.offset) - half, LEAST_BEYOND_M)
+
+    def in_lane(self, ego: EgoSample, ahead: float) -> bool:
+        """Whether the middle of the ego box is in a lane that runs its way, or in a junction."""
+        return self._along(ego, ahead, 1.0) or self._in_junction(ego, ahead)
+
+    def lane_offset(self, ego: EgoSample) -> float:
+        """Distance of the rear axle from the middle of the nearest lane [m]; 0 in junctions, where
+        nobody keeps one, and the offset from the route beside all lanes."""
+        found = self.graph.nearest(ego.x, ego.y, ego.yaw)
+        if found is None:
+            return ego.offset
+        return 0.0 if self.graph.lanes[found.lane_id].junction is not None else found.offset
+
+    def is_against(self, ego: EgoSample, ahead: float) -> bool:
+        """Whether the middle of the ego box is in a lane of oncoming traffic alone."""
+        if self._in_junction(ego, ahead) or self._along(ego, ahead, 1.0):
+            return False
+        return self._along(ego, ahead, -1.0)
+
+    def speed_limit(self, ego: EgoSample) -> float | None:
+        """Of the lane that the ego drives in [m/s]; None where none is known."""
+        found = self.graph.nearest(ego.x, ego.y, ego.yaw, within=5.0)
+        return None if found is None else self.graph.lanes[found.lane_id].speed_limit
+
+    @cached_property
+    def knows_limits(self) -> bool:
+        """Whether any lane has a speed limit."""
+        return any(lane.speed_limit is not None for lane in self.graph.lanes.values())
+
+    def _along(self, ego: EgoSample, ahead: float, sign: float) -> bool:
+        """Whether the middle lies inside a lane whose direction, times ``sign``, is the ego's."""
+        x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
+        heading = ego.yaw if sign > 0 else ego.yaw + math.pi
+        found = self.graph.nearest(x, y, heading)
+        return found is not None and found.inside and math.cos(heading - found.heading) > ALONG
+
+    def _in_junction(self, ego: EgoSample, ahead: float) -> bool:
+        x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
+        found = self.graph.nearest(x, y)
+        return (
+            found is not None
+            and found.inside
+            and self.graph.lanes[found.lane_id].junction is not None
+        )
+
+    def fields(self) -> dict[str, Any]:
+        """Plain values, for a recording."""
+        return lane_document(self.graph, with_roads=False).model_dump(mode="json")
+
+    @classmethod
+    def from_fields(cls, fields: dict[str, Any]) -> RoadMap:
+        """What :meth:`fields` gave. Raises ValueError for anything else."""
+        return cls(graph_of(SceneLanes.model_validate(fields)))
+
+
+_QUARTERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])

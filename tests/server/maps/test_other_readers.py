@@ -1,0 +1,185 @@
+"""Lanelet2, Argoverse 2, nuScenes and the project's own document: what each tells of lanes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from real2sim_server.maps import MAP_READERS, MapError, read_map
+from real2sim_server.scene.io.lane_document import lane_document
+
+NODES = {
+    1: (0, 3),
+    2: (40, 3),
+    3: (0, 0),
+    4: (40, 0),
+    5: (80, 3),
+    6: (80, 0),
+    7: (0, -3),
+    8: (40, -3),
+}
+WAYS = {
+    11: ([1, 2], {"type": "line_thin", "subtype": "solid"}),
+    12: ([3, 4], {"type": "line_thin", "subtype": "dashed"}),
+    13: ([2, 5], {}),
+    14: ([4, 6], {}),
+    15: ([7, 8], {"type": "curbstone"}),
+    16: ([4, 2], {"type": "stop_line"}),
+    17: ([6, 5], {"type": "traffic_light"}),
+}
+LANELETS = {21: (11, 12), 22: (13, 14), 23: (12, 15)}
+
+
+def written_lanelet2(folder):
+    def tags(values):
+        return "".join(f'<tag k="{k}" v="{v}"/>' for k, v in values.items())
+
+    parts = [
+        f'<node id="{n}" lat="0" lon="0">{tags({"local_x": x, "local_y": y, "ele": 1})}</node>'
+        for n, (x, y) in NODES.items()
+    ]
+    for way, (nodes, values) in WAYS.items():
+        refs = "".join(f'<nd ref="{n}"/>' for n in nodes)
+        parts.append(f'<way id="{way}">{refs}{tags(values)}</way>')
+    for key, (left, right) in LANELETS.items():
+        rules = '<member type="relation" role="regulatory_element" ref="31"/>' * (key == 21)
+        rules += '<member type="relation" role="regulatory_element" ref="32"/>'
+        parts.append(
+            f'<relation id="{key}"><member type="way" role="left" ref="{left}"/>'
+            f'<member type="way" role="right" ref="{right}"/>{rules}'
+            f"{tags({'type': 'lanelet', 'subtype': 'road'})}</relation>"
+        )
+    light = {"type": "regulatory_element", "subtype": "traffic_light"}
+    limit = {"type": "regulatory_element", "subtype": "speed_limit", "sign_type": "30 km/h"}
+    parts.append(
+        '<relation id="31"><member type="way" role="refers" ref="17"/>'
+        f'<member type="way" role="ref_line" ref="16"/>{tags(light)}</relation>'
+        f'<relation id="32">{tags(limit)}</relation>'
+    )
+    path = folder / "map.osm"
+    path.write_text(f"<osm>{''.join(parts)}</osm>")
+    return path
+
+
+def written_argoverse2(folder):
+    def line(y):
+        return [{"x": x, "y": y, "z": 0.0} for x in (0.0, 40.0)]
+
+    def segment(name, left, right, **more):
+        return {
+            "id": name, "is_intersection": False, "lane_type": "VEHICLE",
+            "left_lane_boundary": left, "right_lane_boundary": right,
+            "left_lane_mark_type": "DASHED_WHITE", "right_lane_mark_type": "SOLID_WHITE",
+            "successors": [99], "predecessors": [], "left_neighbor_id": None,
+            "right_neighbor_id": None, **more,
+        }  # fmt: skip
+
+    content = {
+        "lane_segments": {
+            "1": segment(1, line(3.0), line(0.0), left_neighbor_id=2),
+            "2": segment(2, line(3.0)[::-1], line(6.0)[::-1], left_neighbor_id=1),
+        },
+        "drivable_areas": {"7": {"id": 7, "area_boundary": [*line(-1.0), *line(7.0)[::-1]]}},
+        "pedestrian_crossings": {"8": {"id": 8, "edge1": line(1.0), "edge2": line(2.0)}},
+    }
+    path = folder / "log_map_archive_x____PIT_city_1.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def written_nuscenes(folder):
+    corners = {"a": (0, -2), "b": (30, -2), "c": (30, 2), "d": (0, 2)}
+    path = [
+        {"start_pose": [0, 0, 0], "end_pose": [0, 0, 0], "shape": "LSR", "radius": 20.0,
+         "segment_length": [10.0, 10.0, 10.0]}
+    ]  # fmt: skip
+    content = {
+        "arcline_path_3": {"l": path},
+        "connectivity": {"l": {"incoming": [], "outgoing": ["gone"]}},
+        "node": [{"token": k, "x": x, "y": y} for k, (x, y) in corners.items()],
+        "polygon": [{"token": "p", "exterior_node_tokens": list(corners)}],
+        "line": [],
+        "lane": [{"token": "l", "polygon_token": "p"}],
+        "drivable_area": [{"token": "r", "polygon_tokens": ["p"]}],
+        "stop_line": [{"token": "w", "polygon_token": "p", "traffic_light_tokens": ["t"]}],
+        "traffic_light": [{"token": "t", "pose": {"tx": 1, "ty": 2, "tz": 3, "rz": 0.5}}],
+    }
+    file = folder / "boston.json"
+    file.write_text(json.dumps(content))
+    return file
+
+
+def written_native(folder):
+    graph = read_map(written_argoverse2(folder))
+    path = folder / "lanes.json"
+    path.write_text(lane_document(graph).model_dump_json())
+    return path
+
+
+def written_opendrive(folder):
+    path = folder / "map.xodr"
+    path.write_text(
+        '<OpenDRIVE><header revMajor="1" revMinor="7"/><road id="1" length="40"><planView>'
+        '<geometry s="0" x="0" y="0" hdg="0" length="40"><line/></geometry></planView><lanes>'
+        '<laneSection s="0"><right><lane id="-1" type="driving"><width sOffset="0" a="3" b="0" '
+        'c="0" d="0"/></lane></right></laneSection></lanes></road></OpenDRIVE>'
+    )
+    return path
+
+
+@pytest.mark.parametrize("reader", MAP_READERS, ids=lambda reader: reader.name)
+def test_every_reader_passes_the_contract(reader, tmp_path):
+    """Its own file is recognised by it alone, read the same twice, and refused by name when cut."""
+    path = globals()[f"written_{reader.name}"](tmp_path)
+    assert [r.name for r in MAP_READERS if r.recognises(path)] == [reader.name]
+    graph = read_map(path)
+    assert graph.lanes
+    assert lane_document(graph) == lane_document(read_map(path, format=reader.name))
+    assert not reader.recognises(tmp_path / "nothing")
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(MapError, match=path.name):
+        read_map(path, format=reader.name)
+
+
+def test_lanelets_are_joined_by_their_points_and_ruled_by_their_elements(tmp_path):
+    graph = read_map(written_lanelet2(tmp_path))
+    first, beside = graph.lane("21"), graph.lane("23")
+    assert (first.successors, first.right, beside.left) == (("22",), "23", "21")
+    assert graph.gaps["21", "22"] == 0
+    assert first.at(10.0) == pytest.approx((10.0, 1.5, 1.0, 0.0))
+    assert first.speed_limit == pytest.approx(30 / 3.6)
+    assert (first.may_change_left, first.may_change_right) == (False, True)
+    light = graph.signals["31"]
+    assert (light.kind, light.lanes, light.stop_line) == ("traffic_light", ("21",), "16")
+    np.testing.assert_allclose(graph.stop_lines["16"].points[:, 0], 40.0)
+
+
+def test_segments_of_argoverse_2_have_middles_neighbours_and_areas(tmp_path):
+    graph = read_map(written_argoverse2(tmp_path))
+    lane = graph.lane("1")
+    assert lane.at(10.0)[:2] == pytest.approx((10.0, 1.5))
+    assert (lane.opposite, lane.left, lane.successors) == ("2", None, ())
+    assert (lane.may_change_left, lane.may_change_right) == (True, False)
+    assert graph.is_drivable([[20, -0.5], [20, -1.5]]).tolist() == [True, False]
+    assert graph.areas["crossing_8"].kind == "crosswalk"
+
+
+def test_arcs_of_nuscenes_are_followed(tmp_path):
+    lane = read_map(written_nuscenes(tmp_path)).lane("l")
+    assert lane.length == pytest.approx(30.0, rel=1e-3)
+    end = lane.at(lane.length)
+    up = 20 * (1 - math.cos(0.5))
+    assert end[0] == pytest.approx(40 * math.sin(0.5) + 10 * math.cos(0.5), abs=1e-6)
+    assert end[1] == pytest.approx(2 * up + 10 * math.sin(0.5), abs=1e-6)
+    assert lane.widths[0] == pytest.approx(4.0, rel=1e-2)
+
+
+def test_a_real_map_of_argoverse_2_has_no_gaps_and_carries_its_drive(test_data):
+    folder = next(Path(test_data, "argoverse2").glob("7fab*"))
+    graph = read_map(folder)
+    assert len(graph.lanes) == 183
+    assert max(graph.gaps.values()) < 0.01
