@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,13 +15,30 @@ from ...scene import LaneGraph
 from ...scene.io.lane_document import graph_of, lane_document
 from ...scene.lane_graph import DRIVABLE
 
-if TYPE_CHECKING:
-    from .instant import EgoSample
-
 LEAST_BEYOND_M = 0.01
 """A corner off every lane and area is this far off the road at least."""
 ALONG = 0.5
 """Cosine of the greatest angle between an ego and the lane that it drives along."""
+
+
+class EgoPose(Protocol):
+    """What is asked of an ego: rear axle in the world [m], heading [rad], offset from the route."""
+
+    @property
+    def x(self) -> float:
+        """[m]."""
+
+    @property
+    def y(self) -> float:
+        """[m]."""
+
+    @property
+    def yaw(self) -> float:
+        """[rad]."""
+
+    @property
+    def offset(self) -> float:
+        """To the left of the route [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +79,11 @@ class RoadMap:
         half = self.graph.lanes[found.lane_id].width(found.s) / 2
         return max(abs(found.offset) - half, LEAST_BEYOND_M)
 
-    def in_lane(self, ego: EgoSample, ahead: float) -> bool:
+    def in_lane(self, ego: EgoPose, ahead: float) -> bool:
         """Whether the middle of the ego box is in a lane that runs its way, or in a junction."""
         return self._along(ego, ahead, 1.0) or self._in_junction(ego, ahead)
 
-    def lane_offset(self, ego: EgoSample) -> float:
+    def lane_offset(self, ego: EgoPose) -> float:
         """Distance of the rear axle from the middle of the nearest lane [m]; 0 in junctions, where
         nobody keeps one, and the offset from the route beside all lanes."""
         found = self.graph.nearest(ego.x, ego.y, ego.yaw)
@@ -74,13 +91,13 @@ class RoadMap:
             return ego.offset
         return 0.0 if self.graph.lanes[found.lane_id].junction is not None else found.offset
 
-    def is_against(self, ego: EgoSample, ahead: float) -> bool:
+    def is_against(self, ego: EgoPose, ahead: float) -> bool:
         """Whether the middle of the ego box is in a lane of oncoming traffic alone."""
         if self._in_junction(ego, ahead) or self._along(ego, ahead, 1.0):
             return False
         return self._along(ego, ahead, -1.0)
 
-    def speed_limit(self, ego: EgoSample) -> float | None:
+    def speed_limit(self, ego: EgoPose) -> float | None:
         """Of the lane that the ego drives in [m/s]; None where none is known."""
         found = self.graph.nearest(ego.x, ego.y, ego.yaw, within=5.0)
         return None if found is None else self.graph.lanes[found.lane_id].speed_limit
@@ -90,14 +107,14 @@ class RoadMap:
         """Whether any lane has a speed limit."""
         return any(lane.speed_limit is not None for lane in self.graph.lanes.values())
 
-    def _along(self, ego: EgoSample, ahead: float, sign: float) -> bool:
+    def _along(self, ego: EgoPose, ahead: float, sign: float) -> bool:
         """Whether the middle lies inside a lane whose direction, times ``sign``, is the ego's."""
         x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
         heading = ego.yaw if sign > 0 else ego.yaw + math.pi
         found = self.graph.nearest(x, y, heading)
         return found is not None and found.inside and math.cos(heading - found.heading) > ALONG
 
-    def _in_junction(self, ego: EgoSample, ahead: float) -> bool:
+    def _in_junction(self, ego: EgoPose, ahead: float) -> bool:
         x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
         found = self.graph.nearest(x, y)
         return (
