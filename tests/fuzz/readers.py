@@ -459,6 +459,7 @@ def _targets() -> list[Target]:
             "sweep_space", sweep_space_sample, plain(".yaml"), read_sweep_space, (CommandError,)
         ),
         Target("episode_journal", journal_sample, plain(".journal"), read_journal, (ValueError,)),
+        *map_targets(),
     ]
 
 
@@ -498,8 +499,6 @@ def read_journal(path: Path) -> Any:
     from real2sim_server.sweeps.journal import Journal
 
     return Journal(path).rows
-        *map_targets(),
-    ]
 
 
 def map_targets() -> list[Target]:
