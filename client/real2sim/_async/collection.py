@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Sequence
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from .transport import AsyncTransport
 
@@ -22,9 +22,9 @@ class AsyncCollection(Generic[T]):
     def __init__(self, transport: AsyncTransport) -> None:
         self._transport = transport
 
-    async def list(self) -> Sequence[T]:
-        """All of them."""
-        raise NotImplementedError
+    if TYPE_CHECKING:
+
+        async def list(self) -> Sequence[T]: ...
 
     async def __aiter__(self) -> AsyncIterator[T]:
         for one in await self.list():

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from .transport import Transport
 
@@ -23,9 +23,9 @@ class Collection(Generic[T]):
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
 
-    def list(self) -> Sequence[T]:
-        """All of them."""
-        raise NotImplementedError
+    if TYPE_CHECKING:
+
+        def list(self) -> Sequence[T]: ...
 
     def __iter__(self) -> Iterator[T]:
         for one in self.list():

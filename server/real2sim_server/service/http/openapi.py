@@ -182,7 +182,9 @@ def _add_worker_token(operation: dict[str, Any]) -> None:
 
 def _schema_name(schema: dict[str, Any]) -> str:
     references = [schema, *schema.get("anyOf", ()), *schema.get("oneOf", ())]
-    return next((r["$ref"].rsplit("/", 1)[1] for r in references if "$ref" in r), "")
+    name = next((r["$ref"].rsplit("/", 1)[1] for r in references if "$ref" in r), "")
+    # Models whose answers look otherwise than what is sent have two.
+    return name.removesuffix("-Input")
 
 
 def text_of(made: dict[str, Any]) -> str:

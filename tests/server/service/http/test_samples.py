@@ -9,9 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from real2sim_server.scene import Lane, LaneGraph
 from real2sim_server.scene.io import save_scene
 from real2sim_server.service.app import create_app
 from real2sim_server.service.http.openapi import document, operations
@@ -34,7 +36,10 @@ def demo_street(tiny_scene, tmp_path_factory) -> Path:
         name: replace(tiny_scene.objects[source], object_id=name)
         for name, source in OBJECTS.items()
     }
-    save_scene(replace(tiny_scene, name="demo_street", objects=named), folder / "demo_street.r2s")
+    line = np.array([[-20.0, 0.0, 0.0], [80.0, 0.0, 0.0]])
+    lanes = LaneGraph.of([Lane("own", "driving", line, np.full(2, 3.5))])
+    scene = replace(tiny_scene, name="demo_street", objects=named, lanes=lanes)
+    save_scene(scene, folder / "demo_street.r2s")
     return folder
 
 
