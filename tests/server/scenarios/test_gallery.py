@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
+
 import pytest
 
 from real2sim_proto.episode import ResetSpec
@@ -10,13 +11,24 @@ from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import ScenarioState
 from real2sim_server.scenarios.fit import fitted_to_scene
 from real2sim_server.scenarios.flat_scene import flat_scene
-from real2sim_server.scenarios.gallery import GALLERY, corner_case
+from real2sim_server.scenarios.gallery import FAMILIES, GALLERY, corner_case
 from real2sim_server.scenarios.openscenario import read_openscenario_text, write_openscenario
 from real2sim_server.world import World
 
-EGO_SPEED = 10.0
-FRONT, REAR = 3.6, 0.9
-"""From the ego's rear axle to its front, and from a car's rear axle to its rear end [m]."""
+from .definitions import DEFINITIONS, EGO_SPEED
+
+NEAR, SOON = 0.05, 0.05
+"""How far from its formula [m, m/s], or how late [s], a case may be."""
+
+OTHER = {
+    "ccrb": {"braking": 2.0, "delay": 1.0},
+    "cut_in": {"gap": 6.0, "speed": 5.0, "duration": 3.5},
+    "cpfa": {"ahead": 60.0, "speed": 3.1, "impact": 0.2},
+    "ccftap": {"ahead": 60.0, "radius": 9.0, "acceleration": 2.0},
+    "lss_oncoming": {"drift": 3.0, "speed": 12.0},
+    "junction_crossing": {"ahead": 55.0, "speed": 6.0},
+}
+"""Parameters but the default ones."""
 
 
 @pytest.fixture(scope="module")
@@ -45,20 +57,58 @@ def run(scene, board, seconds=6.0):
     return worlds
 
 
-def track(worlds, name):
-    """x and y from where the ego began, and speed, at each step."""
-    ego = worlds[0].motion
-    found = [w.storyboard.entities[name] for w in worlds]
-    return np.array([(a.x - ego.x, a.y - ego.y, a.speed) for a in found])
-
-
-def started(worlds, event):
-    return [
-        (e.t_us - worlds[0].t_us) * 1e-6
+def starts(worlds):
+    """When each event began [s]."""
+    return {
+        e.element.split("::")[-1]: (e.t_us - worlds[0].t_us) * 1e-6
         for w in worlds
         for e in w.observe().events
-        if e.element and e.element.endswith(f"::{event}") and e.change == "start"
-    ]
+        if e.element_type == "event" and e.change == "start"
+    }
+
+
+def test_each_case_has_a_definition():
+    assert list(DEFINITIONS) == list(GALLERY)
+    assert {case.family for case in GALLERY.values()} == set(FAMILIES)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [*((name, {}) for name in GALLERY), *OTHER.items()],
+    ids=[*GALLERY, *(f"{name}-other" for name in OTHER)],
+)
+def test_a_case_goes_by_its_formulas(scene, name, parameters):
+    case = corner_case(name)
+    definition = DEFINITIONS[name](**{**case.parameters, **parameters})
+    end = max(definition.starts.values(), default=0.0) + 3.5
+    worlds = run(scene, case.storyboard(**parameters), end)
+    origin = worlds[0].motion
+
+    assert starts(worlds) == pytest.approx(definition.starts, abs=SOON)
+    courses = definition.courses
+    names = [n for n in worlds[0].storyboard.entities if n != "Ego"] if "" in courses else courses
+    for entity, course in zip(names, courses.values(), strict=True):
+        for world in worlds:
+            t = (world.t_us - worlds[0].t_us) * 1e-6
+            actor = world.storyboard.entities[entity]
+            x, y, speed = course(t)
+            assert actor.x - origin.x == pytest.approx(x, abs=NEAR), (entity, t)
+            assert actor.y - origin.y == pytest.approx(y, abs=NEAR), (entity, t)
+            soon = [course(max(t + d, 0.0))[2] for d in (-SOON, SOON)]
+            low, high = min(speed, *soon), max(speed, *soon)
+            assert low - NEAR <= actor.speed <= high + NEAR, (entity, t)
+
+
+def test_the_ego_begins_to_leave_its_lane(scene):
+    """The planner's ego is put where lane keeping begins."""
+    board = with_speed(corner_case("lss_keep").storyboard())
+    spec = ResetSpec(storyboard=fitted_to_scene(board, scene), horizon=20)
+    recorded = World(scene, ScenarioState.of(scene), ResetSpec(horizon=20)).motion
+    motion = World(scene, ScenarioState.of(scene), spec).motion
+
+    assert motion.y - recorded.y == pytest.approx(0.5)
+    assert math.remainder(motion.yaw - recorded.yaw, math.tau) == pytest.approx(0.05)
+    assert motion.speed * math.sin(motion.yaw - recorded.yaw) == pytest.approx(0.5, abs=0.001)
 
 
 @pytest.mark.parametrize("name", GALLERY)
@@ -71,62 +121,6 @@ def test_a_case_is_written_as_a_file_and_read_back_to_the_same_run(scene, name):
     assert write_openscenario(again) == data
     first, second = run(scene, board, 3.0)[-1], run(scene, again, 3.0)[-1]
     assert first.agents.positions.tobytes() == second.agents.positions.tobytes()
-
-
-@pytest.mark.parametrize(("name", "speed"), [("ccrs", 0.0), ("ccrm", 5.6), ("cbla", 4.2)])
-def test_a_target_goes_ahead_at_its_speed(scene, name, speed):
-    gap = corner_case(name).parameters["gap"]
-    target = "cyclist" if name == "cbla" else "target"
-    found = track(run(scene, corner_case(name).storyboard(), 3.0), target)
-
-    assert found[:, 0] == pytest.approx(gap + speed * np.arange(31) / 10, abs=0.05)
-
-
-@pytest.mark.parametrize(("braking", "delay"), [(6.0, 2.0), (2.0, 1.0)])
-def test_the_car_ahead_brakes_when_and_as_hard_as_it_says(scene, braking, delay):
-    worlds = run(scene, corner_case("ccrb").storyboard(braking=braking, delay=delay), 8.0)
-    found = track(worlds, "target")
-
-    assert started(worlds, "brake") == pytest.approx([delay], abs=0.05)
-    stop = 26.0 + 10.0 * delay + 10.0**2 / (2 * braking)
-    assert found[-1, 0] == pytest.approx(stop, abs=0.05)
-    k = round(delay * 10) + 5
-    assert found[k, 2] == pytest.approx(10.0 - braking * 0.5, abs=0.01)
-
-
-def test_a_car_cuts_in_at_its_gap_by_its_form(scene):
-    worlds = run(scene, corner_case("cut_in").storyboard(), 9.0)
-    found = track(worlds, "cutter")
-    begin = (35.0 - FRONT - REAR - 12.0) / 3.0
-
-    assert started(worlds, "move_in") == pytest.approx([begin], abs=0.05)
-    for k in range(91):
-        u = min(max((k / 10 - begin) / 2.0, 0.0), 1.0)
-        y = 3.5 * (1 + np.cos(np.pi * u)) / 2
-        assert found[k, 1] == pytest.approx(y, abs=0.05)
-
-
-@pytest.mark.parametrize("name", ["cpna", "cpfa", "cbna", "cbfa", "occluded_pedestrian"])
-def test_who_crosses_is_in_the_ego_s_way_when_it_comes(scene, name):
-    case = corner_case(name)
-    worlds = run(scene, case.storyboard(), 6.0)
-    ahead, distance, speed = (case.parameters[k] for k in ("ahead", "distance", "speed"))
-    side = 1.0 if name in {"cpfa", "cbfa"} else -1.0
-    begin = ahead / EGO_SPEED - distance / speed
-
-    assert started(worlds, "cross") == pytest.approx([begin], abs=0.05)
-    found = track(worlds, "crosser")
-    at = np.interp(ahead / EGO_SPEED, np.arange(len(found)) / 10, found[:, 1])
-    assert at == pytest.approx(0.0, abs=0.05)
-    assert found[0, 1] == pytest.approx(side * distance)
-
-
-def test_cars_meet_at_the_junction(scene):
-    worlds = run(scene, corner_case("junction_crossing").storyboard(), 5.0)
-
-    x, y, speed = track(worlds, "crosser")[45]
-    assert (x, y) == pytest.approx((45.0, 0.0), abs=0.05)
-    assert speed == pytest.approx(8.0, abs=0.05)
 
 
 def test_unknown_cases_and_parameters_are_refused_by_name():

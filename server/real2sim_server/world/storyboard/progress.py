@@ -268,7 +268,9 @@ class Progress:
         for each in element.within():
             tokens = set(self._running.pop(each.number, {}).values())
             if tokens:
-                self.entities = {k: _without(a, tokens) for k, a in self.entities.items()}
+                self.entities = {
+                    k: _without(a, tokens, self._network) for k, a in self.entities.items()
+                }
             if self._status[each.number] != COMPLETE:
                 if self._status[each.number] == RUNNING:
                     self._fresh.add((each.number, "stop_transition"))
@@ -356,13 +358,15 @@ class Progress:
         return Places(self.entities, self._network, self._program.board.origin)
 
 
-def _without(actor: EntityState, tokens: set[int]) -> EntityState:
-    """An entity that actions move no more; it keeps its speed."""
+def _without(actor: EntityState, tokens: set[int], network: RoadNetwork) -> EntityState:
+    """An entity that actions move no more; it keeps its speed, and goes on from where it is."""
     changes: dict[str, Any] = {}
     if actor.longitudinal is not None and actor.longitudinal.token in tokens:
         changes["longitudinal"] = None
     if actor.lateral is not None and actor.lateral.token in tokens:
         changes |= {"lateral": None, "drift": 0.0}
+    if changes:
+        actor = evolved(actor, **changes)
     if actor.trajectory is not None and actor.trajectory.token in tokens:
-        changes["trajectory"] = None
-    return evolved(actor, **changes) if changes else actor
+        actor = evolved(actor, trajectory=None).on_lane(network)
+    return actor

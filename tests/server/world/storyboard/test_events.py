@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from real2sim_proto.episode import ResetSpec
@@ -88,6 +89,20 @@ def test_an_event_that_overrides_stops_those_that_run(run):
     assert times_of(worlds, "long", "stop") == pytest.approx([2.0])
     assert not times_of(worlds, "long", "end")
     assert speeds(worlds)[-1] == pytest.approx(10.0)
+
+
+def test_who_leaves_a_trajectory_goes_on_from_where_it_is(run):
+    vertices = [{"position": {"kind": "world", "x": x, "y": 9.0}} for x in (100.0, 100.1)]
+    vertices.append({"position": {"kind": "world", "x": 100.1, "y": 60.0}})
+    follow = {"kind": "follow_trajectory", "curve": {"shape": "polyline", "vertices": vertices}}
+    worlds = run(
+        event("aside", follow, start=after(1.0)),
+        event("slow", to_speed(8.0), start=after(2.0)),
+    )
+
+    assert places(worlds)[20, 1] == pytest.approx(19.0, abs=0.2)
+    steps = np.hypot(*np.diff(places(worlds)[11:, :2], axis=0).T)
+    assert steps.max() < 1.01
 
 
 def test_an_event_that_skips_does_not_happen_while_another_runs(run):
