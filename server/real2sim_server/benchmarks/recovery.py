@@ -17,13 +17,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from real2sim.images import Frame
-from real2sim.observation import Observation, observation_from_wire
+from real2sim.observation import Observation
 from real2sim.planners import FollowRoute, LearnedPolicy
 from real2sim.planners.learned import PolicyShape
-from real2sim_proto.drive import Obs
 from real2sim_proto.episode import Randomization, ResetSpec, StartRandomization
 from real2sim_proto.plans import TrajectoryPlan
 
@@ -36,10 +33,10 @@ from ..demo.street import SHIPPED
 from ..edit import ScenarioState
 from ..policies.cloning import save_policy, train_network
 from ..policies.exported import LAYOUT, exported_examples
-from ..render import RasterOptions, View, rasterize_batch
-from ..render.quantize import to_uint8
 from ..scene import Camera, Scene
 from ..scene.io import load_scene, read_packed
+from ..sweeps.episode import observation_of
+from ..sweeps.pictures import draw_frames
 from ..world import World
 from ..world.draws import Draws
 from ..world.path import LoggedPath
@@ -55,7 +52,6 @@ PERIOD_US = 100_000
 """Between frames and between steps."""
 AT_ONCE = 16
 """Worlds whose images are drawn in one call."""
-RGB = RasterOptions(depth=False, instance=False)
 INSTANTS = 8
 """At which episodes begin."""
 SEED_STEP = 1_000_003
@@ -214,9 +210,8 @@ def drive_all(
     for step in range(steps):
         for first in range(0, len(worlds), AT_ONCE):
             part = [k for k in range(len(worlds))[first : first + AT_ONCE] if not worlds[k].over]
-            images = _images([worlds[k] for k in part], camera)
-            for k, image in zip(part, images, strict=True):
-                obs = _observation(worlds[k], camera, image)
+            seen = _observations([worlds[k] for k in part], camera)
+            for k, obs in zip(part, seen, strict=True):
                 if step == 0:
                     planners[k].reset(obs)
                 worlds[k].step(planners[k].plan(obs))
@@ -271,35 +266,13 @@ def _world(scene: Scene, seed: int, instant: int, options: RecoveryBenchOptions)
     return World(scene, ScenarioState.of(scene), spec)
 
 
-def _images(worlds: Sequence[World], camera: Camera | None) -> list[NDArray[np.uint8] | None]:
+def _observations(worlds: Sequence[World], camera: Camera | None) -> list[Observation]:
+    """What sessions would show."""
+    blind = [observation_of(world) for world in worlds]
     if camera is None or not worlds:
-        return [None] * len(worlds)
-    views = [View(w.instances(), camera.viewmat(w.T_world_body), camera.K) for w in worlds]
-    drawn = rasterize_batch(
-        views, camera.width, camera.height, sky=worlds[0].scene.sky, options=RGB
-    )
-    return list(to_uint8(drawn.rgb))
-
-
-def _observation(
-    world: World, camera: Camera | None, image: NDArray[np.uint8] | None
-) -> Observation:
-    """What a session would show."""
-    obs = observation_from_wire(Obs(**world.observe().obs_fields(), frames=[]))
-    if camera is None or image is None:
-        return obs
-    frame = Frame(
-        modality="rgb",
-        codec="raw",
-        dtype="uint8",
-        shape=image.shape,
-        data=image.tobytes(),
-        sensor=camera.name,
-        t_us=world.t_us,
-        T_world_sensor=world.T_world_body @ camera.T_vehicle_camera,
-        K=camera.K,
-    )
-    return replace(obs, frames={camera.name: {"rgb": frame}})
+        return blind
+    frames = zip(blind, draw_frames(worlds, camera), strict=True)
+    return [replace(obs, frames={camera.name: {"rgb": frame}}) for obs, frame in frames]
 
 
 def _outcome(world: World) -> Outcome:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from real2sim.images import Frame
 from real2sim.observation import Observation
@@ -11,6 +15,7 @@ from real2sim.planners import Needs
 from ..render import RasterOptions, View, rasterize_batch
 from ..render.quantize import to_uint8
 from ..scene import Camera, Scene
+from ..service.library.views import camera_infos
 from ..world import World
 
 RGB = RasterOptions(depth=False, instance=False)
@@ -40,34 +45,40 @@ class CameraFeed:
                 f"the planner wants {', '.join(needs.modalities)}; sweeps draw rgb alone: drive it "
                 "with evaluate-policy"
             )
-        names = list(needs.cameras or scene.rig.names[:1])
-        if missing := [name for name in names if name not in scene.rig.names]:
-            raise ValueError(
-                f"the planner wants camera {missing[0]!r}; the scene has "
-                f"{', '.join(scene.rig.names) or 'none'}"
-            )
-        cameras = (scene.rig[name] for name in names)
+        sensors = needs.sensors(camera_infos(tuple(scene.rig)))
+        cameras = (scene.rig[sensor["camera"]] for sensor in sensors)
         return cls(tuple(c if needs.width is None else c.resized(needs.width) for c in cameras))
 
     def added_to(self, obs: Observation, world: World) -> Observation:
         """The observation with the images of its instant."""
-        frames = {}
-        for camera in self.cameras:
-            view = View(world.instances(), camera.viewmat(world.T_world_body), camera.K)
-            drawn = rasterize_batch(
-                [view], camera.width, camera.height, sky=world.scene.sky, options=RGB
-            )
-            image = to_uint8(drawn.rgb)[0]
-            frame = Frame(
-                modality="rgb",
-                codec="raw",
-                dtype="uint8",
-                shape=image.shape,
-                data=image.tobytes(),
-                sensor=camera.name,
-                t_us=world.t_us,
-                T_world_sensor=world.T_world_body @ camera.T_vehicle_camera,
-                K=camera.K,
-            )
-            frames[camera.name] = {"rgb": frame}
+        frames = {camera.name: {"rgb": draw_frames([world], camera)[0]} for camera in self.cameras}
         return replace(obs, frames=frames)
+
+
+def draw_frames(worlds: Sequence[World], camera: Camera) -> list[Frame]:
+    """What a camera sees in each of several worlds of one scene, drawn in one call.
+
+    Args:
+        worlds: at their instants; one at least.
+        camera: of the ego.
+    """
+    views = [View(w.instances(), camera.viewmat(w.T_world_body), camera.K) for w in worlds]
+    drawn = rasterize_batch(
+        views, camera.width, camera.height, sky=worlds[0].scene.sky, options=RGB
+    )
+    images = zip(worlds, to_uint8(drawn.rgb), strict=True)
+    return [_frame(world, camera, image) for world, image in images]
+
+
+def _frame(world: World, camera: Camera, image: NDArray[np.uint8]) -> Frame:
+    return Frame(
+        modality="rgb",
+        codec="raw",
+        dtype="uint8",
+        shape=image.shape,
+        data=image.tobytes(),
+        sensor=camera.name,
+        t_us=world.t_us,
+        T_world_sensor=world.T_world_body @ camera.T_vehicle_camera,
+        K=camera.K,
+    )
