@@ -18,7 +18,8 @@ from .errors import (
     UnknownObjectError,
 )
 from .ground import Ground
-from .lane_graph import Area, Lane, LaneGraph, LanePlace, Signal, StopLine
+from .lane import Area, Lane, LanePlace, Signal, StopLine
+from .lane_graph import LaneGraph
 from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
 from .lidar import Beams, Detection, Lidar
 from .lidar_surfaces import LidarSurfaces, Reflector, RingResponse

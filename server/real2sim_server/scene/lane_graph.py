@@ -8,226 +8,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, NamedTuple, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
-
 from ..geometry.rotation import Float
 from .errors import SceneError
-from .lane_kernels import count_cells, fill_cells, inside_any, nearest_lanes
+from .lane import DRIVABLE, TRAVELLED, Area, Lane, LanePlace, Signal, StopLine
+from .lane_index import LaneIndex
+from .lane_kernels import inside_any, nearest_lanes
 from .road import Road, turned
 
-LANE_KINDS: tuple[str, ...] = get_args(LaneKind)
-AREA_KINDS: tuple[str, ...] = get_args(AreaKind)
-SIGNAL_KINDS: tuple[str, ...] = get_args(SignalKind)
-TRAVELLED: frozenset[str] = frozenset({"driving", "bus"})
-"""Lanes that cars drive along."""
-DRIVABLE: frozenset[str] = TRAVELLED | {"bicycle", "shoulder", "parking"}
-"""Lanes whose surface a car may touch."""
-CELL_M, MAX_CELLS = 5.0, 4_000_000
-LONGEST_SEGMENT_M = 20.0
 MAX_LENGTH_M = 2e7
-SAME_PLACE_M = 1e-6
-
-
-class LanePlace(NamedTuple):
-    """A place in a lane's own coordinates.
-
-    Attributes:
-        lane_id: the lane.
-        s: arc length along its centre line, seen from above [m].
-        offset: distance from it, positive to the left [m].
-        heading: of the lane there [rad].
-        inside: whether it lies between the lane's rims.
-    """
-
-    lane_id: str
-    s: float
-    offset: float
-    heading: float
-    inside: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Lane:
-    """One lane, in the direction that its traffic drives.
-
-    Attributes:
-        lane_id: unique in the graph.
-        kind: what it is for.
-        centre: [N, 3] float64, centre line in the world [m], N >= 2, without repeated points.
-        widths: [N] float64, across the centre line, half to each side [m], from 0.
-        speed_limit: [m/s], None where the map states none.
-        successors: lanes that go on where it ends.
-        left, right: neighbours of the same direction, whose traffic shares its rim.
-        opposite: the neighbour to the left that runs the other way.
-        may_change_left, may_change_right: whether markings allow to change to those neighbours.
-        junction: the junction that it crosses, or None.
-
-    Raises:
-        SceneError: naming the lane.
-    """
-
-    lane_id: str
-    kind: LaneKind
-    centre: Float
-    widths: Float
-    speed_limit: float | None = None
-    successors: tuple[str, ...] = ()
-    left: str | None = None
-    right: str | None = None
-    opposite: str | None = None
-    may_change_left: bool = True
-    may_change_right: bool = True
-    junction: str | None = None
-
-    def __post_init__(self) -> None:
-        what = f"lane {self.lane_id!r}"
-        centre = points_of(self.centre, what)
-        widths = np.array(self.widths, dtype=np.float64)
-        if self.kind not in LANE_KINDS:
-            raise SceneError(f"{what}: kind {self.kind!r}; allowed: {', '.join(LANE_KINDS)}")
-        if widths.shape != (len(centre),) or not (np.isfinite(widths) & (widths >= 0)).all():
-            raise SceneError(f"{what}: widths must be {len(centre)} lengths from 0")
-        if (np.linalg.norm(np.diff(centre[:, :2], axis=0), axis=1) < SAME_PLACE_M).any():
-            raise SceneError(f"{what}: two points of its centre line share a place")
-        limit = self.speed_limit
-        if limit is not None and not (math.isfinite(limit) and limit > 0):
-            raise SceneError(f"{what}: speed limit {limit!r} must be positive [m/s], or None")
-        widths.flags.writeable = False
-        object.__setattr__(self, "centre", centre)
-        object.__setattr__(self, "widths", widths)
-        object.__setattr__(self, "successors", tuple(dict.fromkeys(self.successors)))
-
-    @cached_property
-    def s(self) -> Float:
-        """[N] float64, arc length of each point of the centre line seen from above [m]."""
-        steps = np.linalg.norm(np.diff(self.centre[:, :2], axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps)])
-
-    @property
-    def length(self) -> float:
-        """Of the centre line seen from above [m]."""
-        return float(self.s[-1])
-
-    @cached_property
-    def headings(self) -> Float:
-        """[N] float64, direction of the centre line at its points [rad], without jumps of 2 pi."""
-        d = np.diff(self.centre[:, :2], axis=0)
-        along = np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
-        steps = np.linalg.norm(d, axis=1)
-        if len(along) == 1:
-            return np.array([along[0], along[0]])
-        # At a point the neighbours' directions count by the nearness of their middles.
-        between = (along[:-1] * steps[1:] + along[1:] * steps[:-1]) / (steps[:-1] + steps[1:])
-        ends = np.array([2 * along[0] - between[0], 2 * along[-1] - between[-1]])
-        return np.concatenate([ends[:1], between, ends[1:]])
-
-    @cached_property
-    def rims(self) -> tuple[Float, Float]:
-        """Left and right rim, [N, 3] float64 each, at the points of the centre line [m]."""
-        aside = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)
-        half = np.zeros_like(self.centre)
-        half[:, :2] = aside * (self.widths / 2)[:, None]
-        return self.centre + half, self.centre - half
-
-    def at(self, s: float, offset: float = 0.0) -> tuple[float, float, float, float]:
-        """x, y, z [m] and heading [rad] at ``s``, ``offset`` to the left of the centre line.
-
-        Before its start and past its end the lane goes on straight.
-        """
-        x, y, z = (float(np.interp(s, self.s, self.centre[:, i])) for i in range(3))
-        heading = float(np.interp(s, self.s, self.headings))
-        beyond = min(s, 0.0) + max(s - self.length, 0.0)
-        cos, sin = math.cos(heading), math.sin(heading)
-        return x + beyond * cos - offset * sin, y + beyond * sin + offset * cos, z, heading
-
-    def width(self, s: float) -> float:
-        """Width at ``s`` [m]."""
-        return float(np.interp(s, self.s, self.widths))
-
-    def moved(self, yaw: float, shift: Float) -> Lane:
-        """The lane turned about the z axis of the world by ``yaw`` [rad], then moved [m]."""
-        return replace(self, centre=turned(self.centre, yaw) + shift)
-
-
-@dataclass(frozen=True, eq=False)
-class Area:
-    """A marked part of the ground.
-
-    Attributes:
-        area_id: unique among the areas.
-        kind: what it is for.
-        outline: [N, 3] float64, corners of a simple polygon in the world [m], N >= 3.
-    """
-
-    area_id: str
-    kind: AreaKind
-    outline: Float
-
-    def __post_init__(self) -> None:
-        if self.kind not in AREA_KINDS:
-            raise SceneError(
-                f"area {self.area_id!r}: kind {self.kind!r}; allowed: {', '.join(AREA_KINDS)}"
-            )
-        outline = points_of(self.outline, f"area {self.area_id!r}", least=3)
-        object.__setattr__(self, "outline", outline)
-
-
-@dataclass(frozen=True, eq=False)
-class StopLine:
-    """Where vehicles wait.
-
-    Attributes:
-        stop_line_id: unique among the stop lines.
-        points: [N, 3] float64, across the lanes [m], N >= 2.
-        lanes: those whose traffic waits there.
-    """
-
-    stop_line_id: str
-    points: Float
-    lanes: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        points = points_of(self.points, f"stop line {self.stop_line_id!r}")
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "lanes", tuple(dict.fromkeys(self.lanes)))
-
-
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """A traffic light or sign.
-
-    Attributes:
-        signal_id: unique among the signals.
-        kind: what it orders.
-        position: x, y, z in the world [m].
-        heading: where its face looks [rad].
-        lanes: those that it rules.
-        stop_line: where their traffic waits; None: at the lanes' ends.
-        value: of a speed limit [m/s], else None.
-    """
-
-    signal_id: str
-    kind: SignalKind
-    position: tuple[float, float, float]
-    heading: float = 0.0
-    lanes: tuple[str, ...] = ()
-    stop_line: str | None = None
-    value: float | None = None
-
-    def __post_init__(self) -> None:
-        what = f"signal {self.signal_id!r}"
-        if self.kind not in SIGNAL_KINDS:
-            raise SceneError(f"{what}: kind {self.kind!r}; allowed: {', '.join(SIGNAL_KINDS)}")
-        numbers = (*self.position, self.heading, 0.0 if self.value is None else self.value)
-        if len(self.position) != 3 or not all(math.isfinite(v) for v in numbers):
-            raise SceneError(f"{what}: holds a number that is not finite")
-        object.__setattr__(self, "position", tuple(float(v) for v in self.position))
-        object.__setattr__(self, "lanes", tuple(dict.fromkeys(self.lanes)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -529,8 +322,8 @@ class LaneGraph:
         )
 
     @cached_property
-    def _table(self) -> _Table:
-        return _Table(tuple(self.lanes.values()))
+    def _table(self) -> LaneIndex:
+        return LaneIndex(tuple(self.lanes.values()))
 
     @cached_property
     def _outlines(self) -> tuple[Float, NDArray[np.int64], Float]:
@@ -549,89 +342,6 @@ _IDS = {
     "signals": "signal_id",
     "roads": "road_id",
 }
-
-
-class _Table:
-    """Segments of all lanes in arrays, and a grid over them, as kernels take them."""
-
-    def __init__(self, lanes: tuple[Lane, ...]) -> None:
-        self.lanes = lanes
-        parts = [_segments(lane) for lane in lanes]
-        counts = [len(quads) for _, quads in parts]
-        self.segments = np.concatenate([p for p, _ in parts]) if parts else np.zeros((0, 7))
-        self.quads = np.concatenate([q for _, q in parts]) if parts else np.zeros((0, 4, 2))
-        self.lane_of = np.repeat(np.arange(len(lanes), dtype=np.int32), counts)
-        self.kinds = np.array([lane.kind for lane in lanes], dtype=object)
-        self.grid = self._grid()
-
-    def of_kinds(self, kinds: Iterable[str]) -> NDArray[np.bool_]:
-        """Which lanes are of these kinds, [L] bool."""
-        wanted = frozenset(kinds)
-        known = self._of_kinds.get(wanted)
-        if known is None:
-            known = np.array([kind in wanted for kind in self.kinds], dtype=np.bool_)
-            self._of_kinds[wanted] = known
-        return known
-
-    @cached_property
-    def _of_kinds(self) -> dict[frozenset[str], NDArray[np.bool_]]:
-        return {}
-
-    def _grid(self) -> tuple[NDArray[np.int64], NDArray[np.int32], Float, int, int]:
-        """Segments by cell: of every cell that the rectangle around their rims touches."""
-        ends = self.segments[:, :4].reshape(-1, 2, 2)
-        corners = np.concatenate([self.quads, ends], axis=1)
-        boxes = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
-        if not len(boxes):
-            boxes = np.zeros((0, 4))
-        low = boxes[:, :2].min(axis=0) if len(boxes) else np.zeros(2)
-        high = boxes[:, 2:].max(axis=0) if len(boxes) else np.ones(2)
-        size = np.maximum(high - low, 1.0)
-        cell = max(CELL_M, float(np.sqrt(size.prod() / MAX_CELLS)), float(size.max()) / MAX_CELLS)
-        columns, rows = (int(n) for n in np.floor(size / cell) + 1)
-        frame = np.array([*low, cell])
-        boxes = np.ascontiguousarray(boxes)
-        first = count_cells(boxes, frame, columns, rows)
-        return first, fill_cells(boxes, frame, columns, rows, first), frame, columns, rows
-
-
-def _segments(lane: Lane) -> tuple[Float, Float]:
-    """Segments [K, 7] (both ends, heading, arc length at both) and rims [K, 4, 2] of a lane, none
-    longer than a few cells."""
-    left, right = lane.rims
-    s = lane.s
-    longest = np.diff(s).max()
-    if longest > LONGEST_SEGMENT_M:
-        counts = np.ceil(np.diff(s) / LONGEST_SEGMENT_M).astype(int)
-        inner = [
-            np.linspace(a, b, n, endpoint=False)
-            for a, b, n in zip(s[:-1], s[1:], counts, strict=True)
-        ]
-        s = np.concatenate([*inner, s[-1:]])
-    lines = [
-        np.stack([np.interp(s, lane.s, line[:, i]) for i in (0, 1)], axis=1)
-        for line in (lane.centre, left, right)
-    ]
-    centre, left, right = lines
-    a, b = centre[:-1], centre[1:]
-    heading = np.arctan2(*(b - a).T[::-1])
-    segments = np.column_stack([a, b, heading, s[:-1], s[1:]])
-    return segments, np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
-
-
-def points_of(values: ArrayLike, what: str, *, least: int = 2) -> Float:
-    """Finite points [N, 3] that nobody writes to, N >= ``least``.
-
-    Raises:
-        SceneError: naming ``what``.
-    """
-    points = np.array(values, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < least:
-        raise SceneError(f"{what}: points must be [N, 3] with N >= {least}, not {points.shape}")
-    if not (np.abs(points) < 1e7).all():
-        raise SceneError(f"{what}: holds points that are not finite or beyond 10,000 km")
-    points.flags.writeable = False
-    return points
 
 
 def _known(parts: Mapping[str, Any]) -> str:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from real2sim_server.scene import SceneError
-from real2sim_server.scene.lane_graph import Area, Lane, LaneGraph, Signal
+from real2sim_server.scene.lane import Area, Lane, Signal
+from real2sim_server.scene.lane_graph import LaneGraph
 
 
 def straight(name, y=0.0, *, x=0.0, length=50.0, flip=False, **more):

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...scene.lane_graph import Lane, LaneGraph
+from ...scene.lane import Lane
+from ...scene.lane_graph import LaneGraph
 from ...scene.road import Road, RoadLane
 from ..errors import MapError, damage_named
 from ..xml_files import head_of, number, read_xml

@@ -12,7 +12,7 @@ import numpy as np
 from real2sim_proto.lanes import SignalKind
 
 from ...geometry.rotation import Float
-from ...scene.lane_graph import TRAVELLED, Area, Signal, StopLine
+from ...scene.lane import TRAVELLED, Area, Signal, StopLine
 from ...scene.road import Road, RoadLane
 from ..xml_files import integer, number
 from .roads import SPEED_UNITS, OpenDriveRoad

@@ -174,9 +174,7 @@ def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
         BundleError: as :func:`load_scene`, or it is another bundle by now.
     """
     folder = Path(path)
-    document = read_container(folder, SceneDocument, verify=False)
-    if document.content_hash != content_hash:
-        raise BundleError(f"{folder}: another bundle stands here now; read its summary again")
+    document = _document_of(folder, content_hash)
     with _as_bundle_error(folder):
         if document.content.ground is not None:
             return of_bundle(content_hash, lambda: _read_ground(folder, document, verify=True))
@@ -194,11 +192,16 @@ def load_lanes(path: str | PathLike[str], content_hash: str) -> LaneGraph | None
         BundleError: as :func:`load_scene`, or it is another bundle by now.
     """
     folder = Path(path)
+    document = _document_of(folder, content_hash)
+    with _as_bundle_error(folder):
+        return _lanes(folder, document, verify=True) if document.content.lanes else None
+
+
+def _document_of(folder: Path, content_hash: str) -> SceneDocument:
     document = read_container(folder, SceneDocument, verify=False)
     if document.content_hash != content_hash:
         raise BundleError(f"{folder}: another bundle stands here now; read its summary again")
-    with _as_bundle_error(folder):
-        return _lanes(folder, document, verify=True) if document.content.lanes else None
+    return document
 
 
 def save_asset(asset: Asset, path: str | PathLike[str], *, overwrite: bool = False) -> Asset:

@@ -13,7 +13,8 @@ from pydantic import ValidationError
 from real2sim_proto.lanes import SceneLanes
 
 from ..errors import BundleError, SceneError
-from ..lane_graph import Area, Lane, LaneGraph, Signal, StopLine
+from ..lane import Area, Lane, Signal, StopLine
+from ..lane_graph import LaneGraph
 from ..road import Road, RoadLane
 
 _TABLES = {

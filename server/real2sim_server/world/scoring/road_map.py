@@ -13,7 +13,7 @@ from real2sim_proto.lanes import SceneLanes
 
 from ...scene import LaneGraph
 from ...scene.io.lane_document import graph_of, lane_document
-from ...scene.lane_graph import DRIVABLE
+from ...scene.lane import DRIVABLE
 
 LEAST_BEYOND_M = 0.01
 """A corner off every lane and area is this far off the road at least."""

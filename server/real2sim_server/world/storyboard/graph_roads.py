@@ -10,7 +10,8 @@ import numpy as np
 from real2sim_proto import ErrorCode
 
 from ...scene.errors import SceneError
-from ...scene.lane_graph import LANE_KINDS, Lane, LaneGraph
+from ...scene.lane import LANE_KINDS, Lane
+from ...scene.lane_graph import LaneGraph
 from ...scene.road import Road
 from ..errors import WorldError
 from ..path import Float, LoggedPath
