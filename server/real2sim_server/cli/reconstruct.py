@@ -61,7 +61,7 @@ def reconstruct(
     json: JsonFile = None,
 ) -> None:
     """Turn a driving log into a scene of Gaussians."""
-    from ..logs import open_log, select_from_log
+    from ..logs import inspect_log, open_log, select_from_log
     from ..reconstruct import ReconstructOptions, reconstruct
     from ..reconstruct.training.schedule import at_width
     from ..reconstruct.training.schedule import preset as training_preset
@@ -78,6 +78,8 @@ def reconstruct(
     if width is not None:
         logged = max((camera.width for camera in opened.rig), default=width)
         training = at_width(training, min(width, logged))
+    for question in inspect_log(opened).problems:
+        console.print(f"problem   {question}", highlight=False, markup=False, soft_wrap=True)
     with staged_progress() as report:
         result = reconstruct(
             opened,

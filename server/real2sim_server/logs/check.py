@@ -10,6 +10,8 @@ import numpy as np
 from .driving_log import DrivingLog, LogError
 
 SWEEPS_CHECKED = 3
+FARTHEST_M = 100_000.0
+"""Of the world's zero; single precision is 8 mm there."""
 
 
 @runtime_checkable
@@ -43,6 +45,7 @@ def check_log(
     """
     _check_cameras(log)
     _check_times(log)
+    _check_place(log)
     _check_tracks(log)
     sweeps = range(log.frame_count) if decode_images else _few(log.frame_count)
     for frame in range(log.frame_count):
@@ -85,6 +88,16 @@ def _check_times(log: DrivingLog) -> None:
                     f"log {log.name!r}: ego poses cover [{log.ego.start_us}, {log.ego.end_us}] us, "
                     f"but camera {camera!r} takes an image at {t_us} us"
                 )
+
+
+def _check_place(log: DrivingLog) -> None:
+    far = float(np.abs(log.ego.positions).max())
+    if far > FARTHEST_M:
+        raise LogError(
+            f"log {log.name!r}: its drive lies {far / 1e3:,.0f} km from the world's zero, where "
+            f"Gaussians could only move by {float(np.spacing(np.float32(far))):.2g} m; subtract "
+            "the first pose's position from all poses and boxes"
+        )
 
 
 def _check_tracks(log: DrivingLog) -> None:

@@ -11,20 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float
-from ..geometry.transform import apply_transform
 from .driving_log import DrivingLog, LidarSweep
 from .images import write_image
-from .overlay import draw_frame, points_in_box
+from .overlay import draw_frame
+from .plausibility import ego_steps, gaps_between, questions_to
 from .top_view import draw_top_view
 
 INSPECTED_FRAMES = 3
-GAP_FACTOR = 1.6
-"""A frame is missing where the time step is this many times the usual one."""
-
-MAX_EGO_SPEED = 70.0
-NEAR_BOXES = 30.0
-FEW_POINTS = 5
 PICTURE_WIDTH = 960
 
 
@@ -138,14 +131,14 @@ def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
         frames=log.frame_count,
         duration=float(steps.sum()),
         rate=1 / float(np.median(steps)) if len(steps) else 0.0,
-        gaps=_gaps(steps),
+        gaps=gaps_between(steps),
         lidar_points=(min(counts), int(np.median(counts)), max(counts)),
         lidar_range=float(np.percentile(np.concatenate(far), 99)) if far else 0.0,
         tracks=dict(sorted(Counter(t.category for t in log.tracks).items())),
         moving=dict(sorted(Counter(t.category for t in moving).items())),
-        ego_distance=float(_ego_steps(log).sum()),
-        ego_speed=float((_ego_steps(log) / steps).max()) if len(steps) else 0.0,
-        problems=tuple(_problems(log, sweeps, steps)),
+        ego_distance=float(ego_steps(log).sum()),
+        ego_speed=float((ego_steps(log) / steps).max()) if len(steps) else 0.0,
+        problems=tuple(questions_to(log, sweeps)),
         drawings=() if out is None else tuple(_draw(log, sweeps, Path(out))),
     )
 
@@ -166,72 +159,6 @@ def _cameras(log: DrivingLog) -> tuple[CameraReport, ...]:
 def _delay(log: DrivingLog, camera: str) -> float:
     times = log.image_times_us.get(camera, log.frame_times_us)
     return float(np.median(times - log.frame_times_us)) * 1e-6
-
-
-def _gaps(steps: Float) -> tuple[tuple[int, float], ...]:
-    if len(steps) < 2:
-        return ()
-    wide = np.flatnonzero(steps > GAP_FACTOR * np.median(steps))
-    return tuple((int(i), float(steps[i])) for i in wide)
-
-
-def _ego_steps(log: DrivingLog) -> Float:
-    positions = np.array([log.ego.pose(int(t))[0] for t in log.frame_times_us])
-    return np.asarray(np.linalg.norm(np.diff(positions, axis=0), axis=1))
-
-
-def _problems(log: DrivingLog, sweeps: dict[int, LidarSweep], steps: Float) -> list[str]:
-    problems = [f"{s:.2f} s pass after frame {i}: are frames missing?" for i, s in _gaps(steps)]
-    without = log.provenance.get("cameras_without_images")
-    if without:
-        problems.append(f"cameras without images, left out: {', '.join(without)}")
-    if len(steps):
-        speed = _ego_steps(log) / steps
-        if speed.max() > MAX_EGO_SPEED:
-            frame = int(speed.argmax())
-            problems.append(f"the ego jumps after frame {frame} ({speed[frame]:.0f} m/s)")
-    if not any(len(s.points) for s in sweeps.values()):
-        return [*problems, "there is no LiDAR: nothing to start a reconstruction from"]
-    if not log.tracks:
-        problems.append("there are no boxes: moving objects have to be tracked first")
-    problems += _ground_problems(sweeps)
-    return problems + _box_problems(log, sweeps)
-
-
-def _ground_problems(sweeps: dict[int, LidarSweep]) -> list[str]:
-    heights = []
-    for sweep in sweeps.values():
-        x, y, z = sweep.points.T
-        beside = (np.abs(x) < 12) & (np.abs(y) < 5) & ((np.abs(x) > 3) | (np.abs(y) > 1.5))
-        if beside.sum() > 100:
-            heights.append(float(np.percentile(z[beside], 10)))
-    if not heights or abs(np.median(heights)) < 0.5:
-        return []
-    return [
-        f"the road near the vehicle lies {np.median(heights):+.1f} m from the vehicle frame's "
-        "zero: is the LiDAR's pose right?"
-    ]
-
-
-def _box_problems(log: DrivingLog, sweeps: dict[int, LidarSweep]) -> list[str]:
-    held = near = 0
-    for frame, sweep in sweeps.items():
-        t_us = int(log.frame_times_us[frame])
-        here = log.ego.transform(t_us)
-        points = apply_transform(here, sweep.points.astype(np.float64))
-        for track in log.tracks:
-            if not track.trajectory.covers(t_us):
-                continue
-            pose = track.trajectory.transform(t_us)
-            if np.linalg.norm(pose[:2, 3] - here[:2, 3]) < NEAR_BOXES:
-                near += 1
-                held += points_in_box(points, pose, track.size) >= FEW_POINTS
-    if near < 3 or held >= near / 3:
-        return []
-    return [
-        f"only {held} of {near} boxes within {NEAR_BOXES:.0f} m hold LiDAR points: are they in the "
-        "right frame?"
-    ]
 
 
 def _draw(log: DrivingLog, sweeps: dict[int, LidarSweep], out: Path) -> list[str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,14 @@ MANIFEST = "log.json"
 LANES = "lanes.json"
 MAX_SWEEP_BYTES = 1 << 30
 """Of a sweep when unpacked: thirty million points."""
+LOG_KEYS = (
+    "format", "version", "name", "frame_times_us", "cameras", "ego", "tracks", "lidar",
+    "image_times_us", "provenance",
+)  # fmt: skip
+CAMERA_KEYS = ("name", "width", "height", "K", "T_vehicle_camera", "recorded")
+POSE_KEYS = ("times_us", "positions", "quaternions")
+EGO_KEYS = ("size", *POSE_KEYS)
+TRACK_KEYS = ("object_id", "category", "size", *POSE_KEYS)
 LIDAR_SHAPES = {"points": (3,), "intensity": (), "offset_us": ()}
 
 
@@ -50,10 +59,10 @@ class NativeReader:
         manifest = path / MANIFEST
         if sequence is not None:
             raise LogError(f"{path}: holds one log; it has no sequence {sequence!r}")
-        content = _JsonSection(_load(manifest), str(manifest))
+        content = _JsonSection(_load(manifest), str(manifest)).only(LOG_KEYS)
         times_us = check_frame_times(content.integers("frame_times_us"), str(manifest))
         rig = _read_rig(content)
-        ego = content.section("ego")
+        ego = content.section("ego").only(EGO_KEYS)
         trajectory = _read_trajectory(ego)
         check_ego_covers(trajectory, times_us, str(manifest))
         images = _image_files(path, rig, len(times_us))
@@ -104,6 +113,18 @@ class _JsonSection:
 
     content: Mapping[str, Any]
     where: str
+
+    def only(self, keys: Sequence[str]) -> _JsonSection:
+        """The section itself, which has none but these keys."""
+        for key in self.content:
+            if key not in keys:
+                like = difflib.get_close_matches(str(key), keys, n=1)
+                meant = f"did you mean {like[0]!r}?" if like else f"known: {', '.join(keys)};"
+                raise LogError(
+                    f"{self.where}: unknown key {key!r}; {meant} What is yours alone belongs into "
+                    "'provenance'"
+                )
+        return self
 
     def get(self, key: str, kind: type) -> Any:
         value = self.content.get(key)
@@ -161,7 +182,7 @@ class _JsonSection:
 def _read_rig(content: _JsonSection) -> CameraRig:
     cameras = []
     for entry in content.sections("cameras"):
-        name = entry.get("name", str)
+        name = entry.only(CAMERA_KEYS).get("name", str)
         if not name or Path(name).name != name:
             raise LogError(f"{entry.where}: 'name' must be usable as a folder name, not {name!r}")
         k, pose = entry.numbers("K", (3, 3)), entry.numbers("T_vehicle_camera", (4, 4))
@@ -197,7 +218,7 @@ def _read_trajectory(section: _JsonSection) -> Trajectory:
 def _read_tracks(content: _JsonSection) -> tuple[ObjectTrack, ...]:
     tracks: dict[str, ObjectTrack] = {}
     for entry in content.sections("tracks"):
-        object_id = entry.get("object_id", str)
+        object_id = entry.only(TRACK_KEYS).get("object_id", str)
         if not object_id or object_id in tracks:
             raise LogError(f"{entry.where}: 'object_id' {object_id!r} is empty or used twice")
         tracks[object_id] = ObjectTrack(
