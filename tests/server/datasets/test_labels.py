@@ -20,7 +20,8 @@ from real2sim_server.datasets.labels import (
     projected_box,
     views_of,
 )
-from real2sim_server.datasets.labels.surface import on_surface
+from real2sim_server.datasets.labels.pixels import surface_mask
+from real2sim_server.datasets.labels.surface import body_of, on_surface
 from real2sim_server.render.ground_class import back_projected
 from real2sim_server.scene import Camera, Trajectory
 
@@ -107,7 +108,7 @@ def test_what_stands_behind_another_is_less_visible(tiny_scene, tiny_drive):
     (images,) = draw_moment(tiny_scene, moment, [tiny_scene.rig["front"]])
     view = views_of(images, boxes_at(moment.placed), moment.instances)
     visibility = {v.object_id: v.visibility for v in view.objects}
-    assert visibility["car_blue"] > 0.95
+    assert visibility["car_blue"] > 0.9
     assert 0.0 < visibility[hidden.object_id] < 0.7
 
 
@@ -124,6 +125,31 @@ def test_what_stands_behind_another_is_less_visible(tiny_scene, tiny_drive):
 def test_between_its_wheels_a_vehicle_shows_its_shadow(place, own):
     points = np.add([place], (0, 0, 10))
     assert on_surface(points, pose(0, 0, 10), box(0.0)).tolist() == [own]
+
+
+@pytest.mark.parametrize(
+    ("eye", "place", "own"),
+    [
+        ((0, 9, 0.7), (0.0, 0.3, -1.0), False),  # under the sill, on the road
+        ((0, 9, 0.7), (0.0, 0.3, -0.78), False),  # the road, thought too near
+        ((0, 9, 0.7), (0.0, 0.85, -0.65), True),  # the sill
+        ((0, 9, 0.7), (0.0, 0.5, -0.7), True),  # the sill, thought too far
+        ((1.2, 9, 0.7), (1.2, 0.9, -0.98), True),  # a tyre where it stands
+        ((1.2, 9, 0.7), (1.2, 0.2, -1.0), True),  # a tyre, thought too far
+        ((1.2, 9, 0.7), (1.2, 1.4, -1.0), False),  # the road before the tyre
+        ((12, 0, 0.7), (1.5, 0.0, -1.0), False),  # under the bumper
+        ((12, 0.8, 0.7), (1.5, 0.8, -0.95), True),  # a front tyre below the bumper
+        ((0, 9, 0.7), (0.0, 1.12, 0.0), True),  # a side that is a little too near
+        ((9, 9, 0.7), (0.0, 1.3, 0.0), False),  # a wall beside it
+        ((30, 1.3, 0.7), (2.1, 1.12, 0.0), False),  # what is seen past the box
+    ],
+)
+def test_where_a_ray_comes_in_tells_a_vehicle_from_its_shadow(eye, place, own):
+    ahead = np.subtract(place, eye, dtype=np.float64)
+    rays = np.column_stack([np.zeros((3, 2)), ahead, np.add(eye, (0, 0, 10))])
+    mask = np.empty((1, 1), np.bool_)
+    surface_mask(np.ones((1, 1), np.float32), 0, 0, rays, body_of(box(0.0), pose(0, 0, 10)), mask)
+    assert mask[0, 0] == own
 
 
 def test_ground_is_as_far_as_its_heights_say(tiny_scene, tiny_drive):

@@ -30,10 +30,10 @@ def test_labels_of_a_frame_agree_with_rays(street):
 def test_labels_of_the_whole_drive_agree_with_rays(street):
     found = measure(street, range(1, 54, 4), street.rig.names).summary()
     print(found)
-    assert found["mask_iou"] > 0.93
-    assert found["mask_iou_by_pixels"] > 0.93
-    assert found["box_iou"] > 0.93
-    assert found["box_iou_p10"] > 0.87
+    assert found["mask_iou"] > 0.95
+    assert found["mask_iou_by_pixels"] > 0.965
+    assert found["box_iou"] > 0.95
+    assert found["box_iou_p10"] > 0.9
     assert found["visibility_error"] < 0.05
     assert found["depth_median"] < 0.045
     assert found["flow_median"] < 0.3

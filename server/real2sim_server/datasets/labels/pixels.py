@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ from real2sim_proto.semantics import GROUND, STATIC
 from ..._numba import PARALLEL_LOOPS, func, kernel
 
 F32 = np.float32
-BODY = 21
-"""Numbers of a body, see is_surface."""
+BODY = 25
+"""Numbers of a body, see is_surface and shows_surface."""
 
 TOLERANCE = 0.15
 """What is nearer to the ground's height shows it [m]."""
@@ -24,6 +25,18 @@ TOLERANCE = 0.15
 UNDER_BODY = 0.6
 """A shadow is drawn as high above the ground as the body's underside may be [m]; what an object
 shows outside of its body farther up is what stands behind it."""
+
+TYRE = 0.24
+"""Wheels reach so far inwards from the sides of the box [m]."""
+
+ROUNDED = 0.06
+"""A vehicle's sides and corners lie about so far inside of its box below [m]."""
+
+SEEN_FARTHER = 0.05
+"""A front may be farther outside of the box than what is measured [m], and its ray less."""
+
+NO_STEP = 1e-9
+"""Rays that go less far are followed as if they went so far [m]."""
 
 FLATTEST = 0.01
 """Rays that fall less by metre of depth are not followed to the ground."""
@@ -44,9 +57,10 @@ def is_surface(body: Any, x: float, y: float, z: float) -> bool:
     """Whether a place of the world is of a body and not of its shadow, see :mod:`.surface`.
 
     Args:
-        body: [BODY]: ``T_object_world`` [3, 4]; half length, width and height; margin about the
-            box; lowest place of the surface; sill, below which are wheels alone, and wheels: how
-            far aside they begin, and between which places ahead and behind they are [m].
+        body: at least 21 numbers: ``T_object_world`` [3, 4]; half length, width and height; margin
+            about the box; lowest place of the surface; sill, below which are wheels alone, and
+            wheels: how far aside they begin, and between which places ahead and behind they are
+            [m].
         x, y, z: place in the world [m].
     """
     a = abs(body[0] * x + body[1] * y + body[2] * z + body[3])
@@ -61,6 +75,81 @@ def is_surface(body: Any, x: float, y: float, z: float) -> bool:
     return True
 
 
+@func(inline="always")
+def within(a: float, b: float, reach: float, other: float, from_a: float, from_b: float) -> Any:
+    """Shares of a segment from ``from`` to (a, b) and on, between which it is inside of a
+    rectangle of half sizes ``reach`` and ``other``; the first is the larger where it never is."""
+    first, last = 0.0, 1e9
+    for size, start, end in ((reach, from_a, a), (other, from_b, b)):
+        step = end - start
+        step = step if abs(step) > NO_STEP else NO_STEP
+        one, two = (-size - start) / step, (size - start) / step
+        first, last = max(first, min(one, two)), min(last, max(one, two))
+    return first, last
+
+
+@func(inline="always")
+def meets_wheel(body: Any, a: float, b: float, c: float, fa: float, fb: float, fc: float) -> bool:
+    """Whether the ray from (fa, fb, fc) through (a, b, c) meets one of a body's four tyres."""
+    radius = body[22]
+    up, along, across = c - fc, a - fa, b - fb
+    across = across if abs(across) > NO_STEP else NO_STEP
+    squared = along * along + up * up
+    above = fc + body[14] - radius
+    for side in (-1.0, 1.0):
+        one = (side * body[13] - fb) / across
+        two = (side * (body[13] - TYRE) - fb) / across
+        first, last = max(min(one, two), 0.0), max(one, two)
+        for end in (-1.0, 1.0):
+            ahead = fa - (body[23] if end > 0 else -body[24])
+            half = ahead * along + above * up
+            root = half * half - squared * (ahead * ahead + above * above - radius * radius)
+            if root <= 0:
+                continue
+            root = math.sqrt(root)
+            if max(first, (-half - root) / squared) < min(last, (-half + root) / squared):
+                return True
+    return False
+
+
+@func(inline="always")
+def shows_surface(
+    body: Any, x: float, y: float, z: float, from_x: float, from_y: float, from_z: float
+) -> bool:
+    """Whether a ray that ends at a place of the world shows a body there and not its shadow.
+
+    Where a pixel's front lies below a vehicle is known to decimetres: seen flatly from afar the
+    road is nowhere far below the sill. Where the ray comes in below the sides is known as well as
+    the box.
+
+    Args:
+        body: as of is_surface; and from [21] the sill of what wheels, 0 for other bodies, radius of
+            the wheels, and how far their axles are ahead and behind [m].
+        x, y, z: place in the world [m].
+        from_x, from_y, from_z: of the camera.
+    """
+    if body[21] <= 0:
+        return is_surface(body, x, y, z)
+    a = body[0] * x + body[1] * y + body[2] * z + body[3]
+    b = body[4] * x + body[5] * y + body[6] * z + body[7]
+    c = body[8] * x + body[9] * y + body[10] * z + body[11]
+    far = body[15] + SEEN_FARTHER
+    if abs(a) > body[12] + far or abs(b) > body[13] + far or c > body[14] + far:
+        return False
+    fa = body[0] * from_x + body[1] * from_y + body[2] * from_z + body[3]
+    fb = body[4] * from_x + body[5] * from_y + body[6] * from_z + body[7]
+    fc = body[8] * from_x + body[9] * from_y + body[10] * from_z + body[11]
+    slack = body[15] - SEEN_FARTHER
+    first, last = within(a, b, body[12] + slack, body[13] + slack, fa, fb)
+    if first >= last or min(fc + first * (c - fc), fc + last * (c - fc)) > body[14] + slack:
+        return False
+    first, last = within(a, b, body[12] - ROUNDED, body[13] - ROUNDED, fa, fb)
+    entry = fc + first * (c - fc) if first < last else c
+    if (entry + c) / 2 + body[14] > body[21]:
+        return True
+    return meets_wheel(body, a, b, c, fa, fb, fc)
+
+
 @kernel(parallel=PARALLEL_LOOPS)
 def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, heights, frame):
     """Make depth, instance and semantic image of fronts; shadows of objects become ground.
@@ -72,7 +161,7 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
         rays: [3, 4] float64: a pixel (x, y) of depth d lies at d * rays[:, :3] @ (x, y, 1)
             + rays[:, 3] of the world.
         slots: [65536] int16, body of an instance id, -1 for none.
-        bodies: [K, ...] see is_surface.
+        bodies: [K, BODY] see shows_surface.
         classes: [65536] uint8, by instance id.
         behind: class where nothing is.
         heights, frame: of the ground.
@@ -93,7 +182,9 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
             z = d * slope + rays[2, 3]
             number = instance[row, column]
             found, slot = classes[number], slots[number]
-            shadow = slot >= 0 and not is_surface(bodies[slot], x, y, z)
+            shadow = slot >= 0 and not shows_surface(
+                bodies[slot], x, y, z, rays[0, 3], rays[1, 3], rays[2, 3]
+            )
             if shadow:
                 instance[row, column], found = 0, STATIC
             if shadow or found == STATIC:
@@ -137,7 +228,9 @@ def surface_mask(depth, left, top, rays, body, mask):
             x = d * (rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]) + rays[0, 3]
             y = d * (rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]) + rays[1, 3]
             z = d * (rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]) + rays[2, 3]
-            mask[row, column] = d > 0 and is_surface(body, x, y, z)
+            mask[row, column] = d > 0 and shows_surface(
+                body, x, y, z, rays[0, 3], rays[1, 3], rays[2, 3]
+            )
 
 
 @kernel
