@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import io
 import os
-import tempfile
+import secrets
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -219,15 +219,14 @@ def frames_by_camera(
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that nobody ever sees half of it; makes the folder where it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    # Opened and not made by tempfile, whose files nobody else may read.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             file.write(data)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def matrix_from_wire(value: Any, shape: tuple[int, int], name: str) -> NDArray[np.float64]:

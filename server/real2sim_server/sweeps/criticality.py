@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
 
 from ..world import World
 from ..world.scoring.contact_side import STOPPED
@@ -15,10 +19,29 @@ PER_METRE = 2.0
 them in a second."""
 SHARPNESS = 16.0
 """Of the smooth minimum over time [1/s]."""
-FARTHEST = 10.0
-"""Margins are cut here [s]."""
+FARTHEST = 100.0
+"""Margins are cut here [s]: half as many metres away, nobody is told from nobody."""
 AT_FAULT, PER_SPEED = 0.5, 0.05
-"""What an at-fault collision adds, and each m/s of its speed."""
+"""An at-fault collision, and each m/s of its speed."""
+NOT_AT_FAULT = -1.0
+"""At most, where others caused a collision: a margin of a second, so that no search ends there."""
+
+
+def actors_of(
+    reset: Mapping[str, Any], operations: Sequence[Mapping[str, Any]] = ()
+) -> frozenset[str]:
+    """Objects that a case is about: those with drivers, in a storyboard, or edited. Empty where it
+    names none, which means everybody.
+
+    Args:
+        reset: options of an episode.
+        operations: edits when it begins, as JSON.
+    """
+    names = set(reset.get("agents", {}).get("drivers", {}))
+    names |= {str(o["object_id"]) for o in operations if o.get("object_id")}
+    for entity in (reset.get("storyboard") or {}).get("entities", []):
+        names.add(entity.get("object_id") or entity["name"])
+    return frozenset(names)
 
 
 @dataclass
@@ -31,13 +54,16 @@ class Danger:
     :meth:`criticality` is its negative, in seconds, and above 0 only for collisions at fault.
 
     Attributes:
+        actors: whose margins count, see :func:`actors_of`: parked cars that everybody passes would
+            hide how near those come who make the case. Empty for all.
         gap: smallest from the ego's box to another's so far, below 0 where they overlap [m].
         margin: smallest so far [s].
     """
 
+    actors: frozenset[str] = frozenset()
     gap: float = math.inf
     margin: float = FARTHEST
-    _sum: float = 0.0
+    _margins: list[float] = field(default_factory=list)
 
     def add(self, world: World) -> None:
         """The instant that a world is at."""
@@ -52,24 +78,27 @@ class Danger:
         self.gap = min(self.gap, float(signed_gaps((x, y, ego.yaw, length, width), *where).min()))
         if abs(ego.speed) <= STOPPED:
             return
+        meant = [k for k, name in enumerate(others.ids) if name in self.actors or not self.actors]
+        if not meant:
+            return
         bumper = (x + length / 2 * cos, y + length / 2 * sin, ego.yaw, 0.0, width)
         velocity = (
             ego.speed * cos - ego.lateral_speed * sin,
             ego.speed * sin + ego.lateral_speed * cos,
         )
-        found = least_margin(bumper, velocity, (*where, others.velocities), PER_METRE)
-        margin = min(float(found), FARTHEST)
+        theirs = (*(values[meant] for values in where), others.velocities[meant])
+        margin = min(float(least_margin(bumper, velocity, theirs, PER_METRE)), FARTHEST)
         self.margin = min(self.margin, margin)
-        self._sum += math.exp(-SHARPNESS * margin)
+        self._margins.append(margin)
 
     def criticality(self, world: World) -> float:
-        """Of the episode up to now: -10 far from everybody, around 0 at a touch, more with fault
-        and speed."""
-        smooth = -math.log(self._sum + math.exp(-SHARPNESS * FARTHEST)) / SHARPNESS
-        found = -min(smooth, FARTHEST)
+        """Of the episode up to now: -100 far from everybody, towards 0 the nearer; above 0 for a
+        collision at fault, more with its speed."""
         if sum(world.accumulator.at_fault.values()):
-            found += AT_FAULT + PER_SPEED * (world.accumulator.first_impact or 0.0)
-        else:
-            # Without fault it cannot be a failure, however near.
-            found = min(found, 0.0)
-        return found
+            return AT_FAULT + PER_SPEED * (world.accumulator.first_impact or 0.0)
+        margins = np.array(self._margins or [FARTHEST])
+        least = float(margins.min())
+        smooth = least - math.log(np.exp(-SHARPNESS * (margins - least)).sum()) / SHARPNESS
+        # Without fault it cannot be a failure, however near.
+        found = min(-smooth, 0.0)
+        return min(found, NOT_AT_FAULT) if world.accumulator.collisions else found

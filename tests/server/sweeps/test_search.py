@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from scipy.stats import norm
 from real2sim.planners import Needs, load_planner
 from real2sim_server.policies.suite import Case
 from real2sim_server.scene.io import load_scene
+from real2sim_server.sweeps.criticality import Danger, actors_of
 from real2sim_server.sweeps.episode import Drive, begin, drive_episode
 from real2sim_server.sweeps.search.archive import Archive
 from real2sim_server.sweeps.search.evaluation import Evaluation, Evaluator
+from real2sim_server.sweeps.search.gaussian_process import GaussianProcess
 from real2sim_server.sweeps.search.optimise import SearchBudget, random_search, search
 from real2sim_server.sweeps.search.reference import SIDEWAYS, drive_reference, manoeuvres, plan_of
 from real2sim_server.sweeps.search.run import FAILURES, PAGE, SearchOptions, run_search
@@ -101,6 +104,74 @@ def test_swerves_ask_for_no_more_than_tyres_give(scene):
         assert np.abs(np.diff(velocity) / 0.2).max() <= 1.25 * SIDEWAYS
     hardest = min(m.acceleration for m in manoeuvres(8.0) if m.aside)
     assert math.hypot(SIDEWAYS, hardest) < 0.9 * 9.81
+
+
+def test_the_surrogate_goes_through_what_it_has_seen_and_doubts_what_it_has_not():
+    rng = np.random.default_rng(0)
+    points = rng.random((40, 2))
+    values = np.sin(5.0 * points[:, 0])
+    model = GaussianProcess.fitted(points, values)
+    means, spreads = model.at(points)
+    np.testing.assert_allclose(means, values, atol=0.02)
+    assert spreads.max() < 0.05
+    # The second coordinate says nothing.
+    assert model.scales[1] > 2.0 * model.scales[0]
+    few = GaussianProcess.fitted(points[:2], values[:2])
+    assert few.at(np.array([[0.5, 0.5]]))[1] > 5 * model.at(np.array([[0.5, 0.5]]))[1]
+
+
+def test_a_search_finds_what_one_in_hundreds_of_points_is_like():
+    """A corner of 0.3 % of a cube that grades towards it, in a fifth of the points that drawing
+    them would take."""
+    pytest.importorskip("cmaes")
+
+    class Corner:
+        spaces = (None,)
+
+        def dimensions(self, space: int) -> int:
+            return 3
+
+        def __call__(self, space: int, point) -> Evaluation:
+            score = 0.13 - float(np.abs(np.asarray(point) - 0.85).sum())
+            given = dict.fromkeys(Evaluation.__dataclass_fields__)
+            given |= {"space": 0, "point": tuple(point), "score": 20.0 * score}
+            given |= {"at_fault": score > 0, "avoided": True, "implausibility": 0.0}
+            return Evaluation(**given | {"cell": ("front", "", "")})
+
+    firsts = [
+        search(Corner(), SearchBudget(300, seed, stop_at_first=True)).archive.first
+        for seed in range(3)
+    ]
+    assert max(firsts) < 0.2 * math.log(2) / (4 / 3 * 0.13**3)
+
+
+def test_who_is_not_meant_by_a_case_does_not_hide_how_near_others_came(scene):
+    """Parked cars are nearer to the ego than the one that brakes far ahead."""
+    near, far = (
+        Drive("pid", {"agents": {"drivers": {"car_blue": {"kind": "hard_brake", "gap": gap}}}})
+        for gap in (25.0, 5.0)
+    )
+    driven = [drive_episode(scene, drive, load_planner("pid")) for drive in (near, far)]
+    assert driven[0].danger.actors == {"car_blue"}
+    assert driven[0].criticality > driven[1].criticality
+
+
+def test_collisions_that_others_cause_are_no_end_of_a_search(scene):
+    world = begin(scene, Drive("pid", {}), Needs(), privileged=False)
+    danger = Danger(actors_of({}))
+    danger.add(world)
+    hit = {"collisions": 1, "first_impact": 4.0}
+    struck = SimpleNamespace(accumulator=SimpleNamespace(at_fault={}, **hit))
+    assert danger.criticality(struck) <= -1.0
+    blamed = SimpleNamespace(accumulator=SimpleNamespace(at_fault={"vehicle": 1}, **hit))
+    assert danger.criticality(blamed) == pytest.approx(0.7)
+
+
+def test_a_case_is_about_those_that_it_names():
+    assert actors_of({}) == frozenset()
+    board = {"entities": [{"name": "Van"}, {"name": "Ego2", "object_id": "car_1"}]}
+    edits = [{"op": "scale", "object_id": "car_2"}, {"op": "relight"}]
+    assert actors_of({"storyboard": board}, edits) == {"Van", "car_1", "car_2"}
 
 
 def test_searches_of_one_seed_are_the_same(evaluate):

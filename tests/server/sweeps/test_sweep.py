@@ -7,6 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +22,7 @@ from typer.testing import CliRunner
 
 from real2sim.cli import build_app
 from real2sim_server.console import CommandError
-from real2sim_server.executors import InProcess, executor_of
+from real2sim_server.executors import Executor, InProcess, executor_of
 from real2sim_server.sweeps import load_sweep, run_sweep
 from real2sim_server.sweeps.gaps import signed_gaps
 from real2sim_server.sweeps.journal import FORMAT, Journal
@@ -85,6 +88,13 @@ def test_the_worst_leave_recordings_that_replay_to_the_same_bits(alone, tiny_sce
             first_difference(recording, recording.replayer(load_scene(scene_folder / "tiny")))
             is None
         )
+
+
+def test_recordings_may_be_read_by_whom_the_umask_allows(alone):
+    umask = os.umask(0)
+    os.umask(umask)
+    for file in (alone / RECORDINGS).iterdir():
+        assert file.stat().st_mode & 0o777 == 0o666 & ~umask
 
 
 def test_cut_off_anywhere_the_journal_leads_to_the_same_table(
@@ -182,6 +192,49 @@ def test_ray_gives_the_bytes_of_one_process(alone, sweep_file, scene_folder, tmp
     pytest.importorskip("ray")
     run_sweep(load_sweep(sweep_file), tmp_path, executor_of("ray", workers=2), scenes=scene_folder)
     assert (tmp_path / TABLE).read_bytes() == (alone / TABLE).read_bytes()
+
+
+class Mortal:
+    """A worker whose process is killed at its second episode, once of all workers."""
+
+    def __init__(self, recipe, folder: Path, threads: int) -> None:
+        self._worker, self._folder, self._begun = recipe(threads), folder, 0
+
+    def make(self, task):
+        self._begun += 1
+        with (self._folder / "begun").open("a") as file:
+            file.write(f"{os.getpid()}\n")
+        if self._begun == 2:
+            with suppress(FileExistsError):
+                (self._folder / "killed").touch(exist_ok=False)
+                os.kill(os.getpid(), signal.SIGKILL)
+        return self._worker.make(task)
+
+
+@dataclass
+class Deadly:
+    """An executor whose workers are mortal."""
+
+    executor: Executor
+    folder: Path
+
+    def run(self, recipe, tasks, on_result) -> None:
+        self.executor.run(partial(Mortal, recipe, self.folder), tasks, on_result)
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_an_actor_killed_in_a_sweep_costs_one_episode_and_changes_no_byte(
+    alone, sweep_file, scene_folder, tmp_path
+):
+    pytest.importorskip("ray")
+    deadly = Deadly(executor_of("ray", workers=2), tmp_path)
+    figures = run_sweep(load_sweep(sweep_file), tmp_path / "out", deadly, scenes=scene_folder)
+    begun = (tmp_path / "begun").read_text().split()
+    assert (tmp_path / "killed").exists()
+    assert len(begun) == figures["episodes"] + 1
+    assert len(set(begun)) == 3
+    assert (tmp_path / "out" / TABLE).read_bytes() == (alone / TABLE).read_bytes()
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from ..spec import Space
 from .realism import Manners, Watch
 from .reference import Drove, drive_reference
 
-UNAVOIDABLE, REFUSED = -1.0, -12.0
+UNAVOIDABLE, REFUSED = -1.0, -200.0
 """Scores of a failure that the reference does not avoid, and of what cannot begin."""
 MOST_STRANGE = 0.5
 """A collision in a case that is less plausible than this is no finding."""

@@ -1,5 +1,5 @@
-"""The search itself: spread points, then CMA-ES where they were most critical, then variations of
-what was found.
+"""The search itself: spread points, then those that a surrogate expects to be more critical; once
+something is found, CMA-ES and variations of it for other kinds.
 
 Everything random is drawn from the seed, so that the same search finds the same.
 """
@@ -17,6 +17,7 @@ from ...console import CommandError
 from ..sampling import spread
 from .archive import Archive
 from .evaluation import Evaluation, Evaluator
+from .gaussian_process import GaussianProcess
 
 Point = NDArray[np.float64]
 Report = Callable[[int, int], None]
@@ -24,10 +25,20 @@ Report = Callable[[int, int], None]
 POPULATION = 8
 STEP = 0.25
 """Standard deviation that CMA-ES begins with, of a range."""
-STALE = 6
+STALE = 3
 """Generations without anything better after which it begins elsewhere."""
-SHARE_OF_START = 0.12
-"""Of the episodes, for the spread points."""
+START, LEAST_START = 8, 4
+"""Spread points in all, and of each space."""
+BATCH = 8
+"""Points by the surrogate before spaces are weighed again."""
+OPTIMISM = (2.0, 0.5, 1.0)
+"""Standard deviations that are added to what the surrogate expects, by turns."""
+REFIT = 4
+"""Points after which the surrogate's length scales are fitted anew."""
+MOST_SEEN = 160
+"""Points that it goes through: the most critical ones, and the latest."""
+UNIFORM, NEAR, AROUND = 600, 60, 6
+"""Places that are looked at: anywhere, and around each of so many of the most critical points."""
 ISO, LINE = 0.05, 0.3
 """Of a variation: isotropic, and along the line to another (Vassiliades and Mouret 2018)."""
 
@@ -103,16 +114,25 @@ def _points(
 ) -> Iterator[tuple[int, Point]]:
     """Points to drive next, each asked for once the one before is in the state."""
     yield from _start(evaluate, budget)
+    spent = np.zeros((len(evaluate.spaces), 2))
     while True:
-        yield from _descend(evaluate, state, rng)
-        if state.archive.elites:
-            yield from _variations(evaluate, state, rng)
+        space = _space(spent, rng)
+        before = len(state.archive.elites), len(state.evaluations)
+        mine = any(e.space == space for e in state.archive.elites.values())
+        if not mine or rng.random() < 0.25:
+            yield from _guided(evaluate, state, rng, space)
+        elif rng.random() < 0.5:
+            yield from _descend(state, rng, space)
+        else:
+            yield from _variations(state, rng, space)
+        gained, driven = len(state.archive.elites), len(state.evaluations)
+        spent[space] += gained - before[0], (driven - before[1]) / BATCH
 
 
 def _start(evaluate: Evaluator, budget: SearchBudget) -> Iterator[tuple[int, Point]]:
     """Spread points of every space, spaces by turns."""
     spaces = len(evaluate.spaces)
-    each = max(round(SHARE_OF_START * budget.episodes / spaces), 4)
+    each = max(START // spaces, LEAST_START)
     clouds = [
         spread("sobol", each, evaluate.dimensions(k), seed=budget.seed) for k in range(spaces)
     ]
@@ -121,12 +141,66 @@ def _start(evaluate: Evaluator, budget: SearchBudget) -> Iterator[tuple[int, Poi
             yield k, cloud[row]
 
 
+def _space(spent: NDArray[np.float64], rng: np.random.Generator) -> int:
+    """Where to go on: more likely where more kinds of failures came of what was driven (Thompson
+    sampling of rates).
+
+    Args:
+        spent: [S, 2] kinds found and batches driven, of each space.
+        rng: draws.
+    """
+    return int(np.argmax(rng.gamma(spent[:, 0] + 1.0) / (spent[:, 1] + 1.0)))
+
+
+def _guided(
+    evaluate: Evaluator, state: SearchState, rng: np.random.Generator, space: int
+) -> Iterator[tuple[int, Point]]:
+    """Points at which a Gaussian process through all episodes of a space hopes for most."""
+    scales = None
+    for k in range(BATCH):
+        mine = _telling([e for e in state.evaluations if e.space == space])
+        if len(mine) < 2:
+            yield space, rng.random(evaluate.dimensions(space))
+            continue
+        points = np.array([e.point for e in mine])
+        values = _compressed(np.array([e.score for e in mine]))
+        model = GaussianProcess.fitted(points, values, scales=scales if k % REFIT else None)
+        scales = model.scales
+        places = _places(points[np.argsort(-values, kind="stable")[:AROUND]], rng)
+        means, spreads = model.at(places)
+        yield space, places[int(np.argmax(means + OPTIMISM[k % len(OPTIMISM)] * spreads))]
+
+
+def _telling(seen: Sequence[Evaluation]) -> list[Evaluation]:
+    """The most critical ones and the latest, in their order."""
+    if len(seen) <= MOST_SEEN:
+        return list(seen)
+    ranked = sorted(range(len(seen)), key=lambda k: -seen[k].score)[: MOST_SEEN // 2]
+    return [seen[k] for k in sorted({*ranked, *range(len(seen) - MOST_SEEN // 2, len(seen))})]
+
+
+def _compressed(scores: Point) -> Point:
+    """Scores so that a second near a collision is worth as much as half of the way to it."""
+    found: Point = np.where(scores < 0.0, -np.log1p(np.maximum(-scores, 0.0)), scores)
+    return found
+
+
+def _places(best: Point, rng: np.random.Generator) -> Point:
+    """[N, D] anywhere, and near the best [K, D]: moved a little, a lot, or in few coordinates."""
+    dimensions = best.shape[1]
+    near = np.repeat(best, NEAR, axis=0)
+    step = rng.choice([0.02, 0.08, 0.25], size=(len(near), 1)) * rng.standard_normal(near.shape)
+    kept = rng.random(near.shape) < rng.choice([0.0, 0.6], size=(len(near), 1))
+    found = [rng.random((UNIFORM, dimensions)), np.clip(near + np.where(kept, 0.0, step), 0.0, 1.0)]
+    return np.concatenate(found)
+
+
 def _descend(
-    evaluate: Evaluator, state: SearchState, rng: np.random.Generator
+    state: SearchState, rng: np.random.Generator, space: int
 ) -> Iterator[tuple[int, Point]]:
     """CMA-ES from a point that was critical and is no failure known already, until it finds nothing
     better, or a failure in a new cell."""
-    begin = _begin(evaluate, state, rng)
+    begin = _begin(state, rng, space)
     optimiser = _cma(begin, seed=int(rng.integers(2**31)))
     best, stale = -np.inf, 0
     while stale < STALE and not optimiser.should_stop():
@@ -135,7 +209,7 @@ def _descend(
         for _ in range(optimiser.population_size):
             before = len(state.archive.elites)
             point = optimiser.ask()
-            yield begin.space, point
+            yield space, point
             told.append((point, -state.evaluations[-1].score))
             gained = gained or len(state.archive.elites) > before
         optimiser.tell(told)
@@ -146,17 +220,11 @@ def _descend(
             return
 
 
-def _begin(evaluate: Evaluator, state: SearchState, rng: np.random.Generator) -> Evaluation:
-    """One of the most critical points, more likely the more critical, without failures: they are
-    varied elsewhere. Spaces take turns where several are searched."""
-    alive = [e for e in state.evaluations if not e.is_failure] or state.evaluations
-    if len(evaluate.spaces) > 1:
-        turn = int(rng.integers(len(evaluate.spaces)))
-        alive = [e for e in alive if e.space == turn] or alive
-    ranked = sorted(alive, key=lambda e: -e.score)
-    found = {e.space for e in state.archive.elites.values()}
-    if not found:
-        return ranked[min(int(rng.exponential(1.0)), len(ranked) - 1)]
+def _begin(state: SearchState, rng: np.random.Generator, space: int) -> Evaluation:
+    """One of the most critical points of a space, more likely the more critical, without failures:
+    they are varied elsewhere."""
+    mine = [e for e in state.evaluations if e.space == space]
+    ranked = sorted([e for e in mine if not e.is_failure] or mine, key=lambda e: -e.score)
     return ranked[min(int(rng.exponential(3.0)), len(ranked) - 1)]
 
 
@@ -178,23 +246,14 @@ def _cma(begin: Evaluation, *, seed: int) -> Any:
 
 
 def _variations(
-    evaluate: Evaluator, state: SearchState, rng: np.random.Generator
+    state: SearchState, rng: np.random.Generator, space: int
 ) -> Iterator[tuple[int, Point]]:
-    """As many as a generation, each of a failure, towards another of its space."""
+    """Two generations of them, each of a failure, towards another of its space."""
     for _ in range(2 * POPULATION):
-        elites = _by_space(state.archive.ordered())
-        space = list(elites)[int(rng.integers(len(elites)))]
-        own = elites[space]
+        own = [e for e in state.archive.ordered() if e.space == space]
         one = np.array(own[int(rng.integers(len(own)))].point)
         other = np.array(own[int(rng.integers(len(own)))].point)
         step = ISO * rng.standard_normal(len(one)) + LINE * rng.standard_normal() * (other - one)
         if len(own) == 1:
             step *= 3.0
         yield space, np.clip(one + step, 0.0, 1.0)
-
-
-def _by_space(elites: Sequence[Evaluation]) -> dict[int, list[Evaluation]]:
-    found: dict[int, list[Evaluation]] = {}
-    for elite in elites:
-        found.setdefault(elite.space, []).append(elite)
-    return found

@@ -12,13 +12,12 @@ import base64
 import io
 import json
 import math
-import os
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ..._files import atomic_file
 from .. import scoring
 from ..scoring import Instant
 from .recorded_clouds import SUFFIX, foxglove_cloud
@@ -46,16 +45,9 @@ def save_mcap(recording: Recording, path: Path) -> Path:
     Raises:
         RecordingError: the ``mcap`` extra is not installed.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     data = mcap_bytes(recording)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    with atomic_file(path) as file:
+        file.write(data)
     return path
 
 

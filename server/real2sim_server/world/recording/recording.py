@@ -16,13 +16,10 @@ Everything but the frames is the same bytes for the same episode.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import json
-import os
 import re
-import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,6 +28,7 @@ from typing import IO, Any
 
 from real2sim_proto import decode, encode
 
+from ..._files import atomic_file
 from ..._npy import read_entries
 from ...edit import AssetLookup, EditError, ScenarioState, pack_state, unpack_state
 from ...scene import Scene
@@ -231,16 +229,8 @@ def to_bytes(recording: Recording) -> bytes:
 
 def save_recording(recording: Recording, path: Path) -> Path:
     """Write the recording atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(to_bytes(recording))
-        Path(name).replace(path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            Path(name).unlink()
-        raise
+    with atomic_file(path) as file:
+        file.write(to_bytes(recording))
     return path
 
 
