@@ -49,7 +49,7 @@ class GaussianProcess:
         mean, spread = float(values.mean()), max(float(values.std()), 1e-9)
         unit = (values - mean) / spread
         found = _likeliest(points, unit) if scales is None else scales
-        factor = np.linalg.cholesky(_covariance(points, points, found) + NOISE * np.eye(len(unit)))
+        factor = _factor(points, found)
         return cls(found, points, factor, _solved(factor, unit), mean, spread)
 
     def at(self, points: Array) -> tuple[Array, Array]:
@@ -71,6 +71,11 @@ def _covariance(a: Array, b: Array, scales: Array) -> Array:
     return found
 
 
+def _factor(points: Array, scales: Array) -> Array:
+    noisy = _covariance(points, points, scales) + NOISE * np.eye(len(points))
+    return np.asarray(np.linalg.cholesky(noisy), np.float64)
+
+
 def _solved(factor: Array, values: Array) -> Array:
     from scipy.linalg import cho_solve
 
@@ -84,9 +89,8 @@ def _likeliest(points: Array, unit: Array) -> Array:
 
     def cost(logs: Array) -> float:
         scales = np.exp(logs)
-        covariance = _covariance(points, points, scales) + NOISE * np.eye(len(unit))
-        factor = np.linalg.cholesky(covariance)
-        fit = 0.5 * unit @ _solved(factor, unit) + np.log(np.diag(factor)).sum()
+        factor = _factor(points, scales)
+        fit = 0.5 * float(unit.dot(_solved(factor, unit))) + np.log(np.diag(factor)).sum()
         return float(fit + 0.5 * ((logs - np.log(0.5)) ** 2).sum())
 
     bounds = [(np.log(SHORTEST), np.log(LONGEST))] * points.shape[1]
