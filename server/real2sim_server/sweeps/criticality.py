@@ -27,7 +27,7 @@ NOT_AT_FAULT = -1.0
 """At most, where others caused a collision: a margin of a second, so that no search ends there."""
 
 
-def actors_of(
+def adversaries_of(
     reset: Mapping[str, Any], operations: Sequence[Mapping[str, Any]] = ()
 ) -> frozenset[str]:
     """Objects that a case is about: those with drivers, in a storyboard, or edited. Empty where it
@@ -54,13 +54,13 @@ class Danger:
     :meth:`criticality` is its negative, in seconds, and above 0 only for collisions at fault.
 
     Attributes:
-        actors: whose margins count, see :func:`actors_of`: parked cars that everybody passes would
-            hide how near those come who make the case. Empty for all.
+        adversaries: whose margins count, see :func:`adversaries_of`: parked cars that everybody
+            passes would hide how near those come who make the case. Empty for all.
         gap: smallest from the ego's box to another's so far, below 0 where they overlap [m].
         margin: smallest so far [s].
     """
 
-    actors: frozenset[str] = frozenset()
+    adversaries: frozenset[str] = frozenset()
     gap: float = math.inf
     margin: float = FARTHEST
     _margins: list[float] = field(default_factory=list)
@@ -78,7 +78,11 @@ class Danger:
         self.gap = min(self.gap, float(signed_gaps((x, y, ego.yaw, length, width), *where).min()))
         if abs(ego.speed) <= STOPPED:
             return
-        meant = [k for k, name in enumerate(others.ids) if name in self.actors or not self.actors]
+        meant = [
+            k
+            for k, name in enumerate(others.ids)
+            if name in self.adversaries or not self.adversaries
+        ]
         if not meant:
             return
         bumper = (x + length / 2 * cos, y + length / 2 * sin, ego.yaw, 0.0, width)

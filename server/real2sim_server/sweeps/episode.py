@@ -28,7 +28,7 @@ from ..world import World, WorldError
 from ..world.recording.recording import Recording, record
 from ..world.recording.replay import Entry, Replayer, action_payload, edit_payload, reset_payload
 from ..world.scoring import metrics_version
-from .criticality import Danger, actors_of
+from .criticality import Danger, adversaries_of
 from .pictures import CameraFeed
 
 OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
@@ -138,7 +138,7 @@ def drive_episode(
         world = begin(scene, drive, needs, privileged=privileged)
     except (WorldError, ValidationError) as error:
         return Driven(None, Danger(), f"{type(error).__name__}: {error}")
-    driven = Driven(world, Danger(actors_of(drive.reset, drive.operations)))
+    driven = Driven(world, Danger(adversaries_of(drive.reset, drive.operations)))
     feed = CameraFeed.of(scene, needs)
     if keep_entries:
         driven.entries.append(Entry("reset", 0, reset_payload(world.spec)))

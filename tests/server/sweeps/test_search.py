@@ -14,7 +14,7 @@ from scipy.stats import norm
 from real2sim.planners import Needs, load_planner
 from real2sim_server.policies.suite import Case
 from real2sim_server.scene.io import load_scene
-from real2sim_server.sweeps.criticality import Danger, actors_of
+from real2sim_server.sweeps.criticality import Danger, adversaries_of
 from real2sim_server.sweeps.episode import Drive, begin, drive_episode
 from real2sim_server.sweeps.search.archive import Archive
 from real2sim_server.sweeps.search.evaluation import Evaluation, Evaluator
@@ -152,13 +152,13 @@ def test_who_is_not_meant_by_a_case_does_not_hide_how_near_others_came(scene):
         for gap in (25.0, 5.0)
     )
     driven = [drive_episode(scene, drive, load_planner("pid")) for drive in (near, far)]
-    assert driven[0].danger.actors == {"car_blue"}
+    assert driven[0].danger.adversaries == {"car_blue"}
     assert driven[0].criticality > driven[1].criticality
 
 
 def test_collisions_that_others_cause_are_no_end_of_a_search(scene):
     world = begin(scene, Drive("pid", {}), Needs(), privileged=False)
-    danger = Danger(actors_of({}))
+    danger = Danger(adversaries_of({}))
     danger.add(world)
     hit = {"collisions": 1, "first_impact": 4.0}
     struck = SimpleNamespace(accumulator=SimpleNamespace(at_fault={}, **hit))
@@ -168,10 +168,10 @@ def test_collisions_that_others_cause_are_no_end_of_a_search(scene):
 
 
 def test_a_case_is_about_those_that_it_names():
-    assert actors_of({}) == frozenset()
+    assert adversaries_of({}) == frozenset()
     board = {"entities": [{"name": "Van"}, {"name": "Ego2", "object_id": "car_1"}]}
     edits = [{"op": "scale", "object_id": "car_2"}, {"op": "relight"}]
-    assert actors_of({"storyboard": board}, edits) == {"Van", "car_1", "car_2"}
+    assert adversaries_of({"storyboard": board}, edits) == {"Van", "car_1", "car_2"}
 
 
 def test_searches_of_one_seed_are_the_same(evaluate):
