@@ -4,6 +4,8 @@ import { ViewSocket } from "./view_socket.js";
 import { project, rotate, present } from "./poses.js";
 import { attempt, notify } from "./messages.js";
 import { drawSweepInPicture } from "./sweep.js";
+import { startFlight } from "./flight.js";
+import { ink } from "./theme.js";
 
 const $ = (id) => document.getElementById(id);
 const MOVING_WIDTH = 640;
@@ -21,14 +23,16 @@ export function startView() {
     onPick: select,
     onChanged: attempt(refresh),
     onError: (text) => notify(text, "bad"),
+    onGone: (gone) => ($("gone").hidden = !gone),
   });
   on("time draft camera", () => requestFrame(true));
   on("scenario run", () => requestFrame(false));
-  on("selection draft scenario sweep", outline);
+  on("selection draft scenario sweep layout", outline);
+  new ResizeObserver(() => requestFrame(false)).observe($("stage"));
   new ResizeObserver(outline).observe($("stage"));
   $("uncertainty").hidden = !model.scene.has_uncertainties;
-  $("uncertainty").classList.toggle("on", model.shows !== "rgb");
-  fly($("stage"));
+  pressed("uncertainty", model.shows !== "rgb");
+  startFlight($("stage"), (e) => !model.mosaic && pickAt(e));
   requestFrame(false);
 }
 
@@ -130,7 +134,7 @@ function outline() {
     );
     return pixel && [left + pixel[0] * scale, top + pixel[1] * scale];
   });
-  pen.strokeStyle = "#ffb454";
+  pen.strokeStyle = ink().selected;
   pen.lineWidth = 1.6;
   for (let a = 0; a < 8; a++) {
     for (const bit of [1, 2, 4]) {
@@ -150,60 +154,24 @@ function outline() {
 export function toggleUncertainty() {
   if (model.scene.has_uncertainties) {
     model.shows = model.shows === "rgb" ? "uncertainty" : "rgb";
-    $("uncertainty").classList.toggle("on", model.shows !== "rgb");
+    pressed("uncertainty", model.shows !== "rgb");
     emit("camera");
   }
 }
 
 export function toggleFree() {
   model.free = model.free ? null : (header?.T_world_camera?.slice() ?? null);
-  $("free").classList.toggle("on", !!model.free);
+  pressed("free", !!model.free);
   $("stage").classList.toggle("free", !!model.free);
   emit("camera");
 }
 
-function fly(stage) {
-  let from = null;
-  let moved = 0;
-  stage.addEventListener("contextmenu", (e) => e.preventDefault());
-  stage.addEventListener("pointerdown", (e) => {
-    from = e;
-    moved = 0;
-    if (model.free) {
-      stage.setPointerCapture(e.pointerId);
-    }
-  });
-  stage.addEventListener("pointermove", (e) => {
-    if (!from) {
-      return;
-    }
-    const dx = e.clientX - from.clientX;
-    const dy = e.clientY - from.clientY;
-    moved += Math.abs(dx) + Math.abs(dy);
-    if (model.free) {
-      from.button === 2 ? shift(-dx * 0.02, -dy * 0.02, 0) : turn(dx * 0.004, dy * 0.004);
-      from = keep(e, from.button);
-    }
-  });
-  stage.addEventListener("pointerup", (e) => {
-    if (from && moved < 4 && from.button === 0 && !model.mosaic) {
-      pickAt(e);
-    }
-    from = null;
-  });
-  stage.addEventListener(
-    "wheel",
-    (e) => {
-      if (model.free) {
-        e.preventDefault();
-        shift(0, 0, -e.deltaY * 0.01);
-      }
-    },
-    { passive: false },
-  );
-}
-const keep = ({ clientX, clientY }, button) => ({ clientX, clientY, button });
+const pressed = (id, on_) => {
+  $(id).classList.toggle("on", on_);
+  $(id).setAttribute("aria-pressed", on_);
+};
 
+// What is clicked, or tapped, is asked for.
 function pickAt(e) {
   if (!header) {
     return;
@@ -217,31 +185,4 @@ function pickAt(e) {
   if (pick.every((v) => v >= 0 && v <= 1)) {
     socket.pick({ ...viewRequest(MOVING_WIDTH), pick });
   }
-}
-
-// Camera axes are the columns of T: right, down, forward.
-export function shift(right, down, forward) {
-  const T = model.free.slice();
-  for (let i = 0; i < 3; i++) {
-    T[4 * i + 3] += T[4 * i] * right + T[4 * i + 1] * down + T[4 * i + 2] * forward;
-  }
-  model.free = T;
-  emit("camera");
-}
-function turn(yaw, pitch) {
-  const T = model.free.slice();
-  const [c, s] = [Math.cos(yaw), Math.sin(yaw)];
-  const [d, e] = [Math.cos(pitch), Math.sin(pitch)];
-  for (let column = 0; column < 3; column++) {
-    const [x, y] = [T[column], T[4 + column]];
-    T[column] = c * x - s * y;
-    T[4 + column] = s * x + c * y;
-  }
-  for (let i = 0; i < 3; i++) {
-    const [down, forward] = [T[4 * i + 1], T[4 * i + 2]];
-    T[4 * i + 1] = d * down + e * forward;
-    T[4 * i + 2] = d * forward - e * down;
-  }
-  model.free = T;
-  emit("camera");
 }

@@ -1,10 +1,5 @@
 // Colours of objects by their category.
-const COLOURS = {
-  car: "#5aa9ff",
-  truck: "#b48cff",
-  van: "#62d0c4",
-  bus: "#b48cff",
-  pedestrian: "#ff8fa3",
-  cyclist: "#ffd166",
-};
-export const colourOf = ({ category }) => COLOURS[category] ?? COLOURS.car;
+import { ink } from "./theme.js";
+
+const KINDS = { car: 0, truck: 4, van: 5, bus: 4, pedestrian: 6, cyclist: 7 };
+export const colourOf = ({ category }) => ink().lines[KINDS[category] ?? 0];

@@ -25,11 +25,10 @@ let finished = [];
 let shown = null;
 
 export function startDatasets() {
-  const tab = document.querySelector('[data-tab="datasets"]');
-  tab.addEventListener("click", attempt(list));
   draw();
 }
 const isDataset = (job) => job.kind === "export" && job.request.kind === "dataset";
+export const listDatasets = attempt(list);
 async function list() {
   const subject = encodeURIComponent(model.scenario.scenario_id);
   const { jobs } = await get(`/v1/jobs?subject=${subject}`);

@@ -1,44 +1,35 @@
 // Lanes of the scene's map from above: surface, middle, direction, stop lines, signals.
-const SURFACES = {
-  driving: "#1c2533",
-  bus: "#2a2030",
-  bicycle: "#182b22",
-  parking: "#18202b",
-  shoulder: "#18202b",
-  sidewalk: "#151b24",
-  other: "#141a22",
-};
-const RIM = "#3d4b5f";
-const MIDDLE = "#55657c";
+import { ink } from "./theme.js";
 
 export function drawLanes(pen, toScreen, lanes) {
   const shapes = lanes.lanes.map((lane) => ({ lane, ...rims(lane) }));
   for (const { lane, left, right } of shapes) {
     trace(pen, [...left, ...right.slice().reverse()].map(toScreen), true);
-    pen.fillStyle = SURFACES[lane.kind] ?? SURFACES.other;
+    const { lanes: surfaces } = ink();
+    pen.fillStyle = surfaces[lane.kind] ?? surfaces.other;
     pen.fill();
   }
   for (const area of lanes.areas) {
     trace(pen, area.outline.map(toScreen), true);
-    pen.fillStyle = area.kind === "crosswalk" ? "#d8dee930" : "#8a97a810";
+    pen.fillStyle = area.kind === "crosswalk" ? ink().crossing : ink().area;
     pen.fill();
   }
   pen.lineWidth = 1;
   for (const { lane, left, right } of shapes) {
-    stroke(pen, left.map(toScreen), RIM);
-    stroke(pen, right.map(toScreen), RIM);
+    stroke(pen, left.map(toScreen), ink().rim);
+    stroke(pen, right.map(toScreen), ink().rim);
     if (lane.kind === "driving" || lane.kind === "bus") {
       pen.setLineDash([5, 6]);
-      stroke(pen, lane.centre.map(toScreen), MIDDLE);
+      stroke(pen, lane.centre.map(toScreen), ink().middle);
       pen.setLineDash([]);
       arrow(pen, toScreen, lane.centre);
     }
   }
   pen.lineWidth = 2;
-  lanes.stop_lines.forEach((line) => stroke(pen, line.points.map(toScreen), "#e06c75"));
+  lanes.stop_lines.forEach((line) => stroke(pen, line.points.map(toScreen), ink().stop));
   for (const signal of lanes.signals) {
     const [x, y] = toScreen(signal.position);
-    pen.fillStyle = signal.kind === "traffic_light" ? "#e5c07b" : "#8a97a8";
+    pen.fillStyle = signal.kind === "traffic_light" ? "#e5c07b" : ink().collider;
     pen.fillRect(x - 3, y - 3, 6, 6);
   }
 }
@@ -63,7 +54,7 @@ function arrow(pen, toScreen, centre) {
   const [x0, y0] = toScreen(centre[k - 1]);
   const [x1, y1] = toScreen(centre[k]);
   const angle = Math.atan2(y1 - y0, x1 - x0);
-  pen.strokeStyle = MIDDLE;
+  pen.strokeStyle = ink().middle;
   pen.beginPath();
   for (const side of [-2.6, 2.6]) {
     pen.moveTo(x1, y1);

@@ -106,14 +106,16 @@ export function python(value) {
   return JSON.stringify(value);
 }
 export function asCurl(batches) {
-  const url = `${location.origin}/v1/scenarios/${model.scenario.scenario_id}/operations`;
+  const { scene, name } = model.scenario;
   const quoted = (body) => `'${JSON.stringify(body).replaceAll("'", "'\\''")}'`;
-  return batches
-    .map(
-      (batch) =>
-        `curl -s -X POST ${url} -H 'Content-Type: application/json' \\\n     -d ${quoted({ operations: batch.map(withoutNulls) })}`,
-    )
-    .join("\n");
+  const call = (path, body) =>
+    `curl -sf -X POST ${path} -H 'Content-Type: application/json' \\\n     -d ${quoted(body)}`;
+  const made = call(`${location.origin}/v1/scenarios`, { scene, name: `${name} (copy)` });
+  const id = `ID=$(${made} | sed -E 's/.*"scenario_id": ?"([^"]+)".*/\\1/')`;
+  const edits = batches.map((batch) =>
+    call(`${location.origin}/v1/scenarios/$ID/operations`, { operations: batch.map(withoutNulls) }),
+  );
+  return [id, ...edits, ""].join("\n");
 }
 async function copy(text) {
   await navigator.clipboard.writeText(text);

@@ -1,16 +1,15 @@
 // Opens what the address names, or the first page.
 import { addressParameters, startAddress } from "./address.js";
 import { model, open, on, undo, redo, fork, exportFile, select, setTime } from "./model.js";
+import { el } from "./dom.js";
 import { attempt, notify } from "./messages.js";
 import { startPage } from "./start.js";
 import { startView, toggleFree, toggleUncertainty } from "./camera_view.js";
 import { startMosaic } from "./mosaic.js";
 import { startMap, fit, centre } from "./map.js";
-import { startProperties } from "./properties.js";
-import { startLog } from "./log.js";
-import { startAssets } from "./assets.js";
-import { startPhysics, show } from "./physics.js";
-import { startDatasets } from "./datasets.js";
+import { startPanels, turnTo } from "./panels.js";
+import { startLayout } from "./layout.js";
+import { show } from "./physics.js";
 import { startTimeline } from "./timeline.js";
 import { startSweep, chooseLidar } from "./sweep.js";
 import { startShortcuts } from "./shortcuts.js";
@@ -25,7 +24,7 @@ async function main() {
   await open(address.scenario);
   const names = model.scene.cameras.map((c) => c.name);
   const { start_us: firstUs, end_us: lastUs } = model.scenario;
-  model.camera = names.includes(address.camera) ? address.camera : names[0];
+  model.camera = names.includes(address.camera) ? address.camera : forward();
   model.mosaic = address.camera === "*";
   if (address.shows === "uncertainty" && model.scene.has_uncertainties) {
     model.shows = address.shows;
@@ -33,24 +32,21 @@ async function main() {
   model.t = Math.min(lastUs, Math.max(firstUs, Number(address.t ?? firstUs)));
   $("studio").hidden = false;
   [
+    startPanels,
+    startLayout,
     startMap,
     startTimeline,
-    startProperties,
-    startLog,
-    startAssets,
-    startPhysics,
-    startDatasets,
     startMosaic,
     startView,
     startShortcuts,
   ].forEach((start) => start());
   bar();
-  tabs();
   if (model.scenario.objects.some((o) => o.object_id === address.selected)) {
     select(address.selected);
   }
   if (address.run) {
     const t = model.t;
+    turnTo("physics");
     await attempt(show)(address.run);
     setTime(t);
   }
@@ -61,6 +57,11 @@ async function main() {
   startAddress();
   document.body.dataset.ready = "yes";
   return null;
+}
+// The camera that looks ahead.
+function forward() {
+  const aside = ({ T_vehicle_camera: T }) => Math.abs(Math.atan2(T[1][2], T[0][2]));
+  return model.scene.cameras.toSorted((a, b) => aside(a) - aside(b))[0].name;
 }
 function bar() {
   const draw = () => {
@@ -99,17 +100,18 @@ async function download() {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
-function tabs() {
-  $("side-tabs").onclick = ({ target }) => {
-    if (!target.dataset.tab) {
-      return;
-    }
-    for (const b of $("side-tabs").children) {
-      b.classList.toggle("on", b === target);
-    }
-    for (const page of document.querySelectorAll("[data-page]")) {
-      page.hidden = page.dataset.page !== target.dataset.tab;
-    }
-  };
+// A link to what is not here leads to a page that says so.
+function lost(error) {
+  $("studio").hidden = true;
+  $("lost").hidden = false;
+  $("lost").replaceChildren(
+    el("h1", { textContent: "This link leads to nothing here" }),
+    el("p", { textContent: error.message }),
+    el("p", {
+      textContent:
+        "The scenario may have been deleted, or belong to another worker. Ask whoever sent the link, or choose another one.",
+    }),
+    el("a", { href: "./", textContent: "All scenarios and scenes" }),
+  );
 }
-main().catch((error) => notify(error.message, "bad"));
+main().catch((error) => (error.status === 404 ? lost(error) : notify(error.message, "bad")));

@@ -1,100 +1,88 @@
-// The map from above: world x to the right, y up. Drag moves, the handle ahead of a box turns it.
-import { model, on, emit, object, poseOf, select, edit, draftOperations } from "./model.js";
-import { yawOf, poseAt, present } from "./poses.js";
+// The map from above: what is where. `map_hands` moves and turns it.
+import { model, on, object, poseOf, egoPoseAt } from "./model.js";
+import { yawOf, present } from "./poses.js";
 import { fromAbove } from "./colliders.js";
 import { drawSweepAbove } from "./sweep.js";
 import { drawLanes } from "./lanes.js";
 import { colourOf } from "./categories.js";
+import { ink, onTheme } from "./theme.js";
+import { startMapHands } from "./map_hands.js";
+import { view, toScreen, useCanvas, shown, lookAtEverything, lookAtSelection } from "./map_view.js";
 
 let canvas;
 let pen;
-let view = { x: 0, y: 0, scale: 6 };
-let drag = null;
+const layers = [];
+// Others draw on the map too: after the objects, with the pen and what turns metres into pixels.
+export const addLayer = (layer) => layers.push(layer);
 
 export function startMap() {
   canvas = document.getElementById("map");
   pen = canvas.getContext("2d");
-  canvas.addEventListener("pointerdown", down);
-  canvas.addEventListener("pointermove", move);
-  canvas.addEventListener("pointerup", up);
-  canvas.addEventListener("wheel", zoom, { passive: false });
-  on("scenario selection time draft run camera box sweep", draw);
+  useCanvas(canvas);
+  startMapHands(canvas, draw);
+  on("scenario selection time draft run camera box sweep drive layout", draw);
+  onTheme(draw);
   new ResizeObserver(draw).observe(canvas);
   centre();
 }
-const toScreen = ([x, y]) => [
-  canvas.clientWidth / 2 + (x - view.x) * view.scale,
-  canvas.clientHeight / 2 - (y - view.y) * view.scale,
-];
-const toWorld = (e) => [
-  view.x + (e.offsetX - canvas.clientWidth / 2) / view.scale,
-  view.y - (e.offsetY - canvas.clientHeight / 2) / view.scale,
-];
 export const screenOfBox = () => toScreen(model.box.position);
 export const screenOf = (id) => toScreen(poseOf(object(id)).position);
-
 export function fit() {
-  const points = [...(model.scene.ego?.positions ?? []), ...shown().map((o) => poseOf(o).position)];
-  const [xs, ys] = [0, 1].map((k) => points.map((p) => p[k]));
-  const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
-  view = {
-    x: (x0 + x1) / 2,
-    y: (y0 + y1) / 2,
-    scale: Math.min(40, canvas.clientWidth / (x1 - x0 + 16), canvas.clientHeight / (y1 - y0 + 16)),
-  };
+  lookAtEverything();
   draw();
 }
 export function centre() {
-  const subject = object(model.selected);
-  const [x, y] = subject ? poseOf(subject).position : poseAt(model.scene.ego, model.t).position;
-  view = { x: subject ? x : x + 18, y, scale: Math.max(view.scale, 9) };
+  lookAtSelection();
   draw();
 }
-const shown = () => model.scenario.objects.filter((o) => present(o, model.t));
 
 function draw() {
   const ratio = devicePixelRatio;
   canvas.width = canvas.clientWidth * ratio;
   canvas.height = canvas.clientHeight * ratio;
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  pen.fillStyle = "#0f141c";
+  pen.fillStyle = ink().ground;
   pen.fillRect(0, 0, canvas.clientWidth, canvas.clientHeight);
   grid();
   if (model.lanes) {
     drawLanes(pen, toScreen, model.lanes);
   }
-  line(model.scene.ego.positions, "#3f5a46", 2);
-  drawSweepAbove(pen, toScreen, poseAt(model.scene.ego, model.t));
+  line(model.scene.ego.positions, ink().way, 2);
+  drawSweepAbove(pen, toScreen, egoPoseAt(model.t));
   for (const o of shown()) {
     if (o.trajectory.positions.length > 1) {
-      line(o.trajectory.positions, o.object_id === model.selected ? "#ffb45499" : "#33425680", 1.2);
+      line(
+        o.trajectory.positions,
+        o.object_id === model.selected ? `${ink().selected}99` : ink().other,
+        1.2,
+      );
     }
   }
   for (const region of model.scenario.erased) {
-    box(region.pose, region.size, "#ff7b72", false);
+    box(region.pose, region.size, ink().erased, false);
   }
   for (const { shape } of model.scenario.colliders) {
     const { size, lines = [] } = fromAbove(shape);
     if (size) {
-      box(shape, size, "#8a97a8", false);
+      box(shape, size, ink().collider, false);
     }
-    lines.forEach((corners) => line(corners, "#8a97a880", 1));
+    lines.forEach((corners) => line(corners, `${ink().collider}80`, 1));
   }
   if (!model.selected && model.box) {
     pen.setLineDash([4, 4]);
-    box(model.box, model.box.size, "#dbe2ec", false);
+    box(model.box, model.box.size, ink().text, false);
     pen.setLineDash([]);
   }
   for (const o of shown()) {
     box(
       poseOf(o),
       o.size,
-      o.object_id === model.selected ? "#ffb454" : colourOf(o),
+      o.object_id === model.selected ? ink().selected : colourOf(o),
       true,
       o.object_id,
     );
   }
-  const ego = poseAt(model.scene.ego, model.t);
+  const ego = egoPoseAt(model.t);
   const yaw = yawOf(ego.quaternion);
   const p = ego.position;
   box(
@@ -103,10 +91,11 @@ function draw() {
       quaternion: ego.quaternion,
     },
     [4.6, 1.9, 1.5],
-    "#6fcf7c",
+    ink().ego,
     true,
-    "recording vehicle",
+    model.playback?.ego ? "driven vehicle" : "recording vehicle",
   );
+  layers.forEach((layer) => layer(pen, toScreen, { line, box }));
   if (object(model.selected) && present(object(model.selected), model.t) && !model.job) {
     handle();
   }
@@ -114,8 +103,8 @@ function draw() {
 function grid() {
   const step = view.scale > 14 ? 5 : view.scale > 5 ? 10 : 50;
   const [w, h] = [canvas.clientWidth, canvas.clientHeight];
-  pen.fillStyle = "#5b6879";
-  pen.strokeStyle = "#1a2230";
+  pen.fillStyle = ink().faint;
+  pen.strokeStyle = ink().grid;
   pen.lineWidth = 1;
   pen.font = "10px system-ui";
   for (
@@ -181,117 +170,15 @@ export function handleAt() {
 }
 function handle() {
   const [x, y] = handleAt();
-  pen.strokeStyle = "#ffb454";
+  pen.strokeStyle = ink().selected;
   pen.lineWidth = 1.5;
   pen.beginPath();
   pen.moveTo(...screenOf(model.selected));
   pen.lineTo(x, y);
   pen.stroke();
-  pen.fillStyle = "#0f141c";
+  pen.fillStyle = ink().ground;
   pen.beginPath();
   pen.arc(x, y, 6, 0, 7);
   pen.fill();
   pen.stroke();
-}
-function under([wx, wy]) {
-  return shown()
-    .filter((o) => {
-      const { position, quaternion } = poseOf(o);
-      const yaw = yawOf(quaternion);
-      const dx = wx - position[0];
-      const dy = wy - position[1];
-      const slack = 4 / view.scale;
-      return (
-        Math.abs(dx * Math.cos(yaw) + dy * Math.sin(yaw)) < o.size[0] / 2 + slack &&
-        Math.abs(dy * Math.cos(yaw) - dx * Math.sin(yaw)) < o.size[1] / 2 + slack
-      );
-    })
-    .at(-1);
-}
-function down(e) {
-  canvas.setPointerCapture(e.pointerId);
-  const at = toWorld(e);
-  if (object(model.selected) && !model.job) {
-    const [hx, hy] = handleAt();
-    if (Math.hypot(e.offsetX - hx, e.offsetY - hy) < 11) {
-      return begin("turn", model.selected, at);
-    }
-  }
-  const hit = under(at);
-  if (hit && !model.job) {
-    select(hit.object_id);
-    return begin("move", hit.object_id, at);
-  }
-  if (!hit && !model.selected && model.box && inside(at)) {
-    drag = { kind: "box", at, from: [...model.box.position] };
-    return;
-  }
-  drag = { kind: "pan", from: [e.offsetX, e.offsetY], view: { ...view } };
-}
-function begin(kind, id, at) {
-  const { position } = poseOf(object(id));
-  drag = {
-    kind,
-    id,
-    at,
-    centre: position,
-    angle: Math.atan2(at[1] - position[1], at[0] - position[0]),
-  };
-}
-function move(e) {
-  if (!drag) {
-    return;
-  }
-  if (drag.kind === "pan") {
-    view = {
-      ...view,
-      x: drag.view.x - (e.offsetX - drag.from[0]) / view.scale,
-      y: drag.view.y + (e.offsetY - drag.from[1]) / view.scale,
-    };
-    return draw();
-  }
-  const [x, y] = toWorld(e);
-  if (drag.kind === "box") {
-    return moveBox(x - drag.at[0], y - drag.at[1]);
-  }
-  const angle = Math.atan2(y - drag.centre[1], x - drag.centre[0]) - drag.angle;
-  model.draft =
-    drag.kind === "move"
-      ? { id: drag.id, x: x - drag.at[0], y: y - drag.at[1], angle: 0 }
-      : { id: drag.id, x: 0, y: 0, angle: Math.atan2(Math.sin(angle), Math.cos(angle)) };
-  emit("draft");
-}
-// The box lies along the axes of the world, and belongs to no object: nothing is committed.
-const inside = (at) =>
-  [0, 1].every((k) => Math.abs(at[k] - model.box.position[k]) < model.box.size[k] / 2);
-function moveBox(dx, dy) {
-  const place = (v) => Math.round(v * 10) / 10;
-  model.box.position = [place(drag.from[0] + dx), place(drag.from[1] + dy), drag.from[2]];
-  model.box.placed = true;
-  emit("box");
-}
-async function up() {
-  const was = drag;
-  drag = null;
-  if (was?.kind === "pan" || was?.kind === "box" || !model.draft) {
-    return;
-  }
-  const { x, y } = model.draft;
-  const round = (v) => Math.round(v * 1e4) / 1e4;
-  if (was.kind === "move" && Math.hypot(x, y) * view.scale < 3) {
-    model.draft = null;
-    emit("draft");
-    return;
-  }
-  Object.assign(model.draft, { x: round(x), y: round(y), angle: round(model.draft.angle) });
-  await edit(draftOperations());
-}
-function zoom(e) {
-  e.preventDefault();
-  const [x, y] = toWorld(e);
-  const factor = Math.exp(-e.deltaY * 0.0015);
-  const scale = Math.min(120, Math.max(0.5, view.scale * factor));
-  const k = view.scale / scale;
-  view = { x: x + (view.x - x) * k, y: y + (view.y - y) * k, scale };
-  draw();
 }

@@ -65,6 +65,9 @@ export function poseOf(subject) {
   };
 }
 
+// Of the ego: as it was recorded, or as it drives in the drive that is shown.
+export const egoPoseAt = (t) => poseAt(model.playback?.ego ?? model.scene.ego, t);
+
 export const scenarioPoseOf = (subject) => poseAt(subject.trajectory, model.t);
 
 export function draftOperations() {
@@ -90,6 +93,11 @@ export function draftOperations() {
   return list;
 }
 
+// For how long moves hold, until another object is selected: nobody remembers for longer.
+export function setWhen(when) {
+  model.when = when;
+  emit("when");
+}
 // When a move holds; it is whole at the time shown, and blends in before or out after it.
 export function timeRange() {
   const blend_us = 500_000;
@@ -154,6 +162,9 @@ async function change(rest, body) {
 }
 
 export function select(id) {
+  if (id !== model.selected) {
+    setWhen("always");
+  }
   model.selected = id;
   emit("selection");
 }

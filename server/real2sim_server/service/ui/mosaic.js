@@ -7,13 +7,22 @@ let busy = false;
 let again = false;
 
 export function startMosaic() {
-  const names = model.scene.cameras.map((c) => c.name);
+  const names = inOrder().map((c) => c.name);
   $("cameras").replaceChildren(
     ...names.map((name) => tab(name, name)),
     ...(names.length > 1 ? [tab("All cameras", null)] : []),
   );
   on("time scenario run mosaic", draw);
   mark();
+}
+// As one turns round: what looks ahead from left to right, then what looks back.
+function inOrder() {
+  const aside = ({ T_vehicle_camera: T }) => Math.atan2(T[1][2], T[0][2]);
+  const ahead = (camera) => Math.abs(aside(camera)) <= Math.PI / 2 + 0.01;
+  const left = (a, b) => aside(b) - aside(a);
+  const { cameras } = model.scene;
+  const back = cameras.filter((c) => !ahead(c)).sort(left);
+  return [...cameras.filter(ahead).sort(left), ...back];
 }
 function tab(label, name) {
   const button = document.createElement("button");
@@ -28,6 +37,7 @@ export function choose(name) {
     model.camera = name;
     model.free = null;
     $("free").classList.remove("on");
+    $("free").setAttribute("aria-pressed", false);
     $("stage").classList.remove("free");
   }
   mark();
@@ -37,7 +47,9 @@ export function choose(name) {
 function mark() {
   $("mosaic").hidden = !model.mosaic;
   for (const b of $("cameras").children) {
-    b.classList.toggle("on", b.dataset.camera === (model.mosaic ? "*" : model.camera));
+    const chosen = b.dataset.camera === (model.mosaic ? "*" : model.camera);
+    b.classList.toggle("on", chosen);
+    b.setAttribute("aria-pressed", chosen);
   }
 }
 async function draw() {
@@ -53,7 +65,7 @@ async function draw() {
     const base = model.job
       ? `/v1/jobs/${model.job}`
       : `/v1/scenarios/${model.scenario.scenario_id}`;
-    for (const { name } of model.scene.cameras) {
+    for (const { name } of inOrder()) {
       const src = await picture(
         `${base}/preview?camera=${encodeURIComponent(name)}&t_us=${model.t}&width=400`,
       );
@@ -74,7 +86,9 @@ function tile(name, src) {
     figure.dataset.camera = name;
     const caption = document.createElement("figcaption");
     caption.textContent = name;
-    figure.append(document.createElement("img"), caption);
+    const image = document.createElement("img");
+    image.alt = name;
+    figure.append(image, caption);
     figure.onclick = () => choose(name);
     $("mosaic").append(figure);
   }

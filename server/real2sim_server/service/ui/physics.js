@@ -12,13 +12,15 @@ let duration = 2;
 
 export function startPhysics() {
   on("scenario selection run", draw);
-  on("time", () => model.playback && chart());
+  // A hidden plot has no size to be drawn at.
+  on("time layout", () => model.playback && chart());
   draw();
 }
 function draw() {
   const { start_us: start, end_us: end } = model.scenario;
   const seconds = el("input", {
     id: "duration",
+    "aria-label": "for [s]",
     type: "number",
     min: 0.1,
     max: (end - start) / 1e6,

@@ -1,5 +1,6 @@
 // Lines over time on a canvas.
-const COLOURS = ["#5aa9ff", "#ffb454", "#6fcf7c", "#ff7b72", "#b48cff", "#62d0c4"];
+import { ink } from "./theme.js";
+
 export function plot(canvas, xs, series, now) {
   if (!canvas?.clientWidth) {
     return;
@@ -15,8 +16,9 @@ export function plot(canvas, xs, series, now) {
   const x = (v) => 34 + (v / (xs.at(-1) || 1)) * (w - 40);
   const y = (v) => h - 30 - ((v - low) / (high - low)) * (h - 38);
   pen.font = "10px system-ui";
-  pen.fillStyle = "#8a97a8";
-  pen.strokeStyle = "#273140";
+  const { lines, faint, grid, text } = ink();
+  pen.fillStyle = faint;
+  pen.strokeStyle = grid;
   for (const v of [low, (low + high) / 2, high]) {
     pen.beginPath();
     pen.moveTo(34, y(v));
@@ -25,13 +27,13 @@ export function plot(canvas, xs, series, now) {
     pen.fillText(v.toPrecision(3), 0, y(v) + 3);
   }
   series.forEach((s, k) => {
-    pen.strokeStyle = pen.fillStyle = COLOURS[k % COLOURS.length];
+    pen.strokeStyle = pen.fillStyle = lines[k % lines.length];
     pen.beginPath();
     s.values.forEach((v, i) => pen.lineTo(x(xs[i]), y(v)));
     pen.stroke();
     pen.fillText(s.name.replace("_", " "), 4 + (k % 3) * (w / 3), h - 14 + Math.floor(k / 3) * 12);
   });
-  pen.strokeStyle = "#fff8";
+  pen.strokeStyle = text;
   pen.beginPath();
   pen.moveTo(x(now), 4);
   pen.lineTo(x(now), h - 30);

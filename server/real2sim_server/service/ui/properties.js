@@ -9,6 +9,7 @@ import {
   select,
   emit,
   timeRange,
+  setWhen,
 } from "./model.js";
 import { yawOf, present } from "./poses.js";
 import { el, number, row, tidy } from "./dom.js";
@@ -22,6 +23,7 @@ export function startProperties() {
   on("scenario", () => (object(drawn) ? refreshFields() : draw()));
   on("run time draft", refreshFields);
   on("box", refreshBox);
+  on("when", drawWhen);
   draw();
 }
 // A panel stays while its object does, so that whoever is typing or tabbing through it can go on.
@@ -69,7 +71,11 @@ function panel(id) {
     });
   const material = el(
     "select",
-    { id: "material", onchange: (e) => setPhysics("material", e.target.value || null) },
+    {
+      id: "material",
+      "aria-label": "material",
+      onchange: (e) => setPhysics("material", e.target.value || null),
+    },
     el("option", { value: "", textContent: "by category" }),
     ...MATERIALS.map((m) => el("option", { value: m, textContent: m })),
   );
@@ -200,22 +206,33 @@ export const duplicate = (id) =>
   ]);
 const action = (label, name, onclick, kind = "") =>
   el("button", { textContent: label, onclick, class: kind, "data-action": name });
-// For how long a move or turn holds, also one made with the mouse.
+const WHEN = {
+  always: "at all times",
+  on: "from now on",
+  until: "until now",
+  around: "for 2 s around now",
+};
+// For how long a move or turn holds, also one made with the mouse: said beside the map as well,
+// while it is anything but the usual.
+function drawWhen() {
+  const chip = document.getElementById("when-mode");
+  chip.hidden = model.when === "always";
+  chip.textContent = `Moves hold ${WHEN[model.when]} ✕`;
+  chip.onclick = () => setWhen("always");
+  const choice = document.getElementById("when");
+  if (choice) {
+    choice.value = model.when;
+  }
+}
 function when() {
-  const choices = {
-    always: "at all times",
-    on: "from now on",
-    until: "until now",
-    around: "for 2 s around now",
-  };
   const choose = (e) => {
-    model.when = e.target.value;
+    setWhen(e.target.value);
     emit("draft");
   };
   return el(
     "select",
     { id: "when", class: "wide", onchange: choose, "aria-label": "when moves hold" },
-    ...Object.entries(choices).map(([value, textContent]) =>
+    ...Object.entries(WHEN).map(([value, textContent]) =>
       el("option", { value, textContent, selected: value === model.when }),
     ),
   );
@@ -226,7 +243,12 @@ function velocity(id) {
   );
   const frame = el(
     "select",
-    { id: "velocity-frame", onchange: () => object(id).velocity && commit(), class: "wide" },
+    {
+      id: "velocity-frame",
+      "aria-label": "axes of the velocity",
+      onchange: () => object(id).velocity && commit(),
+      class: "wide",
+    },
     ...["object", "world"].map((f) =>
       el("option", { value: f, textContent: f === "object" ? "x is forward" : "world axes" }),
     ),

@@ -1,7 +1,9 @@
 // Keys, and the page that lists them.
 import { model, undo, redo, edit, select } from "./model.js";
 import { toggle, step } from "./timeline.js";
-import { toggleFree, toggleUncertainty, shift } from "./camera_view.js";
+import { toggleFree, toggleUncertainty } from "./camera_view.js";
+import { shift } from "./flight.js";
+import { swap } from "./layout.js";
 import { fit, centre } from "./map.js";
 import { duplicate } from "./properties.js";
 import { choose } from "./mosaic.js";
@@ -48,6 +50,7 @@ const KEYS = [
   [null, "", "a", flying(-0.5, 0, 0)],
   [null, "", "d", flying(0.5, 0, 0)],
   ["M", "all cameras", "m", () => choose(model.mosaic ? model.camera : null)],
+  ["X", "picture and map change places", "x", swap],
   ["0", "whole map", "0", fit],
   ["C", "map to the selection", "c", centre],
   ["Esc", "select nothing", "Escape", () => select(null)],
@@ -64,7 +67,7 @@ export function startShortcuts() {
   document.getElementById("help-button").onclick = help;
   document.addEventListener("keydown", (e) => {
     if (
-      e.target.matches("input:not([type=range]), select, textarea") ||
+      e.target.matches("input:not([type=range], [type=checkbox]), select, textarea") ||
       document.querySelector("dialog[open]")
     ) {
       return;

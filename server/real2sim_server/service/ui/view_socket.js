@@ -2,13 +2,14 @@
 import { token } from "./api.js";
 
 export class ViewSocket {
-  constructor(id, { onFrame, onPick, onChanged, onError }) {
+  constructor(id, { onFrame, onPick, onChanged, onError, onGone }) {
     Object.assign(this, {
       id,
       onFrame,
       onPick,
       onChanged,
       onError,
+      onGone,
       busy: false,
       next: null,
       seq: 0,
@@ -29,6 +30,7 @@ export class ViewSocket {
       if (code >= 4400) {
         this.onError(reason);
       } else {
+        this.onGone(true);
         setTimeout(() => this.connect(), 1000);
       }
     };
@@ -53,6 +55,7 @@ export class ViewSocket {
   text(message) {
     if (message.type === "welcome") {
       this.ready = true;
+      this.onGone(false);
       this.flush();
       return;
     }

@@ -8,7 +8,7 @@ from real2sim_server.service.routes.ui import FOLDER, STUDIO
 
 MODULES = sorted(name for name in STUDIO if name.endswith(".js"))
 IMPORT = re.compile(r'^import (?:\{([^}]*)\} )?from "\./([\w.]+)";', re.MULTILINE)
-EXPORT = re.compile(r"^export (?:async )?(?:function\*?|const|class) (\w+)", re.MULTILINE)
+EXPORT = re.compile(r"^export (?:async )?(?:function\*?|const|let|class) (\w+)", re.MULTILINE)
 
 
 def text(name: str) -> str:
