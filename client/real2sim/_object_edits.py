@@ -58,8 +58,18 @@ class ObjectEdits(Generic[R]):
         """Id of the object in its scenario."""
         return self.info.object_id
 
+    @property
+    def category(self) -> str:
+        """What it is, such as ``car``."""
+        return self.info.category
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """Length, width and height of its box [m]."""
+        return self.info.size
+
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.object_id!r}, category={self.info.category!r})"
+        return f"{type(self).__name__}({self.object_id!r}, category={self.category!r})"
 
     def translate(
         self,

@@ -100,10 +100,12 @@ class Image:
         """Write the image atomically and return its path.
 
         The bytes go out as they came where the suffix fits the codec (``.jpg``, ``.png``,
-        ``.npy`` for raw); rgb can also be written as ``.jpg``, and anything as ``.npy``.
+        ``.npy`` for raw); rgb can also be written as ``.jpg`` or ``.png``, and anything as
+        ``.npy``.
 
         Raises:
-            ValueError: a suffix that the image cannot be written as.
+            ValueError: a suffix that the image cannot be written as; a ``.png`` that has to be
+                made where neither Pillow nor OpenCV is installed.
 
         Examples:
             >>> image.save(folder / "front.jpg").suffix
@@ -126,7 +128,7 @@ class Image:
         """Who writes the image, by each suffix that would do."""
         writers: dict[str, Callable[[], bytes]] = {".npy": self._as_npy}
         if self.modality == "rgb":
-            writers |= {".jpg": self._as_jpeg, ".jpeg": self._as_jpeg}
+            writers |= {".jpg": self._as_jpeg, ".jpeg": self._as_jpeg, ".png": self._as_png}
         return writers | dict.fromkeys(AS_SENT[self.codec], lambda: self.data)
 
     def _as_npy(self) -> bytes:
@@ -139,6 +141,17 @@ class Image:
 
         encoded: bytes = simplejpeg.encode_jpeg(np.ascontiguousarray(self.array), quality=92)
         return encoded
+
+    def _as_png(self) -> bytes:
+        if importlib.util.find_spec("PIL") is not None:
+            buffer = io.BytesIO()
+            importlib.import_module("PIL.Image").fromarray(self.array).save(buffer, format="PNG")
+            return buffer.getvalue()
+        if importlib.util.find_spec("cv2") is not None:
+            cv2 = importlib.import_module("cv2")
+            encoded: bytes = cv2.imencode(".png", self.array[..., ::-1])[1].tobytes()
+            return encoded
+        raise ValueError("to write '.png' install Pillow or OpenCV; '.jpg' needs neither")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

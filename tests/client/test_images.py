@@ -105,6 +105,23 @@ def test_raw_rgb_can_be_saved_as_jpeg(tmp_path):
     assert np.abs(decoded.astype(int) - IMAGE).max() <= 8
 
 
+@pytest.mark.parametrize("library", ["PIL", "cv2"])
+def test_raw_rgb_is_saved_as_png_without_loss(tmp_path, monkeypatch, library):
+    pytest.importorskip(library)
+    monkeypatch.setattr(
+        "real2sim.images.importlib.util.find_spec", lambda name: name if name == library else None
+    )
+    path = raw_image(IMAGE, "rgb", "uint8").save(tmp_path / "a.png")
+    again = Image(data=path.read_bytes(), codec="png", modality="rgb", dtype="uint8")
+    np.testing.assert_array_equal(again.array, IMAGE)
+
+
+def test_a_png_that_nothing_can_write_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr("real2sim.images.importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"install Pillow or OpenCV; '\.jpg' needs neither"):
+        raw_image(IMAGE, "rgb", "uint8").save(tmp_path / "a.png")
+
+
 def test_depth_is_saved_as_numbers(tmp_path):
     depth = np.linspace(0, 80, 12, dtype=np.float32).reshape(3, 4)
     path = raw_image(depth, "depth", "float32").save(tmp_path / "a.npy")
@@ -119,8 +136,10 @@ def test_a_suffix_that_would_lose_something_is_refused(tmp_path):
 
 
 def test_a_refused_suffix_names_each_that_would_do_once(tmp_path):
-    with pytest.raises(ValueError, match=r"as '\.png'; use '\.jpeg' or '\.jpg' or '\.npy'$"):
-        raw_image(IMAGE, "rgb", "uint8").save(tmp_path / "a.png")
+    with pytest.raises(
+        ValueError, match=r"as '\.gif'; use '\.jpeg' or '\.jpg' or '\.npy' or '\.png'$"
+    ):
+        raw_image(IMAGE, "rgb", "uint8").save(tmp_path / "a.gif")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
