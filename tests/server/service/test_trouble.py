@@ -20,7 +20,20 @@ from .postgres import Postgres, running_postgres
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 MOVE = {"operations": [{"op": "translate", "object_id": "post", "x": 0.25}]}
-TIMEOUT_S = 0.5
+TIMEOUT_S = 2.0
+
+
+def made(client: TestClient, path: str, body: dict):
+    """What a POST makes. On a busy machine a healthy database may miss the worker's short time
+    limit; the worker says so, and the request is made again, as clients do."""
+    deadline = time.monotonic() + 30.0
+    while True:
+        answer = client.post(path, json=body)
+        if answer.status_code < 300:
+            return answer
+        assert answer.json()["retryable"], answer.text
+        assert time.monotonic() < deadline, answer.text
+        time.sleep(0.1)
 
 
 class Site:
@@ -28,10 +41,11 @@ class Site:
 
     def __init__(self, client: TestClient) -> None:
         self.client = client
-        self.scenario = client.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"]
-        made = client.post("/v1/sessions?scene=tiny", json={"reset": {"action": "control"}}).json()
-        self.session = f"/v1/sessions/{made['session_id']}"
-        self.token = {"Authorization": f"Bearer {made['token']}"}
+        self.scenario = made(client, "/v1/scenarios", {"scene": "tiny"}).headers["Location"]
+        reset = {"reset": {"action": "control"}}
+        session = made(client, "/v1/sessions?scene=tiny", reset).json()
+        self.session = f"/v1/sessions/{session['session_id']}"
+        self.token = {"Authorization": f"Bearer {session['token']}"}
         self.edits = 0
         self.steps = 0
 
@@ -125,8 +139,8 @@ def site(own_postgres, start_worker) -> Site:
     """A worker whose database can be taken away."""
     url = own_postgres.new_database()
     site = Site(start_worker(store_url=url, store_timeout_seconds=TIMEOUT_S))
-    assert site.edit().status_code == 200
-    assert site.step().status_code == 200
+    wait_until(lambda: site.edit("first edit").status_code == 200)
+    wait_until(lambda: site.step("first step").status_code == 200)
     return site
 
 
@@ -173,7 +187,7 @@ def test_a_database_that_goes_in_a_step_leaves_the_session_where_it_was(site, ow
 
 def test_a_job_that_ends_without_a_database_is_on_record_afterwards(site, own_postgres):
     body = {"scene": "tiny", "camera": "front", "fps": 1, "width": 64}
-    job = site.client.post("/v1/exports", json=body).headers["Location"]
+    job = made(site.client, "/v1/exports", body).headers["Location"]
     with stopped(own_postgres):
         time.sleep(2.0)
     wait_until(lambda: is_ready(site.client))
