@@ -43,6 +43,16 @@ STORE_RETRY_S = 1.0
 MAX_FINISHED_JOBS = 64
 """Ended jobs in memory; others are read from the store."""
 
+JOBS_AT_A_TIME = {"physics": 1, "exports": 2}
+"""Lanes. Physics takes all cores; a video or a data set waits for none of it."""
+
+LANE_OF: Mapping[str, str] = {
+    "load_scene": "physics",
+    "simulate": "physics",
+    "calibrate": "physics",
+    "export": "exports",
+}
+
 log = structlog.get_logger(__name__)
 
 
@@ -121,7 +131,8 @@ class NewJob:
 class Jobs:
     """All jobs of a worker. Belongs to the event loop.
 
-    Heavy jobs run one after the other, in the order they came; light ones at once.
+    Heavy jobs run in the order they came, as many of a lane at a time as ``JOBS_AT_A_TIME`` says,
+    beside those of other lanes; light ones at once.
 
     Args:
         job_log: keeps them.
@@ -137,7 +148,7 @@ class Jobs:
         self._quota = quota
         self._folder = quota.folder
         self._jobs: OrderedDict[str, _Job] = OrderedDict()
-        self._turn = asyncio.Lock()
+        self._turns = {lane: asyncio.Semaphore(many) for lane, many in JOBS_AT_A_TIME.items()}
         self._closing = False
 
     @property
@@ -327,7 +338,7 @@ class Jobs:
             if light:
                 await self._work(job)
             else:
-                async with self._turn:
+                async with self._turns[LANE_OF[job.info.kind]]:
                     await self._work(job)
         except asyncio.CancelledError:
             # Cancelled while it waited for its turn, or the worker stops.

@@ -83,8 +83,8 @@ def test_a_failure_tells_its_problem(with_jobs):
 
 def test_cancelling_ends_running_and_waiting_jobs(with_jobs):
     async def work(jobs):
-        running = await jobs.start(NewJob("export", "a"), for_ever)
-        waiting = await jobs.start(NewJob("export", "b"), for_ever)
+        running = await jobs.start(NewJob("simulate", "a"), for_ever)
+        waiting = await jobs.start(NewJob("simulate", "b"), for_ever)
         await asyncio.sleep(0.05)
         before = [j.state for j in (await jobs.get(running.job_id), await jobs.get(waiting.job_id))]
         return before, [await jobs.cancel(j.job_id) for j in (waiting, running)]
@@ -96,14 +96,24 @@ def test_cancelling_ends_running_and_waiting_jobs(with_jobs):
 
 def test_heavy_jobs_take_turns_and_light_ones_do_not_wait(with_jobs):
     async def work(jobs):
-        await jobs.start(NewJob("export", "a"), for_ever)
-        heavy = await jobs.start(NewJob("export", "b"), nothing)
+        await jobs.start(NewJob("simulate", "a"), for_ever)
+        heavy = await jobs.start(NewJob("simulate", "b"), nothing)
         light = await jobs.start(NewJob("load_scene", "c", light=True), nothing)
         await until_over(jobs, light)
         return await jobs.get(heavy.job_id), await jobs.get(light.job_id)
 
     heavy, light = with_jobs(work)
     assert (heavy.state, light.state) == (JobState.QUEUED, JobState.SUCCEEDED)
+
+
+def test_exports_do_not_wait_for_physics_and_two_run_at_a_time(with_jobs):
+    async def work(jobs):
+        physics = [await jobs.start(NewJob("simulate", "a"), for_ever) for _ in range(2)]
+        exports = [await jobs.start(NewJob("export", "a"), for_ever) for _ in range(3)]
+        await asyncio.sleep(0.05)
+        return [(await jobs.get(job.job_id)).state.value for job in physics + exports]
+
+    assert with_jobs(work) == ["running", "queued", "running", "running", "queued"]
 
 
 def test_a_stopped_worker_marks_its_jobs_interrupted(with_jobs):
