@@ -19,6 +19,7 @@ from ..sweeps.episode import drive_episode, recording_of
 from ..sweeps.scenes import open_scene
 from ..sweeps.search.evaluation import Evaluation, Evaluator
 from ..sweeps.search.optimise import SearchBudget, SearchState, random_search, search
+from ..sweeps.search.statistics import wilson
 from ..sweeps.spec import load_space
 from ..world import warm_up
 from ..world.recording.recording import first_difference
@@ -26,14 +27,14 @@ from ..world.recording.recording import first_difference
 Figures = dict[str, Any]
 
 CASES: Mapping[str, str] = {
-    "idm": "cut_in_broad",
-    "follow_route": "cut_in_broad",
+    "idm": "cut_in_everyday",
+    "follow_route": "cut_in_everyday",
     "pid": "cut_in_calm",
+    "learned": "cut_in_brief",
 }
 """In which space each planner is tested: one in which it fails once in hundreds of times."""
-LEARNED_SPACE = "cut_in_brief"
+LEARNED = "learned"
 ALL_SPACES = ("cut_in", "hard_brake", "junction_crossing", "oncoming", "slow_crossing")
-WHOLE_FOR = "follow_route"
 
 
 @dataclass(frozen=True)
@@ -43,16 +44,24 @@ class SearchBenchOptions:
     Attributes:
         episodes: at most, of each search.
         seeds: of each planner.
-        policy: weights of a trained planner, as of `train-policy`; None leaves it out.
-        planners: by name, beside the trained one.
-        whole: whether all spaces are searched with all episodes for the kinds of failures.
+        first_seed: of them; spaces were chosen on seeds from 1000 on.
+        policy: weights of the learned planner, as of `train-policy`; None leaves it out.
+        planners: by name.
+        whole: searches of each planner through all spaces, with all episodes, for the kinds of
+            failures.
     """
 
     episodes: int = 300
     seeds: int = 5
+    first_seed: int = 0
     policy: Path | None = None
-    whole: bool = True
+    whole: int = 1
     planners: tuple[str, ...] = tuple(CASES)
+
+    @property
+    def all_seeds(self) -> range:
+        """Those of the searches."""
+        return range(self.first_seed, self.first_seed + self.seeds)
 
 
 def run(options: SearchBenchOptions | None = None) -> Figures:
@@ -60,16 +69,17 @@ def run(options: SearchBenchOptions | None = None) -> Figures:
     options = options or SearchBenchOptions()
     warm_up()
     scene, figures = open_scene("demo_street"), Figures()
-    cases = {planner: CASES[planner] for planner in options.planners}
-    if options.policy is not None:
-        cases[f"learned={options.policy}"] = LEARNED_SPACE
+    names = [n for n in options.planners if n != LEARNED or options.policy is not None]
     with staged_progress() as report:
-        for number, (planner, space) in enumerate(cases.items()):
-            name = planner.partition("=")[0]
-            figures[f"{name} in {space}"] = _compared(scene, planner, space, options)
-            report("planners", number + 1, len(cases))
-        if options.whole:
-            figures[f"{WHOLE_FOR} in all spaces"] = _whole(scene, options)
+        for number, name in enumerate(names):
+            planner, space = name, CASES[name]
+            if name == LEARNED:
+                planner = f"{LEARNED}={options.policy}"
+            if options.seeds:
+                figures[f"{name} in {space}"] = _compared(scene, planner, space, options)
+            if options.whole:
+                figures[f"{name} in all spaces"] = _whole(scene, planner, options)
+            report("planners", number + 1, len(names))
     print_figures("episodes to the first avoidable failure", figures)
     return figures
 
@@ -80,38 +90,50 @@ def _compared(scene: Scene, planner: str, space: str, options: SearchBenchOption
         "search": search,
         "random": random_search,
     }
-    found: Figures = {}
-    for way, look in ways.items():
-        firsts = []
-        for seed in range(options.seeds):
+    firsts: dict[str, list[int]] = {way: [] for way in ways}
+    drawn = failed = 0
+    for seed in options.all_seeds:
+        for way, look in ways.items():
             budget = SearchBudget(options.episodes, seed, stop_at_first=True)
             state = look(Evaluator(scene, [load_space(space)], planner), budget)
             # One that found none needs more than all episodes.
-            firsts.append(state.archive.first or options.episodes + 1)
-        found[way] = firsts
-    medians = {way: float(np.median(found[way])) for way in ways}
+            firsts[way].append(state.archive.first or options.episodes + 1)
+        drawn, failed = drawn + len(state.evaluations), failed + (state.archive.first is not None)
+    medians = {way: float(np.median(found)) for way, found in firsts.items()}
+    # Draws that end with the first failure: failures over draws is the likeliest rate.
+    odds = wilson(failed, drawn)
     return {
-        **found,
+        **firsts,
         "median search": medians["search"],
         "median random": medians["random"],
         "search : random": medians["search"] / medians["random"],
+        "random points": drawn,
+        "failures among them": failed,
+        "failure rate": odds.value,
+        "failure rate, 95 %": [odds.low, odds.high],
         "cpu_s": time.process_time() - begun,
     }
 
 
-def _whole(scene: Scene, options: SearchBenchOptions) -> Figures:
+def _whole(scene: Scene, planner: str, options: SearchBenchOptions) -> Figures:
+    """Kinds of failures that whole searches find, one figure a seed."""
     spaces = [load_space(name) for name in ALL_SPACES]
-    state = search(Evaluator(scene, spaces, WHOLE_FOR), SearchBudget(options.episodes, 0))
-    at_fault = sum(e.at_fault for e in state.evaluations)
-    return {
-        "episodes": len(state.evaluations),
-        "at fault": at_fault,
-        "avoidable share": sum(e.is_failure for e in state.evaluations) / max(at_fault, 1),
-        "cells": len(state.archive.elites),
-        "replay to the same collision": sum(
-            _replays(scene, e) for e in state.archive.elites.values()
-        ),
-    }
+    rows: list[Figures] = []
+    for seed in range(options.first_seed, options.first_seed + options.whole):
+        evaluate = Evaluator(scene, spaces, planner)
+        state = search(evaluate, SearchBudget(options.episodes, seed))
+        at_fault = sum(e.at_fault for e in state.evaluations)
+        elites = state.archive.elites.values()
+        rows.append(
+            {
+                "episodes": len(state.evaluations),
+                "at fault": at_fault,
+                "avoidable share": sum(e.is_failure for e in state.evaluations) / max(at_fault, 1),
+                "cells": len(elites),
+                "replay to the same collision": sum(_replays(scene, e) for e in elites),
+            }
+        )
+    return {name: [row[name] for row in rows] for name in rows[0]}
 
 
 def _replays(scene: Scene, found: Evaluation) -> bool:

@@ -103,15 +103,35 @@ def planners(*, json: JsonFile = None) -> None:
 def search(
     *,
     episodes: Annotated[int, typer.Option(min=20, help="Of each search, at most.")] = 300,
-    seeds: Annotated[int, typer.Option(min=1, help="Searches of each planner.")] = 5,
-    policy: Annotated[Path | None, typer.Option(help="Weights, for a trained planner.")] = None,
+    seeds: Annotated[int, typer.Option(min=0, help="Searches of each planner.")] = 5,
+    first_seed: Annotated[int, typer.Option(min=0, help="Of those searches.")] = 0,
+    planner: Annotated[
+        list[str] | None,
+        typer.Option(help="idm, follow_route, pid or learned; all where none is named."),
+    ] = None,
+    policy: Annotated[Path | None, typer.Option(help="Weights of the learned planner.")] = None,
+    whole: Annotated[
+        int, typer.Option(min=0, help="Searches of each planner through all spaces.")
+    ] = 1,
     json: JsonFile = None,
 ) -> None:
     """Episodes to a planner's first avoidable failure, searched for and drawn at random."""
     from ..benchmarks import search
-    from ..benchmarks.search import SearchBenchOptions
+    from ..benchmarks.search import CASES, SearchBenchOptions
 
-    asked = SearchBenchOptions(episodes=episodes, seeds=seeds, policy=policy)
+    names = tuple(planner or CASES)
+    if unknown := sorted(set(names) - set(CASES)):
+        raise CommandError(f"no planner {unknown[0]!r} in this bench; known: {', '.join(CASES)}")
+    if policy is None and "learned" in (planner or ()):
+        raise CommandError("the learned planner takes --policy, weights as of train-policy")
+    asked = SearchBenchOptions(
+        episodes=episodes,
+        seeds=seeds,
+        first_seed=first_seed,
+        policy=policy,
+        whole=whole,
+        planners=names,
+    )
     _report(json, search.run(asked))
 
 
