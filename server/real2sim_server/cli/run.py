@@ -34,7 +34,9 @@ def run(
     ],
     scene: Annotated[
         Path | None,
-        typer.Argument(help="Scene bundle; default: a flat scene made from the file's roads."),
+        typer.Argument(
+            help="Scene bundle, or demo_street; default: a flat scene made from the file's roads."
+        ),
     ] = None,
     planner: Annotated[
         str, typer.Option(help="As of evaluate-policy; 'storyboard': the ego is scripted too.")
@@ -54,6 +56,9 @@ def run(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of what distributions draw.")] = 0,
     save: Annotated[Path | None, typer.Option("--save", help="Recording (.r2e).")] = None,
+    as_it_is: Annotated[
+        bool, typer.Option("--as-it-is", help="The scene's world is the file's: move nothing.")
+    ] = False,
     scene_out: Annotated[
         Path | None, typer.Option(help="Keep the flat scene as this bundle, for replay.")
     ] = None,
@@ -81,7 +86,7 @@ def run(
         report = stack.enter_context(staged_progress())
         report("scene", 0, 1)
         loaded = _scene(scene, board, road_file, scene_out or folder / "scene")
-        if scene is not None or road_file is None:
+        if not as_it_is and (scene is not None or road_file is None):
             board = fitted_to_scene(board, loaded)
         report("scene", 1, 1)
         board = board.model_copy(update={"drives_ego": planner == SCRIPTED})
@@ -170,10 +175,11 @@ def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made:
     from ..scenarios.errors import ScenarioError
     from ..scenarios.flat_scene import flat_scene
     from ..scene.io import load_scene, save_scene
+    from ..sweeps.scenes import open_scene
     from ..world import WorldError
 
     if bundle is not None:
-        return load_scene(bundle)
+        return open_scene(str(bundle))
     try:
         save_scene(flat_scene(board, road_file), made)
     except (ScenarioError, MapError, WorldError) as error:
@@ -188,14 +194,10 @@ def _drive(
     from real2sim.planners import load_planner
 
     from ..sweeps.episode import Drive, drive_episode
+    from ..sweeps.storyboard_space import run_options
 
     driver: Any = _Scripted() if planner == SCRIPTED else load_planner(planner)
-    options = {
-        "storyboard": board.model_dump(mode="json"),
-        "seed": seed,
-        "horizon": max(round(seconds * 10), 1),
-        "beyond_log": "extend",
-    }
+    options = run_options(board, seed=seed, seconds=seconds)
     events: list[Event] = []
     driven = drive_episode(
         scene,

@@ -49,7 +49,7 @@ def search(
         films=films,
         scenes=scenes,
     )
-    asked = [load_space(name) for name in spaces]
+    asked = [load_space(name, scenes) for name in spaces]
     with staged_progress() as report:
         found = run_search(asked, planner, out, options, on_progress=report)
     keys = ("episodes", "first_failure", "at_fault", "avoidable", "cells")

@@ -36,7 +36,7 @@ def sweep(
     from ..executors import ExecutorError, executor_of
     from ..sweeps import load_sweep, run_sweep
 
-    asked = load_sweep(spec)
+    asked = load_sweep(spec, scenes)
     try:
         who = executor_of(executor, workers=workers, address=ray_address)
         with staged_progress() as report:

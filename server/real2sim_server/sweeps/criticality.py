@@ -11,6 +11,7 @@ import numpy as np
 
 from ..world import World
 from ..world.scoring.contact_side import STOPPED
+from ..world.storyboard.entities import object_ids_of
 from .gap_kernels import least_margin
 from .gaps import signed_gaps
 
@@ -40,7 +41,8 @@ def adversaries_of(
     names = set(reset.get("agents", {}).get("drivers", {}))
     names |= {str(o["object_id"]) for o in operations if o.get("object_id")}
     for entity in (reset.get("storyboard") or {}).get("entities", []):
-        names.add(entity.get("object_id") or entity["name"])
+        known = entity.get("object_id")
+        names.update([known] if known else object_ids_of(entity["name"]))
     return frozenset(names)
 
 

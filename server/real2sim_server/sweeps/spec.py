@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    InstanceOf,
+    ValidationError,
+    model_validator,
+)
 
 from real2sim_proto.base import Identifier
 
@@ -17,6 +24,7 @@ from ..console import CommandError
 from ..policies.suite import Case
 from .parameters import Name, Parameter, Value, check_derived, drawn_parameters, values_at
 from .sampling import Method, Spread, points_of
+from .storyboard_space import StoryboardSpace, is_scenario, with_storyboard
 
 MOST_BYTES = 1 << 20
 SHIPPED_SPACES = Path(__file__).with_name("spaces")
@@ -36,12 +44,18 @@ class Space(BaseModel):
     """A case and what is varied in it.
 
     The same for a sweep, which drives points of it, and for a search, which chooses them.
+
+    Attributes:
+        case: as of a suite, with a scene.
+        parameters: by name.
+        storyboard: makes the storyboard of each point; None where the case has none, or its own.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     case: Case
     parameters: dict[Name, Parameter] = Field(min_length=1, max_length=64)
+    storyboard: InstanceOf[StoryboardSpace] | None = Field(default=None, exclude=True)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -62,6 +76,9 @@ class Space(BaseModel):
             "reset": copy.deepcopy(self.case.reset),
             "operations": [o.model_dump(mode="json") for o in self.case.operations],
         }
+        if self.storyboard is not None:
+            board = self.storyboard.at(values)
+            fields["reset"]["storyboard"] = board.model_dump(mode="json")
         for name, parameter in self.parameters.items():
             for path in parameter.paths:
                 _put(fields, path, values[name])
@@ -73,8 +90,6 @@ class SweepSpec(Space):
     """A sweep: ``sweep.yaml``.
 
     Attributes:
-        case: as of a suite, with a scene.
-        parameters: by name.
         method: which points.
         seeds: each point is driven with each.
         planners: by name, as ``load_planner`` takes them; each drives each point.
@@ -105,22 +120,28 @@ class SweepSpec(Space):
 S = TypeVar("S", bound=Space)
 
 
-def load_sweep(path: Path) -> SweepSpec:
+def load_sweep(path: Path, scenes: Path | None = None) -> SweepSpec:
     """A sweep in a YAML or JSON file.
+
+    Args:
+        path: the file.
+        scenes: folder of bundles, where a storyboard is laid out in one.
 
     Raises:
         CommandError: it cannot be read, or is none; the sentence says why.
     """
-    return _loaded(path, SweepSpec, "sweep")
+    return _loaded(path, SweepSpec, "sweep", scenes)
 
 
-def load_space(name: str | Path) -> Space:
-    """A space in a YAML or JSON file, or the shipped one of that name; what a sweep has beyond a
-    space is left out.
+def load_space(name: str | Path, scenes: Path | None = None) -> Space:
+    """A space in a YAML or JSON file, or the shipped one of that name, or that of the distributions
+    of an OpenSCENARIO file; what a sweep has beyond a space is left out.
 
     Raises:
         CommandError: as :func:`load_sweep`.
     """
+    if is_scenario(str(name)):
+        return _validated({"storyboard": str(name)}, Path(), Space, (str(name), "space"), scenes)
     path = Path(name)
     shipped = SHIPPED_SPACES / f"{name}.yaml"
     if not path.exists() and shipped.is_file():
@@ -128,21 +149,34 @@ def load_space(name: str | Path) -> Space:
     elif not path.exists():
         there = ", ".join(sorted(p.stem for p in SHIPPED_SPACES.glob("*.yaml")))
         raise CommandError(f"no space {str(name)!r}; give a file, or one of {there}")
-    return _loaded(path, Space, "space", only=("case", "parameters"))
+    return _loaded(path, Space, "space", scenes)
 
 
-def _loaded(path: Path, kind: type[S], what: str, *, only: tuple[str, ...] | None = None) -> S:
+def _loaded(path: Path, kind: type[S], what: str, scenes: Path | None) -> S:
     try:
         fields = _content(path)
-        if only is not None:
-            fields = {k: v for k, v in fields.items() if k in only}
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise CommandError(f"{path} is no {what}: {error}") from error
+    return _validated(fields, path.parent, kind, (str(path), what), scenes)
+
+
+def _validated(
+    fields: dict[str, Any], folder: Path, kind: type[S], named: tuple[str, str], scenes: Path | None
+) -> S:
+    """Args: fields; the folder of names in them; what they are of; file and kind for messages."""
+    name, what = named
+    if kind is Space:
+        fields = {k: v for k, v in fields.items() if k in Space.model_fields}
+    try:
+        if "storyboard" in fields:
+            fields = with_storyboard(fields, folder, scenes)
         return kind.model_validate(fields)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise CommandError(f"{path} is no {what}: {where}: {first['msg']}") from error
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise CommandError(f"{path} is no {what}: {error}") from error
+        raise CommandError(f"{name} is no {what}: {where}: {first['msg']}") from error
+    except (TypeError, ValueError) as error:
+        raise CommandError(f"{name} is no {what}: {error}") from error
 
 
 def _content(path: Path) -> dict[str, Any]:

@@ -171,7 +171,7 @@ def test_a_case_is_about_those_that_it_names():
     assert adversaries_of({}) == frozenset()
     board = {"entities": [{"name": "Van"}, {"name": "Ego2", "object_id": "car_1"}]}
     edits = [{"op": "scale", "object_id": "car_2"}, {"op": "relight"}]
-    assert adversaries_of({"storyboard": board}, edits) == {"Van", "car_1", "car_2"}
+    assert adversaries_of({"storyboard": board}, edits) == {"Van", "Van.story", "car_1", "car_2"}
 
 
 def test_searches_of_one_seed_are_the_same(evaluate):

@@ -14,6 +14,7 @@ from real2sim.planners import Needs, load_planner
 
 from ...scene import Scene
 from ...world import World
+from ..criticality import adversaries_of
 from ..episode import OPERATIONS, Drive, Driven, begin, drive_episode
 from ..parameters import Value, drawn_parameters, values_at
 from ..spec import Space
@@ -96,7 +97,7 @@ class Evaluator:
         values = values_at(asked.parameters, inside)
         case = asked.case_at(values)
         drive = Drive.of(case, self.planner, self.seed)
-        watch = Watch(frozenset(case.reset.get("agents", {}).get("drivers", {})), self.manners)
+        watch = Watch(adversaries_of(drive.reset), self.manners)
         driven = drive_episode(self.scene, drive, load_planner(self.planner), on_world=watch.add)
         given: dict[str, Any] = {"space": space, "point": inside, "values": values, "drive": drive}
         if driven.world is None or driven.error is not None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from ...world.recording.recording import Recording
 from .evaluation import Evaluation
+from .scenario_file import WrittenScenario
 from .shrink import Boundary
 
 
@@ -25,6 +26,7 @@ class Failure:
             planner, still avoids it; None where it cannot, or plans are not trajectories.
         boundaries: nearest first.
         film: file, or None.
+        scenario: its file; None where the case is no storyboard.
     """
 
     name: str
@@ -34,6 +36,7 @@ class Failure:
     avoidable_until: float | None
     boundaries: Sequence[Boundary]
     film: str | None
+    scenario: WrittenScenario | None = None
 
     def fields(self) -> dict[str, Any]:
         """For JSON."""
@@ -54,4 +57,5 @@ class Failure:
             "recording": f"recordings/{self.name}.r2e",
             "replays": self.replays,
             "film": self.film,
+            "scenario": dataclasses.asdict(self.scenario) if self.scenario else None,
         }

@@ -78,6 +78,11 @@ def _card(failure: Failure) -> str:
         f'<p><a href="recordings/{failure.name}.r2e">recording</a> ({same}), '
         f'<a href="cases/{failure.name}.json">case</a></p>'
     )
+    if failure.scenario is not None:
+        file = escape(failure.scenario.file)
+        lines.append(
+            f'<p><a href="{file}">scenario</a>: <code>{escape(failure.scenario.command)}</code></p>'
+        )
     return f'<div class="card">{"".join(lines)}</div>'
 
 

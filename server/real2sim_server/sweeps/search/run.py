@@ -28,6 +28,7 @@ from .failure import Failure
 from .optimise import SearchBudget, SearchState, search
 from .page import render_page
 from .reference import drive_reference
+from .scenario_file import write_scenario
 from .shrink import boundaries
 from .statistics import Probability, sobol_indices, splitting, wilson
 
@@ -135,7 +136,16 @@ def _failure(
         film_episode(recording, again, evaluate.scene, path, width=options.film_width)
     edges = boundaries(evaluate, found) if number < options.shrink else []
     replays = first_difference(recording, recording.replayer(evaluate.scene)) is None
-    return Failure(name, found, recording, replays, _avoidable_until(driven), edges, film)
+    scene = _scene_path(evaluate.spaces[0].case.scene or "", options.scenes)
+    scenario = write_scenario(out / "scenarios" / name, evaluate, found, driven, scene=scene)
+    until = _avoidable_until(driven)
+    return Failure(name, found, recording, replays, until, edges, film, scenario)
+
+
+def _scene_path(name: str, folder: Path | None) -> str:
+    """What `real2sim run` takes for a scene."""
+    below = folder / name if folder is not None else None
+    return str(below) if below is not None and below.is_dir() else name
 
 
 def _avoidable_until(driven: Driven) -> float | None:

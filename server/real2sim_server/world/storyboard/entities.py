@@ -83,6 +83,12 @@ def subjects_of(entities: Iterable[Entity], state: ScenarioState) -> dict[str, O
     return found
 
 
+def object_ids_of(name: str) -> tuple[str, str]:
+    """The id of the object of a new entity, and the one where that is taken."""
+    object_id = "".join(c if c.isalnum() or c in "_.-" else "_" for c in name)[:80]
+    return object_id, f"{object_id[:72]}.story"
+
+
 def _known(state: ScenarioState, object_id: str, who: str) -> ObjectState:
     known = {o.object_id: o for o in state.visible}
     if object_id not in known:
@@ -96,9 +102,9 @@ def _known(state: ScenarioState, object_id: str, who: str) -> ObjectState:
 
 def _new(entity: Entity, state: ScenarioState, instance_id: int) -> ObjectState:
     size, _ = box_of(entity, None, (1.0, 1.0, 1.0))
-    object_id = "".join(c if c.isalnum() or c in "_.-" else "_" for c in entity.name)[:80]
+    object_id, else_id = object_ids_of(entity.name)
     if state.has_id(object_id):
-        object_id = f"{object_id[:72]}.story"
+        object_id = else_id
     here = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
     common = {
         "object_id": object_id,
