@@ -35,6 +35,11 @@ in `LICENSE`. Written by `scripts/third_party.py`; a CycloneDX SBOM is attached 
 - **CUDA, cuDNN, NCCL** and others (NVIDIA's licences), with torch's CUDA builds on GPU images. Read
   their terms before you publish such an image.
 
+## Data
+
+- **The body model** (CC0-1.0), `real2sim_server/body/asset.npz`, made from data of MakeHuman; where
+  they come from is in `ASSET.md` beside it.
+
 ## Python distributions
 
 | name | version | licence |

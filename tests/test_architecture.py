@@ -31,6 +31,7 @@ LAYERS = (
     "console",
     "settings",
     "geometry",
+    "body",
     "scene",
     "render",
     "physics",

@@ -1,0 +1,21 @@
+"""People and bicycles as surfaces that move: a body model, linear blend skinning, gait and cycling.
+
+The frame of a body is that of an object that stands on the ground: origin on the ground under the
+pelvis, x forward, y left, z up, metres. Joint rotations are those of SMPL-like models: zero is the
+rest pose, and each turns what lies below its joint, about the axes of the body's frame.
+"""
+
+from .model import JOINTS, Body, BodyModel, body_model
+from .skinning import Pose, joint_transforms, keypoints, rest_pose, skin
+
+__all__ = [
+    "JOINTS",
+    "Body",
+    "BodyModel",
+    "Pose",
+    "body_model",
+    "joint_transforms",
+    "keypoints",
+    "rest_pose",
+    "skin",
+]
