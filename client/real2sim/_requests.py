@@ -16,6 +16,7 @@ from real2sim_proto.episode import SensorSpec
 from real2sim_proto.jobs import (
     CalibrateRequest,
     DatasetRequest,
+    DriveRequest,
     ExportRequest,
     JobInfo,
     JobList,
@@ -35,6 +36,7 @@ from real2sim_proto.scenarios import (
 )
 from real2sim_proto.scenes import Readiness, SceneImport, SceneInfo, SceneList, ServerInfo
 from real2sim_proto.sessions import (
+    SessionClock,
     SessionCreate,
     SessionInfo,
     SessionList,
@@ -321,9 +323,39 @@ def step_session(session_id: str, token: str | None, body: StepRequest) -> Call[
     return Call(request, model_of(SessionState))
 
 
-def session_state(session_id: str, token: str | None) -> Call[SessionState]:
-    request = Request("GET", f"{_session(session_id)}/state", headers=bearer(token))
+def session_state(session_id: str, token: str | None, after: int | None) -> Call[SessionState]:
+    request = Request(
+        "GET",
+        f"{_session(session_id)}/state",
+        params={} if after is None else {"after": str(after)},
+        headers=bearer(token),
+        long_timeout=after is not None,
+    )
     return Call(request, model_of(SessionState))
+
+
+def session_clock(session_id: str, token: str | None, body: SessionClock) -> Call[SessionInfo]:
+    """Not sent twice: steps of it would pass twice."""
+    request = Request(
+        "PUT",
+        f"{_session(session_id)}/clock",
+        headers=bearer(token) | {"Content-Type": "application/json"},
+        body=json_of(body),
+        idempotent=False,
+    )
+    return Call(request, model_of(SessionInfo))
+
+
+def drive_session(session_id: str, token: str | None, body: DriveRequest) -> Call[JobInfo]:
+    request = post(f"{_session(session_id)}/drive", body, long_timeout=True)
+    return Call(replace(request, headers=request.headers | bearer(token)), model_of(JobInfo))
+
+
+def fork_session(session_id: str, token: str | None, step: int | None) -> Call[SessionInfo]:
+    request = post(f"{_session(session_id)}/fork", None, long_timeout=True)
+    params = {} if step is None else {"step": str(step)}
+    made = replace(request, params=params, headers=request.headers | bearer(token))
+    return Call(made, model_of(SessionInfo))
 
 
 def record_session(session_id: str, token: str | None, frames: bool) -> Call[bytes]:

@@ -28,7 +28,7 @@ class JobState(StrEnum):
 OVER = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED})
 """States that last."""
 
-JobKind = Literal["load_scene", "simulate", "calibrate", "export"]
+JobKind = Literal["load_scene", "simulate", "calibrate", "export", "drive"]
 
 
 class JobFile(Reply):
@@ -69,6 +69,20 @@ class JobList(Reply):
     """Jobs of a worker, newest first."""
 
     jobs: list[JobInfo]
+
+
+class DriveRequest(Model):
+    """Body of `POST /v1/sessions/{id}/drive`: a planner drives the session, and is recorded."""
+
+    planner: Literal["follow_route", "pid", "idm", "depth_sampling"] | None = Field(
+        default="follow_route",
+        description="of the SDK, run in a process of its own: it resets the session as it was made "
+        "and drives from there; null waits for a planner of yours, on the drive socket "
+        "(`real2sim drive --session`) or by `POST .../step`, and goes on from where the session is",
+    )
+    steps: int | None = Field(
+        default=None, ge=1, le=100_000, description="of the episode; default: to its end"
+    )
 
 
 class SimulateRequest(Model):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from .base import Microseconds, Model
@@ -35,6 +37,7 @@ class SessionInfo(Reply):
     step: int | None = None
     t_us: Microseconds | None = None
     controller: bool = Field(default=False, description="whether a controller is connected")
+    held: bool = Field(default=False, description="whether its clock is held, see `.../clock`")
     reset: ResetSpec
 
 
@@ -42,6 +45,31 @@ class SessionList(Reply):
     """All sessions of a worker. Tokens are left empty."""
 
     sessions: list[SessionInfo]
+
+
+class SessionClock(Model):
+    """Body of `PUT /v1/sessions/{id}/clock`: what the clock of a driven session may do.
+
+    A held clock lets actions on the drive socket wait; nothing is lost, and nobody times out.
+    Steps by REST, and those of many sessions by one message, do not ask it.
+    """
+
+    state: Literal["running", "held", "ended"] = Field(
+        description="`ended` ends the episode where it is, with the reason `stopped`"
+    )
+    steps: int | None = Field(
+        default=None,
+        ge=1,
+        le=MAX_STEPS_PER_REQUEST,
+        description="of `held`: that many more steps before it holds",
+    )
+    pace: float | None = Field(
+        default=None,
+        ge=0.01,
+        le=100.0,
+        description="of `running`: simulated seconds in a second, at most; default: as fast as "
+        "the controller and the worker can",
+    )
 
 
 class StepRequest(Model):
@@ -93,6 +121,14 @@ class SessionState(Reply):
         default_factory=dict, description="what the seed drew for the start and for objects so far"
     )
     timing: dict[str, float] = Field(default_factory=dict)
+    held: bool = Field(default=False, description="whether the clock is held")
+    plan: list[tuple[float, float, float]] = Field(
+        default_factory=list,
+        description="poses of the newest plan: x [m], y [m], yaw [rad] in the world; `GET` only",
+    )
+    planning_ms: float | None = Field(
+        default=None, description="from an observation to the newest plan; `GET` only"
+    )
 
 
 class SessionRender(Model):

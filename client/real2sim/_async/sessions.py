@@ -5,8 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Unpack
 
+from real2sim_proto.jobs import DriveRequest
 from real2sim_proto.plans import Plan
-from real2sim_proto.sessions import SessionCreate, SessionInfo, SessionState, StepRequest
+from real2sim_proto.sessions import (
+    SessionClock,
+    SessionCreate,
+    SessionInfo,
+    SessionState,
+    StepRequest,
+)
 
 from .. import _requests
 from .._call import checked
@@ -23,6 +30,7 @@ from .._sensors import (
 from .._session_state import SessionTokens
 from ..observation import View
 from .collection import AsyncCollection
+from .jobs import AsyncJob
 from .transport import AsyncTransport
 
 
@@ -111,16 +119,85 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         call = _requests.step_session(session_id, self._tokens.of(session_id), body)
         return await self._transport.send(call)
 
-    async def state(self, session_id: str) -> SessionState:
-        """Where everything is now.
+    async def state(self, session_id: str, *, after: int | None = None) -> SessionState:
+        """Where everything is now, and the newest plan.
+
+        Args:
+            session_id: of the session.
+            after: wait until the clock has left this step, 10 s at most.
 
         Examples:
             >>> state = await client.sessions.state(info.session_id)
             >>> state.step, round(state.ego.speed, 3)
             (0, 5.0)
         """
-        call = _requests.session_state(session_id, self._tokens.of(session_id))
+        call = _requests.session_state(session_id, self._tokens.of(session_id), after)
         return await self._transport.send(call)
+
+    async def drive(
+        self, session_id: str, planner: str | None = "follow_route", *, steps: int | None = None
+    ) -> AsyncJob:
+        """Let a planner drive the session: a job that leaves a recording and ``playback.json``.
+
+        Args:
+            session_id: of the session; it stays.
+            planner: of the SDK, by name, from a reset on; None waits for one of yours, on the drive
+                socket or by :meth:`step`.
+            steps: of the episode; default: to its end.
+
+        Raises:
+            ConflictError: somebody drives it already.
+
+        Examples:
+            >>> job = await client.sessions.drive(info.session_id, planner=None, steps=3)
+            >>> state = await client.sessions.step(info.session_id, n=3)
+            >>> (await job.wait()).result["steps"]
+            3
+        """
+        body = checked(DriveRequest, planner=planner, steps=steps)
+        call = _requests.drive_session(session_id, self._tokens.of(session_id), body)
+        return AsyncJob(self._transport, await self._transport.send(call))
+
+    async def set_clock(
+        self,
+        session_id: str,
+        state: str,
+        *,
+        steps: int | None = None,
+        pace: float | None = None,
+    ) -> SessionInfo:
+        """Hold the clock while a planner drives, let it go, or end the episode.
+
+        Args:
+            session_id: of the session.
+            state: "held", "running" or "ended".
+            steps: of "held": so many more before it holds.
+            pace: of "running": simulated seconds in a second; default: as fast as it can.
+
+        Examples:
+            >>> (await client.sessions.set_clock(info.session_id, "held")).held
+            True
+            >>> (await client.sessions.set_clock(info.session_id, "running", pace=1.0)).held
+            False
+        """
+        body = checked(SessionClock, state=state, steps=steps, pace=pace)
+        call = _requests.session_clock(session_id, self._tokens.of(session_id), body)
+        return await self._transport.send(call)
+
+    async def fork(self, session_id: str, *, step: int | None = None) -> SessionInfo:
+        """A new session that goes on from an instant of this one.
+
+        Args:
+            session_id: of the session.
+            step: of the running episode; default: the present one.
+
+        Examples:
+            >>> state = await client.sessions.step(info.session_id, n=4)
+            >>> (await client.sessions.fork(info.session_id, step=2)).step
+            2
+        """
+        call = _requests.fork_session(session_id, self._tokens.of(session_id), step)
+        return self._tokens.keep(await self._transport.send(call))
 
     async def render(
         self,

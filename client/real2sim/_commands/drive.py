@@ -38,6 +38,17 @@ def drive(
     *,
     scene: Annotated[str | None, typer.Option(help="Name of a scene.")] = None,
     scenario: Annotated[str | None, typer.Option(help="Id of a scenario.")] = None,
+    session: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ID",
+            help="Drive this session, which the studio or somebody else has made; it stays.",
+        ),
+    ] = None,
+    session_token: Annotated[
+        str | None,
+        typer.Option(help="Of --session.", envvar="REAL2SIM_SESSION_TOKEN", show_envvar=True),
+    ] = None,
     planner: Annotated[
         str,
         typer.Option(
@@ -105,16 +116,16 @@ def drive(
     """Drive a scene or scenario with a planner, over the drive socket."""
     from real2sim.planners import load_planner, needs_of, run_episode
 
-    if (scene is None) == (scenario is None):
-        raise typer.BadParameter("give exactly one of --scene and --scenario")
+    if sum(given is not None for given in (scene, scenario, session)) != 1:
+        raise typer.BadParameter("give exactly one of --scene, --scenario and --session")
     options = _reset_options(reset, beyond_log, spawn=spawn, randomization=randomization)
     driver = load_planner(planner)
     needs = needs_of(driver)
     with (
         connected(url, token, timeout) as client,
-        _session(client, scene=scene, scenario=scenario, codec=codec) as session,
+        _opened(_named(client, session, session_token, scene, scenario, codec)) as opened,
     ):
-        names = session.cameras if cameras == "all" else _names(cameras)
+        names = opened.cameras if cameras == "all" else _names(cameras)
         for kind, named in (("lidars", _names(lidar)), ("radars", _names(radar))):
             options |= {kind: named} if named else {}
         with _progress(steps) as advance, _saver(out) as save:
@@ -124,10 +135,10 @@ def drive(
                 advance(obs)
 
             summary = run_episode(
-                session,
+                opened,
                 driver,
                 steps=steps,
-                sensors=_sensors(names, width, needs.sensors(session.welcome.cameras)),
+                sensors=_sensors(names, width, needs.sensors(opened.welcome.cameras)),
                 on_observation=on_observation,
                 **options
                 | {
@@ -184,11 +195,24 @@ def _sensors(
     return list(sensors.values())
 
 
+def _named(  # noqa: PLR0917, one for each way to name a session
+    client: Any,
+    session: str | None,
+    token: str | None,
+    scene: str | None,
+    scenario: str | None,
+    codec: str,
+) -> Any:
+    """A session of one's own, or one that is there already."""
+    if session is None:
+        return client.session(scene=scene, scenario=scenario, codec=codec)
+    return client.join(session, token=token or "", codec=codec)
+
+
 @contextlib.contextmanager
-def _session(client: Any, **options: Any) -> Iterator[Any]:
+def _opened(session: Any) -> Iterator[Any]:
     from rich.console import Console
 
-    session = client.session(**options)
     with Console(stderr=True).status("the worker opens the session"):
         session.open()
     try:

@@ -6,8 +6,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Unpack
 
+from real2sim_proto.jobs import DriveRequest
 from real2sim_proto.plans import Plan
-from real2sim_proto.sessions import SessionCreate, SessionInfo, SessionState, StepRequest
+from real2sim_proto.sessions import (
+    SessionClock,
+    SessionCreate,
+    SessionInfo,
+    SessionState,
+    StepRequest,
+)
 
 from .. import _requests
 from .._call import checked
@@ -24,6 +31,7 @@ from .._sensors import (
 from .._session_state import SessionTokens
 from ..observation import View
 from .collection import Collection
+from .jobs import Job
 from .transport import Transport
 
 
@@ -112,16 +120,85 @@ class Sessions(Collection[SessionInfo]):
         call = _requests.step_session(session_id, self._tokens.of(session_id), body)
         return self._transport.send(call)
 
-    def state(self, session_id: str) -> SessionState:
-        """Where everything is now.
+    def state(self, session_id: str, *, after: int | None = None) -> SessionState:
+        """Where everything is now, and the newest plan.
+
+        Args:
+            session_id: of the session.
+            after: wait until the clock has left this step, 10 s at most.
 
         Examples:
             >>> state = client.sessions.state(info.session_id)
             >>> state.step, round(state.ego.speed, 3)
             (0, 5.0)
         """
-        call = _requests.session_state(session_id, self._tokens.of(session_id))
+        call = _requests.session_state(session_id, self._tokens.of(session_id), after)
         return self._transport.send(call)
+
+    def drive(
+        self, session_id: str, planner: str | None = "follow_route", *, steps: int | None = None
+    ) -> Job:
+        """Let a planner drive the session: a job that leaves a recording and ``playback.json``.
+
+        Args:
+            session_id: of the session; it stays.
+            planner: of the SDK, by name, from a reset on; None waits for one of yours, on the drive
+                socket or by :meth:`step`.
+            steps: of the episode; default: to its end.
+
+        Raises:
+            ConflictError: somebody drives it already.
+
+        Examples:
+            >>> job = client.sessions.drive(info.session_id, planner=None, steps=3)
+            >>> state = client.sessions.step(info.session_id, n=3)
+            >>> (job.wait()).result["steps"]
+            3
+        """
+        body = checked(DriveRequest, planner=planner, steps=steps)
+        call = _requests.drive_session(session_id, self._tokens.of(session_id), body)
+        return Job(self._transport, self._transport.send(call))
+
+    def set_clock(
+        self,
+        session_id: str,
+        state: str,
+        *,
+        steps: int | None = None,
+        pace: float | None = None,
+    ) -> SessionInfo:
+        """Hold the clock while a planner drives, let it go, or end the episode.
+
+        Args:
+            session_id: of the session.
+            state: "held", "running" or "ended".
+            steps: of "held": so many more before it holds.
+            pace: of "running": simulated seconds in a second; default: as fast as it can.
+
+        Examples:
+            >>> (client.sessions.set_clock(info.session_id, "held")).held
+            True
+            >>> (client.sessions.set_clock(info.session_id, "running", pace=1.0)).held
+            False
+        """
+        body = checked(SessionClock, state=state, steps=steps, pace=pace)
+        call = _requests.session_clock(session_id, self._tokens.of(session_id), body)
+        return self._transport.send(call)
+
+    def fork(self, session_id: str, *, step: int | None = None) -> SessionInfo:
+        """A new session that goes on from an instant of this one.
+
+        Args:
+            session_id: of the session.
+            step: of the running episode; default: the present one.
+
+        Examples:
+            >>> state = client.sessions.step(info.session_id, n=4)
+            >>> (client.sessions.fork(info.session_id, step=2)).step
+            2
+        """
+        call = _requests.fork_session(session_id, self._tokens.of(session_id), step)
+        return self._tokens.keep(self._transport.send(call))
 
     def render(
         self,

@@ -16,6 +16,7 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``scenarios``: edited under a lock each, cached, on record before they take effect.
 - ``jobs``: long work: rollouts and videos.
 - ``sessions``: closed loops; ``pipeline`` takes a step from the socket to the bytes of its answer.
+- ``drives``: planners that drive sessions as jobs.
 - ``upkeep``: leftovers and what has been kept long enough go by themselves.
 - ``worker``: all of it put together once.
 - ``routes``: calls and sockets; ``ui`` is the studio that they serve as files.

@@ -23,11 +23,13 @@ from ..render.backends import device_of
 from ..scene.io import StagingLimits
 from ..settings import Settings
 from .accounts import Accounts
+from .drives.drives import Drives
 from .engine import Engine
 from .http.connections import ConnectionLimits, Connections, connection_limit
 from .http.idempotency import Idempotency
 from .http.metrics import Metrics
 from .jobs.calibrations import Calibrations
+from .jobs.exports import VideoSource
 from .jobs.jobs import Jobs
 from .jobs.simulations import Simulations
 from .library.assets import AssetLibrary
@@ -77,6 +79,7 @@ class Worker:
     jobs: Jobs
     simulations: Simulations
     calibrations: Calibrations
+    drives: Drives
     idempotency: Idempotency
     kernels: KernelWarmUp
     renderer: Renderer
@@ -133,6 +136,24 @@ class Worker:
             max_pixels=settings.max_pixels_per_step,
             budget=budget,
         )
+        sessions = Sessions(
+            SessionLimits(settings.worker_id, settings.max_sessions, settings.session_idle_seconds),
+            pipeline=StepPipeline(
+                engine,
+                renderer,
+                metrics,
+                deformation=kernels.deformation,
+                max_pixels=settings.max_pixels_per_step,
+                max_rays=settings.max_rays_per_step,
+            ),
+            kernels=kernels,
+            store=store,
+            scene_cache=scene_cache,
+            scenarios=scenarios,
+            metrics=metrics,
+            segments=Segments(budget, settings.shared_memory_bytes),
+            accounts=accounts,
+        )
         worker = cls(
             settings=settings,
             engine=engine,
@@ -149,26 +170,8 @@ class Worker:
             idempotency=Idempotency(store),
             kernels=kernels,
             renderer=renderer,
-            sessions=Sessions(
-                SessionLimits(
-                    settings.worker_id, settings.max_sessions, settings.session_idle_seconds
-                ),
-                pipeline=StepPipeline(
-                    engine,
-                    renderer,
-                    metrics,
-                    deformation=kernels.deformation,
-                    max_pixels=settings.max_pixels_per_step,
-                    max_rays=settings.max_rays_per_step,
-                ),
-                kernels=kernels,
-                store=store,
-                scene_cache=scene_cache,
-                scenarios=scenarios,
-                metrics=metrics,
-                segments=Segments(budget, settings.shared_memory_bytes),
-                accounts=accounts,
-            ),
+            sessions=sessions,
+            drives=Drives(jobs, sessions, scene_cache, assets.find),
             backend=backend,
             device=_device_info(backend, settings),
         )
@@ -268,6 +271,15 @@ class Worker:
         """Count an answer that was given before."""
         self.metrics.replays.inc()
         return answer
+
+    async def video_source(self, job_id: str) -> VideoSource:
+        """What a finished simulation or drive shows.
+
+        Raises:
+            ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED, or INVALID_REQUEST for other jobs.
+        """
+        shown = self.drives if (await self.jobs.get(job_id)).kind == "drive" else self.simulations
+        return await shown.video_source(job_id)
 
     def drain(self) -> None:
         """Show that the worker is on its way out, and begin no sessions; open ones go on."""

@@ -1,7 +1,7 @@
 """The closed loop: the only package in which time passes."""
 
 from .agents import Agents, agent_fields
-from .ego.controller import Plan
+from .ego.controller import Plan, plan_in_world
 from .ego.motion import Motion
 from .errors import WorldError
 from .events import Event
@@ -36,6 +36,7 @@ __all__ = [
     "kernels_on_disk",
     "may_deform",
     "metrics_version",
+    "plan_in_world",
     "planning_on_disk",
     "plans_ahead",
     "warm_up",

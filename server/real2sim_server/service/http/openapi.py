@@ -58,6 +58,8 @@ BODIES: dict[str, Any] = {
         ]
     },
     "SimulateRequest": {"start_us": 0, "end_us": 2_000_000, "objects": ["car_0", "van_0"]},
+    "DriveRequest": {"planner": "idm"},
+    "SessionClock": {"state": "held", "steps": 5},
     "CalibrateRequest": {
         "object_id": "car_0",
         "parameters": ["friction", "speed"],

@@ -13,6 +13,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.jobs import ExportRequest
 
+from ...geometry.rotation import Float
 from ...render import Instance
 from ...render.video import VideoError, VideoFile
 from ...scene import Scene
@@ -35,6 +36,7 @@ class VideoSource:
         scene: gives cameras, sky and the ego trajectory.
         instances: what is drawn at an instant [us]; called off the event loop.
         span: first and last instant that can be shown [us].
+        vehicle: where the cameras' vehicle is; None: as it was recorded.
         outside: the same for who looks on from outside the ego; None where that is the same.
     """
 
@@ -42,6 +44,11 @@ class VideoSource:
     instances: Callable[[int], Sequence[Instance]]
     span: tuple[int, int]
     outside: Callable[[int], Sequence[Instance]] | None = None
+    vehicle: Callable[[int], Float] | None = None
+
+    def T_world_vehicle(self, t_us: int) -> Float:
+        """[4, 4] of the vehicle that carries the cameras, at an instant."""
+        return self.scene.ego.transform(t_us) if self.vehicle is None else self.vehicle(t_us)
 
 
 async def export_video(
@@ -124,7 +131,7 @@ def _render_request(video_source: VideoSource, sensor: SensorSpec, t_us: int) ->
     return RenderRequest(
         scene=video_source.scene,
         instances=video_source.instances(t_us),
-        T_world_vehicle=video_source.scene.ego.transform(t_us),
+        T_world_vehicle=video_source.T_world_vehicle(t_us),
         t_us=t_us,
         sensors=(sensor,),
     )

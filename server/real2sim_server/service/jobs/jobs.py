@@ -43,14 +43,15 @@ STORE_RETRY_S = 1.0
 MAX_FINISHED_JOBS = 64
 """Ended jobs in memory; others are read from the store."""
 
-JOBS_AT_A_TIME = {"physics": 1, "exports": 2}
-"""Lanes. Physics takes all cores; a video or a data set waits for none of it."""
+JOBS_AT_A_TIME = {"physics": 1, "exports": 2, "drives": 8}
+"""Lanes. Physics takes all cores; a video, a data set or a planner waits for none of it."""
 
 LANE_OF: Mapping[str, str] = {
     "load_scene": "physics",
     "simulate": "physics",
     "calibrate": "physics",
     "export": "exports",
+    "drive": "drives",
 }
 
 log = structlog.get_logger(__name__)

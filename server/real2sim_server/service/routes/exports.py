@@ -79,7 +79,7 @@ async def _video_work(worker: Worker, body: ExportRequest) -> Work:
 
 async def _video_source(worker: Worker, request: ExportRequest) -> VideoSource:
     if request.simulation is not None:
-        return await worker.simulations.video_source(request.simulation)
+        return await worker.video_source(request.simulation)
     if request.scenario is not None:
         view = await worker.scenarios.view(request.scenario)
         scene = await worker.scene_cache.get(view.row.scene)

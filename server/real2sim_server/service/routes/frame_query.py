@@ -12,6 +12,7 @@ from real2sim_proto.base import Identifier, Microseconds, Modality
 from real2sim_proto.episode import SensorSpec
 
 from ...edit import ScenarioState, instances_at
+from ...geometry.rotation import Float
 from ...render import Instance
 from ...scene import Scene
 from ..rendering.renderer import RenderRequest
@@ -50,9 +51,14 @@ class FrameQuery:
         return self.render_request_for(scene, instances_at(scene, state, t_us), t_us, media_type)
 
     def render_request_for(
-        self, scene: Scene, instances: Sequence[Instance], t_us: int, media_type: str
+        self,
+        scene: Scene,
+        instances: Sequence[Instance],
+        t_us: int,
+        media_type: str,
+        T_world_vehicle: Float | None = None,
     ) -> RenderRequest:
-        """The same for instances that are there already."""
+        """The same for instances that are there already, and another way of the vehicle."""
         sensor = SensorSpec(
             camera=self.camera or scene.rig.names[0],
             modalities=[self.modality],
@@ -62,7 +68,9 @@ class FrameQuery:
         return RenderRequest(
             scene=scene,
             instances=instances,
-            T_world_vehicle=scene.ego.transform(t_us),
+            T_world_vehicle=(
+                scene.ego.transform(t_us) if T_world_vehicle is None else T_world_vehicle
+            ),
             t_us=t_us,
             sensors=(sensor,),
         )

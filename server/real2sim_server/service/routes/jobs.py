@@ -19,6 +19,7 @@ from ..http.responses import info_response
 from ..jobs.jobs import Jobs
 from ..rendering.renderer import RenderRequest
 from ..rendering.responses import FRAME_RESPONSES, frame_response
+from ..sessions.recording import RECORDING
 from ..worker import WorkerOf
 from .frame_query import FrameQueryOf
 
@@ -26,6 +27,7 @@ FILE_TYPES = (
     "video/webm",
     "application/json",
     "application/octet-stream",
+    RECORDING,
     "application/x-tar",
     "image/jpeg",
 )
@@ -103,14 +105,18 @@ async def events(
 async def preview(
     worker: WorkerOf, job_id: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
-    """One frame of a finished simulation, from where the recording vehicle was at ``t_us``."""
+    """One frame of a finished simulation, or of a drive from where its vehicle was at ``t_us``."""
     media_type = query.media_type()
-    video_source = await worker.simulations.video_source(job_id)
+    video_source = await worker.video_source(job_id)
     t_us = video_source.span[0] if query.t_us is None else query.t_us
 
     def build() -> RenderRequest:
         return query.render_request_for(
-            video_source.scene, video_source.instances(t_us), t_us, media_type
+            video_source.scene,
+            video_source.instances(t_us),
+            t_us,
+            media_type,
+            video_source.T_world_vehicle(t_us),
         )
 
     render_request = await asyncio.to_thread(build)

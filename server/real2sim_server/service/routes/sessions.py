@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -11,7 +13,9 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier
 from real2sim_proto.episode import ResetSpec
+from real2sim_proto.jobs import DriveRequest, JobInfo
 from real2sim_proto.sessions import (
+    SessionClock,
     SessionCreate,
     SessionEdit,
     SessionEdited,
@@ -24,6 +28,7 @@ from real2sim_proto.sessions import (
 
 from ...edit import EditOutcome
 from ...world import Event, World
+from ..drives.drives import Seat
 from ..http.accounting import begin_paying
 from ..http.auth import (
     SESSION_SCHEME,
@@ -33,10 +38,12 @@ from ..http.auth import (
     require_token,
     unauthorized,
 )
+from ..http.clients import ClientName
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
 from ..http.responses import info_response, large_response
-from ..sessions.describe import session_edited, session_info, session_state
+from ..jobs.jobs import accepted_headers
+from ..sessions.describe import session_edited, session_info, session_state, shown_state
 from ..sessions.recording import RECORDING, recording_of
 from ..sessions.registry import check_not_closed, created_headers
 from ..sessions.session import Session, opens_session
@@ -54,6 +61,7 @@ _bearer = HTTPBearer(
 )
 
 
+STATE_CHECK_S = 0.03
 EXACTLY_ONE = "that the session runs on; give exactly one of `scene` and `scenario`"
 
 
@@ -231,10 +239,68 @@ async def edit(
 
 
 @router.get("/{session_id}/state", response_model=SessionState)
-async def state(session: SessionOf) -> Response:
-    """Where everything is now."""
-    world, events = session.running_world(), tuple(session.events)
-    return await large_response(lambda: session_state(session.session_id, world, events))
+async def state(
+    session: SessionOf,
+    after: Annotated[
+        int | None, Query(ge=0, description="wait until the clock has left this step")
+    ] = None,
+    wait_s: Annotated[float, Query(ge=0, le=30, description="for so long at most")] = 10.0,
+) -> Response:
+    """Where everything is now, with the newest plan; with `after` it waits for what comes next,
+    beside any controller."""
+    if after is not None:
+        await _left(session, after, wait_s)
+    return await large_response(lambda: shown_state(session))
+
+
+async def _left(session: Session, step: int, seconds: float) -> None:
+    """Wait until the clock has left a step, the episode is over, or so long."""
+    give_up = time.monotonic() + seconds
+    while time.monotonic() < give_up:
+        session.check_open()
+        world = session.world
+        if world is not None and (world.steps != step or world.over):
+            return
+        await asyncio.sleep(STATE_CHECK_S)
+
+
+@router.put("/{session_id}/clock")
+async def clock(
+    worker: WorkerOf, session: SessionOf, request: Request, body: SessionClock
+) -> SessionInfo:
+    """Hold the clock beside a controller, let it go for some steps or for good, at a pace or as
+    fast as it can, or end the episode. Actions of the controller wait meanwhile."""
+    match body.state:
+        case "running":
+            session.hold.release(pace=body.pace)
+        case "held":
+            session.hold.hold(after=body.steps or 0)
+        case "ended":
+            await worker.sessions.end_episode(session)
+    return session_info(session, ws_base=_ws_base(request))
+
+
+@router.post("/{session_id}/drive", status_code=202, response_model=JobInfo)
+async def drive(  # noqa: PLR0917, one parameter for each part of the request
+    worker: WorkerOf,
+    session: SessionOf,
+    request: Request,
+    body: DriveRequest,
+    idempotency_key: IdempotencyKey = None,
+    who: ClientName = "",
+) -> Response:
+    """Let a planner drive the session, from a reset to its end, and keep a recording; the answer is
+    a job. Once it has succeeded: `GET /v1/jobs/{id}/files/playback.json` (poses, scores, plans and
+    events of every instant), `recording.r2e`, and `GET /v1/jobs/{id}/preview`. The session stays,
+    to be forked from any of its steps."""
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        session.check_no_controller()
+        token = bearer_token(request) or ""
+        seat = Seat(session, url=_own_url(request), token=token)
+        info = await worker.drives.start(seat, body, who=who, idempotent=idempotent)
+        return info_response(info, status=202, headers=accepted_headers(info))
 
 
 @router.post("/{session_id}/fork", status_code=201, response_model=SessionInfo)
@@ -242,16 +308,22 @@ async def fork(
     worker: WorkerOf,
     session: SessionOf,
     request: Request,
+    step: Annotated[
+        int | None,
+        Query(ge=0, description="of the running episode; default: the present one"),
+    ] = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """A new session that goes on from the present instant of this one."""
+    """A new session that goes on from the present instant of this one, or from an earlier one."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
         async with session.lock:
             session.check_open()
             ws_base = _ws_base(request)
-            info = await worker.sessions.fork(session, ws_base=ws_base, idempotent=idempotent)
+            info = await worker.sessions.fork(
+                session, ws_base=ws_base, idempotent=idempotent, step=step
+            )
         return info_response(info, status=201, headers=created_headers(info))
 
 
@@ -305,6 +377,12 @@ def _state_reply(session: Session, idempotent: IdempotentRequest) -> MakeReply:
         return idempotent.reply(session_state(session.session_id, world, events), status=200)
 
     return reply
+
+
+def _own_url(request: Request) -> str:
+    """How a process on this machine reaches the worker, whatever way the request has come."""
+    host, port = request.scope.get("server") or ("127.0.0.1", 8600)
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def _ws_base(request: Request) -> str:

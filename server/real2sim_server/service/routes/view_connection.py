@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from real2sim_proto.episode import SensorSpec
 from real2sim_proto.operations import Operation
 
 from ...edit import EditError, instances_at, replay_operations
+from ...geometry.rotation import Float
 from ...render import Instance, RenderError
 from ...render.encode import encode_rgb
 from ...render.uncertainty import UNCERTAINTY, uncertainty_picture
@@ -158,6 +159,7 @@ class ViewConnection:
         view = await self._worker.scenarios.view(self._scenario_id)
         if request.job is None:
             scene = await self._worker.scene_cache.get(view.row.scene)
+            vehicle_at = scene.ego.transform
 
             def instances() -> Sequence[Instance]:
                 state = (
@@ -167,8 +169,9 @@ class ViewConnection:
                 )
                 return instances_at(scene, state, request.t_us)
         else:
-            video_source = await self._worker.simulations.video_source(request.job)
+            video_source = await self._worker.video_source(request.job)
             scene = video_source.scene
+            vehicle_at = video_source.T_world_vehicle
 
             def instances() -> Sequence[Instance]:
                 show = video_source.instances
@@ -177,7 +180,7 @@ class ViewConnection:
                 return show(request.t_us)
 
         render_request = await asyncio.to_thread(
-            lambda: _render_request(scene, instances(), request)
+            lambda: _render_request(scene, instances(), request, vehicle_at)
         )
         rendered = await self._worker.renderer.render(render_request, stream="view")
         frame = rendered.frames[0]
@@ -244,10 +247,13 @@ def pack_frame_message(header: dict[str, Any], data: bytes) -> bytes:
 
 
 def _render_request(
-    scene: Scene, instances: Sequence[Instance], request: ViewRequest
+    scene: Scene,
+    instances: Sequence[Instance],
+    request: ViewRequest,
+    vehicle_at: Callable[[int], Float],
 ) -> RenderRequest:
     """Raises SceneError for a time or camera that the scene does not have."""
-    vehicle = scene.ego.transform(request.t_us)
+    vehicle = vehicle_at(request.t_us)
     if request.T_world_camera is not None:
         camera = next((c for c in scene.rig if c.name == request.camera), None)
         if camera is not None:

@@ -38,6 +38,7 @@ from ..http.websocket import let_take, send_parts, try_send_parts
 from .deadline_timer import DeadlineTimer
 from .describe import result_fields, welcome_fields
 from .handshake import (
+    PROGRESS_S,
     FatalError,
     close_with_error,
     error_message,
@@ -142,7 +143,7 @@ class Connection:
         old = session.controller
         if old is not None and not is_resuming(hello, session.resume_token):
             raise FatalError(controller_taken(session.session_id), message_id=hello.id)
-        session.controller = self
+        session.controller, session.tell_controller = self, self._send
         if isinstance(old, Connection):
             # Its client has come back by another way; the old one may never notice.
             await old.yield_control()
@@ -151,7 +152,7 @@ class Connection:
         finally:
             self._deadline_timer.cancel()
             if session.controller is self:
-                session.controller = None
+                session.controller = session.tell_controller = None
 
     async def end(self, error: ServiceError) -> None:
         """Tell the client why, and leave it."""
@@ -283,10 +284,12 @@ class Connection:
         arrived, slot = time.perf_counter(), self._slot(action.slot)
         if action.step == session.lockstep.step:
             self._deadline_timer.cancel()
+        await self._until_let(action)
         async with session.lock:
             given_before = self._check(action, content)
             if given_before is not None:
                 return given_before
+            session.hold.take_step(session.spec.dt_us)
             answer = await self._sessions.stepper.act(
                 session,
                 action.plan,
@@ -297,6 +300,17 @@ class Connection:
             )
             self._sessions.metrics.steps.observe(time.perf_counter() - arrived)
             return answer
+
+    async def _until_let(self, action: Action) -> None:
+        """Wait for the clock; a client whose clock is held is told, so that it does not give up."""
+        session = self._session
+        while (wait_s := session.hold.wait_s) > 0 and session.lockstep.is_due(action.step):
+            session.check_open()
+            session.touch()
+            if session.hold.held:
+                fields = {"phase": "the clock is held", "eta_s": None}
+                await self._send(pack_message("progress", fields), action.id)
+            await session.hold.wait(min(wait_s, PROGRESS_S))
 
     def _check(self, action: Action, content: bytes) -> EncodedMessage | None:
         """Whether this action is due; the answer to it where it was given before.

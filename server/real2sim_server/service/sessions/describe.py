@@ -15,7 +15,17 @@ from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.sessions import SessionEdited, SessionInfo, SessionState
 
 from ...edit import EditOutcome
-from ...world import Event, LoggedPath, Score, World, agent_fields, ego_fields, metrics_version
+from ...world import (
+    Event,
+    LoggedPath,
+    Score,
+    World,
+    agent_fields,
+    ego_fields,
+    metrics_version,
+    plan_in_world,
+)
+from ...world.ego.reference import PlannedTrajectory
 from ...world.ego.route import whole_route
 from ..library.views import camera_infos, edited_objects
 from .image_limits import MAX_IMAGE_BYTES
@@ -37,6 +47,7 @@ def session_info(session: Session, *, ws_base: str, token: str = "") -> SessionI
         step=world.steps if world else None,
         t_us=world.t_us if world else None,
         controller=session.controller is not None,
+        held=session.hold.held,
         reset=session.spec,
     )
 
@@ -59,6 +70,22 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
             "reason": world.reason,
             "lap": world.lap,
             "drawn": world.drawn,
+        }
+    )
+
+
+def shown_state(session: Session) -> SessionState:
+    """As :func:`session_state`, for those who look on: with the newest plan."""
+    state = session_state(session.session_id, session.running_world(), tuple(session.events))
+    newest = session.newest_plan
+    plan = plan_in_world(newest.plan, newest.motion) if newest is not None else None
+    return state.model_copy(
+        update={
+            "held": session.hold.held,
+            "plan": [tuple(pose) for pose in plan.poses.tolist()]
+            if isinstance(plan, PlannedTrajectory)
+            else [],
+            "planning_ms": newest.took_us / 1e3 if newest is not None else None,
         }
     )
 

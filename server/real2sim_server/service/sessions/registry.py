@@ -22,7 +22,7 @@ from real2sim_proto.sessions import SessionInfo
 
 from ...edit import ScenarioState
 from ...scene import Scene
-from ...world import Score
+from ...world import Score, World
 from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
 from ...world.scoring import scores_of
 from ..accounts import Accounts, owner_name
@@ -31,7 +31,7 @@ from ..http.metrics import Metrics
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..scenarios.scenarios import Scenarios
-from ..storage.store import SessionRow, Store, now_us
+from ..storage.store import SessionEntry, SessionRow, Store, now_us
 from ..storage.tokens import token_hash
 from ..warm_up import KernelWarmUp
 from .describe import session_info
@@ -226,9 +226,14 @@ class Sessions:
         return row
 
     async def fork(
-        self, session: Session, *, ws_base: str, idempotent: IdempotentRequest
+        self,
+        session: Session,
+        *,
+        ws_base: str,
+        idempotent: IdempotentRequest,
+        step: int | None = None,
     ) -> SessionInfo:
-        """A new session that goes on from the present instant of another, held by its lock.
+        """A new session that goes on from an instant of another, held by its lock.
 
         Its log begins with a copy of the other's, so that it can be rebuilt on its own.
 
@@ -236,9 +241,11 @@ class Sessions:
             session: the other one.
             ws_base: how clients reach this worker.
             idempotent: what the answer is stored under.
+            step: of that instant, in the running episode; None for the present one.
 
         Raises:
-            ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET.
+            ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET; INVALID_REQUEST for a step that the
+                episode has not had.
         """
         world = session.running_world()
         with self._reserved_slot(owner_name()):
@@ -254,10 +261,13 @@ class Sessions:
             try:
                 rows = await self._store.session_entries(session.session_id)
                 entries = [entry for entry in rows if entry.seq < session.next_seq]
+                if step is not None:
+                    world, entries = await self._back_at(session, entries, step)
                 forked = self._session(row, session.start)
                 forked.begin(world, session.cameras)
                 forked.lockstep.reset(world.steps, over=world.over)
-                forked.next_seq, forked.snapshots = len(entries), dict(session.snapshots)
+                forked.next_seq = len(entries)
+                forked.snapshots = dict(session.snapshots) if step is None else {}
                 info = session_info(forked, ws_base=ws_base, token=token)
                 reply = idempotent.reply(info, status=201, headers=created_headers(info))
                 await self._store.create_session(row, entries=entries, reply=reply)
@@ -267,6 +277,48 @@ class Sessions:
             self._open[row.session_id] = forked
         log.info("session forked", session_id=row.session_id, parent=session.session_id)
         return info
+
+    async def _back_at(
+        self, session: Session, rows: list[SessionEntry], step: int
+    ) -> tuple[World, list[SessionEntry]]:
+        """The instant of a step, and the log up to it.
+
+        Raises:
+            ServiceError: INVALID_REQUEST, the episode has not had it.
+        """
+        episode = last_episode(entries_of(rows))
+
+        def found() -> tuple[World, int] | None:
+            replayer, last = Replayer.on(session.start.scene, session.start.state), None
+            for count, entry in enumerate(episode, start=1):
+                world = replayer.apply(entry)
+                if world.steps == step and entry.kind != "stop":
+                    last = world, count
+            return last
+
+        back = await self.pipeline.on_world_thread(found)
+        if back is None:
+            raise ServiceError(
+                ErrorCode.INVALID_REQUEST,
+                f"step {step} is not one of the episode, which is at {session.lockstep.step}",
+                hint="fork from a step between 0 and the present one",
+            )
+        world, count = back
+        return world, rows[: len(rows) - len(episode) + count]
+
+    async def end_episode(self, session: Session) -> None:
+        """End the running episode where it is; the controller is told. A second time changes
+        nothing."""
+        async with session.lock:
+            session.check_open()
+            if session.running_world().over:
+                return
+            message = await self.stepper.stop(session, "stopped")
+            # An action that waits for the clock is refused behind this, once the lock is let go.
+            if session.tell_controller is not None:
+                with contextlib.suppress(Exception):
+                    await session.tell_controller(message)
+        session.hold.release()
 
     async def entries(self, session: Session) -> list[Entry]:
         """Everything that has happened to a session, oldest first."""

@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec
@@ -13,17 +14,35 @@ from real2sim_proto.episode import ResetSpec
 from ...edit import ScenarioState
 from ...scene import Camera, Scene
 from ...scene.io import SceneSummary
-from ...world import Event, World
+from ...world import Event, Motion, Plan, World
 from ..http.auth import secrets_equal
 from ..http.problems import ServiceError
 from ..storage.store import SessionRow
 from ..storage.tokens import token_hash
+from .clock_hold import ClockHold
 from .lockstep import LockStep, not_reset
 from .observers import ObserverQueue
 from .wire import EncodedMessage
 
 CloseWithError = Callable[[ServiceError], Awaitable[None]]
 """Tells a connection that its session is over, and ends it."""
+
+
+TellController = Callable[[EncodedMessage], Awaitable[None]]
+
+
+class NewestPlan(NamedTuple):
+    """What a controller wants.
+
+    Attributes:
+        plan: as it was sent.
+        motion: of the observation that it answers.
+        took_us: from the observation to the action [us].
+    """
+
+    plan: Plan
+    motion: Motion
+    took_us: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +82,9 @@ class Session:
         late: whether the planner has missed the deadline of the due action, and the clock waits.
         expires_at: monotonic time at which the episode is cut off [s]; None for never.
         controller: the connection that drives, if there is one.
+        tell_controller: sends it an observation that no action has led to.
+        hold: whether the clock may move.
+        newest_plan: that the controller has sent.
         observers: queues of the connections that look on.
         close_callbacks: one for each open connection.
         closed: why the session is over; None while it is not.
@@ -84,6 +106,9 @@ class Session:
     late: bool = False
     expires_at: float | None = None
     controller: object | None = None
+    tell_controller: TellController | None = None
+    hold: ClockHold = field(default_factory=ClockHold)
+    newest_plan: NewestPlan | None = None
     observers: set[ObserverQueue] = field(default_factory=set)
     close_callbacks: set[CloseWithError] = field(default_factory=set)
     closed: ServiceError | None = None
@@ -118,7 +143,7 @@ class Session:
         """An episode begins."""
         self.world, self.cameras = world, cameras
         self.lockstep.reset()
-        self.events, self.newest, self.late = [], None, False
+        self.events, self.newest, self.late, self.newest_plan = [], None, False, None
         cap = world.spec.wall_clock_s
         self.expires_at = None if cap is None else time.monotonic() + cap
 

@@ -38,7 +38,7 @@ from .log_write import LogWrite
 from .observation import EncodedObservation, Seen, message_of
 from .pipeline import StepPipeline
 from .segment import FrameSlot
-from .session import Session
+from .session import NewestPlan, Session
 from .transition import Transition
 from .wire import DeferredMessage, EncodedMessage
 from .world_clouds import mounted_beside
@@ -482,8 +482,10 @@ class Stepper:
 
 def _movement(action: DueAction) -> tuple[Callable[[], World], bytes]:
     """What makes the next world, and what is recorded of it."""
-    session, plan, payload, latency_us = action
-    latency_us = latency_us if session.spec.latency.model == "measured" else 0
+    session, plan, payload, waited_us = action
+    if plan is not None:
+        session.newest_plan = NewestPlan(plan, session.running_world().motion, waited_us)
+    latency_us = waited_us if session.spec.latency.model == "measured" else 0
     if latency_us or session.late:
         payload = action_payload(plan, latency_us=latency_us, missed=session.late)
     return partial(_moved, session.running_world(), plan, latency_us, session.late), payload

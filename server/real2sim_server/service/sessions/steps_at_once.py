@@ -93,6 +93,8 @@ class StepsAtOnce:
             return False
         if world is None or session.cameras or world.ranging:
             return False
+        if not session.hold.free:
+            return False
         if session.closed is not None or session.lock.locked() or not self._is_driving():
             return False
         action = action_in(data)

@@ -188,7 +188,7 @@ class EgoController:
                 hint="times_us are absolute simulation times after t_us of the observation",
             )
         kept = tuple(p for p in self.pending if p.from_us < from_us)
-        pending = (*kept, PendingPlan(from_us, _in_world(plan, motion)))
+        pending = (*kept, PendingPlan(from_us, plan_in_world(plan, motion)))
         return evolved(self, pending=pending)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[EgoController, Motion]:
@@ -265,7 +265,8 @@ def emergency_brake(controller: EgoController, motion: Motion, spec: EgoSpec) ->
     )
 
 
-def _in_world(plan: Plan, motion: Motion) -> WorldPlan:
+def plan_in_world(plan: Plan, motion: Motion) -> WorldPlan:
+    """A plan that answers the observation of ``motion``, with its poses in the world."""
     if not isinstance(plan, TrajectoryPlan):
         return plan
     frame = (motion.x, motion.y, motion.yaw) if plan.frame == "vehicle" else None

@@ -1,0 +1,1 @@
+"""Planners that drive sessions as jobs, and what they leave."""

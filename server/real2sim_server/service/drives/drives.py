@@ -1,0 +1,212 @@
+"""Drives: a planner in a session, as a job that leaves a recording and what a page plays."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections import OrderedDict
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.jobs import DriveRequest, JobInfo
+
+from ...datasets.drive import EpisodeDrive
+from ...edit import AssetLookup
+from ...world.recording.recording import Recording, load_recording, to_bytes
+from ..http.idempotency import IdempotentRequest
+from ..http.problems import ServiceError
+from ..jobs.exports import VideoSource
+from ..jobs.jobs import JobContext, JobResult, Jobs, NewJob, require_success
+from ..library.scene_cache import SceneCache
+from ..sessions import Sessions
+from ..sessions.recording import RECORDING, episode_of
+from ..sessions.session import Session
+from .planner_process import PlannerProcess
+from .playback import playback_of
+
+PLAYBACK, RECORDED = "playback.json", "recording.r2e"
+CHECK_S = 0.1
+MAX_CACHED_DRIVES = 4
+"""Finished drives kept open; others are replayed from their files again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seat:
+    """Where a planner may sit down.
+
+    Attributes:
+        session: that it drives.
+        url: of this worker, as seen from this machine.
+        token: that opens the session.
+    """
+
+    session: Session
+    url: str
+    token: str
+
+
+class Drives:
+    """Starts drives and shows finished ones. Belongs to the event loop."""
+
+    def __init__(
+        self, jobs: Jobs, sessions: Sessions, scene_cache: SceneCache, assets: AssetLookup
+    ) -> None:
+        self._jobs = jobs
+        self._sessions = sessions
+        self._scene_cache = scene_cache
+        self._assets = assets
+        self._opened: OrderedDict[str, EpisodeDrive] = OrderedDict()
+
+    async def start(
+        self, seat: Seat, request: DriveRequest, *, who: str, idempotent: IdempotentRequest
+    ) -> JobInfo:
+        """Let a planner drive; its recording is kept when the episode is over.
+
+        Raises:
+            ServiceError: as jobs do.
+        """
+        row = seat.session.row
+
+        async def work(context: JobContext) -> JobResult:
+            error = await _driven(self._sessions, seat, request, context)
+            context.progress(1.0, "recording")
+            return await self._recorded(seat.session, context, error)
+
+        fields = request.model_dump(mode="json", exclude_none=True)
+        fields |= {"planner": request.planner, "session_id": row.session_id, "scene": row.scene}
+        if row.scenario_id is not None:
+            fields |= {"scenario": row.scenario_id, "revision": row.scenario_revision}
+        new = NewJob("drive", row.scenario_id or row.scene, fields, who)
+        return await self._jobs.start(new, work, idempotent=idempotent)
+
+    async def _recorded(
+        self, session: Session, context: JobContext, error: str | None
+    ) -> JobResult:
+        recording = await episode_of(self._sessions, session)
+        scene, folder = session.start.scene, context.folder
+
+        def write() -> None:
+            drive = EpisodeDrive.of(recording, scene, assets=self._assets)
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / RECORDED).write_bytes(to_bytes(recording))
+            shown = json.dumps(playback_of(recording, drive), separators=(",", ":"))
+            (folder / PLAYBACK).write_text(shown, encoding="utf-8")
+
+        await self._sessions.pipeline.on_world_thread(write)
+        return JobResult(
+            _figures(recording, session) | ({"error": error} if error else {}),
+            {PLAYBACK: "application/json", RECORDED: RECORDING},
+        )
+
+    async def video_source(self, job_id: str) -> VideoSource:
+        """What a finished drive shows, from its own vehicle.
+
+        Raises:
+            ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; as the scene cache does.
+        """
+        drive = self._opened.get(job_id)
+        if drive is None:
+            drive = self._opened[job_id] = await self._open(job_id)
+            while len(self._opened) > MAX_CACHED_DRIVES:
+                self._opened.popitem(last=False)
+        self._opened.move_to_end(job_id)
+        return VideoSource(
+            drive.scene, lambda t_us: drive.at(t_us).instances, drive.span, vehicle=drive.ego_at
+        )
+
+    async def _open(self, job_id: str) -> EpisodeDrive:
+        info = await self._jobs.get(job_id)
+        require_success(info)
+        path, _ = await self._jobs.file(job_id, RECORDED)
+        scene = await self._scene_cache.get(info.request["scene"])
+        return await self._sessions.pipeline.on_world_thread(
+            lambda: EpisodeDrive.of(load_recording(path), scene, assets=self._assets)
+        )
+
+
+def _figures(recording: Recording, session: Session) -> dict[str, object]:
+    first, last = recording.instants[0], recording.instants[-1]
+    world = session.running_world()
+    return {
+        "steps": len(recording.instants) - 1,
+        "start_us": first.t_us,
+        "end_us": last.t_us,
+        "reason": world.reason,
+        "scores": list(recording.scores),
+        "metrics": recording.metrics,
+    }
+
+
+# --- at the wheel -------------------------------------------------------------------------------
+
+
+async def _driven(
+    sessions: Sessions, seat: Seat, request: DriveRequest, context: JobContext
+) -> str | None:
+    """Wait until the drive is over; what the planner failed with, if it did.
+
+    Raises:
+        ServiceError: JOB_FAILED, the planner did not drive a single step.
+        JobCancelled: the job was cancelled; the episode is ended.
+    """
+    session = seat.session
+    before = session.world
+    async with _planner(seat, request) as process:
+        try:
+            await _until_over(session, process, request, context)
+        except BaseException:
+            with contextlib.suppress(ServiceError):
+                await sessions.end_episode(session)
+            raise
+        error = await process.error() if process is not None else None
+    if session.world is None or session.world is before:
+        raise ServiceError(
+            ErrorCode.JOB_FAILED,
+            f"nobody has driven: {error or 'the planner left before its first observation'}",
+            hint="start it again, or read the log of the planner",
+        )
+    return error
+
+
+@asynccontextmanager
+async def _planner(seat: Seat, request: DriveRequest) -> AsyncIterator[PlannerProcess | None]:
+    """The planner's process while it drives; None where somebody else brings theirs."""
+    if request.planner is None:
+        yield None
+        return
+    process = await PlannerProcess.start(request, seat.session, url=seat.url, token=seat.token)
+    try:
+        yield process
+    finally:
+        await process.close()
+
+
+async def _until_over(
+    session: Session, process: PlannerProcess | None, request: DriveRequest, context: JobContext
+) -> None:
+    before, was_driven = session.world, False
+    while session.closed is None:
+        context.check()
+        world = session.world
+        begun = world is not None and world is not before
+        if process is not None and not process.running:
+            return
+        if process is None:
+            has_left = was_driven and session.controller is None
+            was_driven = was_driven or session.controller is not None
+            if has_left or (begun and _is_done(session, request)):
+                return
+        if world is None or not begun:
+            context.progress(0.0, f"waiting for {request.planner or 'a planner'}")
+        else:
+            last = request.steps or max(world.horizon, 1)
+            context.progress(min(world.steps / last, 1.0), f"step {world.steps}")
+        await asyncio.sleep(CHECK_S)
+
+
+def _is_done(session: Session, request: DriveRequest) -> bool:
+    world = session.running_world()
+    return world.over or (request.steps is not None and world.steps >= request.steps)
