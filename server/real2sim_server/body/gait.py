@@ -1,0 +1,530 @@
+"""Walking and running along a path, driven by the distance covered.
+
+Steps are laid along the path first: every foot stands on one spot of the ground from heel strike
+to toe-off, and the legs are bent so that they reach their feet. So no foot slides, at any speed, on
+any path. Stride lengths follow from speed and leg length, for walking and running alike:
+
+    stride = 2.3 (v^2 / (g h))^0.3 h
+
+Alexander, "Estimates of speeds of dinosaurs", Nature 261, 1976, for mammals; people who walk take a
+tenth more (113 steps a minute at 1.4 m/s: Perry and Burnfield, below). The Froude number
+v^2 / (g h) also says when people walk and when they run (about 0.5; Alexander, "Optimization and
+gaits in the locomotion of vertebrates", Physiological Reviews 69, 1989). Angles of the trunk and
+the arms in walking are those of Perry and Burnfield, "Gait analysis", 2010, rounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..geometry.rotation import Float, matrix_to_quaternion
+from .limbs import LATERAL, UP, about, aim, bend, frame, partial_turn, smooth, unit
+from .model import JOINTS, Body
+from .skinning import Pose
+
+GRAVITY = 9.81
+WALK_TO_RUN = (0.4, 0.8)
+"""Froude numbers between which walking goes over into running."""
+TURN_RADIUS = 0.25
+"""Turning on the spot makes steps as going round a circle of this radius would [m]."""
+STANDING = 0.04
+"""Below this speed a person stands [m/s]."""
+_STEP = 0.01
+_MARGIN = 3.0
+
+
+@dataclass(frozen=True)
+class GaitStyle:
+    """How somebody walks; ones and zeros are the mean.
+
+    Attributes:
+        stride: factor on the length of strides.
+        arms: factor on the swing of the arms.
+        lean: further lean forward [rad].
+        width: factor on the distance between the feet's tracks.
+        phase: steps by which the gait is ahead; one starts with the other foot.
+    """
+
+    stride: float = 1.0
+    arms: float = 1.0
+    lean: float = 0.0
+    width: float = 1.0
+    phase: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Footsteps:
+    """The spots that a foot stands on.
+
+    Attributes:
+        lift, land: [K] steps counted along the walk at which it leaves a spot and meets the next.
+        spots: [K + 1, 3] of the middle of its hip's track, on the ground, world frame [m].
+        yaws: [K + 1] which way it points [rad].
+    """
+
+    lift: Float
+    land: Float
+    spots: Float
+    yaws: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Gait:
+    """How a body goes along a path.
+
+    Attributes:
+        body, style: who goes, and how.
+        times: [N] of the path [s].
+        path: [N, 4] x, y, z on the ground and yaw, world frame.
+        steps: [N] steps made so far; a foot swings over each whole one.
+        speeds: [N], smoothed [m/s].
+        feet: footsteps of the left and of the right foot.
+    """
+
+    body: Body
+    style: GaitStyle
+    times: Float
+    path: Float
+    steps: Float
+    speeds: Float
+    feet: tuple[Footsteps, Footsteps]
+
+    def at(self, times: ArrayLike) -> tuple[Float, Float]:
+        """Places x, y, z, yaw [T, 4] on the path and steps made [T] at times [T] [s]."""
+        times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        place = np.stack([np.interp(times, self.times, self.path[:, i]) for i in range(4)], -1)
+        return place, np.interp(times, self.times, self.steps)
+
+    def pose(self, times: ArrayLike) -> Pose:
+        """Poses at times [T] [s], in the body's frame, whose origin is on the path."""
+        times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        place, steps = self.at(times)
+        speed = np.interp(times, self.times, self.speeds)
+        return _Motion(self, place, steps, speed, times).pose()
+
+
+def stride_length(speed: ArrayLike, leg_length: float) -> Float:
+    """Of a body with hips at ``leg_length`` [m] at speeds [m/s]; see the module's docstring."""
+    froude = np.asarray(speed, dtype=np.float64) ** 2 / (GRAVITY * leg_length)
+    human = 1.1 - 0.1 * running_share(speed, leg_length)
+    return human * 2.3 * froude**0.3 * leg_length
+
+
+def duty_factor(speed: ArrayLike, leg_length: float) -> Float:
+    """Share of a stride that a foot is on the ground: .7 in slow walking, .36 in running."""
+    froude = np.asarray(speed, dtype=np.float64) ** 2 / (GRAVITY * leg_length)
+    running = running_share(speed, leg_length)
+    walking = 0.70 - 0.10 * np.clip(np.sqrt(froude) / 0.6, 0.0, 1.0)
+    return walking * (1 - running) + 0.36 * running
+
+
+def running_share(speed: ArrayLike, leg_length: float) -> Float:
+    """From 0 for walking to 1 for running."""
+    froude = np.asarray(speed, dtype=np.float64) ** 2 / (GRAVITY * leg_length)
+    return smooth((froude - WALK_TO_RUN[0]) / (WALK_TO_RUN[1] - WALK_TO_RUN[0]))
+
+
+def plan_gait(
+    body: Body,
+    times: ArrayLike,
+    positions: ArrayLike,
+    yaws: ArrayLike,
+    style: GaitStyle | None = None,
+) -> Gait:
+    """Lay footsteps along a path.
+
+    Args:
+        body: who goes.
+        times: [N] rising [s].
+        positions: [N, 3] of the body's origin on the ground, world frame [m].
+        yaws: [N], which way the body faces [rad].
+        style: how it walks.
+
+    Returns:
+        The gait. Before and after the path it goes straight on.
+
+    Raises:
+        ValueError: times that do not rise, or arrays that do not belong together.
+    """
+    style = style or GaitStyle()
+    times, path = _checked(times, positions, yaws)
+    fine, path = _extended(times, path)
+    speed = _smoothed(_path_speed(fine, path))
+    steps, segments = _count_steps(fine, speed, body.leg_length, style)
+    feet = _lay_footsteps(body, style, path, steps, speed, segments)
+    return Gait(body, style, fine, path, steps, speed, feet)
+
+
+def _checked(times: ArrayLike, positions: ArrayLike, yaws: ArrayLike) -> tuple[Float, Float]:
+    times = np.asarray(times, dtype=np.float64)
+    positions, yaws = np.asarray(positions, np.float64), np.asarray(yaws, np.float64)
+    if times.ndim != 1 or positions.shape != (len(times), 3) or yaws.shape != times.shape:
+        raise ValueError(
+            f"times [N], positions [N, 3] and yaws [N] are needed, not {times.shape}, "
+            f"{positions.shape} and {yaws.shape}"
+        )
+    if len(times) == 0 or (np.diff(times) <= 0).any():
+        raise ValueError("times must rise")
+    return times, np.column_stack([positions, np.unwrap(yaws)])
+
+
+def _extended(times: Float, path: Float) -> tuple[Float, Float]:
+    """The path at even steps, straight on for a while at both ends."""
+    if len(times) == 1:
+        times, path = times[0] + np.array([0.0, _STEP]), np.repeat(path, 2, axis=0)
+    ends = []
+    for near, beyond, sign in ((0, 1, -1.0), (-1, -2, 1.0)):
+        velocity = (path[near] - path[beyond]) / (times[near] - times[beyond])
+        velocity[3] = 0.0
+        ends.append((times[near] + sign * _MARGIN, path[near] + sign * _MARGIN * velocity))
+    times = np.concatenate([[ends[0][0]], times, [ends[1][0]]])
+    path = np.concatenate([[ends[0][1]], path, [ends[1][1]]])
+    fine = np.linspace(times[0], times[-1], max(round((times[-1] - times[0]) / _STEP), 2) + 1)
+    fine = np.union1d(fine, times)
+    return fine, np.stack([np.interp(fine, times, path[:, i]) for i in range(4)], axis=-1)
+
+
+def _path_speed(times: Float, path: Float) -> Float:
+    change = np.gradient(path, times, axis=0)
+    return np.hypot(np.hypot(change[:, 0], change[:, 1]), TURN_RADIUS * change[:, 3])
+
+
+def _smoothed(speed: Float) -> Float:
+    """Means over .3 s: paths from recordings jump in speed."""
+    half = round(0.15 / _STEP)
+    total = np.concatenate([[0.0], np.cumsum(np.pad(speed, half, mode="edge"))])
+    return (total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1)  # type: ignore[no-any-return]
+
+
+def _count_steps(
+    times: Float, speed: Float, leg: float, style: GaitStyle
+) -> tuple[Float, list[tuple[int, int]]]:
+    """Steps made [N], and the first and the last step of each way between two halts.
+
+    From halt to halt there are whole steps: a stride is a little longer or shorter for that.
+    """
+    going = speed > STANDING
+    length = 0.5 * style.stride * stride_length(np.maximum(speed, STANDING), leg)
+    rate = np.where(going, speed / length, 0.0)
+    made = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(times))])
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], going, [False]]).astype(int)))
+    steps, done, ways = np.zeros(len(times)), 0, []
+    for start, end in zip(edges[::2], edges[1::2] - 1, strict=True):
+        count = max(round(made[end] - made[start]), 1)
+        scale = count / max(made[end] - made[start], 1e-9)
+        steps[start : end + 1] = done + (made[start : end + 1] - made[start]) * scale
+        steps[end + 1 :] = done + count
+        ways.append((done, done + count))
+        done += count
+    return steps, ways
+
+
+def _lay_footsteps(  # noqa: PLR0917 - all that a step depends on
+    body: Body,
+    style: GaitStyle,
+    path: Float,
+    steps: Float,
+    speed: Float,
+    ways: list[tuple[int, int]],
+) -> tuple[Footsteps, Footsteps]:
+    """Footsteps of both feet; step ``n`` is the left foot's where ``n + phase`` is even."""
+    rising = np.concatenate([[True], np.diff(steps) > 0])
+    known, where = steps[rising], path[rising]
+    feet = []
+    for foot in range(2):
+        lift, land, spots, yaws = [], [], [], []
+        start = where[0]
+        spots.append(start[:3])
+        yaws.append(start[3])
+        for first, last in ways:
+            for n in range(first, last):
+                if (n + round(style.phase) + foot) % 2:
+                    continue
+                pace = np.interp(n + 0.5, known, speed[rising])
+                swing = 1 - float(duty_factor(pace, body.leg_length))
+                lift.append(max(n + 0.5 - swing, first))
+                land.append(min(n + 0.5 + swing, last))
+                # The body is over the spot in the middle of the time that the foot stands there.
+                spot = _place(known, where, min(n + 1.5, last))
+                spots.append(spot[:3])
+                yaws.append(spot[3])
+        lift, land = _apart(lift, land)
+        feet.append(Footsteps(np.array(lift), np.array(land), np.array(spots), np.array(yaws)))
+    return feet[0], feet[1]
+
+
+def _place(known: Float, where: Float, step: float) -> Float:
+    return np.array([np.interp(step, known, where[:, i]) for i in range(4)])
+
+
+def _apart(lift: list[float], land: list[float]) -> tuple[list[float], list[float]]:
+    """A foot stands a moment on each spot, however fast its owner runs."""
+    for k in range(1, len(lift)):
+        if lift[k] < land[k - 1] + 0.2:
+            middle = (lift[k] + land[k - 1]) / 2
+            land[k - 1], lift[k] = middle - 0.1, middle + 0.1
+    return lift, land
+
+
+class _Motion:
+    """A gait at some instants: places [T, 4], steps [T], speeds [T]."""
+
+    def __init__(self, gait: Gait, place: Float, steps: Float, speed: Float, times: Float) -> None:
+        self.gait, self.body, self.style = gait, gait.body, gait.style
+        self.place, self.steps, self.speed, self.times = place, steps, speed, times
+        leg = self.body.leg_length
+        self.running = running_share(speed, leg)
+        # How much of a full stride's motion there is: nothing while standing.
+        self.effort = smooth(speed / (0.55 * np.sqrt(GRAVITY * leg)) * 1.2)
+        self.turn = np.pi * (steps + round(self.style.phase))
+
+    def pose(self) -> Pose:
+        body, count = self.body, len(self.steps)
+        local = np.broadcast_to(np.eye(3), (count, len(JOINTS), 3, 3)).copy()
+        feet = [self._foot(side) for side in range(2)]
+        pelvis_turn = self._pelvis_turn()
+        pelvis = self._pelvis_place(pelvis_turn, feet)
+        local[:, JOINTS.index("pelvis")] = pelvis_turn
+        for (ankle, turned, toes), side in zip(feet, "lr", strict=True):
+            hip = pelvis + pelvis_turn @ (body.joint(f"thigh_{side}") - body.joint("pelvis"))
+            put_leg(body, local, side, hip, ankle, turned)
+            local[:, JOINTS.index(f"ball_{side}")] = about(LATERAL, toes)
+        self._put_trunk(local, pelvis_turn)
+        return Pose(matrix_to_quaternion(local), pelvis)
+
+    def _foot(self, side: int) -> tuple[Float, Float, Float]:
+        """Ankle [T, 3], rotation [T, 3, 3] and bend of the toes [T] of a foot, body frame."""
+        foot = Foot(self.body, "lr"[side])
+        walk = self.gait.feet[side]
+        swings = len(walk.lift)
+        k = (
+            np.searchsorted(walk.lift, self.steps, side="right")
+            if swings
+            else np.zeros(len(self.steps), np.int64)
+        )
+        swinging = (k > 0) & (self.steps < np.append(0.0, walk.land)[k])
+        # Before and after this instant: strike of the spot, and the leaving of it.
+        spot = np.where(swinging, k - 1, k)
+        size = np.append(np.append(0.0, self._sizes(walk)), 0.0)
+        leaving, striking = self._off_angle(size[spot + 1]), self._strike_angle(size[spot])
+        since = np.append(-1e9, walk.land)[spot]
+        until = np.append(walk.lift, 1e9)[spot]
+        share = np.clip((self.steps - since) / np.maximum(until - since, 1e-9), 0, 1)
+        pitch = (
+            striking * (1 - smooth(share / 0.16))
+            + leaving * np.clip((share - 0.4) / 0.6, 0, 1) ** 1.5
+        )
+        stance = foot.standing(self._spot(walk, spot, side), self._yaw(walk, spot, side), pitch)
+        toes = -np.maximum(pitch, 0.0)
+        if swings:
+            j = np.clip(k - 1, 0, swings - 1)
+            p = np.clip((self.steps - walk.lift[j]) / (walk.land[j] - walk.lift[j]), 0, 1)
+            off, strike = self._off_angle(size[j + 1]), self._strike_angle(size[j + 1])
+            angle = off * (1 - smooth(p / 0.75)) + strike * smooth((p - 0.45) / 0.55)
+            away = foot.standing(self._spot(walk, j, side), self._yaw(walk, j, side), off)
+            down = foot.standing(
+                self._spot(walk, j + 1, side), self._yaw(walk, j + 1, side), strike
+            )
+            # A foot that has to overtake a running body must not dwell where it was.
+            linear = 0.35 + 0.4 * self.running
+            flown = away + (smooth(p) + linear * (p - smooth(p)))[:, None] * (down - away)
+            flown[:, 2] += self._lift_height(size[j + 1], p)
+            stance = np.where(swinging[:, None], flown, stance)
+            pitch = np.where(swinging, angle, pitch)
+            toes = np.where(swinging, -np.maximum(off, 0) * (1 - smooth(p / 0.4)), toes)
+            from_yaw, to_yaw = self._yaw(walk, j, side), self._yaw(walk, j + 1, side)
+            yaw = np.where(
+                swinging, from_yaw + smooth(p) * (to_yaw - from_yaw), self._yaw(walk, spot, side)
+            )
+        else:
+            yaw = self._yaw(walk, spot, side)
+        return self._to_body(stance), foot.turned(yaw - self.place[:, 3], pitch), toes
+
+    def _sizes(self, walk: Footsteps) -> Float:
+        """Lengths of a foot's swings against the leg's [K]."""
+        return np.linalg.norm(np.diff(walk.spots, axis=0), axis=1) / self.body.leg_length  # type: ignore[no-any-return]
+
+    def _off_angle(self, size: Float) -> Float:
+        return np.radians(62) * smooth(size / 1.7)  # type: ignore[no-any-return]
+
+    def _strike_angle(self, size: Float) -> Float:
+        return -np.radians(17) * smooth(size / 1.7) * (1 - 0.8 * self.running)  # type: ignore[no-any-return]
+
+    def _lift_height(self, size: Float, p: Float) -> Float:
+        leg = self.body.leg_length
+        walking = 0.035 * np.sin(np.pi * p) ** 2 + 0.03 * np.sin(np.pi * np.sqrt(p)) ** 2
+        height = walking * smooth(size / 0.6) + 0.24 * self.running * np.sin(np.pi * p**0.8) ** 2
+        return leg * height  # type: ignore[no-any-return]
+
+    def _spot(self, walk: Footsteps, index: NDArray[np.int64], side: int) -> Float:
+        """Where the ankle stands flat [T, 3], world frame."""
+        yaw = walk.yaws[index]
+        sign = 1.0 - 2.0 * side
+        hip = self.body.joint("thigh_l")[1]
+        width = hip * self.style.width * 0.62
+        behind = -0.09 * self.body.leg_length
+        offset = np.stack(
+            [
+                behind * np.cos(yaw) - sign * width * np.sin(yaw),
+                behind * np.sin(yaw) + sign * width * np.cos(yaw),
+                np.zeros_like(yaw),
+            ],
+            axis=-1,
+        )
+        return walk.spots[index] + offset  # type: ignore[no-any-return]
+
+    def _yaw(self, walk: Footsteps, index: NDArray[np.int64], side: int) -> Float:
+        return walk.yaws[index] + (1 - 2 * side) * np.radians(6)  # type: ignore[no-any-return]
+
+    def _to_body(self, points: Float) -> Float:
+        away = points - self.place[:, :3]
+        return (np.swapaxes(about(UP, self.place[:, 3]), -1, -2) @ away[..., None])[..., 0]
+
+    def _pelvis_turn(self) -> Float:
+        yaw = np.radians(5) * self.effort * np.cos(self.turn)
+        list_ = -np.radians(4) * self.effort * np.sin(self.turn)
+        lean = np.radians(2) * self.effort + np.radians(6) * self.running
+        return about(UP, yaw) @ about(LATERAL, lean) @ about([1, 0, 0], list_)
+
+    def _pelvis_place(self, turned: Float, feet: list[tuple[Float, Float, Float]]) -> Float:
+        """As high as both legs allow, with soft transitions."""
+        body, leg = self.body, self.body.leg_length
+        sway = -0.02 * leg * self.effort * np.sin(self.turn) * (1 - 0.5 * self.running)
+        idle = 0.006 * leg * (1 - self.effort)
+        sway = sway + idle * np.sin(0.9 * self.times + 3 * self.style.phase)
+        pelvis = np.stack([idle * np.sin(0.6 * self.times), sway, np.zeros_like(sway)], axis=-1)
+        bob = 0.035 * leg * self.running * (1 + np.cos(2 * self.turn - np.pi)) / 2
+        limits = [
+            body.joint("pelvis")[2] * (1 - 0.03 * self.running) - 0.035 * leg * self.running + bob
+        ]
+        for (ankle, _, _), side in zip(feet, "lr", strict=True):
+            hip = (turned @ (body.joint(f"thigh_{side}") - body.joint("pelvis"))) + pelvis
+            away = np.linalg.norm((ankle - hip)[:, :2], axis=-1)
+            full = 0.998 * leg_lengths(body, side)[0] + 0.998 * leg_lengths(body, side)[1]
+            rise = np.sqrt(np.maximum(full**2 - away**2, (0.3 * leg) ** 2))
+            limits.append(ankle[:, 2] + rise - hip[:, 2])
+        soft = 0.02 * leg
+        lowest = np.min(limits, axis=0)
+        pelvis[:, 2] = lowest - soft * np.log(
+            sum(np.exp(-(limit - lowest) / soft) for limit in limits)
+        )
+        return pelvis
+
+    def _put_trunk(self, local: Float, pelvis_turn: Float) -> None:
+        swing = self.effort * np.cos(self.turn)
+        lean = self.style.lean + np.radians(1.5) * self.effort + np.radians(7) * self.running
+        chest = about(UP, -np.radians(6) * swing) @ about(LATERAL, lean)
+        put_spine(local, pelvis_turn, chest, about(LATERAL, 0.3 * lean))
+        for side, sign in (("l", 1.0), ("r", -1.0)):
+            # An arm goes with the leg of the other side.
+            ahead = (
+                sign * swing * self.style.arms * (np.radians(20) + np.radians(22) * self.running)
+            )
+            shoulder = ahead - np.radians(4) * self.effort
+            elbow = np.radians(12) + np.radians(10) * self.effort + np.radians(62) * self.running
+            elbow = elbow + np.maximum(ahead, 0) * 0.7
+            out = np.radians(8) + np.radians(4) * self.running
+            put_arm(self.body, local, side, shoulder, elbow, out)
+
+
+class Foot:
+    """A foot as it is in the rest pose.
+
+    Attributes:
+        ankle, ball: joints [3].
+        heel: [3] its hindmost point on the ground.
+        yaw: which way it points [rad].
+    """
+
+    def __init__(self, body: Body, side: str) -> None:
+        self.ankle, self.ball = body.joint(f"foot_{side}"), body.joint(f"ball_{side}")
+        away = self.ball - self.ankle
+        self.yaw = float(np.arctan2(away[1], away[0]))
+        part = body.vertices[body.model.parts == body.model.part_names.index(f"foot_{side}")]
+        along = part[:, :2] @ unit(away[:2])
+        back = part[along < along.min() + 0.02 * body.leg_length]
+        self.heel = np.array([*back[:, :2].mean(axis=0), 0.0])
+
+    def standing(self, spots: Float, yaw: Float, pitch: Float) -> Float:
+        """Ankles [T, 3] over spots, rolled over the heel (pitch < 0) or the ball (pitch > 0)."""
+        flat = about(UP, yaw - self.yaw)
+        rolled = self.turned(yaw, pitch)
+        pivot = np.where((pitch > 0)[:, None], self.ball, self.heel)
+        ground = np.array([0.0, 0.0, self.ankle[2]])
+        at = spots + ground + (flat @ (pivot - self.ankle)[..., None])[..., 0]
+        return at + (rolled @ (self.ankle - pivot)[..., None])[..., 0]  # type: ignore[no-any-return]
+
+    def turned(self, yaw: Float, pitch: Float) -> Float:
+        """Rotations [T, 3, 3] from the rest pose."""
+        square = np.array([-np.sin(self.yaw), np.cos(self.yaw), 0.0])
+        return about(UP, yaw - self.yaw) @ about(square, pitch)
+
+
+def leg_lengths(body: Body, side: str) -> tuple[float, float]:
+    """Of thigh and calf [m]."""
+    hip, knee, ankle = (body.joint(f"{name}_{side}") for name in ("thigh", "calf", "foot"))
+    return float(np.linalg.norm(knee - hip)), float(np.linalg.norm(ankle - knee))
+
+
+def put_leg(  # noqa: PLR0917 - hip, ankle and foot are one leg
+    body: Body, local: Float, side: str, hip: Float, ankle: Float, foot: Float
+) -> None:
+    """Turn thigh, calf and foot in rotations ``local`` [T, J, 3, 3], whose pelvis is set.
+
+    Args:
+        body: whose leg it is.
+        local: rotations that are written to.
+        side: "l" or "r".
+        hip, ankle: joints [T, 3] in the body frame.
+        foot: [T, 3, 3] rotation of the foot in the body frame.
+    """
+    pelvis = local[:, JOINTS.index("pelvis")]
+    ahead = unit(pelvis[:, :, 0] + foot[:, :, 0] * [1, 1, 0.0])
+    knee = bend(hip, ankle, *leg_lengths(body, side), ahead)
+    lateral = np.cross(UP, ahead)
+    rest_hip, rest_knee, rest_ankle = (
+        body.joint(f"{name}_{side}") for name in ("thigh", "calf", "foot")
+    )
+    thigh = frame(knee - hip, lateral) @ frame(rest_knee - rest_hip, LATERAL).T
+    calf = frame(ankle - knee, lateral) @ frame(rest_ankle - rest_knee, LATERAL).T
+    local[:, JOINTS.index(f"thigh_{side}")] = np.swapaxes(pelvis, -1, -2) @ thigh
+    local[:, JOINTS.index(f"calf_{side}")] = np.swapaxes(thigh, -1, -2) @ calf
+    local[:, JOINTS.index(f"foot_{side}")] = np.swapaxes(calf, -1, -2) @ foot
+
+
+def put_spine(local: Float, pelvis: Float, chest: Float, head: Float) -> None:
+    """Spread the turn from pelvis to chest over the spine, and from chest to head over the neck."""
+    part = partial_turn(np.swapaxes(pelvis, -1, -2) @ chest, 1 / 3)
+    for name in ("spine_1", "spine_2", "spine_3"):
+        local[:, JOINTS.index(name)] = part
+    part = partial_turn(np.swapaxes(chest, -1, -2) @ head, 1 / 2)
+    for name in ("neck", "head"):
+        local[:, JOINTS.index(name)] = part
+
+
+def put_arm(  # noqa: PLR0917 - the angles of one arm
+    body: Body, local: Float, side: str, shoulder: Float, elbow: Float, out: ArrayLike
+) -> None:
+    """Hang an arm.
+
+    Args:
+        body: whose arm it is.
+        local: [T, J, 3, 3] rotations that are written to.
+        side: "l" or "r".
+        shoulder: [T] swing forward of the upper arm against the chest [rad].
+        elbow: [T] bend [rad].
+        out: of the arm from the side [rad].
+    """
+    sign = 1.0 if side == "l" else -1.0
+    out = np.broadcast_to(np.asarray(out, dtype=np.float64), shoulder.shape)
+    joints = [body.joint(f"{name}_{side}") for name in ("upper_arm", "forearm", "hand")]
+    down = np.stack([np.sin(shoulder), sign * np.sin(out), -np.cos(shoulder) * np.cos(out)], -1)
+    bent = shoulder + elbow
+    low = np.stack([np.sin(bent), np.full_like(bent, -sign * 0.05), -np.cos(bent)], axis=-1)
+    upper = aim(joints[1] - joints[0], down)
+    fore = aim((upper @ (joints[2] - joints[1])[:, None])[..., 0], low) @ upper
+    local[:, JOINTS.index(f"upper_arm_{side}")] = upper
+    local[:, JOINTS.index(f"forearm_{side}")] = np.swapaxes(upper, -1, -2) @ fore
