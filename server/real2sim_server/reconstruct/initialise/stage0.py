@@ -28,7 +28,7 @@ from .surfels import Surfels, fit_surfels, round_surfels
 from .triangulate import TriangulatedPoints, triangulate
 from .vehicle_body import VehicleBody, faced, fitted_body
 from .views import PlacedSurfels, ProjectedView, chosen_frames, gather_views
-from .walls import beside_walls, continue_walls, real_walls
+from .walls import continue_walls, real_walls
 
 OPACITY = 0.95
 ABOVE_GROUND = 0.1
@@ -177,14 +177,9 @@ def _shape(
     above = thin_to(above, options.voxel, limit, levels)
     largest = 0.03 + 0.006 * path_distance(above.points, path)
     structure = fit_surfels(above.points, largest=largest)
-    seen, single = _surfels_of_images(
-        from_images, measured.background, fitted.surface, path, options
-    )
-    # Swept points scatter too much to say where a wall stands.
-    measured_walls = Surfels.join([structure, single])
-    walls = continue_walls(measured_walls, measured.limit, max_count=options.max_background // 5)
-    seen = Surfels.join([beside_walls(seen, walls), single])
+    seen = _surfels_of_images(from_images, measured.background, fitted.surface, path, options)
     structure = Surfels.join([structure, seen])
+    walls = continue_walls(structure, measured.limit, max_count=options.max_background // 5)
     surfels = [ground, structure, walls]
     standing = len(ground) + len(structure)
     intensity = [np.zeros(len(ground), np.float32), above.intensity]
@@ -232,9 +227,8 @@ def _above_ground(background: PointSet, surface: Ground) -> PointSet:
 
 def _surfels_of_images(
     seen: _Seen, background: PointSet, surface: Ground, path: Float, options: InitialiseOptions
-) -> tuple[Surfels, Surfels]:
-    """What only images show, where the background has no LiDAR point and above the ground: of
-    swept planes and of single features."""
+) -> Surfels:
+    """What only images show, where the background has no LiDAR point and above the ground."""
     swept = seen.swept[_beyond_lidar(seen.swept, background, surface)]
     distance = path_distance(swept, path)
     held = well_supported(swept, 0.1 + 0.015 * distance)
@@ -247,7 +241,7 @@ def _surfels_of_images(
     dense = fit_surfels(cloud.points, largest=0.03 + 0.012 * distance)
     single = seen.features.points
     single = single[_beyond_lidar(single, background, surface)]
-    return dense, round_surfels(single, path_distance(single, path))
+    return Surfels.join([dense, round_surfels(single, path_distance(single, path))])
 
 
 def _beyond_lidar(

@@ -20,8 +20,6 @@ REACH, HEIGHT = 45.0, 14.0
 """Walls up to this far from the drive are continued by this much [m]."""
 MIN_POINTS, MIN_EXTENT = 6, 0.8
 """A column is a wall when it has so many points over such a height [m]."""
-AT_WALL = 0.6
-"""Points from images this close to a continued wall are of the wall [m]."""
 MAX_DEVIATION = 28.0
 """Views of a real wall differ less than this in brightness, standard deviation of 0 to 255."""
 
@@ -57,16 +55,6 @@ def continue_walls(structure: Surfels, limit: ScanLimit, *, max_count: int) -> S
             columns = columns.every_other()
             step = CELL
     return _rise(columns, step)
-
-
-def beside_walls(seen: Surfels, walls: Surfels) -> Surfels:
-    """Without what lies at a wall that is continued upwards, which knows better where it stands."""
-    from scipy.spatial import cKDTree
-
-    if not len(walls) or not len(seen):
-        return seen
-    distance, _ = cKDTree(walls.points).query(seen.points, workers=-1)
-    return seen.select(distance > AT_WALL)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,10 +4,8 @@ import numpy as np
 
 from real2sim_server.reconstruct.initialise.surfels import fit_surfels
 from real2sim_server.reconstruct.initialise.walls import (
-    AT_WALL,
     HEIGHT,
     ScanLimit,
-    beside_walls,
     continue_walls,
     real_walls,
 )
@@ -53,12 +51,3 @@ def test_sky_unseen_and_inconsistent_candidates_are_no_walls():
     known = np.array([True, False, True, True, True])
     deviation = np.array([5, 5, 80, 2, 1], np.float32)
     assert real_walls(colours, known, deviation).tolist() == [True, False, False, False, False]
-
-
-def test_points_from_images_at_a_continued_wall_leave_its_place_to_it():
-    walls = continue_walls(wall(2.6), LIMIT, max_count=100_000)
-    crown, scatter = wall(6.0, x=10 - 2 * AT_WALL), wall(6.0, x=10 - AT_WALL / 2)
-    assert len(beside_walls(crown, walls)) == len(crown)
-    kept = beside_walls(scatter, walls)
-    assert kept.points[:, 2].max() < 2.6 + AT_WALL
-    assert beside_walls(scatter, walls.select(np.zeros(len(walls), np.bool_))) is scatter
