@@ -87,12 +87,13 @@ class Drives:
     ) -> JobResult:
         recording = await episode_of(self._sessions, session)
         scene, folder = session.start.scene, context.folder
+        reason = session.running_world().reason
 
         def write() -> None:
             drive = EpisodeDrive.of(recording, scene, assets=self._assets)
             folder.mkdir(parents=True, exist_ok=True)
             (folder / RECORDED).write_bytes(to_bytes(recording))
-            shown = json.dumps(playback_of(recording, drive), separators=(",", ":"))
+            shown = json.dumps(playback_of(recording, drive, reason=reason), separators=(",", ":"))
             (folder / PLAYBACK).write_text(shown, encoding="utf-8")
 
         await self._sessions.pipeline.on_world_thread(write)

@@ -17,12 +17,13 @@ from ...world.ego.reference import PlannedTrajectory
 from ...world.recording.recording import Recording
 
 
-def playback_of(recording: Recording, drive: EpisodeDrive) -> dict[str, Any]:
+def playback_of(recording: Recording, drive: EpisodeDrive, *, reason: str | None) -> dict[str, Any]:
     """Times, poses, scores, plans and events by instant.
 
     ``tracks``, ``ego`` and ``times_us`` are as those of a physics rollout (`rollouts.describe`);
     ``metrics`` has a list for each score, ``plans`` poses (x [m], y [m], yaw [rad], world) that
-    were planned from each instant, ``speeds`` is of the ego [m/s].
+    were planned from each instant, ``speeds`` is of the ego [m/s];
+    ``reason`` says why the episode is over.
     """
     worlds = drive.worlds
     seen = [world.observe() for world in worlds]
@@ -36,7 +37,7 @@ def playback_of(recording: Recording, drive: EpisodeDrive) -> dict[str, Any]:
         "end_us": worlds[-1].t_us,
         "times_us": [world.t_us for world in worlds],
         "steps": [world.steps for world in worlds],
-        "reason": worlds[-1].reason,
+        "reason": reason,
         "ego": _ego(worlds),
         "speeds": [round(float(np.hypot(*world.motion.velocity)), 4) for world in worlds],
         "tracks": _tracks(worlds),

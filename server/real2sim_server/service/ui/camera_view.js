@@ -50,7 +50,7 @@ function viewRequest(width) {
 
 // Small pictures while something moves, a full one as soon as it rests.
 function requestFrame(moving) {
-  if (model.mosaic) {
+  if (model.mosaic || model.live) {
     return;
   }
   clearTimeout(still);
@@ -71,6 +71,9 @@ function fullWidth() {
 }
 
 function show(head, blob) {
+  if (model.live) {
+    return;
+  }
   header = head;
   const old = url;
   url = URL.createObjectURL(blob);
@@ -87,6 +90,21 @@ function show(head, blob) {
     arrivals.length > 2
       ? `${arrivals.length} fps · ${head.width}×${head.height}`
       : `${head.width}×${head.height}`;
+  outline();
+}
+
+// A picture of a session that is driven; nothing is drawn over it, since no pose comes with it.
+export function showLive(blob, goesOn) {
+  if (!goesOn()) {
+    return;
+  }
+  clearTimeout(still);
+  header = null;
+  const old = url;
+  url = URL.createObjectURL(blob);
+  $("picture").onload = () => old && URL.revokeObjectURL(old);
+  $("picture").src = url;
+  $("rate").textContent = "live";
   outline();
 }
 
@@ -111,9 +129,11 @@ function outline() {
   const subject = object(model.selected);
   $("stage-hint").textContent = subject
     ? subject.object_id
-    : model.free || model.mosaic
-      ? ""
-      : "Click an object to select it";
+    : model.live
+      ? "Live"
+      : model.free || model.mosaic
+        ? ""
+        : "Click an object to select it";
   if (!header) {
     return;
   }

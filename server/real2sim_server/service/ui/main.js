@@ -46,8 +46,8 @@ async function main() {
   }
   if (address.run) {
     const t = model.t;
-    turnTo("physics");
     await attempt(show)(address.run);
+    turnTo(model.playback?.kind === "drive" ? "drive" : "physics");
     setTime(t);
   }
   await attempt(startSweep)();

@@ -7,7 +7,15 @@ import { drawLanes } from "./lanes.js";
 import { colourOf } from "./categories.js";
 import { ink, onTheme } from "./theme.js";
 import { startMapHands } from "./map_hands.js";
-import { view, toScreen, useCanvas, shown, lookAtEverything, lookAtSelection } from "./map_view.js";
+import {
+  view,
+  toScreen,
+  useCanvas,
+  shown,
+  keepInView,
+  lookAtEverything,
+  lookAtSelection,
+} from "./map_view.js";
 
 let canvas;
 let pen;
@@ -20,7 +28,7 @@ export function startMap() {
   pen = canvas.getContext("2d");
   useCanvas(canvas);
   startMapHands(canvas, draw);
-  on("scenario selection time draft run camera box sweep drive layout", draw);
+  on("scenario selection time draft run camera box sweep drive-step layout", draw);
   onTheme(draw);
   new ResizeObserver(draw).observe(canvas);
   centre();
@@ -29,6 +37,11 @@ export const screenOfBox = () => toScreen(model.box.position);
 export const screenOf = (id) => toScreen(poseOf(object(id)).position);
 export function fit() {
   lookAtEverything();
+  draw();
+}
+// Where somebody drives, the map goes along.
+export function follow(position) {
+  keepInView(position);
   draw();
 }
 export function centre() {
@@ -68,7 +81,7 @@ function draw() {
     }
     lines.forEach((corners) => line(corners, `${ink().collider}80`, 1));
   }
-  if (!model.selected && model.box) {
+  if (!model.selected && model.box && !model.live && !model.job) {
     pen.setLineDash([4, 4]);
     box(model.box, model.box.size, ink().text, false);
     pen.setLineDash([]);
@@ -93,10 +106,15 @@ function draw() {
     [4.6, 1.9, 1.5],
     ink().ego,
     true,
-    model.playback?.ego ? "driven vehicle" : "recording vehicle",
+    model.live || model.playback?.ego ? "driven vehicle" : "recording vehicle",
   );
   layers.forEach((layer) => layer(pen, toScreen, { line, box }));
-  if (object(model.selected) && present(object(model.selected), model.t) && !model.job) {
+  if (
+    object(model.selected) &&
+    present(object(model.selected), model.t) &&
+    !model.job &&
+    !model.live
+  ) {
     handle();
   }
 }

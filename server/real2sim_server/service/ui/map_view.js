@@ -32,7 +32,10 @@ export function zoomAt(place, factor) {
 export const panBy = (dx, dy) =>
   lookAt({ ...view, x: view.x - dx / view.scale, y: view.y + dy / view.scale });
 
-export const shown = () => model.scenario.objects.filter((o) => present(o, model.t));
+export const shown = () =>
+  model.scenario.objects.filter((o) =>
+    model.live ? model.live.agents.some((a) => a.object_id === o.object_id) : present(o, model.t),
+  );
 export function lookAtEverything() {
   const points = [...(model.scene.ego?.positions ?? []), ...shown().map((o) => poseOf(o).position)];
   const [xs, ys] = [0, 1].map((k) => points.map((p) => p[k]));
@@ -42,6 +45,15 @@ export function lookAtEverything() {
     canvas.clientHeight / (y1 - y0 + 16),
   );
   lookAt({ x: (x0 + x1) / 2, y: (y0 + y1) / 2, scale: Math.min(40, fitting) });
+}
+// Moves on once something comes near the rim.
+export function keepInView([x, y]) {
+  const [across, down] = toScreen([x, y]);
+  const rim = 0.2;
+  const inside = (at, size) => at > size * rim && at < size * (1 - rim);
+  if (!inside(across, canvas.clientWidth) || !inside(down, canvas.clientHeight)) {
+    lookAt({ ...view, x, y });
+  }
 }
 export function lookAtSelection() {
   const subject = object(model.selected);

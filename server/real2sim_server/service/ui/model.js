@@ -14,6 +14,7 @@ export const model = {
   draft: null,
   job: null,
   playback: null,
+  live: null,
   free: null,
   shows: "rgb",
   mosaic: false,
@@ -49,6 +50,10 @@ export const object = (id) => model.scenario.objects.find((o) => o.object_id ===
 
 // Pose as shown: of a physics run while one is played, else with what is being dragged.
 export function poseOf(subject) {
+  const now = model.live?.agents.find((a) => a.object_id === subject.object_id);
+  if (now) {
+    return now;
+  }
   const run = model.playback?.tracks[subject.object_id];
   if (model.job && run) {
     return poseAt({ times_us: model.playback.times_us, ...run }, model.t);
@@ -66,7 +71,8 @@ export function poseOf(subject) {
 }
 
 // Of the ego: as it was recorded, or as it drives in the drive that is shown.
-export const egoPoseAt = (t) => poseAt(model.playback?.ego ?? model.scene.ego, t);
+export const egoPoseAt = (t) =>
+  model.live?.ego ?? poseAt(model.playback?.ego ?? model.scene.ego, t);
 
 export const scenarioPoseOf = (subject) => poseAt(subject.trajectory, model.t);
 

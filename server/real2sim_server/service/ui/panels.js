@@ -4,6 +4,8 @@ import { startProperties } from "./properties.js";
 import { startAssets } from "./assets.js";
 import { startPhysics } from "./physics.js";
 import { startDatasets, listDatasets } from "./datasets.js";
+import { startDrive, listDrives } from "./drive.js";
+import { startWork, listWork } from "./work.js";
 import { startLog } from "./log.js";
 import { emit } from "./model.js";
 import { el } from "./dom.js";
@@ -23,11 +25,25 @@ const PANELS = [
   },
   { id: "physics", label: "Physics", icon: "M3 16h14M5 16l5-11 5 11M8 9h4", start: startPhysics },
   {
+    id: "drive",
+    label: "Drive",
+    icon: "M10 3a7 7 0 1 0 .01 0M10 8a2 2 0 1 0 .01 0M3.4 9h4.8M11.8 9h4.8M10 12v5",
+    start: startDrive,
+    shown: listDrives,
+  },
+  {
     id: "datasets",
     label: "Data sets",
     icon: "M3 4h14v12H3zM3 12l4-4 4 4 2-2 4 4",
     start: startDatasets,
     shown: listDatasets,
+  },
+  {
+    id: "work",
+    label: "Work",
+    icon: "M4 6h12M4 10h12M4 14h7M14 13l2 2 3-4",
+    start: startWork,
+    shown: listWork,
   },
   {
     id: "log",

@@ -13,7 +13,7 @@ let duration = 2;
 export function startPhysics() {
   on("scenario selection run", draw);
   // A hidden plot has no size to be drawn at.
-  on("time layout", () => model.playback && chart());
+  on("time layout", () => model.playback?.energies && chart());
   draw();
 }
 function draw() {
@@ -69,11 +69,11 @@ function draw() {
   if (refused) {
     parts.push(el("p", { id: "refused", class: "refused", textContent: refused }));
   }
-  if (model.playback) {
+  if (model.playback?.energies) {
     parts.push(...results());
   }
   page().replaceChildren(...parts);
-  if (model.playback) {
+  if (model.playback?.energies) {
     chart();
   }
 }

@@ -43,6 +43,7 @@ const KEYS = [
     selected((id) => edit([{ op: "rotate", object_id: id, angle: 0.0872665 }])),
   ],
   [null, "", "]", selected((id) => edit([{ op: "rotate", object_id: id, angle: -0.0872665 }]))],
+  ["Arrows", "while you drive: faster, brake, left, right", "", null],
   ["F", "free camera; drag looks, right drag moves, the wheel goes", "f", toggleFree],
   ["U", "uncertainty of what is shown, where the scene knows it", "u", toggleUncertainty],
   ["W A S D", "fly", "w", flying(0, 0, 0.5)],

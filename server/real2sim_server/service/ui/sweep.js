@@ -33,7 +33,7 @@ function later() {
     model.sweep = null;
     emit("sweep");
   }
-  if (model.lidar && !model.job) {
+  if (model.lidar && !model.job && !model.live) {
     waiting = setTimeout(attempt(ask), REST_MS);
   }
 }

@@ -85,7 +85,7 @@ def test_a_planner_of_the_sdk_is_held_let_go_by_steps_and_ended(site, drive):
     assert "error" not in done["result"]
     shown = site.http.get(f"/v1/jobs/{job['job_id']}/files/playback.json").json()
     assert all(len(plan) > 1 for plan in shown["plans"][:3])
-    assert shown["scenario_id"] is None
+    assert (shown["scenario_id"], shown["reason"]) == (None, "stopped")
 
 
 def test_a_drive_is_looked_at_from_its_own_vehicle(site, drive):

@@ -1,0 +1,303 @@
+// Drive: a planner or a person in the scenario, watched live; then the recording, read at any instant.
+import { model, on, egoPoseAt, setTime, stopRun } from "./model.js";
+import { get } from "./api.js";
+import { el, row } from "./dom.js";
+import { attempt } from "./messages.js";
+import { plot } from "./plot.js";
+import { ink } from "./theme.js";
+import { addLayer, follow } from "./map.js";
+import { show } from "./physics.js";
+import { drivesOf, isMine } from "./drive_session.js";
+import { seat, start, startDriving, take, takeTheWheel, hold, end, press } from "./driving.js";
+
+const WHO = [
+  ["idm", "idm: keeps its distance"],
+  ["follow_route", "follow_route: along the route"],
+  ["pid", "pid: along the recording"],
+  ["depth_sampling", "depth_sampling: by depth images"],
+  ["hand", "me, by arrow keys"],
+  ["other", "a planner of mine, elsewhere"],
+];
+const PACES = [
+  ["1", "real time"],
+  ["2", "twice as fast"],
+  ["0.25", "a quarter"],
+  ["", "as fast as it can"],
+];
+const chosen = { who: "idm", pace: "1", onCollision: "terminate" };
+const page = () => document.getElementById("drive");
+const isReplay = () => model.playback?.kind === "drive";
+let drives = [];
+let happened = [];
+
+export function startDrive() {
+  startDriving();
+  addLayer((pen, toScreen, { line }) => {
+    const plan = model.live?.plan ?? (isReplay() ? model.playback.plans[instant()] : []);
+    if (plan.length) {
+      const ego = model.live?.ego.position ?? model.playback.ego.positions[instant()];
+      line([ego, ...plan], ink().plan, 3);
+    }
+  });
+  on("drive", () => {
+    happened = [];
+    draw();
+  });
+  on("run scenario", draw);
+  on("drive-step", live);
+  on("drive-step", () => model.live && follow(model.live.ego.position));
+  on("time", () => isReplay() && follow(egoPoseAt(model.t).position));
+  on("time layout", () => isReplay() && replayed());
+  draw();
+}
+// What was driven; one that goes on in this tab is watched again after a reload.
+export const listDrives = attempt(async () => {
+  drives = await drivesOf(model.scenario.scenario_id);
+  const going = drives.find((job) => job.state === "running" && isMine(job.request.session_id));
+  if (going && !seat) {
+    attempt(take)(going, going.request.planner ?? "other");
+  }
+  draw();
+});
+function draw() {
+  page().replaceChildren(...(seat ? driving() : isReplay() ? replay() : [...choice(), ...past()]));
+  if (seat) {
+    live();
+  } else if (isReplay()) {
+    replayed();
+  }
+}
+
+// --- before ----------------------------------------------------------------------------------
+
+function choice() {
+  return [
+    el("p", {
+      textContent: "Somebody drives the recording vehicle through the scenario as it is now.",
+    }),
+    row("who", [pick("who", WHO)]),
+    row("pace", [pick("pace", PACES)]),
+    row("a crash", [
+      pick("onCollision", [
+        ["terminate", "ends the drive"],
+        ["continue", "goes on"],
+      ]),
+    ]),
+    el(
+      "div",
+      { class: "actions" },
+      button("drive-start", "Drive", () =>
+        start({ ...chosen, pace: chosen.who === "hand" ? null : Number(chosen.pace) || null }),
+      ),
+    ),
+  ];
+}
+function pick(name, options) {
+  const select = el(
+    "select",
+    { id: `drive-${name}`, class: "wide", "aria-label": name },
+    ...options.map(([value, label]) => new Option(label, value)),
+  );
+  select.value = chosen[name];
+  select.onchange = () => (chosen[name] = select.value);
+  return select;
+}
+function past() {
+  const done = drives.filter((job) => job.state === "succeeded");
+  if (!done.length) {
+    return [];
+  }
+  return [
+    el("h2", { class: "group-title", textContent: "Drives of this scenario" }),
+    ...done.map((job) => {
+      const { steps, reason } = job.result;
+      const who = job.request.planner ?? "by hand";
+      return el(
+        "button",
+        { class: "past", "data-drive": job.job_id, onclick: attempt(() => show(job.job_id)) },
+        el("strong", { textContent: who }),
+        el("small", {
+          textContent: `${steps} steps · ${said(reason)} · ${new Date(job.created_at).toLocaleTimeString()}`,
+        }),
+      );
+    }),
+  ];
+}
+
+// --- live ------------------------------------------------------------------------------------
+
+function driving() {
+  const { held, who, session } = seat;
+  return [
+    el("p", { id: "drive-now", role: "status" }),
+    el(
+      "div",
+      { class: "actions" },
+      button("drive-hold", held ? "Go on" : "Pause", () => hold(!seat.held), "primary"),
+      button("drive-step", "One step", () => hold(true, 1)),
+      who === "hand"
+        ? null
+        : button("drive-wheel", "Take the wheel", () => takeTheWheel(session, model.live.step)),
+      button("drive-end", "End", end, "danger"),
+    ),
+    who === "hand" ? wheel() : null,
+    who === "other"
+      ? el("p", {
+          textContent: `Let it drive session ${session}: real2sim drive --session ${session}`,
+        })
+      : null,
+    el("dl", { id: "drive-figures", class: "figures" }),
+    el("div", { id: "drive-events" }),
+  ].filter(Boolean);
+}
+function live() {
+  if (!seat || !document.getElementById("drive-now")) {
+    return;
+  }
+  const state = model.live;
+  const name = seat.who === "hand" ? "You drive" : `${seat.who} drives`;
+  document.getElementById("drive-hold").textContent = seat.held ? "Go on" : "Pause";
+  document.getElementById("drive-now").textContent = state
+    ? `${name}${seat.held ? ", held" : ""} · step ${state.step} · ${state.ego.speed.toFixed(1)} m/s${
+        state.planning_ms && seat.who !== "hand"
+          ? ` · plans in ${state.planning_ms.toFixed(0)} ms`
+          : ""
+      }`
+    : seat.stage || "The session begins";
+  if (!state) {
+    return;
+  }
+  for (const event of state.events) {
+    if (!happened.some((e) => e.t_us === event.t_us && e.type === event.type)) {
+      happened.push(event);
+    }
+  }
+  figures(Object.entries(state.metrics));
+  document.getElementById("drive-events").replaceChildren(...eventList(happened, null));
+}
+function wheel() {
+  const keys = [
+    ["ArrowLeft", "←", "left"],
+    ["ArrowUp", "↑", "faster"],
+    ["ArrowDown", "↓", "brake"],
+    ["ArrowRight", "→", "right"],
+  ].map(([key, label, what]) => {
+    const one = el("button", {
+      textContent: label,
+      "aria-label": what,
+      title: `${what} (${label})`,
+    });
+    one.onpointerdown = () => press(key, true);
+    one.onpointerup = one.onpointerleave = one.onpointercancel = () => press(key, false);
+    return one;
+  });
+  return el("div", { class: "wheel" }, ...keys);
+}
+
+// --- replay ----------------------------------------------------------------------------------
+
+function replay() {
+  const { reason, scores, events, metrics } = model.playback;
+  const last = Object.entries(metrics).map(([name, values]) => [name, values.at(-1)]);
+  return [
+    el("p", { id: "drive-over", textContent: `${seconds(lasts())} s driven; ${said(reason)}.` }),
+    el(
+      "div",
+      { class: "actions" },
+      button("drive-leave", "Back to the scenario", async () => {
+        stopRun();
+        await listDrives();
+      }),
+      button("drive-fork", "Take the wheel here", goOn),
+    ),
+    el(
+      "fieldset",
+      {},
+      el("legend", { textContent: "Speed [m/s]" }),
+      el("canvas", { id: "drive-speed", class: "plot" }),
+    ),
+    el(
+      "fieldset",
+      {},
+      el("legend", { textContent: "At the time shown" }),
+      el("dl", { id: "drive-figures", class: "figures" }),
+    ),
+    ...eventList(events, setTime),
+    el("h2", { class: "group-title", textContent: "Scores of the whole drive" }),
+    el(
+      "dl",
+      { class: "figures" },
+      ...terms(scores.length ? scores.map((s) => [s.name, s.value]) : last),
+    ),
+  ];
+}
+function replayed() {
+  const { times_us: times, speeds, metrics } = model.playback;
+  if (!document.getElementById("drive-speed")) {
+    return;
+  }
+  const k = instant();
+  figures(Object.entries(metrics).map(([name, values]) => [name, values[k]]));
+  plot(
+    document.getElementById("drive-speed"),
+    times.map((t) => (t - times[0]) / 1e6),
+    [{ name: "driven", values: speeds }],
+    (model.t - times[0]) / 1e6,
+  );
+}
+async function goOn() {
+  const job = await get(`/v1/jobs/${model.job}`);
+  if (!isMine(job.request.session_id)) {
+    throw new Error(
+      "The session of this drive is gone, or belongs to another tab: drive again, and take the wheel then",
+    );
+  }
+  await takeTheWheel(job.request.session_id, model.playback.steps[instant()]);
+}
+const lasts = () => model.playback.end_us - model.playback.start_us;
+const instant = () =>
+  Math.max(
+    0,
+    model.playback.times_us.findLastIndex((t) => t <= model.t),
+  );
+
+// --- figures ---------------------------------------------------------------------------------
+
+const figures = (values) =>
+  document.getElementById("drive-figures").replaceChildren(...terms(values));
+function terms(values) {
+  return values.map(([name, value]) =>
+    el(
+      "div",
+      {},
+      el("dt", { textContent: name.replaceAll("_", " ") }),
+      el("dd", { textContent: Number.isFinite(value) ? tidy(value) : "–" }),
+    ),
+  );
+}
+const tidy = (value) => String(Math.round(value * 1000) / 1000);
+function eventList(events, jump) {
+  if (!events.length) {
+    return [];
+  }
+  const began = model.playback?.start_us ?? model.scenario.start_us;
+  return [
+    el("h2", { class: "group-title", textContent: "Events" }),
+    ...events.map((event) =>
+      el(
+        jump ? "button" : "div",
+        { class: "past", ...(jump ? { onclick: () => jump(event.t_us) } : {}) },
+        el("strong", { textContent: said(event.type) }),
+        el("small", {
+          textContent: [event.object_id, `${seconds(event.t_us - began)} s`]
+            .filter(Boolean)
+            .join(" · "),
+        }),
+      ),
+    ),
+  ];
+}
+const seconds = (us) => (us / 1e6).toFixed(1);
+const said = (word) => (word ?? "not over").replaceAll("_", " ");
+const button = (id, label, act, kind = id === "drive-start" ? "primary" : "") =>
+  el("button", { id, textContent: label, class: kind, onclick: attempt(act) });
