@@ -33,6 +33,7 @@ from real2sim_proto.scenarios import (
     ScenarioFork,
     ScenarioInfo,
     ScenarioList,
+    ScenarioRename,
 )
 from real2sim_proto.scenes import Readiness, SceneImport, SceneInfo, SceneList, ServerInfo
 from real2sim_proto.sessions import (
@@ -144,6 +145,16 @@ def list_scenarios() -> Call[ScenarioList]:
 
 def get_scenario(scenario_id: str) -> Call[ScenarioInfo]:
     return Call(Request("GET", _scenario(scenario_id)), model_of(ScenarioInfo))
+
+
+def rename_scenario(scenario_id: str, name: str) -> Call[ScenarioInfo]:
+    request = Request(
+        "PATCH",
+        _scenario(scenario_id),
+        headers={"Content-Type": "application/json"},
+        body=json_of(checked(ScenarioRename, name=name)),
+    )
+    return Call(request, model_of(ScenarioInfo))
 
 
 def delete_scenario(scenario_id: str) -> Call[None]:

@@ -20,6 +20,12 @@ class ScenarioCreate(Model):
     name: str = Field(default="", max_length=200)
 
 
+class ScenarioRename(Model):
+    """Body of `PATCH /v1/scenarios/{id}`."""
+
+    name: str = Field(min_length=1, max_length=200)
+
+
 class ScenarioInfo(Reply):
     """A scenario and what it looks like after all its operations."""
 

@@ -78,6 +78,7 @@ MODELS: dict[str, type[BaseModel]] = {
         jobs.ExportRequest,
         jobs.DatasetRequest,
         scenarios.ScenarioCreate,
+        scenarios.ScenarioRename,
         scenarios.ScenarioFork,
         scenarios.ScenarioDocument,
         scenarios.ScenarioInfo,

@@ -99,6 +99,16 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         found = await self._transport.send(_requests.list_scenarios())
         return found.scenarios
 
+    async def rename(self, scenario: ScenarioRef, name: str) -> ScenarioInfo:
+        """Give a scenario another name; its id and its history stay.
+
+        Examples:
+            >>> (await client.scenarios.rename(scenario, "in the rain")).name
+            'in the rain'
+        """
+        call = _requests.rename_scenario(scenario_id_of(scenario), name)
+        return await self._transport.send(call)
+
     async def delete(self, scenario: ScenarioRef) -> None:
         """Remove a scenario and its history.
 

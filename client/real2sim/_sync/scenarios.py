@@ -98,6 +98,16 @@ class Scenarios(Collection[ScenarioInfo]):
         found = self._transport.send(_requests.list_scenarios())
         return found.scenarios
 
+    def rename(self, scenario: ScenarioRef, name: str) -> ScenarioInfo:
+        """Give a scenario another name; its id and its history stay.
+
+        Examples:
+            >>> (client.scenarios.rename(scenario, "in the rain")).name
+            'in the rain'
+        """
+        call = _requests.rename_scenario(scenario_id_of(scenario), name)
+        return self._transport.send(call)
+
     def delete(self, scenario: ScenarioRef) -> None:
         """Remove a scenario and its history.
 

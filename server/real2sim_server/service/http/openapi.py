@@ -35,6 +35,7 @@ PARAMETERS: dict[str, Any] = {
 
 BODIES: dict[str, Any] = {
     "ScenarioCreate": {"scene": "demo_street", "name": "cut-in"},
+    "ScenarioRename": {"name": "cut-in in the rain"},
     "ScenarioFork": {"name": "cut-in, later"},
     "ScenarioDocument": {
         "format": "real2sim.scenario",

@@ -115,13 +115,19 @@ async def describe(worker: WorkerOf, asset_id: Identifier) -> AssetInfo:
 
 
 @router.delete("/{asset_id}", status_code=204, response_class=Response)
-async def delete(worker: WorkerOf, asset_id: Identifier) -> Response:
+async def delete(
+    worker: WorkerOf,
+    asset_id: Identifier,
+    dry_run: Annotated[bool, Query(description="check, change nothing")] = False,
+) -> Response:
     """Remove an asset that no scenario has in its history; its id may then be given again.
 
     Sessions that show it go on.
     """
     await asyncio.to_thread(worker.assets.info, asset_id)
     await _check_unused(worker, asset_id)
+    if dry_run:
+        return Response(status_code=204)
     with worker.assets.removing(asset_id):
         # Once more: an edit that was under way may have found it before.
         await _check_unused(worker, asset_id)
@@ -156,10 +162,12 @@ async def thumbnail(
 async def _check_unused(worker: Worker, asset_id: str) -> None:
     users = await worker.scenarios.using_asset(asset_id)
     if users:
+        named = {info.scenario_id: info.name for info in await worker.scenarios.list()}
+        shown = [f"{named[u]!r} ({u})" if named.get(u) else u for u in users[:3]]
         more = f" and {len(users) - 3} more" if len(users) > 3 else ""
         raise ServiceError(
             ErrorCode.ASSET_IN_USE,
-            f"asset {asset_id!r} is in the history of {', '.join(users[:3])}{more}",
+            f"asset {asset_id!r} is in the history of {', '.join(shown)}{more}",
             hint="delete those scenarios first",
         )
 

@@ -22,6 +22,7 @@ from real2sim_proto.scenarios import (
     ScenarioFork,
     ScenarioInfo,
     ScenarioList,
+    ScenarioRename,
 )
 
 from ...edit.points import Part, ply_of_points, points_at
@@ -123,6 +124,13 @@ async def import_(
 async def describe(worker: WorkerOf, scenario_id: Identifier) -> Response:
     """One scenario with all its objects as they are now."""
     view = await worker.scenarios.view(scenario_id)
+    return await large_response(view.info, headers={"ETag": etag(view.revision)})
+
+
+@router.patch("/{scenario_id}", response_model=ScenarioInfo)
+async def rename(worker: WorkerOf, scenario_id: Identifier, body: ScenarioRename) -> Response:
+    """Give a scenario another name; its id and its history stay."""
+    view = await worker.scenarios.rename(scenario_id, body.name)
     return await large_response(view.info, headers={"ETag": etag(view.revision)})
 
 

@@ -6,7 +6,7 @@ import asyncio
 from collections import OrderedDict
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from real2sim_proto import ErrorCode
 
@@ -27,6 +27,7 @@ class CachedScenario:
     """A scenario in memory.
 
     Attributes:
+        row: replaced where its name has changed.
         scenario: replaced, under the lock, by a longer one when others have added to its log.
         lock: one edit at a time; readers need none, for states are immutable.
     """
@@ -100,10 +101,13 @@ class ScenarioCache:
         The log is asked each time, because other workers on the same store may have written to it.
         """
         known = cached.scenario.revision
-        stored = await self._store.revision(scenario_id)
-        if stored is None:
+        newest = await self._store.newest_of_scenario(scenario_id)
+        if newest is None:
             self.evict(scenario_id)
             raise _unknown(scenario_id)
+        stored, name = newest
+        if name != cached.row.name:
+            cached.row = replace(cached.row, name=name)
         if stored < known:
             # The store has been put back to an earlier day.
             self.evict(scenario_id)

@@ -137,6 +137,11 @@ class Scenarios:
             document.name, scene, summary, document.entries, idempotent=idempotent
         )
 
+    async def rename(self, scenario_id: str, name: str) -> ScenarioView:
+        """Give a scenario another name. Raises ServiceError: UNKNOWN_SCENARIO."""
+        await self._store.rename_scenario(scenario_id, name)
+        return await self.view(scenario_id)
+
     async def delete(self, scenario_id: str) -> None:
         """Remove a scenario and its history. Raises ServiceError: UNKNOWN_SCENARIO."""
         async with self._scenarios_cache.locked(scenario_id):

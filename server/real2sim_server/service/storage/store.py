@@ -155,15 +155,22 @@ class Store:
         changes = [_insert_rows(t.scenario_log, row), *_reply_writes(reply)]
         self.database.execute(changes)
 
-    async def revision(self, scenario_id: str) -> int | None:
-        """Revisions that a scenario has, 0 for none; None where there is no such scenario."""
+    async def rename_scenario(self, scenario_id: str, name: str) -> bool:
+        """Give a scenario another name; whether there was one."""
+        of_scenario = t.scenarios.c.scenario_id == scenario_id
+        changes = sa.update(t.scenarios).where(of_scenario).values(name=name)
+        return (await self.database.write(Write(changes)))[-1] > 0
+
+    async def newest_of_scenario(self, scenario_id: str) -> tuple[int, str] | None:
+        """Revisions that a scenario has, 0 for none, and its name; None where there is no such
+        scenario."""
         log, row = t.scenario_log, t.scenarios
         newest = sa.select(sa.func.max(log.c.revision)).where(log.c.scenario_id == scenario_id)
-        query = sa.select(newest.scalar_subquery().label("newest"))
+        query = sa.select(newest.scalar_subquery().label("newest"), row.c.name)
         rows = await self.database.read(
             query.select_from(row).where(row.c.scenario_id == scenario_id)
         )
-        return (rows[0]["newest"] or 0) if rows else None
+        return (rows[0]["newest"] or 0, rows[0]["name"]) if rows else None
 
     async def scenario_entries(self, scenario_id: str, *, after: int = 0) -> list[dict[str, Any]]:
         """The log of a scenario behind revision ``after``, oldest first."""

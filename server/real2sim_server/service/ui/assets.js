@@ -2,6 +2,7 @@
 import { model, on, edit, object } from "./model.js";
 import { call, get, post, picture } from "./api.js";
 import { poseAt, yawOf } from "./poses.js";
+import { isInBin, putInBin } from "./bin.js";
 import { el } from "./dom.js";
 import { attempt, notify } from "./messages.js";
 
@@ -11,7 +12,8 @@ export function startAssets() {
 }
 
 async function draw() {
-  const { assets } = await get("/v1/assets");
+  const { assets: all } = await get("/v1/assets");
+  const assets = all.filter((asset) => !isInBin(pathOf(asset.asset_id)));
   const subject = object(model.selected);
   const cut = el("button", {
     textContent: subject ? `Keep ${subject.object_id} as asset` : "Keep the selection as asset",
@@ -64,10 +66,11 @@ function insert(asset) {
   const position = [x + 15 * Math.cos(yaw), y + 15 * Math.sin(yaw), z + asset.size[2] / 2];
   return edit([{ op: "insert", asset_id: asset.asset_id, pose: { position, quaternion } }]);
 }
-async function remove(asset) {
-  await call("DELETE", `/v1/assets/${asset.asset_id}`);
-  await draw();
+async function remove({ asset_id: id }) {
+  await call("DELETE", `${pathOf(id)}?dry_run=true`);
+  putInBin(pathOf(id), id, attempt(draw));
 }
+const pathOf = (id) => `/v1/assets/${id}`;
 async function keep(subject) {
   const { assets } = await get("/v1/assets");
   const taken = new Set(assets.map((a) => a.asset_id));

@@ -1,6 +1,18 @@
 // Opens what the address names, or the first page.
 import { addressParameters, startAddress } from "./address.js";
-import { model, open, on, undo, redo, fork, exportFile, select, setTime } from "./model.js";
+import { call } from "./api.js";
+import {
+  model,
+  open,
+  refresh,
+  on,
+  undo,
+  redo,
+  fork,
+  exportFile,
+  select,
+  setTime,
+} from "./model.js";
 import { el } from "./dom.js";
 import { attempt, notify } from "./messages.js";
 import { startPage } from "./start.js";
@@ -80,6 +92,7 @@ function bar() {
   $("uncertainty").onclick = toggleUncertainty;
   $("fit").onclick = fit;
   $("centre").onclick = centre;
+  $("rename").onclick = attempt(rename);
   $("fork").onclick = attempt(() => copyAs(`${model.scenario.name} (fork)`));
   $("save").onclick = attempt(async () => {
     const name = prompt("Name", model.scenario.name);
@@ -88,6 +101,13 @@ function bar() {
     }
   });
   $("download").onclick = attempt(download);
+}
+async function rename() {
+  const name = prompt("Name", model.scenario.name)?.trim();
+  if (name) {
+    await call("PATCH", `/v1/scenarios/${model.scenario.scenario_id}`, { body: { name } });
+    await refresh();
+  }
 }
 async function copyAs(name) {
   const made = await fork(name);

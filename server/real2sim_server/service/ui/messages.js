@@ -1,9 +1,19 @@
 // Sentences for the person, shown for a while.
 import { sentence } from "./api.js";
-export function notify(text, kind = "") {
+// An action is a button in the message, which stays for so long and goes once it is pressed.
+export function notify(text, kind = "", action = null) {
   const box = document.createElement("div");
   box.className = `message ${kind}`;
   box.textContent = sentence(text);
+  if (action) {
+    const button = document.createElement("button");
+    button.textContent = action.label;
+    button.onclick = () => {
+      box.remove();
+      action.act();
+    };
+    box.append(button);
+  }
   const list = document.getElementById("messages");
   for (const other of [...list.children]) {
     if (other.textContent === box.textContent) {
@@ -14,7 +24,7 @@ export function notify(text, kind = "") {
   while (list.children.length > 3) {
     list.firstChild.remove();
   }
-  setTimeout(() => box.remove(), kind === "bad" ? 9000 : 5000);
+  setTimeout(() => box.remove(), action?.after ?? (kind === "bad" ? 9000 : 5000));
 }
 export const attempt =
   (fn) =>

@@ -1,20 +1,27 @@
 // The first page: scenarios that exist, and scenes to begin one on.
-import { get, post, picture } from "./api.js";
+import { call, get, post, picture } from "./api.js";
+import { isInBin, putInBin } from "./bin.js";
 import { el } from "./dom.js";
 import { attempt } from "./messages.js";
 
 export async function startPage() {
   document.getElementById("start").hidden = false;
-  const [{ scenarios }, { scenes }] = await Promise.all([get("/v1/scenarios"), get("/v1/scenes")]);
-  fill(
-    "scenario-list",
-    scenarios.reverse().map(scenarioCard),
-    "No scenario yet. Begin one on a scene.",
-  );
+  const [{ scenes }] = await Promise.all([get("/v1/scenes"), listScenarios()]);
   fill(
     "scene-list",
     scenes.map(sceneCard),
     "The worker has no scene. Start it with --scenes FOLDER.",
+  );
+}
+async function listScenarios() {
+  const { scenarios } = await get("/v1/scenarios");
+  fill(
+    "scenario-list",
+    scenarios
+      .reverse()
+      .filter((s) => !isInBin(pathOf(s)))
+      .map(scenarioCard),
+    "No scenario yet. Begin one on a scene.",
   );
 }
 function fill(id, cards, otherwise) {
@@ -23,15 +30,43 @@ function fill(id, cards, otherwise) {
     .replaceChildren(...(cards.length ? cards : [el("p", { textContent: otherwise })]));
 }
 const go = (id) => location.assign(`?scenario=${encodeURIComponent(id)}`);
+const pathOf = (s) => `/v1/scenarios/${s.scenario_id}`;
+const nameOf = (s) => s.name || s.scenario_id;
 const scenarioCard = (s) =>
   el(
-    "button",
-    { class: "card", onclick: () => go(s.scenario_id) },
-    el("strong", { textContent: s.name || s.scenario_id }),
-    el("small", {
-      textContent: `on ${s.scene} · r${s.revision} · ${new Date(s.created_at).toLocaleString()}`,
-    }),
+    "div",
+    { class: "card", "data-scenario": s.scenario_id },
+    el(
+      "a",
+      { class: "open", href: `?scenario=${encodeURIComponent(s.scenario_id)}` },
+      el("strong", { textContent: nameOf(s) }),
+      el("small", {
+        textContent: `on ${s.scene} · r${s.revision} · ${new Date(s.created_at).toLocaleString()}`,
+      }),
+    ),
+    el(
+      "div",
+      { class: "group" },
+      el("button", {
+        textContent: "Rename",
+        ariaLabel: `Rename ${nameOf(s)}`,
+        onclick: attempt(() => rename(s)),
+      }),
+      el("button", {
+        textContent: "Delete",
+        class: "danger",
+        ariaLabel: `Delete ${nameOf(s)}`,
+        onclick: () => putInBin(pathOf(s), nameOf(s), attempt(listScenarios)),
+      }),
+    ),
   );
+async function rename(s) {
+  const name = prompt("Name", s.name)?.trim();
+  if (name) {
+    await call("PATCH", pathOf(s), { body: { name } });
+    await listScenarios();
+  }
+}
 function sceneCard(s) {
   const begin = attempt(async () =>
     go((await post("/v1/scenarios", { scene: s.scene, name: `${s.scene} edit` })).scenario_id),

@@ -158,3 +158,11 @@ def test_edits_at_both_workers_at_once_are_all_kept_in_one_order(workers, scenar
         thread.join()
     assert sorted(answers[0] + answers[1]) == list(range(1, 17))
     assert [worker.get(scenario).json()["revision"] for worker in workers] == [16, 16]
+
+
+def test_another_name_is_seen_by_every_worker_at_once(workers, scenario):
+    assert workers[0].patch(scenario, json={"name": "in the rain"}).json()["name"] == "in the rain"
+    assert workers[1].get(scenario).json()["name"] == "in the rain"
+    assert workers[1].patch(scenario, json={"name": ""}).status_code == 422
+    unknown = workers[1].patch("/v1/scenarios/nobody", json={"name": "x"})
+    assert unknown.json()["code"] == "UNKNOWN_SCENARIO"

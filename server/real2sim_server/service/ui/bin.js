@@ -1,0 +1,45 @@
+// Deleting can be taken back for a while: it is done once the message is gone, or the page is left.
+import { call, token } from "./api.js";
+import { attempt, notify } from "./messages.js";
+
+const AFTER_MS = 8000;
+const KEY = "real2sim-deleted";
+const waiting = new Map();
+
+// What is as good as gone: the worker may list it for a moment after the page was left.
+export const isInBin = (path) =>
+  waiting.has(path) || JSON.parse(sessionStorage.getItem(KEY) ?? "[]").includes(path);
+
+export function putInBin(path, name, changed) {
+  const empty = attempt(async () => {
+    waiting.delete(path);
+    try {
+      await call("DELETE", path);
+    } finally {
+      changed();
+    }
+  });
+  const timer = setTimeout(empty, AFTER_MS);
+  waiting.set(path, timer);
+  changed();
+  notify(`${name} is deleted`, "", {
+    label: "Undo",
+    after: AFTER_MS,
+    act: () => {
+      clearTimeout(timer);
+      waiting.delete(path);
+      changed();
+    },
+  });
+}
+addEventListener("pagehide", () => {
+  const headers = token() ? { Authorization: `Bearer ${token()}` } : {};
+  const gone = JSON.parse(sessionStorage.getItem(KEY) ?? "[]");
+  for (const [path, timer] of waiting) {
+    clearTimeout(timer);
+    fetch(path, { method: "DELETE", headers, keepalive: true });
+    gone.push(path);
+  }
+  waiting.clear();
+  sessionStorage.setItem(KEY, JSON.stringify(gone.slice(-50)));
+});
