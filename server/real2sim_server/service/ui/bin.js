@@ -22,7 +22,7 @@ export function putInBin(path, name, changed) {
   const timer = setTimeout(empty, AFTER_MS);
   waiting.set(path, timer);
   changed();
-  notify(`${name} is deleted`, "", {
+  notify(`“${name}” is deleted`, "", {
     label: "Undo",
     after: AFTER_MS,
     act: () => {

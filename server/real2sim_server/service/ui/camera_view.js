@@ -16,6 +16,10 @@ let header;
 let url;
 let still;
 let arrivals = [];
+const layers = [];
+// Others draw over the picture too: with the pen, and what turns metres into pixels of the stage
+// (null behind the camera).
+export const addPictureLayer = (layer) => layers.push(layer);
 
 export function startView() {
   socket = new ViewSocket(model.scenario.scenario_id, {
@@ -115,12 +119,13 @@ function frameBox() {
   return { scale, left: (w - header.width * scale) / 2, top: (h - header.height * scale) / 2 };
 }
 
-// Where the centre of an object is inside the stage [CSS px]; null when it is out of sight.
-export function stagePlace(id) {
-  const pixel = project(poseOf(object(id)).position, header.T_world_camera, header.K);
+function toStage(point) {
+  const pixel = project(point, header.T_world_camera, header.K);
   const { scale, left, top } = frameBox();
   return pixel && [left + pixel[0] * scale, top + pixel[1] * scale];
 }
+// Where the centre of an object is inside the stage [CSS px]; null when it is out of sight.
+export const stagePlace = (id) => toStage(poseOf(object(id)).position);
 
 function outline() {
   const canvas = $("overlay");
@@ -141,18 +146,19 @@ function outline() {
   const pen = canvas.getContext("2d");
   pen.scale(devicePixelRatio, devicePixelRatio);
   drawSweepInPicture(pen, header, { scale, left, top });
+  pen.save();
+  pen.beginPath();
+  pen.rect(left, top, header.width * scale, header.height * scale);
+  pen.clip();
+  layers.forEach((layer) => layer(pen, toStage));
+  pen.restore();
   if (!subject || !present(subject, model.t)) {
     return;
   }
   const { position, quaternion } = poseOf(subject);
   const corners = [...Array(8).keys()].map((i) => {
     const offset = subject.size.map((s, axis) => ((i >> axis) & 1 ? s : -s) / 2);
-    const pixel = project(
-      rotate(quaternion, offset).map((v, k) => v + position[k]),
-      header.T_world_camera,
-      header.K,
-    );
-    return pixel && [left + pixel[0] * scale, top + pixel[1] * scale];
+    return toStage(rotate(quaternion, offset).map((v, k) => v + position[k]));
   });
   pen.strokeStyle = ink().selected;
   pen.lineWidth = 1.6;

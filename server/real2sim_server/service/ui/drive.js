@@ -5,6 +5,7 @@ import { el, row } from "./dom.js";
 import { attempt } from "./messages.js";
 import { plot } from "./plot.js";
 import { ink } from "./theme.js";
+import { addPictureLayer } from "./camera_view.js";
 import { addLayer, follow } from "./map.js";
 import { show } from "./physics.js";
 import { drivesOf, isMine } from "./drive_session.js";
@@ -39,6 +40,8 @@ export function startDrive() {
       line([ego, ...plan], ink().plan, 3);
     }
   });
+  addPictureLayer(planInPicture);
+  on("drive-toggle", () => attempt(hold)(!seat.held));
   on("drive", () => {
     happened = [];
     draw();
@@ -49,6 +52,19 @@ export function startDrive() {
   on("time", () => isReplay() && follow(egoPoseAt(model.t).position));
   on("time layout", () => isReplay() && replayed());
   draw();
+}
+// Along the ground; of a drive that is replayed, since pictures of a live one tell no pose.
+function planInPicture(pen, toStage) {
+  if (!isReplay()) {
+    return;
+  }
+  const [, , z] = model.playback.ego.positions[instant()];
+  const places = model.playback.plans[instant()].map(([x, y]) => toStage([x, y, z]));
+  pen.strokeStyle = ink().plan;
+  pen.lineWidth = 3;
+  pen.beginPath();
+  places.filter(Boolean).forEach((place) => pen.lineTo(...place));
+  pen.stroke();
 }
 // What was driven; one that goes on in this tab is watched again after a reload.
 export const listDrives = attempt(async () => {
@@ -298,6 +314,7 @@ function eventList(events, jump) {
   ];
 }
 const seconds = (us) => (us / 1e6).toFixed(1);
-const said = (word) => (word ?? "not over").replaceAll("_", " ");
+const SAID = { horizon: "to the end", stopped: "ended by hand" };
+const said = (word) => SAID[word] ?? (word ?? "not over").replaceAll("_", " ");
 const button = (id, label, act, kind = id === "drive-start" ? "primary" : "") =>
   el("button", { id, textContent: label, class: kind, onclick: attempt(act) });

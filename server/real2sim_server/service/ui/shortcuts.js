@@ -14,7 +14,7 @@ const nudge = (x, y) =>
   selected((id) => edit([{ op: "translate", object_id: id, x, y, frame: "object", snap: true }]));
 const flying = (r, d, f) => () => model.free && shift(r, d, f);
 const KEYS = [
-  ["Space", "play, pause", " ", toggle],
+  ["Space", "play, pause; holds a drive that is watched", " ", toggle],
   ["← →", "one frame back, on", "ArrowLeft", () => step(-1)],
   [null, "", "ArrowRight", () => step(1)],
   ["Ctrl Z", "undo", "ctrl+z", undo],

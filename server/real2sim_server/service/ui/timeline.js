@@ -1,5 +1,5 @@
 // Time: a slider, play, single steps, speed.
-import { model, on, setTime, span } from "./model.js";
+import { model, on, emit, setTime, span } from "./model.js";
 
 const $ = (id) => document.getElementById(id);
 let playing = false;
@@ -21,6 +21,10 @@ function draw() {
   $("play").textContent = playing ? "Pause" : "Play";
 }
 export function toggle() {
+  if (model.live) {
+    emit("drive-toggle");
+    return;
+  }
   playing = !playing;
   if (playing && model.t >= span().end_us) {
     setTime(span().start_us);

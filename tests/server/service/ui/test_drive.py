@@ -25,7 +25,7 @@ def test_a_planner_is_watched_held_and_relieved_and_the_drive_is_read_afterwards
     studio.wait_for_selector("#rate:text-is('live')")
     assert shown(studio, "model.live.plan.length") > 1
 
-    studio.click("#drive-hold")
+    studio.keyboard.press("Space")
     driven(studio, "held")
     held = shown(studio, "model.live.step")
     studio.click("#drive-step")
