@@ -66,7 +66,8 @@ pins: $(STAMP)
 	$(BIN)/python scripts/third_party.py
 
 docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
+	  -c constraints.txt -e '.[docs]'
 	$(BIN)/python -m sphinx -q -W --keep-going -j auto -d out/doctrees docs site
 
 bench: $(STAMP)
@@ -75,7 +76,8 @@ bench: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[server,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
+	  -c constraints.txt -e '.[server,dev]'
 	@touch $@
 
 clean:

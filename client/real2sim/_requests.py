@@ -35,7 +35,14 @@ from real2sim_proto.scenarios import (
     ScenarioList,
     ScenarioRename,
 )
-from real2sim_proto.scenes import Readiness, SceneImport, SceneInfo, SceneList, ServerInfo
+from real2sim_proto.scenes import (
+    Fleet,
+    Readiness,
+    SceneImport,
+    SceneInfo,
+    SceneList,
+    ServerInfo,
+)
 from real2sim_proto.sessions import (
     SessionClock,
     SessionCreate,
@@ -77,6 +84,10 @@ from .observation import View
 
 def server_info() -> Call[ServerInfo]:
     return Call(Request("GET", "/v1/server"), model_of(ServerInfo))
+
+
+def fleet() -> Call[Fleet]:
+    return Call(Request("GET", "/v1/fleet"), model_of(Fleet))
 
 
 def readiness() -> Call[Readiness]:

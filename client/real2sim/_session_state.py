@@ -18,12 +18,16 @@ from .errors import (
     ConnectionLostError,
     NotOpenError,
     ReplyTimeoutError,
+    SessionElsewhereError,
     UnreachableError,
 )
 from .version import SDK
 
 TRANSIENT_ERRORS = (UnreachableError, CapacityError, ReplyTimeoutError)
 """What connecting to a worker that is being restarted ends in."""
+
+LOST_ERRORS = (ConnectionLostError, SessionElsewhereError)
+"""After these a session is connected to anew: its worker is gone, or has lost it to another one."""
 
 MAX_RECONNECTS = 10_000
 

@@ -25,6 +25,7 @@
         │   ├── EpisodeOverError           the episode has ended; reset starts another
         │   └── ControllerTakenError       another client drives this session
         ├── CapacityError              the worker is full; has .retry_after (429, 503, 507)
+        │   └── SessionElsewhereError      another worker has the session
         ├── SessionClosedError         the session is over                (410)
         └── WorkerFailedError          a fault of the worker              (500, 502, 504)
 """
@@ -213,6 +214,10 @@ class CapacityError(StatusError):
     """The worker has no room for this now."""
 
 
+class SessionElsewhereError(CapacityError):
+    """Another worker has the session; whoever drives is connected to it again by itself."""
+
+
 class SessionClosedError(StatusError):
     """The session is over."""
 
@@ -241,6 +246,7 @@ _BY_CODE: dict[str, type[StatusError]] = {
     "STORAGE_UNAVAILABLE": CapacityError,
     "DRAINING": CapacityError,
     "SESSION_CLOSED": SessionClosedError,
+    "SESSION_ELSEWHERE": SessionElsewhereError,
 }
 
 _BY_STATUS: dict[int, type[StatusError]] = {

@@ -64,6 +64,7 @@ class ErrorCode(StrEnum):
     CONTROLLER_TAKEN = "CONTROLLER_TAKEN"
     NOT_CONTROLLER = "NOT_CONTROLLER"
     SESSION_CLOSED = "SESSION_CLOSED"
+    SESSION_ELSEWHERE = "SESSION_ELSEWHERE"
     TIMEOUT = "TIMEOUT"
     INTERNAL = "INTERNAL"
 
@@ -121,6 +122,7 @@ HTTP_STATUS: dict[ErrorCode, int] = {
     ErrorCode.CONTROLLER_TAKEN: 409,
     ErrorCode.NOT_CONTROLLER: 403,
     ErrorCode.SESSION_CLOSED: 410,
+    ErrorCode.SESSION_ELSEWHERE: 503,
     ErrorCode.TIMEOUT: 504,
     ErrorCode.INTERNAL: 500,
 }
@@ -139,6 +141,7 @@ RETRYABLE = frozenset(
         ErrorCode.TOO_MANY_CONNECTIONS,
         ErrorCode.STORAGE_FULL,
         ErrorCode.STORAGE_UNAVAILABLE,
+        ErrorCode.SESSION_ELSEWHERE,
     }
 )
 """Codes after which the same request may succeed later, unchanged."""

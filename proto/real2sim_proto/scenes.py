@@ -142,6 +142,26 @@ class ServerInfo(Reply):
     conventions: dict[str, str]
 
 
+class FleetMember(Reply):
+    """A worker of several that share a store, as it last told of itself."""
+
+    worker_id: str
+    alive: bool = Field(description="whether its lease runs; if not, others may have its sessions")
+    ready: bool = False
+    draining: bool = False
+    version: str = ""
+    backend: str = ""
+    sessions: int = Field(default=0, description="open in its memory")
+    max_sessions: int = 0
+    scenes: list[str] = Field(default_factory=list, description="in its memory")
+
+
+class Fleet(Reply):
+    """Answer of `GET /v1/fleet`: the workers that share the store, by name."""
+
+    workers: list[FleetMember]
+
+
 class Readiness(Reply):
     """Answer of `GET /readyz`; status 503 while `ready` is false."""
 

@@ -61,6 +61,7 @@ MODELS: dict[str, type[BaseModel]] = {
         drive_batch.BatchResult,
         errors.Problem,
         scenes.ServerInfo,
+        scenes.Fleet,
         scenes.Readiness,
         scenes.SceneInfo,
         scenes.SceneList,

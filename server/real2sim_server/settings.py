@@ -36,6 +36,8 @@ class Settings(BaseSettings):
         assets_dir: folder of asset bundles.
         jobs_dir: folder of the files that jobs leave.
         store_url: SQLAlchemy URL of scenarios and sessions.
+        lease_seconds: for which a worker promises others on its store to be alive, again and again;
+            once it does not, they may take its sessions over.
         store_timeout_seconds: after which a database that does not answer is in trouble.
         durability: what is on the disk before it is acknowledged: ``all``; ``edits``, which is all
             but the steps of sessions; or ``process``, nothing. The rest is safe when the process
@@ -94,6 +96,7 @@ class Settings(BaseSettings):
     assets_dir: Path | None = None
     jobs_dir: Path | None = None
     store_url: str | None = None
+    lease_seconds: float = Field(default=3.0, ge=0.2, le=600)
     store_timeout_seconds: float = Field(default=5.0, ge=0.1, le=600)
     store_max_bytes: int = Field(default=8 * GIB, ge=MIB)
     session_retention_days: float = Field(default=30.0, gt=0, le=36_500)

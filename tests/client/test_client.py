@@ -65,6 +65,7 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         (409, "SCENE_IN_USE", real2sim.ConflictError),
         (409, "CONTROLLER_TAKEN", real2sim.ControllerTakenError),
         (410, "SESSION_CLOSED", real2sim.SessionClosedError),
+        (503, "SESSION_ELSEWHERE", real2sim.SessionElsewhereError),
         (412, "STALE_REVISION", real2sim.StaleRevisionError),
         (413, "PAYLOAD_TOO_LARGE", real2sim.InvalidRequestError),
         (422, "INVALID_OPERATION", real2sim.InvalidOperationError),

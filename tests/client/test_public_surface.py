@@ -50,6 +50,7 @@ PUBLIC = [
     "ReplyTimeoutError",
     "SensorSpec",
     "SessionClosedError",
+    "SessionElsewhereError",
     "StaleRevisionError",
     "StaleStepError",
     "StatusError",

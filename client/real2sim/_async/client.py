@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 from real2sim_proto import PROTOCOL_VERSION
 from real2sim_proto.drive_batch import MAX_WORLDS
-from real2sim_proto.scenes import Readiness, ServerInfo
+from real2sim_proto.scenes import Fleet, Readiness, ServerInfo
 
 from .. import _requests
 from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
@@ -109,6 +109,15 @@ class AsyncClient:
             ('cpu', 'wxyz, unit length')
         """
         return _same_protocol(await self._transport.send(_requests.server_info()))
+
+    async def fleet(self) -> Fleet:
+        """The workers that share the worker's store, with what each last told of itself.
+
+        Examples:
+            >>> [(w.worker_id, w.alive) for w in (await client.fleet()).workers]
+            [('w0', True)]
+        """
+        return await self._transport.send(_requests.fleet())
 
     async def readiness(self) -> Readiness:
         """Whether the worker takes new sessions now, and if not, why.

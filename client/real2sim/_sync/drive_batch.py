@@ -19,9 +19,9 @@ from .._batch_protocol import BatchProtocol
 from .._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from .._protocol import PendingRequest, error_of
 from .._sensors import ResetOptions, Sensor, reset_spec
-from .._session_state import SessionPlan, not_open
+from .._session_state import LOST_ERRORS, SessionPlan, not_open
 from ..batch_observation import BatchObservation, batch_observation_from_wire
-from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError
+from ..errors import Real2SimError, ReplyTimeoutError
 from .concurrency import Socket, connect_socket, receive
 from .reconnecting import reconnect
 from .transport import Transport
@@ -201,7 +201,7 @@ class DriveBatch:
         have moved already answer a repeated action once more."""
         try:
             return self._exchange(request)
-        except ConnectionLostError:
+        except LOST_ERRORS:
             if self._plan.reconnect <= 0:
                 raise
             reconnect(self._close_socket, self._connect, seconds=self._plan.reconnect)

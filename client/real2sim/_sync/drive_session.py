@@ -32,8 +32,8 @@ from .._sensors import (
     reset_spec,
     sensor_specs,
 )
-from .._session_state import SessionBase, SessionPlan, not_open
-from ..errors import ConnectionLostError, Real2SimError, ReplyTimeoutError, StatusError
+from .._session_state import LOST_ERRORS, SessionBase, SessionPlan, not_open
+from ..errors import Real2SimError, ReplyTimeoutError, StatusError
 from ..images import write_atomically
 from ..observation import Observation, View, observation_from_wire, view_from_frames
 from .concurrency import Socket, connect_socket, receive, run_blocking
@@ -323,7 +323,7 @@ class DriveSession(SessionBase):
         """The answer to a request, over a new connection where the old one is lost."""
         try:
             return self._exchange(request)
-        except ConnectionLostError:
+        except LOST_ERRORS:
             if not self._may_resend(request):
                 raise
             connect = partial(self._connect, self.session_id)

@@ -10,7 +10,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
-from typing import Annotated
+from typing import Annotated, Any
 
 import structlog
 from fastapi import Depends, Response
@@ -38,12 +38,14 @@ from .library.memory import MemoryBudget
 from .library.quotas import Quota
 from .library.scene_cache import SceneCache
 from .library.scene_catalog import SceneCatalog
+from .membership import Membership
 from .rendering.renderer import Renderer
 from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .sessions.segment import Segments
 from .storage.job_log import JobLog
+from .storage.leases import Leases
 from .storage.ownership import owned_folder
 from .storage.store import Store
 from .storage.tokens import worker_key
@@ -81,6 +83,7 @@ class Worker:
     calibrations: Calibrations
     drives: Drives
     idempotency: Idempotency
+    leases: Leases
     kernels: KernelWarmUp
     renderer: Renderer
     sessions: Sessions
@@ -126,6 +129,7 @@ class Worker:
         )
         assets = AssetLibrary(settings.assets_path, budget)
         scenarios = Scenarios(store, scene_cache, metrics, assets=assets.find)
+        leases = Leases(store, settings.worker_id, seconds=settings.lease_seconds)
         job_log = JobLog(store, settings.worker_id)
         jobs = Jobs(job_log, _jobs_quota(settings), on_end=metrics.observe_ended_job)
         kernels = KernelWarmUp()
@@ -152,6 +156,7 @@ class Worker:
             scenarios=scenarios,
             metrics=metrics,
             segments=Segments(budget, settings.shared_memory_bytes),
+            leases=leases,
             accounts=accounts,
         )
         worker = cls(
@@ -168,6 +173,7 @@ class Worker:
             simulations=Simulations(jobs, scenarios, scene_cache),
             calibrations=Calibrations(jobs, scenarios, scene_cache),
             idempotency=Idempotency(store),
+            leases=leases,
             kernels=kernels,
             renderer=renderer,
             sessions=sessions,
@@ -209,6 +215,7 @@ class Worker:
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.connections.watch()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.accounts.watch()))
             await at_exit.enter_async_context(self.sessions.running())
+            await at_exit.enter_async_context(self._membership().running())
             await at_exit.enter_async_context(self.jobs.running())
             at_exit.push_async_callback(_cancel, asyncio.create_task(upkeep.run()))
             at_exit.callback(self.drain)
@@ -284,6 +291,26 @@ class Worker:
     def drain(self) -> None:
         """Show that the worker is on its way out, and begin no sessions; open ones go on."""
         self.draining = self.sessions.draining = True
+
+    def _membership(self) -> Membership:
+        return Membership(
+            self.leases,
+            self.sessions,
+            seconds=self.settings.lease_seconds,
+            document=self._about,
+        )
+
+    def _about(self) -> dict[str, Any]:
+        """What the fleet is told about this worker."""
+        return {
+            "version": version("real2sim"),
+            "backend": self.backend.name,
+            "ready": self.readiness().ready,
+            "draining": self.draining,
+            "sessions": len(self.sessions),
+            "max_sessions": self.settings.max_sessions,
+            "scenes": self.scene_cache.resident_names,
+        }
 
     async def _warm_up(self) -> None:
         started = time.perf_counter()

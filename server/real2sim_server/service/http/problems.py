@@ -32,6 +32,7 @@ from ...world.recording.recording import RecordingError
 from ..accounts import Limit, OverLimitError, RevokedError, seconds_to_wait
 from ..engine import DeviceLostError, EngineStoppedError, QueueFullError
 from ..storage.errors import (
+    FencedError,
     StoreFullError,
     StoreReadOnlyError,
     StoreUnavailableError,
@@ -93,6 +94,7 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (StoreReadOnlyError, ErrorCode.STORAGE_UNAVAILABLE, _AGAIN),
     (StoreUnavailableError, ErrorCode.STORAGE_UNAVAILABLE, _AGAIN),
     (EngineStoppedError, ErrorCode.DRAINING, None),
+    (FencedError, ErrorCode.SESSION_ELSEWHERE, "connect again by the address that made it"),
     (RevokedError, ErrorCode.UNAUTHORIZED, "ask the operator for another token"),
     (TimeOutOfRangeError, ErrorCode.TIME_OUT_OF_RANGE, None),
     (UnknownObjectError, ErrorCode.UNKNOWN_OBJECT, None),

@@ -147,6 +147,11 @@ class SceneCache:
         return {state: partial(count, state) for state in SceneState}
 
     @property
+    def resident_names(self) -> list[str]:
+        """Scenes in memory."""
+        return sorted(self._resident)
+
+    @property
     def resident_bytes(self) -> int:
         """Memory of all resident scenes."""
         return sum(r.scene.nbytes for r in list(self._resident.values()))

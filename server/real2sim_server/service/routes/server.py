@@ -12,7 +12,7 @@ from real2sim_proto.base import Codec, Modality
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from real2sim_proto.episode import MAX_SENSORS
 from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
-from real2sim_proto.scenes import Limits, ServerInfo
+from real2sim_proto.scenes import Fleet, FleetMember, Limits, ServerInfo
 from real2sim_proto.sessions import MAX_STEPS_PER_REQUEST
 from real2sim_proto.version import SUPPORTED_SUBPROTOCOLS
 
@@ -41,6 +41,16 @@ async def describe(worker: WorkerOf) -> ServerInfo:
         radar_models=list(RADARS),
         conventions=CONVENTIONS,
     )
+
+
+@router.get("/fleet")
+async def fleet(worker: WorkerOf) -> Fleet:
+    """The workers that share this one's store, with what each last told of itself."""
+    members = [
+        FleetMember.model_validate({**row.document, "worker_id": row.worker_id, "alive": row.alive})
+        for row in await worker.leases.workers()
+    ]
+    return Fleet(workers=members)
 
 
 def limits_of(settings: Settings) -> Limits:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..._records import made_quickly
-from ..storage.store import SessionEntry, Store
+from ..storage.store import Claim, SessionEntry, Store
 
 
 @made_quickly
@@ -16,21 +16,21 @@ class LogWrite:
 
     Attributes:
         store: takes them.
-        session_id: of the session.
+        claim: on the session.
         entries: of its log.
         instead: whether they take the place of what may be on record from there on.
     """
 
     store: Store
-    session_id: str
+    claim: Claim
     entries: Sequence[SessionEntry]
     instead: bool
 
     def __call__(self) -> None:
         """Raises as :meth:`Store.record` does."""
-        self.store.record(self.session_id, self.entries, instead=self.instead)
+        self.store.record(self.claim, self.entries, instead=self.instead)
 
 
 def write_together(writes: Sequence[LogWrite]) -> None:
     """Write the entries of several sessions to their store: all, or none of them."""
-    writes[0].store.record_together([(write.session_id, write.entries) for write in writes])
+    writes[0].store.record_together([(write.claim, write.entries) for write in writes])

@@ -31,6 +31,7 @@ from ..http.metrics import Metrics
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..scenarios.scenarios import Scenarios
+from ..storage.leases import Leases
 from ..storage.store import SessionEntry, SessionRow, Store, now_us
 from ..storage.tokens import token_hash
 from ..warm_up import KernelWarmUp
@@ -79,6 +80,7 @@ class Sessions:
         scenarios: what they may begin from.
         metrics: gets their number.
         segments: in which controllers on this machine get their images.
+        leases: by which workers on one store tell which of them has which session.
         accounts: of those who make them, each with a limit of its own.
 
     Attributes:
@@ -96,16 +98,18 @@ class Sessions:
         scenarios: Scenarios,
         metrics: Metrics,
         segments: Segments,
+        leases: Leases,
         accounts: Accounts | None = None,
     ) -> None:
         self.pipeline = pipeline
         self.segments = segments
-        self.stepper = Stepper(pipeline, kernels, store)
+        self.stepper = Stepper(pipeline, kernels, store, on_fenced=self.let_go)
         self.metrics = metrics
         self.draining = False
         self.resume_key = secrets.token_bytes()
         self._limits = limits
         self._store = store
+        self._leases = leases
         self._scene_cache = scene_cache
         self._scenarios = scenarios
         self._open: dict[str, Session] = {}
@@ -197,11 +201,12 @@ class Sessions:
         return info
 
     async def find(self, session_id: str) -> Session:
-        """The open session of that id; one that an earlier run left open is rebuilt first.
+        """The open session of that id; one that an earlier run left open, or a worker that is no
+        more, is rebuilt first.
 
         Raises:
-            ServiceError: SESSION_CLOSED when it is over, UNKNOWN_SESSION, or what is in the way
-                of rebuilding it.
+            ServiceError: SESSION_CLOSED when it is over, UNKNOWN_SESSION, SESSION_ELSEWHERE while
+                another worker has it, or what is in the way of rebuilding it.
         """
         if (session := self._open.get(session_id)) is not None:
             if session.log_unsure:
@@ -211,7 +216,7 @@ class Sessions:
         return await self._rebuilt(check_not_closed(await self.row(session_id)))
 
     async def row(self, session_id: str) -> SessionRow:
-        """The row of a session, open or closed, without rebuilding it.
+        """The row of a session, open or closed, whoever has it, without rebuilding it.
 
         Raises:
             ServiceError: UNKNOWN_SESSION.
@@ -220,7 +225,7 @@ class Sessions:
             return session.row
         # What no id of ours looks like need not be asked of a database, which may choke on it.
         row = await self._store.session(session_id) if _ID.fullmatch(session_id) else None
-        if row is None or row.worker_id != self._limits.worker_id:
+        if row is None:
             hint = "GET /v1/sessions lists them"
             raise ServiceError(ErrorCode.UNKNOWN_SESSION, f"no session {session_id!r}", hint=hint)
         return row
@@ -354,19 +359,33 @@ class Sessions:
         session.closed = _closed(session.session_id, reason)
         async with session.lock:
             try:
-                await self._store.close_session(session.session_id, reason=reason)
+                await self._store.close_session(session.row.claim, reason=reason)
             except BaseException:
                 # It is not over as long as the store does not say so.
                 session.closed = None
                 self._open[session.session_id] = session
                 raise
             self._scene_cache.unpin(session.row.scene)
-        for close in session.close_callbacks:
-            # Not awaited: clients may be slow to read.
-            closing = asyncio.ensure_future(close(session.closed))
-            self._closing.add(closing)
-            closing.add_done_callback(self._closing.discard)
+        self._tell(session, session.closed)
         log.info("session closed", session_id=session.session_id, reason=reason)
+
+    def let_go(self, session: Session) -> None:
+        """Leave a session that another worker has taken over; its connections are told to come
+        back to that one. A second time changes nothing."""
+        if self._open.get(session.session_id) is not session:
+            return
+        del self._open[session.session_id]
+        session.closed = elsewhere(session.session_id)
+        self._scene_cache.unpin(session.row.scene)
+        self._tell(session, session.closed)
+        log.warning("session taken over by another worker", session_id=session.session_id)
+
+    async def let_go_of_lost(self) -> None:
+        """Leave all sessions that were taken over: this worker was thought dead."""
+        epochs = await self._leases.epochs(list(self._open))
+        for session in self:
+            if epochs.get(session.session_id) != session.row.epoch:
+                self.let_go(session)
 
     def evict(self, session: Session) -> None:
         """Free the memory of a session without connections; :meth:`find` rebuilds it."""
@@ -431,6 +450,10 @@ class Sessions:
 
     async def _rebuild(self, row: SessionRow) -> Session:
         with self._reserved_slot(row.owner):
+            taken = await self._leases.take_over(row.session_id)
+            if taken is None:
+                raise elsewhere(row.session_id)
+            row = taken
             pinned = await self._scene_cache.pin(row.scene)
             try:
                 summary = await self._scene_cache.summary(row.scene)
@@ -448,6 +471,13 @@ class Sessions:
             self._open[row.session_id] = session
         log.info("session rebuilt", session_id=row.session_id, entries=session.next_seq)
         return session
+
+    def _tell(self, session: Session, error: ServiceError) -> None:
+        """End a session's connections; not awaited, for clients may be slow to read."""
+        for close in session.close_callbacks:
+            closing = asyncio.ensure_future(close(error))
+            self._closing.add(closing)
+            closing.add_done_callback(self._closing.discard)
 
     def _session(self, row: SessionRow, start: EpisodeStart) -> Session:
         return Session(row, start, resume_token=self.resume_token(row))
@@ -506,6 +536,17 @@ def check_not_closed(row: SessionRow) -> SessionRow:
     if row.closed_us is not None:
         raise _closed(row.session_id, row.reason or "closed")
     return row
+
+
+def elsewhere(session_id: str) -> ServiceError:
+    """SESSION_ELSEWHERE."""
+    return ServiceError(
+        ErrorCode.SESSION_ELSEWHERE,
+        f"session {session_id!r} is another worker's",
+        hint="send it again after Retry-After seconds by the address that made the session: the "
+        "worker that has it answers there, or this one takes it over once that is gone",
+        headers={"Retry-After": "1"},
+    )
 
 
 def _closed(session_id: str, reason: str) -> ServiceError:

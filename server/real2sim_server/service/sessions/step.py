@@ -31,7 +31,7 @@ from ...world.recording.replay import (
 )
 from ..accounts import Account
 from ..http.problems import ServiceError
-from ..storage.errors import StoreTroubleError, StoreUnavailableError
+from ..storage.errors import FencedError, StoreTroubleError, StoreUnavailableError
 from ..storage.store import SessionEntry, Store, StoredReply, now_us
 from ..warm_up import KernelWarmUp
 from .log_write import LogWrite
@@ -89,12 +89,21 @@ class Stepper:
         pipeline: makes observations of changed worlds.
         kernels: what episodes wait for before they begin.
         store: takes the logs of the sessions.
+        on_fenced: told of a session that turns out to be another worker's.
     """
 
-    def __init__(self, pipeline: StepPipeline, kernels: KernelWarmUp, store: Store) -> None:
+    def __init__(
+        self,
+        pipeline: StepPipeline,
+        kernels: KernelWarmUp,
+        store: Store,
+        *,
+        on_fenced: Callable[[Session], object] = lambda _: None,
+    ) -> None:
         self._pipeline = pipeline
         self._kernels = kernels
         self._store = store
+        self._on_fenced = on_fenced
 
     async def reset(
         self, session: Session, spec: ResetSpec, *, slot: FrameSlot | None = None
@@ -255,13 +264,15 @@ class Stepper:
         session = action.session
         change, entry = _movement(action)
         entries = _entries(session, [("action", session.running_world().steps, entry)])
-        write = LogWrite(self._store, session.session_id, entries, session.log_unsure)
+        write = LogWrite(self._store, session.row.claim, entries, session.log_unsure)
         return Transition(change, cameras, record=write)
 
     async def _failed(self, action: DueAction, transition: Transition, error: Exception) -> None:
         """A step that has not taken effect leaves nothing on record."""
         if isinstance(error, StoreUnavailableError):
             action.session.log_unsure = True
+        elif isinstance(error, FencedError):
+            self._on_fenced(action.session)
         elif transition.recorded:
             await self._withdraw(action.session)
 
@@ -430,7 +441,7 @@ class Stepper:
     ) -> tuple[EncodedObservation, bool]:
         """The observation of a change, and whether it is written to the socket already."""
         entries = _entries(session, [record])
-        store = LogWrite(self._store, session.session_id, entries, session.log_unsure)
+        store = LogWrite(self._store, session.row.claim, entries, session.log_unsure)
         transition = Transition(
             change, cameras, clouds=clouds, record=store, write=write, slot=slot, scene=scene
         )
@@ -438,6 +449,9 @@ class Stepper:
             observation = await self._pipeline.run(transition)
         except StoreUnavailableError:
             session.log_unsure = True
+            raise
+        except FencedError:
+            self._on_fenced(session)
             raise
         except Exception:
             if transition.recorded:
@@ -449,15 +463,17 @@ class Stepper:
     async def _withdraw(self, session: Session) -> None:
         """Take back what has been recorded ahead; by the next entry where the store is not well."""
         try:
-            await self._store.withdraw(session.session_id, from_seq=session.next_seq)
+            await self._store.withdraw(session.row.claim, from_seq=session.next_seq)
         except StoreTroubleError:
             session.log_unsure = True
+        except FencedError:
+            self._on_fenced(session)
 
     async def settle(self, session: Session) -> None:
         """Take back what may be on record of changes that never took effect, answers included."""
         if session.log_unsure:
             keys, seq = session.unsure_replies, session.next_seq
-            await self._store.withdraw(session.session_id, from_seq=seq, replies=keys)
+            await self._store.withdraw(session.row.claim, from_seq=seq, replies=keys)
             session.log_unsure, session.unsure_replies = False, ()
 
     async def _record(
@@ -470,12 +486,15 @@ class Stepper:
         entries = _entries(session, records)
         try:
             await self._store.append_session_entries(
-                session.session_id, entries, instead=session.log_unsure, reply=reply
+                session.row.claim, entries, instead=session.log_unsure, reply=reply
             )
         except StoreUnavailableError:
             session.log_unsure = True
             if reply is not None:
                 session.unsure_replies += (reply.key,)
+            raise
+        except FencedError:
+            self._on_fenced(session)
             raise
         session.next_seq, session.log_unsure = session.next_seq + len(entries), False
 

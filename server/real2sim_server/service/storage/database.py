@@ -23,6 +23,7 @@ import structlog
 from . import tables as t
 from .connection import connect, file_of, shown_url
 from .errors import (
+    FencedError,
     StoreBusyError,
     StoreError,
     StoreFullError,
@@ -63,16 +64,25 @@ class Write:
     Attributes:
         statement: as text it goes to the driver as it is, with tuples as rows.
         rows: that it is made with, once for each.
+        fenced: how many rows it must change; fewer mean that their sessions were taken over, and
+            nothing of the transaction is kept. None where it may be any number.
     """
 
     statement: sa.Executable | str
     rows: list[dict[str, Any]] | list[tuple[Any, ...]] | None = None
+    fenced: int | None = None
 
     def made_by(self, connection: sa.Connection) -> sa.CursorResult[Any]:
         """What comes of it."""
         if isinstance(self.statement, str):
             return connection.exec_driver_sql(self.statement, cast("Any", self.rows))
         return connection.execute(self.statement, cast("Any", self.rows))
+
+    def checked(self, changed: int) -> int:
+        """The rows that it changed. Raises FencedError."""
+        if self.fenced is not None and changed != self.fenced:
+            raise FencedError("another worker has taken the session over")
+        return changed
 
 
 class Database:
@@ -139,6 +149,11 @@ class Database:
         return self._trouble
 
     @property
+    def is_server(self) -> bool:
+        """Whether it is a server, which has a clock of its own and many writers."""
+        return self._connected().dialect.name == "postgresql"
+
+    @property
     def is_file(self) -> bool:
         """Whether it is a file of SQLite's."""
         return self._file is not None
@@ -176,6 +191,7 @@ class Database:
 
         Raises:
             ConflictError: a row that must be new exists.
+            FencedError: a session was taken over.
         """
         self._refuse_while_down()
         return await self.on_thread(partial(self.execute, changes))
@@ -280,7 +296,7 @@ class Database:
         if self._file is not None and len(changes) == 1 and isinstance(changes[0].statement, str):
             return [self._executed_by_driver(changes[0], durable=durable)]
         with self._transaction(durable=durable) as connection:
-            return [c.made_by(connection).rowcount for c in changes]
+            return [c.checked(c.made_by(connection).rowcount) for c in changes]
 
     def _executed_by_driver(self, change: Write, *, durable: bool) -> int:
         """The same of one statement as text, for a file: SQLAlchemy would take longer to hand it
@@ -291,8 +307,10 @@ class Database:
             # The driver begins a transaction by itself; it is rolled back where one row fails.
             with connection:
                 if len(rows) == 1:
-                    return connection.execute(statement, cast("Any", rows[0])).rowcount
-                return connection.executemany(statement, cast("Any", rows)).rowcount
+                    cursor = connection.execute(statement, cast("Any", rows[0]))
+                else:
+                    cursor = connection.executemany(statement, cast("Any", rows))
+                return change.checked(cursor.rowcount)
 
     @contextlib.contextmanager
     def _transaction(self, *, durable: bool) -> Iterator[sa.Connection]:
@@ -316,7 +334,8 @@ class Database:
         try:
             yield self._writer
         except Exception as error:
-            is_refused = isinstance(error, sa.exc.IntegrityError | sqlite3.IntegrityError)
+            refusals = sa.exc.IntegrityError | sqlite3.IntegrityError | FencedError
+            is_refused = isinstance(error, refusals)
             if not is_refused and not self._found_full(error):
                 self._drop_writer()
             raise

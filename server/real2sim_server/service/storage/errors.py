@@ -35,6 +35,10 @@ class ConflictError(StoreError):
     """A row that must be new exists already: another writer was first."""
 
 
+class FencedError(StoreError):
+    """The session belongs to another worker by now: nothing was written."""
+
+
 class StoreTroubleError(StoreError):
     """The store cannot do it just now, and whether it was done is open; send it again later.
 

@@ -63,9 +63,19 @@ def _add_owners(connection: Connection) -> None:
     )
 
 
+def _add_leases(connection: Connection) -> None:
+    """Workers say that they live, and sessions may go from one to another."""
+    connection.exec_driver_sql("ALTER TABLE sessions ADD COLUMN epoch INTEGER DEFAULT 0 NOT NULL")
+    connection.exec_driver_sql(
+        "CREATE TABLE workers (worker_id VARCHAR(16) NOT NULL PRIMARY KEY, "
+        "lease_until_us BIGINT NOT NULL, document TEXT NOT NULL)"
+    )
+
+
 MIGRATIONS: tuple[Migration, ...] = (
     Migration(2, "tokens of sessions are kept as hashes", _hash_tokens),
     Migration(3, "sessions keep the name of the token they were made with", _add_owners),
+    Migration(4, "sessions may go from one worker to another", _add_leases),
 )
 
 OLDEST = MIGRATIONS[0].version - 1

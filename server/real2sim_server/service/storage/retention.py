@@ -14,7 +14,7 @@ import sqlalchemy as sa
 import structlog
 
 from . import tables as t
-from .store import Store, Write, now_us
+from .store import Claim, Store, Write, now_us
 
 DAY_US = 86_400 * 1_000_000
 PIECE_ROWS = 1000
@@ -98,11 +98,12 @@ class Retention:
         )
         mine = (s.c.worker_id == self._worker_id) & s.c.closed_us.is_(None)
         unused = sa.func.coalesce(newest, s.c.created_us) < cutoff_us
-        query = sa.select(s.c.session_id).where(mine & (s.c.created_us < cutoff_us) & unused)
+        query = sa.select(s.c.session_id, s.c.epoch)
+        query = query.where(mine & (s.c.created_us < cutoff_us) & unused)
         for row in await self._store.read(query):
             if row["session_id"] not in in_use:
                 reason = f"nobody has used it for {self._limits.session_days:g} days"
-                await self._store.close_session(row["session_id"], reason=reason)
+                await self._store.close_session(Claim(**row), reason=reason)
 
     async def _ended(self, *, before_us: int | None = None) -> Sequence[str]:
         """Some ended sessions, those that ended first."""

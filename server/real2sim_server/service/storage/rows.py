@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ..._records import made_quickly
 
@@ -35,15 +36,30 @@ class SnapshotRow:
     state: bytes
 
 
+class Claim(NamedTuple):
+    """A worker's right to write the log of a session.
+
+    Attributes:
+        session_id: of the session.
+        epoch: raised whenever a worker takes the session over; of several claims the one with the
+            highest counts.
+    """
+
+    session_id: str
+    epoch: int
+
+
 @dataclass(frozen=True)
 class SessionRow:
     """A session as created.
 
     Attributes:
+        worker_id: who has it now.
         scenario_id, scenario_revision: what it began from; None for the bare scene.
         token_hash: of the token that opens it, as :func:`~.tokens.token_hash` makes it.
         closed_us, reason: None while it is open.
         owner: name of the token that it was made with.
+        epoch: how often it was taken over.
     """
 
     session_id: str
@@ -57,6 +73,12 @@ class SessionRow:
     closed_us: int | None = None
     reason: str | None = None
     owner: str = "default"
+    epoch: int = 0
+
+    @property
+    def claim(self) -> Claim:
+        """The right of ``worker_id`` to write its log."""
+        return Claim(self.session_id, self.epoch)
 
 
 @made_quickly

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
-from itertools import chain
 from typing import Any
 
 import sqlalchemy as sa
@@ -14,11 +13,14 @@ import sqlalchemy as sa
 from . import tables as t
 from .clock import now_us
 from .database import TIMEOUT_S, Database, Durability, OnCall, Write
-from .errors import ConflictError, StoreError, StoreTroubleError
-from .rows import ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
+from .errors import ConflictError, FencedError, StoreError, StoreTroubleError
+from .rows import Claim, ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
+from .session_log import ClaimedEntries, appended, withdrawn
 
 __all__ = [
+    "Claim",
     "ConflictError",
+    "FencedError",
     "ScenarioRow",
     "SessionEntry",
     "SessionRow",
@@ -248,15 +250,18 @@ class Store:
         )
         return [SessionRow(**row) for row in rows]
 
-    async def close_session(self, session_id: str, *, reason: str) -> None:
-        """Note that a session is over; a second time changes nothing."""
-        still_open = (t.sessions.c.session_id == session_id) & t.sessions.c.closed_us.is_(None)
+    async def close_session(self, claim: Claim, *, reason: str) -> None:
+        """Note that a session is over; a second time changes nothing, nor does it once another
+        worker has the session."""
+        s = t.sessions.c
+        still_open = (s.session_id == claim.session_id) & s.closed_us.is_(None)
+        mine = still_open & (s.epoch == claim.epoch)
         values = {"closed_us": now_us(), "reason": reason}
-        await self.database.write(Write(sa.update(t.sessions).where(still_open).values(values)))
+        await self.database.write(Write(sa.update(t.sessions).where(mine).values(values)))
 
     async def append_session_entries(
         self,
-        session_id: str,
+        claim: Claim,
         entries: Sequence[SessionEntry],
         *,
         instead: bool = False,
@@ -265,21 +270,22 @@ class Store:
         """Append to a session's log, and the answer to the request for it, all or nothing.
 
         Args:
-            session_id: of the session.
+            claim: on the session.
             entries: with their places in its log.
             instead: of anything that is there already from the first of those places on.
             reply: stored for a repeated request.
 
         Raises:
-            ConflictError: a ``seq`` is taken, or the session does not exist.
+            ConflictError: a ``seq`` is taken.
+            FencedError: another worker has the session, or it does not exist.
         """
         await self.database.on_thread(
-            partial(self.record, session_id, entries, instead=instead, reply=reply)
+            partial(self.record, claim, entries, instead=instead, reply=reply)
         )
 
     def record(
         self,
-        session_id: str,
+        claim: Claim,
         entries: Sequence[SessionEntry],
         *,
         instead: bool = False,
@@ -288,38 +294,34 @@ class Store:
         """Like :meth:`append_session_entries`, on the calling thread; never on the event loop."""
         if not entries:
             return
-        changes = [self._append([(session_id, entries)]), *_reply_writes(reply)]
+        changes = [*self._append([(claim, entries)]), *_reply_writes(reply)]
         if instead:
-            changes.insert(0, _log_end(session_id, entries[0].seq))
+            changes = [*withdrawn(claim, entries[0].seq), *changes]
         # A stored answer is a promise beyond the session.
         self.database.execute(changes, promised=reply is not None)
 
-    def record_together(self, logs: Sequence[tuple[str, Sequence[SessionEntry]]]) -> None:
+    def record_together(self, logs: Sequence[ClaimedEntries]) -> None:
         """Entries of several sessions by :meth:`record` in one transaction: all, or none of them.
 
         Args:
-            logs: ids of sessions, and what their logs get.
+            logs: claims on sessions, and what their logs get.
         """
         if any(entries for _, entries in logs):
-            self.database.execute([self._append(logs)], promised=False)
+            self.database.execute(self._append(logs), promised=False)
 
-    def _append(self, logs: Sequence[tuple[str, Sequence[SessionEntry]]]) -> Write:
-        if self.database.is_file:
-            values = [(session, *vars(entry).values()) for session, log in logs for entry in log]
-            if len(values) > MOST_ROWS:
-                return Write(_append_of(1), values)
-            return Write(_append_of(len(values)), [tuple(chain.from_iterable(values))])
-        rows = [{"session_id": session} | vars(entry) for session, log in logs for entry in log]
-        return _insert_rows(t.session_log, *rows)
+    def _append(self, logs: Sequence[ClaimedEntries]) -> list[Write]:
+        return appended(logs, on_server=self.database.is_server)
 
-    async def withdraw(
-        self, session_id: str, *, from_seq: int, replies: Sequence[str] = ()
-    ) -> None:
+    async def withdraw(self, claim: Claim, *, from_seq: int, replies: Sequence[str] = ()) -> None:
         """Remove the end of a session's log, and answers by their keys: what was recorded ahead and
-        never took effect."""
+        never took effect.
+
+        Raises:
+            FencedError: another worker has the session.
+        """
         told = t.idempotent_replies.c.key.in_(replies)
         forgotten = [Write(sa.delete(t.idempotent_replies).where(told))] if replies else []
-        await self.database.write(_log_end(session_id, from_seq), *forgotten)
+        await self.database.write(*withdrawn(claim, from_seq), *forgotten)
 
     async def session_entries(self, session_id: str, *, after: int = -1) -> list[SessionEntry]:
         """The log of a session behind ``after``, oldest first."""
@@ -382,12 +384,6 @@ def _delete_old_replies() -> sa.Delete:
     return sa.delete(table).where(table.c.created_us <= now_us() - REPLY_LIFETIME_US)
 
 
-def _log_end(session_id: str, from_seq: int) -> Write:
-    log = t.session_log
-    end = (log.c.session_id == session_id) & (log.c.seq >= from_seq)
-    return Write(sa.delete(log).where(end))
-
-
 def _snapshot_of(scenario_id: str) -> sa.ColumnElement[bool]:
     return t.scenario_snapshots.c.scenario_id == scenario_id
 
@@ -406,22 +402,6 @@ def _log_row(
 
 def _insert_rows(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
     return Write(_insert(table), [dict(row) for row in rows])
-
-
-MOST_ROWS = 32
-"""Entries that one statement appends; more of them take turns."""
-
-
-@cache
-def _append_of(rows: int) -> str:
-    """The statement that appends entries, for SQLite, in the order of :class:`SessionEntry`.
-
-    Every step of a session makes one: to have the statement put together by SQLAlchemy takes as
-    long as the append. Of many in one go the driver gives the interpreter up but once, not for
-    every row, and other threads keep it longer than a row takes.
-    """
-    columns = "session_id, seq, kind, step, payload, created_us"
-    return f"INSERT INTO session_log ({columns}) VALUES " + ", ".join(["(?, ?, ?, ?, ?, ?)"] * rows)
 
 
 @cache

@@ -15,7 +15,7 @@ from sqlalchemy import (
     Text,
 )
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Raised with every change of a table, together with an entry in `migrations`."""
 
 metadata = MetaData()
@@ -78,6 +78,8 @@ sessions = Table(
     Column("closed_us", BigInteger, nullable=True),
     Column("reason", Text, nullable=True),
     Column("owner", String(80), nullable=False, server_default="default"),
+    # Raised whenever a worker takes the session over; who wrote under an earlier one may no more.
+    Column("epoch", Integer, nullable=False, server_default="0"),
 )
 Index("ix_sessions_open", sessions.c.worker_id, sessions.c.closed_us)
 
@@ -96,6 +98,15 @@ session_log = Table(
     Column("step", Integer, nullable=True),
     Column("payload", LargeBinary, nullable=False),
     Column("created_us", BigInteger, nullable=False),
+)
+
+# Workers that share the store, and until when each has promised to be alive.
+workers = Table(
+    "workers",
+    metadata,
+    Column("worker_id", String(16), primary_key=True),
+    Column("lease_until_us", BigInteger, nullable=False),
+    Column("document", Text, nullable=False),
 )
 
 jobs = Table(

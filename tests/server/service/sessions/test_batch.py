@@ -10,6 +10,7 @@ import pytest
 from real2sim_proto import DRIVE_SUBPROTOCOL
 from real2sim_proto.drive_batch import BATCH_SERVER_MESSAGE, COMMANDS, EGO_COLUMNS, MAX_WORLDS
 from real2sim_server.service.storage.errors import StoreUnavailableError
+from real2sim_server.service.storage.store import Claim
 
 from .conftest import Planner
 
@@ -357,10 +358,10 @@ def test_a_step_that_is_not_on_record_has_not_happened(site, batch, monkeypatch)
     def fail_together(_logs: Any) -> None:
         raise StoreUnavailableError("no disk")
 
-    def fail_for_one(session_id: str, *args: Any, **options: Any) -> None:
-        if session_id == bad:
+    def fail_for_one(claim: Claim, *args: Any, **options: Any) -> None:
+        if claim.session_id == bad:
             raise StoreUnavailableError("no disk")
-        record(session_id, *args, **options)
+        record(claim, *args, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(store, "record_together", fail_together)

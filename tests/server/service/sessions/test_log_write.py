@@ -17,8 +17,8 @@ class Shelf:
         self.refused = set(refused)
         self.transactions: list[list[str]] = []
 
-    def record(self, session_id: str, entries: Sequence[SessionEntry], *, instead: bool) -> None:
-        self.record_together([(session_id, entries)])
+    def record(self, claim: str, entries: Sequence[SessionEntry], *, instead: bool) -> None:
+        self.record_together([(claim, entries)])
 
     def record_together(self, logs: Sequence[tuple[str, Sequence[SessionEntry]]]) -> None:
         names = [name for name, _ in logs]

@@ -12,6 +12,7 @@ from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_server.service.storage import tables
 from real2sim_server.service.storage.errors import StoreFullError
 from real2sim_server.service.storage.job_log import JobLog
+from real2sim_server.service.storage.session_log import ClaimedEntries
 from real2sim_server.service.storage.store import (
     ConflictError,
     ScenarioRow,
@@ -24,26 +25,11 @@ from real2sim_server.service.storage.store import (
     now_us,
 )
 
-from ..postgres import Postgres
 from .opened_store import run
 
 SCENARIO = ScenarioRow("sc_1", "first", "tiny", "0" * 64, 1)
 SESSION = SessionRow("w0.1", "w0", "tiny", "0" * 64, None, None, "secret", 1)
 REPLY = StoredReply("key", "f" * 64, 201, {"ETag": '"r1"'}, b'{"a": 1}')
-
-
-@pytest.fixture
-def sqlite_url(tmp_path) -> str:
-    return f"sqlite:///{tmp_path / 'deep' / 'store.db'}"
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request, sqlite_url) -> str:
-    """An empty database of each kind; what holds for one holds for the other."""
-    if request.param == "sqlite":
-        return sqlite_url
-    server: Postgres = request.getfixturevalue("postgres")
-    return server.new_database()
 
 
 def entry(text: str) -> dict:
@@ -155,11 +141,11 @@ def test_a_session_log_is_appended_all_or_nothing(url):
 
     async def work(store):
         await store.create_session(SESSION)
-        await store.append_session_entries("w0.1", [first])
+        await store.append_session_entries(SESSION.claim, [first])
         with pytest.raises(ConflictError):
-            await store.append_session_entries("w0.1", [second, first])
+            await store.append_session_entries(SESSION.claim, [second, first])
         kept = await store.session_entries("w0.1")
-        await store.append_session_entries("w0.1", [second])
+        await store.append_session_entries(SESSION.claim, [second])
         return kept, await store.session_entries("w0.1", after=0)
 
     assert run(url, work) == ([first], [second])
@@ -170,8 +156,8 @@ def test_open_sessions_are_those_of_the_worker_that_were_not_closed(url):
         for session_id, worker_id in (("w0.1", "w0"), ("w0.2", "w0"), ("w1.1", "w1")):
             row = replace(SESSION, session_id=session_id, worker_id=worker_id)
             await store.create_session(row)
-        await store.close_session("w0.1", reason="done")
-        await store.close_session("w0.1", reason="again")
+        await store.close_session(SESSION.claim, reason="done")
+        await store.close_session(SESSION.claim, reason="again")
         return await store.open_sessions("w0"), await store.session("w0.1")
 
     still_open, closed = run(url, work)
@@ -191,9 +177,9 @@ def test_a_write_ahead_log_is_used(sqlite_url, tmp_path):
 def test_entries_of_several_sessions_are_stored_together_or_not_at_all(url):
     sessions = [replace(SESSION, session_id=name) for name in ("w0.1", "w0.2")]
 
-    def logs(*seqs: int) -> list[tuple[str, list[SessionEntry]]]:
+    def logs(*seqs: int) -> list[ClaimedEntries]:
         entries = [SessionEntry(seq, "action", seq, b"p", 1) for seq in seqs]
-        return [(s.session_id, [e]) for s, e in zip(sessions, entries, strict=True)]
+        return [(s.claim, [e]) for s, e in zip(sessions, entries, strict=True)]
 
     async def work(store):
         for session in sessions:
@@ -237,9 +223,9 @@ def test_what_is_promised_is_on_the_disk_before_it_is_acknowledged(
         for write in (
             store.create_scenario(SCENARIO),
             store.create_session(SESSION),
-            store.append_session_entries("w0.1", [SessionEntry(0, "action", 0, b"", 1)]),
+            store.append_session_entries(SESSION.claim, [SessionEntry(0, "action", 0, b"", 1)]),
             store.append_session_entries(
-                "w0.1", [SessionEntry(1, "action", 1, b"", 1)], reply=REPLY
+                SESSION.claim, [SessionEntry(1, "action", 1, b"", 1)], reply=REPLY
             ),
         ):
             await write
@@ -258,7 +244,7 @@ def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
     connection.execute("UPDATE schema_version SET version = 99")
     connection.commit()
     connection.close()
-    with pytest.raises(StoreError, match="schema version 99, this worker reads 1 to 3"):
+    with pytest.raises(StoreError, match="schema version 99, this worker reads 1 to 4"):
         run(sqlite_url, nothing)
 
 
@@ -308,7 +294,7 @@ def test_a_store_in_memory_works_too():
 def test_appending_nothing_is_allowed(url):
     async def work(store):
         await store.create_session(SESSION)
-        await store.append_session_entries("w0.1", [])
+        await store.append_session_entries(SESSION.claim, [])
         return await store.session_entries("w0.1")
 
     assert run(url, work) == []

@@ -1,0 +1,152 @@
+"""Several workers on one store: a session goes on where its worker is no more, once and nowhere
+twice, and whoever asks the wrong worker is told what to do."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+from fastapi.testclient import TestClient
+
+from .test_trouble import Site, wait_until
+
+LEASE_S = 0.4
+
+
+@pytest.fixture
+def store_url(tmp_path) -> str:
+    return f"sqlite:///{tmp_path / 'shared.db'}"
+
+
+@pytest.fixture
+def start(run_worker, start_worker, store_url, tmp_path):
+    """Starts workers that share a store; their settings beyond that are keywords."""
+
+    def start(worker_id: str, starter=start_worker, **settings):
+        common = {"store_url": store_url, "lease_seconds": LEASE_S}
+        return starter(worker_id=worker_id, data_dir=tmp_path / worker_id, **(common | settings))
+
+    return start
+
+
+def put_to_sleep(client: TestClient, monkeypatch) -> Callable[[], None]:
+    """A worker keeps its promises no more, and does not know it; what wakes it up."""
+    leases, awake = client.app.state.worker.leases, threading.Event()
+    promise = leases.renew
+
+    async def renew(document) -> None:
+        while not awake.is_set():
+            await asyncio.sleep(0.02)
+        await promise(document)
+
+    monkeypatch.setattr(leases, "renew", renew)
+    time.sleep(2 * LEASE_S)
+    return awake.set
+
+
+def by(client: TestClient, site: Site) -> Site:
+    """The same session, asked for elsewhere."""
+    other = object.__new__(Site)
+    other.__dict__ = site.__dict__ | {"client": client}
+    return other
+
+
+def test_a_session_of_a_worker_that_lives_is_refused_with_what_to_do(start):
+    site = Site(start("w0"))
+    assert site.step().status_code == 200
+    answer = by(start("w1"), site).step()
+    assert (answer.status_code, answer.json()["code"]) == (503, "SESSION_ELSEWHERE")
+    assert answer.json()["retryable"]
+    assert float(answer.headers["Retry-After"]) > 0
+    assert site.step().json()["step"] == 2
+
+
+def test_a_session_goes_on_elsewhere_as_if_nothing_had_happened(start, run_worker):
+    undisturbed = Site(start("w5"))
+    with start("w0", run_worker) as first:
+        site = Site(first)
+        for each in (site, undisturbed):
+            assert [each.step().status_code for _ in range(2)] == [200, 200]
+    other = by(start("w1"), site)
+    assert other.step().json() | {"session_id": ""} == undisturbed.step().json() | {
+        "session_id": ""
+    }
+    assert other.state().json()["step"] == 3
+
+
+def test_a_worker_that_slept_writes_nothing_and_sends_clients_away(start, monkeypatch):
+    first = start("w0")
+    site = Site(first)
+    assert site.step("one").status_code == 200
+    put_to_sleep(first, monkeypatch)
+    other = by(start("w1"), site)
+    assert other.step("two").json()["step"] == 2
+
+    late = site.step("three")
+    assert (late.status_code, late.json()["code"]) == (503, "SESSION_ELSEWHERE")
+    # Also once it has noticed that the session is not its own.
+    again = site.step("three")
+    assert again.json()["code"] == "SESSION_ELSEWHERE"
+    assert other.step("three").json()["step"] == 3
+
+
+def test_a_worker_that_wakes_up_leaves_what_was_taken_over(start, monkeypatch):
+    first = start("w0")
+    site, kept = Site(first), Site(first)
+    wake = put_to_sleep(first, monkeypatch)
+    other = by(start("w1"), site)
+    assert other.step().status_code == 200
+    wake()
+    sessions = first.app.state.worker.sessions
+    wait_until(lambda: len(sessions) == 1)
+    assert kept.step().status_code == 200
+
+
+def test_a_driver_is_told_to_come_back_when_its_session_is_taken_over(start, monkeypatch):
+    first = start("w0")
+    site = Site(first)
+    session = first.app.state.worker.sessions._open[site.session.rpartition("/")[2]]
+    told = []
+
+    async def close(error) -> None:
+        told.append(error.code.value)
+
+    session.close_callbacks.add(close)
+    put_to_sleep(first, monkeypatch)
+    assert by(start("w1"), site).step().status_code == 200
+    site.step()
+    wait_until(lambda: told == ["SESSION_ELSEWHERE"])
+
+
+def test_a_session_comes_back_to_a_worker_that_is_there_again(start, run_worker):
+    with start("w0", run_worker) as first:
+        site = Site(first)
+        assert site.step().status_code == 200
+    with start("w1", run_worker) as second:
+        assert by(second, site).step().json()["step"] == 2
+    again = by(start("w0"), site)
+    assert again.step().json()["step"] == 3
+
+
+def test_a_session_that_is_over_is_over_everywhere(start):
+    site = Site(start("w0"))
+    assert site.client.delete(site.session, headers=site.token).status_code == 204
+    assert by(start("w1"), site).step().json()["code"] == "SESSION_CLOSED"
+
+
+def test_any_worker_tells_of_all(start, run_worker):
+    with start("w1", run_worker):
+        Site(start("w0"))
+    client = start("w2")
+    wait_until(lambda: not _fleet(client)["w1"]["alive"])
+    wait_until(lambda: _fleet(client)["w0"]["sessions"] == 1)
+    found = _fleet(client)
+    assert [found[name]["alive"] for name in ("w0", "w1", "w2")] == [True, False, True]
+    assert found["w0"]["scenes"] == ["tiny"]
+
+
+def _fleet(client: TestClient) -> dict:
+    return {w["worker_id"]: w for w in client.get("/v1/fleet").json()["workers"]}
