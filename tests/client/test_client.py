@@ -421,6 +421,16 @@ def test_waiting_for_a_worker_ends_with_what_was_in_the_way(slept):
     assert caught.value.hint == "compiling kernels"
 
 
+def test_a_proxy_that_has_no_worker_yet_is_waited_for(slept):
+    proxy = httpx2.Response(503, html="<h1>503 Service Unavailable</h1>")
+    with (
+        client_of(Script(*[proxy] * 5)) as client,
+        pytest.raises(real2sim.ReplyTimeoutError, match="ready worker") as caught,
+    ):
+        client.wait_ready(timeout=0.0)
+    assert "503" in caught.value.hint
+
+
 def test_loading_waits_until_the_scene_is_there(slept):
     loading = httpx2.Response(200, json={"scene": "street", "state": "loading"})
     resident = httpx2.Response(200, json={"scene": "street", "state": "resident"})

@@ -100,26 +100,34 @@ class KillableWorker:
     """``real2sim serve`` on a port that stays the same however often it is killed.
 
     Attributes:
-        url: where it listens.
+        url, port: where it listens.
         process: the latest.
     """
 
-    def __init__(self, *, scenes: Path, data: Path, log_file: Path) -> None:
+    def __init__(
+        self,
+        *,
+        scenes: Path,
+        data: Path,
+        log_file: Path,
+        settings: Mapping[str, str] | None = None,
+    ) -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
-            self._port: int = probe.getsockname()[1]
+            self.port: int = probe.getsockname()[1]
         self._folders = ["--scenes", str(scenes), "--data", str(data)]
         self._log_file = log_file
-        self.url = f"http://127.0.0.1:{self._port}"
+        self._settings = dict(settings or {})
+        self.url = f"http://127.0.0.1:{self.port}"
         self.process: BaseProcess | None = None
 
     def start(self) -> None:
         """Start it; :meth:`wait_listening` returns once requests are answered."""
         assert self.process is None
         self.process = start_real2sim(
-            ["serve", "--port", str(self._port), *self._folders],
+            ["serve", "--port", str(self.port), *self._folders],
             log_file=self._log_file,
-            environment={"REAL2SIM_LOG_LEVEL": "error", "REAL2SIM_BACKEND": "cpu"},
+            environment={"REAL2SIM_LOG_LEVEL": "error", "REAL2SIM_BACKEND": "cpu"} | self._settings,
         )
 
     def wait_listening(self, seconds: float = 60) -> None:
@@ -127,7 +135,7 @@ class KillableWorker:
         while time.monotonic() < deadline:
             assert self.process is not None
             assert self.process.is_alive(), self._log_file.read_text()
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self._port)):
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self.port)):
                 return
             time.sleep(0.05)
         raise AssertionError(f"not listening: {self._log_file.read_text()}")

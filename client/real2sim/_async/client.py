@@ -14,7 +14,7 @@ from .. import _requests
 from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
 from .._session_state import SessionPlan
 from .._target import Target, resolve_target
-from ..errors import ProtocolMismatchError, ReplyTimeoutError, UnreachableError
+from ..errors import CapacityError, ProtocolMismatchError, ReplyTimeoutError, UnreachableError
 from .assets import AsyncAssets
 from .concurrency import sleep
 from .drive_batch import AsyncDriveBatch
@@ -279,7 +279,7 @@ class AsyncClient:
     async def _obstacle(self) -> str | None:
         try:
             return _obstacle_in(await self.readiness())
-        except (UnreachableError, ReplyTimeoutError) as error:
+        except (UnreachableError, ReplyTimeoutError, CapacityError) as error:
             return str(error)
 
 

@@ -17,6 +17,7 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``jobs``: long work: rollouts and videos.
 - ``sessions``: closed loops; ``pipeline`` takes a step from the socket to the bytes of its answer.
 - ``drives``: planners that drive sessions as jobs.
+- ``membership``: a worker among those that share its store.
 - ``upkeep``: leftovers and what has been kept long enough go by themselves.
 - ``worker``: all of it put together once.
 - ``routes``: calls and sockets; ``ui`` is the studio that they serve as files.
