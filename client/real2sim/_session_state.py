@@ -11,20 +11,20 @@ from real2sim_proto.drive import Frame, Result, Welcome
 from real2sim_proto.sessions import SessionInfo
 
 from ._protocol import PendingRequest, ProtocolState
+from ._retry import RETRYABLE_STATUS
 from ._shared_frames import SharedFrames
 from ._target import Target
 from .errors import (
     CapacityError,
     ConnectionLostError,
     NotOpenError,
+    Real2SimError,
     ReplyTimeoutError,
     SessionElsewhereError,
+    StatusError,
     UnreachableError,
 )
 from .version import SDK
-
-TRANSIENT_ERRORS = (UnreachableError, CapacityError, ReplyTimeoutError)
-"""What connecting to a worker that is being restarted ends in."""
 
 LOST_ERRORS = (ConnectionLostError, SessionElsewhereError)
 """After these a session is connected to anew: its worker is gone, or has lost it to another one."""
@@ -35,6 +35,14 @@ MAX_RECONNECTS = 10_000
 def backoff(attempt: int) -> float:
     """Seconds before try number ``attempt`` of a connection that was lost; with jitter."""
     return min(0.05 * 2.0**attempt, 2.0) * (0.75 + 0.25 * random.random())
+
+
+def is_transient(error: Real2SimError) -> bool:
+    """Whether connecting to a worker that is being restarted may end so; a proxy before it answers
+    502 for a moment, once it is gone."""
+    if isinstance(error, StatusError) and error.status in RETRYABLE_STATUS:
+        return True
+    return isinstance(error, UnreachableError | CapacityError | ReplyTimeoutError)
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class AsyncDriveSession(SessionBase):
             self._info = await self._transport.send(call)
             session_id, self._token = self._info.session_id, self._info.token
         try:
-            await self._connect(session_id)
+            await self._connect_first(session_id)
         except BaseException:
             await self._release()
             raise
@@ -342,6 +342,16 @@ class AsyncDriveSession(SessionBase):
                     raise self._reply_timeout(request) from None
                 if (answer := self._protocol.read(data, request)) is not None:
                     return answer
+
+    async def _connect_first(self, session_id: str) -> None:
+        """Connect; again where the connection is lost on the way, as later on."""
+        connect = partial(self._connect, session_id)
+        try:
+            await connect()
+        except LOST_ERRORS:
+            if self._plan.reconnect <= 0:
+                raise
+            await reconnect(self._close_socket, connect, seconds=self._plan.reconnect)
 
     async def _connect(self, session_id: str) -> None:
         with handshake_errors(self._target):

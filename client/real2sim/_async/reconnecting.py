@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Awaitable, Callable
 
-from .._session_state import MAX_RECONNECTS, TRANSIENT_ERRORS, backoff
+from .._session_state import MAX_RECONNECTS, backoff, is_transient
+from ..errors import Real2SimError
 from .concurrency import sleep
 
 
@@ -21,15 +22,16 @@ async def reconnect(
 
     Raises:
         UnreachableError, CapacityError, ReplyTimeoutError: of the last try.
+        Real2SimError: the worker refuses.
     """
     until = time.monotonic() + seconds
     for attempt in range(MAX_RECONNECTS):
         await close()
         try:
             return await connect()
-        except TRANSIENT_ERRORS:
+        except Real2SimError as error:
             wait = backoff(attempt)
-            if time.monotonic() + wait > until:
+            if not is_transient(error) or time.monotonic() + wait > until:
                 raise
             await sleep(wait)
     return None

@@ -82,7 +82,7 @@ class DriveSession(SessionBase):
             self._info = self._transport.send(call)
             session_id, self._token = self._info.session_id, self._info.token
         try:
-            self._connect(session_id)
+            self._connect_first(session_id)
         except BaseException:
             self._release()
             raise
@@ -343,6 +343,16 @@ class DriveSession(SessionBase):
                     raise self._reply_timeout(request) from None
                 if (answer := self._protocol.read(data, request)) is not None:
                     return answer
+
+    def _connect_first(self, session_id: str) -> None:
+        """Connect; again where the connection is lost on the way, as later on."""
+        connect = partial(self._connect, session_id)
+        try:
+            connect()
+        except LOST_ERRORS:
+            if self._plan.reconnect <= 0:
+                raise
+            reconnect(self._close_socket, connect, seconds=self._plan.reconnect)
 
     def _connect(self, session_id: str) -> None:
         with handshake_errors(self._target):

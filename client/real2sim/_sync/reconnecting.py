@@ -6,7 +6,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from .._session_state import MAX_RECONNECTS, TRANSIENT_ERRORS, backoff
+from .._session_state import MAX_RECONNECTS, backoff, is_transient
+from ..errors import Real2SimError
 from .concurrency import sleep
 
 
@@ -20,15 +21,16 @@ def reconnect(close: Callable[[], None], connect: Callable[[], None], *, seconds
 
     Raises:
         UnreachableError, CapacityError, ReplyTimeoutError: of the last try.
+        Real2SimError: the worker refuses.
     """
     until = time.monotonic() + seconds
     for attempt in range(MAX_RECONNECTS):
         close()
         try:
             return connect()
-        except TRANSIENT_ERRORS:
+        except Real2SimError as error:
             wait = backoff(attempt)
-            if time.monotonic() + wait > until:
+            if not is_transient(error) or time.monotonic() + wait > until:
                 raise
             sleep(wait)
     return None

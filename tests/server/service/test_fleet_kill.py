@@ -53,7 +53,7 @@ class Fleet:
             "GROUP BY worker_id ORDER BY count(*) DESC LIMIT 1"
         )
         with self._engine.connect() as connection:
-            return str(connection.execute(sa.text(query)).scalar_one())
+            return str(connection.execute(sa.text(query)).scalar() or WORKERS[0])
 
     def logs_are_whole(self) -> bool:
         """Whether every session's log has each place once, without a gap."""

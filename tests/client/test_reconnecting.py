@@ -1,0 +1,49 @@
+"""Which errors of a connection that is made anew are waited out."""
+
+from __future__ import annotations
+
+import pytest
+
+import real2sim
+from real2sim._session_state import is_transient
+from real2sim._sync.reconnecting import reconnect
+from real2sim.errors import ErrorDetails, error_for
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "passes"),
+    [
+        (502, "UNKNOWN", True),
+        (503, "UNKNOWN", True),
+        (503, "SESSION_ELSEWHERE", True),
+        (504, "TIMEOUT", True),
+        (507, "OUT_OF_MEMORY", True),
+        (401, "UNAUTHORIZED", False),
+        (404, "UNKNOWN_SESSION", False),
+        (410, "SESSION_CLOSED", False),
+        (500, "INTERNAL", False),
+    ],
+)
+def test_what_a_worker_or_its_proxy_answers_may_pass(status, code, passes):
+    assert is_transient(error_for(ErrorDetails(status, code, "no"))) == passes
+
+
+def test_a_worker_is_tried_until_it_is_there_again(monkeypatch):
+    bad_gateway = error_for(ErrorDetails(502, "UNKNOWN", "bad gateway"))
+    monkeypatch.setattr("real2sim._sync.reconnecting.sleep", lambda _seconds: None)
+    outcomes = [real2sim.UnreachableError("nobody"), bad_gateway, None]
+
+    def connect() -> None:
+        if (error := outcomes.pop(0)) is not None:
+            raise error
+
+    reconnect(lambda: None, connect, seconds=60.0)
+    assert not outcomes
+
+
+def test_a_refusal_is_final():
+    def connect() -> None:
+        raise error_for(ErrorDetails(410, "SESSION_CLOSED", "it is over"))
+
+    with pytest.raises(real2sim.SessionClosedError):
+        reconnect(lambda: None, connect, seconds=60.0)
