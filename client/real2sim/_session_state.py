@@ -17,6 +17,7 @@ from ._target import Target
 from .errors import (
     CapacityError,
     ConnectionLostError,
+    GatewayError,
     NotOpenError,
     Real2SimError,
     ReplyTimeoutError,
@@ -26,7 +27,7 @@ from .errors import (
 )
 from .version import SDK
 
-LOST_ERRORS = (ConnectionLostError, SessionElsewhereError)
+LOST_ERRORS = (ConnectionLostError, SessionElsewhereError, GatewayError)
 """After these a session is connected to anew: its worker is gone, or has lost it to another one."""
 
 MAX_RECONNECTS = 10_000

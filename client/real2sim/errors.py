@@ -27,7 +27,8 @@
         ├── CapacityError              the worker is full; has .retry_after (429, 503, 507)
         │   └── SessionElsewhereError      another worker has the session
         ├── SessionClosedError         the session is over                (410)
-        └── WorkerFailedError          a fault of the worker              (500, 502, 504)
+        └── WorkerFailedError          a fault of the worker              (500, 504)
+            └── GatewayError               of a proxy, whose worker is gone   (502)
 """
 
 from __future__ import annotations
@@ -226,6 +227,10 @@ class WorkerFailedError(StatusError):
     """A fault of the worker, not of the request."""
 
 
+class GatewayError(WorkerFailedError):
+    """A proxy answers that the worker behind it is gone; another one may be there soon."""
+
+
 _BY_CODE: dict[str, type[StatusError]] = {
     "INVALID_OPERATION": InvalidOperationError,
     "INVALID_ACTION": InvalidActionError,
@@ -260,6 +265,7 @@ _BY_STATUS: dict[int, type[StatusError]] = {
     413: InvalidRequestError,
     422: InvalidRequestError,
     429: CapacityError,
+    502: GatewayError,
     503: CapacityError,
     507: CapacityError,
 }

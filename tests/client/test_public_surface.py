@@ -28,6 +28,7 @@ PUBLIC = [
     "DriveBatch",
     "DriveSession",
     "EpisodeOverError",
+    "GatewayError",
     "Frame",
     "Image",
     "ImageDecodeError",
