@@ -214,11 +214,17 @@ def test_the_installed_command_starts():
     assert done.stdout.startswith("real2sim ")
 
 
-@pytest.mark.parametrize("command", ["drive", "frame --camera front -o a.jpg"])
-def test_a_scene_or_a_scenario_is_needed(run, command):
+@pytest.mark.parametrize(
+    ("command", "named"),
+    [
+        ("drive", "--scene, --scenario and --session"),
+        ("frame --camera front -o a.jpg", "--scene and --scenario"),
+    ],
+)
+def test_a_scene_or_a_scenario_is_needed(run, command, named):
     done = run(*command.split())
     assert done.returncode == 2
-    assert "exactly one of --scene and --scenario" in done.stderr
+    assert f"exactly one of {named}" in done.stderr
 
 
 @pytest.mark.parametrize(
