@@ -182,15 +182,9 @@ class ConstantVelocityDriver(Model):
     kind: Literal["constant_velocity"] = "constant_velocity"
 
 
-class IdmDriver(Model):
-    """Follows a path behind whoever is ahead (Treiber et al. 2000)."""
+class IdmParameters(Model):
+    """Of the intelligent driver model (Treiber et al. 2000)."""
 
-    kind: Literal["idm"] = "idm"
-    path: Literal["recorded", "route"] = Field(
-        default="recorded",
-        description="'recorded': its own, as recorded or edited; 'route': the lane beside the "
-        "ego's route in which it is, the way it faces",
-    )
     desired_speed: Speed | None = Field(
         default=None, description="[m/s]; default: its highest recorded speed"
     )
@@ -203,6 +197,42 @@ class IdmDriver(Model):
     lateral: Annotated[float, Field(gt=0, le=10)] = Field(
         default=2.5, description="acceleration sideways that sets the speed in bends [m/s^2]"
     )
+
+
+class IdmDriver(IdmParameters):
+    """Follows a path behind whoever is ahead (Treiber et al. 2000)."""
+
+    kind: Literal["idm"] = "idm"
+    path: Literal["recorded", "route"] = Field(
+        default="recorded",
+        description="'recorded': its own, as recorded or edited; 'route': the lane beside the "
+        "ego's route in which it is, the way it faces",
+    )
+
+
+class LaneDriver(IdmParameters):
+    """Follows the lanes of the scene's map behind whoever is ahead, and changes lanes where that
+    pays (MOBIL: Kesting, Treiber and Helbing 2007)."""
+
+    kind: Literal["lanes"] = "lanes"
+    desired_speed: Speed | None = Field(
+        default=None,
+        description="[m/s]; default: the lane's limit, or its highest recorded speed where the map "
+        "states none",
+    )
+    politeness: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.2, description="how much others' gains and losses count beside its own, p"
+    )
+    threshold: Annotated[float, Field(ge=0, le=5)] = Field(
+        default=0.1, description="gain from which on it changes lanes [m/s^2]"
+    )
+    safe_braking: Annotated[float, Field(gt=0, le=9)] = Field(
+        default=4.0, description="hardest that a change may make the one behind brake [m/s^2]"
+    )
+    change_time: Annotated[float, Field(ge=0.5, le=20)] = Field(
+        default=4.0, description="of a change of lanes [s]"
+    )
+    changes: bool = Field(default=True, description="False: it keeps to its lane")
 
 
 class CutInDriver(Model):
@@ -265,6 +295,7 @@ AgentDriver = Annotated[
     ReplayDriver
     | ConstantVelocityDriver
     | IdmDriver
+    | LaneDriver
     | CutInDriver
     | HardBrakeDriver
     | JunctionCrossingDriver
@@ -323,8 +354,9 @@ class SpawnSpec(Model):
 class AgentsSpec(Model):
     """Who drives the other road users."""
 
-    default: Literal["log", "constant_velocity", "idm"] = Field(
-        default="log", description="of objects that move and are not named in `drivers`"
+    default: Literal["log", "constant_velocity", "idm", "lanes"] = Field(
+        default="log",
+        description="of objects that move and are not named in `drivers`; 'lanes' needs a map",
     )
     drivers: dict[Identifier, AgentDriver] = Field(default_factory=dict, max_length=MAX_DRIVERS)
     ego_off_log: Literal["replay", "idm"] = Field(

@@ -119,6 +119,11 @@ class Lane:
         ends = np.array([2 * along[0] - between[0], 2 * along[-1] - between[-1]])
         return np.concatenate([ends[:1], between, ends[1:]])
 
+    @property
+    def turn(self) -> float:
+        """By how much its direction changes from start to end, either way [rad]."""
+        return abs(float(self.headings[-1] - self.headings[0]))
+
     @cached_property
     def rims(self) -> tuple[Float, Float]:
         """Left and right rim, [N, 3] float64 each, at the points of the centre line [m]."""

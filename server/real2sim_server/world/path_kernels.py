@@ -175,6 +175,41 @@ def next_in_strip(knots, s, box, bodies, own):
 
 
 @kernel
+def previous_in_strip(knots, s, box, bodies, own):
+    """The body that comes next behind a box in the strip that it sweeps along the path, or is
+    beside it.
+
+    Args:
+        knots, s, box, bodies, own: see :func:`next_in_strip`.
+
+    Returns:
+        Gap from its front to the rear of the box [m], negative where they overlap along the path,
+        infinite where there is none, and speed along the path [m/s].
+    """
+    offset, length, width = box
+    back = REACH - 1
+    strip = strip_ahead(knots, s - back, offset)
+    gap, speed = math.inf, 0.0
+    for k in range(len(bodies)):
+        if k == own:
+            continue
+        body = bodies[k]
+        i = _nearest_row(strip, body[0], body[1])
+        dx, dy, heading = body[0] - strip[i, 0], body[1] - strip[i, 1], strip[i, 2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        along, aside = i - back + dx * cos + dy * sin, dy * cos - dx * sin
+        if along > 0.5 or i == 0:
+            continue
+        c, n = abs(math.cos(body[2] - heading)), abs(math.sin(body[2] - heading))
+        if abs(aside) >= width / 2 + (body[3] * n + body[4] * c) / 2 + SIDE:
+            continue
+        free = -along - length / 2 - (body[3] * c + body[4] * n) / 2
+        if free < gap:
+            gap, speed = free, body[5] * cos + body[6] * sin
+    return gap, speed
+
+
+@kernel
 def strip_ahead(knots, s, offset):
     """Places x, y [m] and heading [rad] [REACH, 3] one metre apart from ``s`` on, ``offset`` to the
     left of the path: what :func:`point_at` gives, whose search each place would begin anew."""

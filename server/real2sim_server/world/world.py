@@ -667,9 +667,9 @@ class World:
 
     def _surroundings(self, others: Agents) -> Surroundings:
         ego = ObservedEgo.of(self.motion, self._path_point, self.scene.ego_size)
-        clock = self._clock
+        clock, lanes = self._clock, self.scene.lanes
         return Surroundings(
-            self.t_us, clock.start_us, clock.dt_us, ego, others, self._path, self.ground
+            self.t_us, clock.start_us, clock.dt_us, ego, others, self._path, self.ground, lanes
         )
 
     def _instant(

@@ -13,6 +13,7 @@ from real2sim_proto.base import Model
 from real2sim_proto.episode import AgentDriver as AgentDriverUnion
 from real2sim_proto.episode import AgentsSpec, ResetSpec
 from real2sim_server.edit import ObjectState
+from real2sim_server.scene import Lane, LaneGraph
 from real2sim_server.world.driving import GRAVITY
 from real2sim_server.world.traffic import DRIVERS, AgentDriver, AgentPose, Surroundings
 from real2sim_server.world.traffic.replay import recorded_pose
@@ -57,7 +58,9 @@ def world(request, monkeypatch, make_world, moving):
     agents = AgentsSpec.model_construct(drivers={"car": SPECS[request.param]()})
     spec = ResetSpec().model_copy(update={"agents": agents})
     made = make_world(car=moving(40, 0, z=0.8, speed=8.0))
-    return type(made)(made.scene, made.state, spec)
+    line = np.array([[-50.0, 0.3, 0.0], [300.0, 0.3, 0.0]])
+    lanes = LaneGraph.of([Lane("own", "driving", line, np.full(2, 3.5))])
+    return type(made)(replace(made.scene, lanes=lanes), made.state, spec)
 
 
 def driver_of(world) -> AgentDriver:

@@ -10,7 +10,7 @@ import numpy as np
 from real2sim_proto import ErrorCode
 
 from ...scene.errors import SceneError
-from ...scene.lane import LANE_KINDS, Lane
+from ...scene.lane import LANE_KINDS
 from ...scene.lane_graph import LaneGraph
 from ...scene.road import Road
 from ..errors import WorldError
@@ -121,7 +121,7 @@ class GraphNetwork:
             onward = [lane for lane in onward if lane not in lanes]
             if not onward:
                 break
-            lanes.append(min(onward, key=_turn))
+            lanes.append(min(onward, key=lambda lane: (lane.turn, lane.lane_id)))
         points = np.concatenate([lane.centre for lane in lanes[:: 1 if forwards else -1]])
         yaws = np.unwrap(
             np.concatenate([lane.headings for lane in lanes[:: 1 if forwards else -1]])
@@ -130,10 +130,6 @@ class GraphNetwork:
             points, yaws = points[::-1], yaws[::-1] + math.pi
         path = LoggedPath.through(points, yaws, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
         return path, path.length
-
-
-def _turn(lane: Lane) -> tuple[float, str]:
-    return abs(float(lane.headings[-1] - lane.headings[0])), lane.lane_id
 
 
 def _refused(error: SceneError) -> WorldError:

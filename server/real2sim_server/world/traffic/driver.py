@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple, Protocol, Self
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from ...edit import ObjectState
 from ...scene import Ground
+from ...scene.lane_graph import LaneGraph
 from ..agents import Agents, rows_of
 from ..broad_phase_kernels import headings
 from ..ego.box import REAR_OVERHANG
@@ -88,6 +90,9 @@ class Surroundings:
         others: all objects, the agent itself among them.
         route: the recorded way of the ego.
         ground: what everybody stands on.
+        lanes: of the scene's map; None without one.
+        aims: way x, y that objects have left to the middle of the lane that they change to [m], by
+            id: what indicators tell.
     """
 
     t_us: int
@@ -97,6 +102,8 @@ class Surroundings:
     others: Agents
     route: LoggedPath
     ground: Ground
+    lanes: LaneGraph | None = None
+    aims: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def dt(self) -> float:
@@ -113,6 +120,17 @@ class Surroundings:
         bodies[:-1, 2], bodies[:-1, 5:] = headings(others.quaternions), others.velocities[:, :2]
         vx, vy = ego.speed * math.cos(ego.yaw), ego.speed * math.sin(ego.yaw)
         bodies[-1] = ego.x, ego.y, ego.yaw, ego.length, ego.width, vx, vy
+        return bodies
+
+    @cached_property
+    def bodies_as_meant(self) -> Float:
+        """``bodies``, with those that change lanes where they are going to be aside."""
+        if not self.aims:
+            return self.bodies
+        bodies = self.bodies.copy()
+        for name, way in self.aims.items():
+            if name in self.rows:
+                bodies[self.rows[name], :2] += way
         return bodies
 
     @cached_property

@@ -17,6 +17,7 @@ from real2sim_proto.episode import (
     HardBrakeDriver,
     IdmDriver,
     JunctionCrossingDriver,
+    LaneDriver,
     ReplayDriver,
 )
 
@@ -25,6 +26,7 @@ from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import AgentDriver, Surroundings
 from .external import External
 from .idm import Idm
+from .lane_changer import LaneChanger
 from .replay import ConstantVelocity, Replay
 
 BeginDriver = Callable[[ObjectState, Any, Surroundings], AgentDriver]
@@ -35,6 +37,7 @@ DRIVERS: dict[type[Any], BeginDriver] = {
     ReplayDriver: Replay.begin,
     ConstantVelocityDriver: ConstantVelocity.begin,
     IdmDriver: Idm.begin,
+    LaneDriver: LaneChanger.begin,
     CutInDriver: CutIn.begin,
     HardBrakeDriver: HardBrake.begin,
     JunctionCrossingDriver: JunctionCrossing.begin,

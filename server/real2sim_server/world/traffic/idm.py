@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from real2sim_proto.episode import IdmDriver
+from real2sim_proto.episode import IdmDriver, IdmParameters
 
 from ...edit import ObjectState
 from ...scene import Ground, Trajectory
@@ -129,7 +129,7 @@ class Idm:
         return moved.on(surroundings.ground) if self.along_route else moved
 
 
-def acceleration(spec: IdmDriver, speed: float, desired: float, leader: Leader | None) -> float:
+def acceleration(spec: IdmParameters, speed: float, desired: float, leader: Leader | None) -> float:
     """IDM acceleration [m/s^2], no harder than brakes can."""
     free = 1.0 - (speed / max(desired, STANDSTILL)) ** 4
     if leader is None:
@@ -150,7 +150,7 @@ def advance_along(s: float, speed: float, acceleration: float, dt: float) -> tup
     return s + (speed + acceleration * dt / 2) * dt, speed + acceleration * dt
 
 
-def desired_speed(subject: ObjectState, spec: IdmDriver) -> float:
+def desired_speed(subject: ObjectState, spec: IdmParameters) -> float:
     """Speed on a free, straight road [m/s]: what the spec says, else the highest recorded one."""
     if spec.desired_speed is not None:
         return spec.desired_speed

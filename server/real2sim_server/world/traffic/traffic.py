@@ -11,7 +11,7 @@ import numpy as np
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import AgentDriver as DriverSpec
-from real2sim_proto.episode import AgentsSpec, ConstantVelocityDriver, IdmDriver
+from real2sim_proto.episode import AgentsSpec, ConstantVelocityDriver, IdmDriver, LaneDriver
 
 from ...edit import ObjectState
 from ...edit.tracks import PackedTracks
@@ -25,6 +25,7 @@ from .driver import AgentDriver, Surroundings
 from .drivers import begin_driver
 from .external import External
 from .idm import Idm
+from .lane_changer import LaneChanger
 from .replay import ConstantVelocity, Replay
 from .scripted import Script, ScriptedEntity
 from .spawner import PREFIX as SPAWNED
@@ -36,7 +37,7 @@ MOVING = 2.0
 DRIVEN = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle", "cyclist"})
 """Categories that a default driver drives; pedestrians keep to the log."""
 
-SCRIPTED = (Replay, ConstantVelocity, Idm, CutIn, HardBrake, JunctionCrossing)
+SCRIPTED = (Replay, ConstantVelocity, Idm, LaneChanger, CutIn, HardBrake, JunctionCrossing)
 """Drivers that move an object by themselves."""
 
 NOTHING_DRAWN: Mapping[str, float] = MappingProxyType({})
@@ -99,7 +100,8 @@ class Traffic:
             storyboard: moves entities of its own, from the start on.
 
         Raises:
-            WorldError: UNKNOWN_OBJECT for a driver of an object that does not exist.
+            WorldError: UNKNOWN_OBJECT for a driver of an object that does not exist;
+                INVALID_REQUEST for drivers on lanes where the scene has none.
         """
         unknown = sorted(set(spec.drivers) - {o.object_id for o in tracks.objects})
         if unknown:
@@ -108,6 +110,7 @@ class Traffic:
                 f"agents.drivers names {unknown[0]!r}, which is no object of this world",
                 hint="insert or duplicate it first; GET /v1/scenes/{scene} lists the objects",
             )
+        _check_lanes(spec, surroundings)
         scripted: Mapping[str, AgentDriver] = storyboard.drivers if storyboard is not None else {}
         begun = cls(
             spec,
@@ -142,6 +145,8 @@ class Traffic:
         if not (self.drivers or self.spawner or self.storyboard or self._assigns_drivers):
             return evolved(self, agents=base)
         before = surroundings()
+        if aims := self._aims:
+            before = replace(before, aims=aims)
         drivers = {i: d.advance(before) for i, d in self.drivers.items()}
         storyboard = self.storyboard and self.storyboard.advance(before)
         if storyboard is not None:
@@ -154,6 +159,15 @@ class Traffic:
         moved = replace(self, drivers=MappingProxyType(drivers), storyboard=storyboard)
         moved = moved._with_new_drivers(base, replace(before, t_us=t_us))
         return moved._with_comers_and_goers(base, before) if self.spawner else moved
+
+    @property
+    def _aims(self) -> dict[str, tuple[float, float]]:
+        """Of those that change lanes, see :class:`~.driver.Surroundings`."""
+        return {
+            i: d.aim
+            for i, d in self.drivers.items()
+            if isinstance(d, LaneChanger) and d.changing is not None
+        }
 
     def edited(self, tracks: PackedTracks[ObjectState], surroundings: Surroundings) -> Traffic:
         """Objects after an edit: drivers of objects whose trajectory was edited begin anew."""
@@ -313,7 +327,20 @@ class Traffic:
         kind = "idm" if self.reacting else self.spec.default
         if kind == "log" or subject.category not in DRIVEN or not _moves(subject):
             return None
+        if kind == "lanes":
+            return LaneDriver()
         return IdmDriver() if kind == "idm" else ConstantVelocityDriver()
+
+
+def _check_lanes(spec: AgentsSpec, surroundings: Surroundings) -> None:
+    asked = [i for i, d in spec.drivers.items() if isinstance(d, LaneDriver)]
+    if surroundings.lanes is None and (asked or spec.default == "lanes"):
+        where = f"agents.drivers.{asked[0]}" if asked else "agents.default"
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"{where} is 'lanes', and the scene has no map",
+            hint="`real2sim map SCENE --from MAP` gives it one; 'idm' drives along recorded paths",
+        )
 
 
 def _edits_drive(tracks: PackedTracks[ObjectState]) -> bool:
