@@ -1,15 +1,15 @@
 // Drive: a planner or a person in the scenario, watched live; then the recording, read at any instant.
-import { model, on, egoPoseAt, setTime, stopRun } from "./model.js";
-import { get } from "./api.js";
+import { model, on, egoPoseAt, stopRun } from "./model.js";
 import { el, row } from "./dom.js";
 import { attempt } from "./messages.js";
-import { plot } from "./plot.js";
 import { ink } from "./theme.js";
 import { addPictureLayer } from "./camera_view.js";
 import { addLayer, follow } from "./map.js";
 import { show } from "./physics.js";
 import { drivesOf, isMine } from "./drive_session.js";
 import { seat, start, startDriving, take, takeTheWheel, hold, end, press } from "./driving.js";
+import { button, eventList, figures, said } from "./drive_figures.js";
+import { instant, isReplay, planInPicture, replay, replayed } from "./drive_replay.js";
 
 const WHO = [
   ["idm", "idm: keeps its distance"],
@@ -27,7 +27,6 @@ const PACES = [
 ];
 const chosen = { who: "idm", pace: "1", onCollision: "terminate" };
 const page = () => document.getElementById("drive");
-const isReplay = () => model.playback?.kind === "drive";
 let drives = [];
 let happened = [];
 
@@ -53,19 +52,6 @@ export function startDrive() {
   on("time layout", () => isReplay() && replayed());
   draw();
 }
-// Along the ground; of a drive that is replayed, since pictures of a live one tell no pose.
-function planInPicture(pen, toStage) {
-  if (!isReplay()) {
-    return;
-  }
-  const [, , z] = model.playback.ego.positions[instant()];
-  const places = model.playback.plans[instant()].map(([x, y]) => toStage([x, y, z]));
-  pen.strokeStyle = ink().plan;
-  pen.lineWidth = 3;
-  pen.beginPath();
-  places.filter(Boolean).forEach((place) => pen.lineTo(...place));
-  pen.stroke();
-}
 // What was driven; one that goes on in this tab is watched again after a reload.
 export const listDrives = attempt(async () => {
   drives = await drivesOf(model.scenario.scenario_id);
@@ -75,8 +61,14 @@ export const listDrives = attempt(async () => {
   }
   draw();
 });
+async function leave() {
+  stopRun();
+  await listDrives();
+}
 function draw() {
-  page().replaceChildren(...(seat ? driving() : isReplay() ? replay() : [...choice(), ...past()]));
+  page().replaceChildren(
+    ...(seat ? driving() : isReplay() ? replay(leave) : [...choice(), ...past()]),
+  );
   if (seat) {
     live();
   } else if (isReplay()) {
@@ -149,7 +141,12 @@ function driving() {
     el(
       "div",
       { class: "actions" },
-      button("drive-hold", held ? "Go on" : "Pause", () => hold(!seat.held), "primary"),
+      el("button", {
+        id: "drive-hold",
+        class: "primary",
+        textContent: held ? "Go on" : "Pause",
+        onclick: attempt(() => hold(!seat.held)),
+      }),
       button("drive-step", "One step", () => hold(true, 1)),
       who === "hand"
         ? null
@@ -209,112 +206,3 @@ function wheel() {
   });
   return el("div", { class: "wheel" }, ...keys);
 }
-
-// --- replay ----------------------------------------------------------------------------------
-
-function replay() {
-  const { reason, scores, events, metrics } = model.playback;
-  const last = Object.entries(metrics).map(([name, values]) => [name, values.at(-1)]);
-  return [
-    el("p", { id: "drive-over", textContent: `${seconds(lasts())} s driven; ${said(reason)}.` }),
-    el(
-      "div",
-      { class: "actions" },
-      button("drive-leave", "Back to the scenario", async () => {
-        stopRun();
-        await listDrives();
-      }),
-      button("drive-fork", "Take the wheel here", goOn),
-    ),
-    el(
-      "fieldset",
-      {},
-      el("legend", { textContent: "Speed [m/s]" }),
-      el("canvas", { id: "drive-speed", class: "plot" }),
-    ),
-    el(
-      "fieldset",
-      {},
-      el("legend", { textContent: "At the time shown" }),
-      el("dl", { id: "drive-figures", class: "figures" }),
-    ),
-    ...eventList(events, setTime),
-    el("h2", { class: "group-title", textContent: "Scores of the whole drive" }),
-    el(
-      "dl",
-      { class: "figures" },
-      ...terms(scores.length ? scores.map((s) => [s.name, s.value]) : last),
-    ),
-  ];
-}
-function replayed() {
-  const { times_us: times, speeds, metrics } = model.playback;
-  if (!document.getElementById("drive-speed")) {
-    return;
-  }
-  const k = instant();
-  figures(Object.entries(metrics).map(([name, values]) => [name, values[k]]));
-  plot(
-    document.getElementById("drive-speed"),
-    times.map((t) => (t - times[0]) / 1e6),
-    [{ name: "driven", values: speeds }],
-    (model.t - times[0]) / 1e6,
-  );
-}
-async function goOn() {
-  const job = await get(`/v1/jobs/${model.job}`);
-  if (!isMine(job.request.session_id)) {
-    throw new Error(
-      "The session of this drive is gone, or belongs to another tab: drive again, and take the wheel then",
-    );
-  }
-  await takeTheWheel(job.request.session_id, model.playback.steps[instant()]);
-}
-const lasts = () => model.playback.end_us - model.playback.start_us;
-const instant = () =>
-  Math.max(
-    0,
-    model.playback.times_us.findLastIndex((t) => t <= model.t),
-  );
-
-// --- figures ---------------------------------------------------------------------------------
-
-const figures = (values) =>
-  document.getElementById("drive-figures").replaceChildren(...terms(values));
-function terms(values) {
-  return values.map(([name, value]) =>
-    el(
-      "div",
-      {},
-      el("dt", { textContent: name.replaceAll("_", " ") }),
-      el("dd", { textContent: Number.isFinite(value) ? tidy(value) : "–" }),
-    ),
-  );
-}
-const tidy = (value) => String(Math.round(value * 1000) / 1000);
-function eventList(events, jump) {
-  if (!events.length) {
-    return [];
-  }
-  const began = model.playback?.start_us ?? model.scenario.start_us;
-  return [
-    el("h2", { class: "group-title", textContent: "Events" }),
-    ...events.map((event) =>
-      el(
-        jump ? "button" : "div",
-        { class: "past", ...(jump ? { onclick: () => jump(event.t_us) } : {}) },
-        el("strong", { textContent: said(event.type) }),
-        el("small", {
-          textContent: [event.object_id, `${seconds(event.t_us - began)} s`]
-            .filter(Boolean)
-            .join(" · "),
-        }),
-      ),
-    ),
-  ];
-}
-const seconds = (us) => (us / 1e6).toFixed(1);
-const SAID = { horizon: "to the end", stopped: "ended by hand" };
-const said = (word) => SAID[word] ?? (word ?? "not over").replaceAll("_", " ");
-const button = (id, label, act, kind = id === "drive-start" ? "primary" : "") =>
-  el("button", { id, textContent: label, class: kind, onclick: attempt(act) });
