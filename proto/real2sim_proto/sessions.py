@@ -127,7 +127,9 @@ class SessionState(Reply):
         description="poses of the newest plan: x [m], y [m], yaw [rad] in the world; `GET` only",
     )
     planning_ms: float | None = Field(
-        default=None, description="from an observation to the newest plan; `GET` only"
+        default=None,
+        description="from an observation to the newest plan, where somebody drives on a socket of "
+        "the session's own; `GET` only",
     )
 
 

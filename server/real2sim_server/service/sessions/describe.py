@@ -85,7 +85,7 @@ def shown_state(session: Session) -> SessionState:
             "plan": [tuple(pose) for pose in plan.poses.tolist()]
             if isinstance(plan, PlannedTrajectory)
             else [],
-            "planning_ms": newest.took_us / 1e3 if newest is not None else None,
+            "planning_ms": newest.took_us / 1e3 if newest is not None and newest.took_us else None,
         }
     )
 
