@@ -5,9 +5,9 @@ Chromium on the PATH (or in ``CHROMIUM``) for the studio::
 
     .venv/bin/python docs/images/make.py [--work out/pictures] [NAME ...]
 
-NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars, jam; without
-one, all but jam are made. It takes about a quarter of an hour on two cores. ``jam`` trains for
-another five minutes, on the KITTI drive whose folder ``KITTI_LOG`` names.
+NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars, people, jam;
+without one, all but jam are made. It takes about a quarter of an hour on two cores. ``jam`` trains
+for another five minutes, on the KITTI drive whose folder ``KITTI_LOG`` names.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from real2sim_server.edit import ScenarioState, apply_operations, instances_at, 
 from real2sim_server.render import render_cameras
 from real2sim_server.scene import Fisheye, Scene, Shutter
 from real2sim_server.scene.io import load_scene
+from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 
 HERE = Path(__file__).parent
 EDITS = [
@@ -202,6 +203,32 @@ def cars(_: Path, scenes: Path) -> None:
     edits("cars.jpg", load_scene(scenes / SCENE), CARS_US, rows, rows_shown=slice(180, 480))
 
 
+def people(_: Path, __: Path) -> None:
+    """``people.jpg``: a stride, and who else is on a synthetic street."""
+    log = generate_log(SyntheticConfig(seed=3, frames=40, samples=3, pedestrians=10, cyclists=2))
+    first = int(log.people(0).tracks[0])
+    stride = [(first + 7, 1_000_000 + k * 150_000, 1.5) for k in range(8)]
+    others = [(first + i, 1_500_000, -0.9 + 0.5 * (i % 4)) for i in (0, 1, 2, 3, 6)]
+    others += [(first + 10, 1_500_000, 0.5), (first + 11, 1_500_000, 1.4)]
+    others += [(first + 11, 1_500_000, 2.6)]
+    rows = [[portrait(log, *view) for view in row] for row in (stride, others)]
+    image = np.concatenate([np.concatenate(row, axis=1) for row in rows])
+    save("people.jpg", image, width=1280)
+
+
+def portrait(log: SyntheticLog, track: int, t_us: int, yaw: float) -> np.ndarray:
+    """Somebody from a side, BGR [300, 200, 3]."""
+    away = np.array([np.cos(yaw), np.sin(yaw), 0.08])
+    right = np.cross(-away, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(-away, right), -away], axis=1)
+    pose[:3, 3] = 3.6 * away
+    K = np.array([[340.0, 0, 100], [0, 340, 150], [0, 0, 1]])
+    T_world_camera = log.tracks[track].trajectory.transform(t_us) @ pose
+    return log.render(T_world_camera, K, 200, 300, t_us)[0][..., ::-1]
+
+
 def jam(work: Path, _: Path) -> None:
     """``jam.jpg``: the car ahead in a KITTI drive, which was only ever seen from behind."""
     log, scene = os.environ["KITTI_LOG"], work / "jam"
@@ -246,7 +273,20 @@ def edits(
 
 PICTURES = {
     make.__name__: make
-    for make in (demo, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars, jam)
+    for make in (
+        demo,
+        scenario,
+        studio,
+        wall,
+        pair,
+        drop,
+        crashes,
+        ground,
+        lenses,
+        cars,
+        people,
+        jam,
+    )
 }
 
 

@@ -222,7 +222,8 @@ class Seat:
 
 def seat_rider(body: Body) -> Seat:
     """Sit a body on the bicycle that fits it: legs almost straight below, hands on the grips."""
-    scale = body.leg_length / ADULT_LEG
+    # Frames for tall riders are hardly longer; their saddle is higher.
+    scale = min(body.leg_length / ADULT_LEG, 1.02)
     pelvis_lean = np.radians(12)
     trial = Seat(body, scale, np.array([SEAT_X * scale, 0, 1.0]), pelvis_lean, 0.0, 0.0)
     ankle = trial._on_pedal(np.linspace(0, 2 * np.pi, 73) * WHEEL_RADIUS * scale * GEAR, 0)[0]

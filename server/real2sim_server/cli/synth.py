@@ -23,6 +23,8 @@ def synth(
     height: Annotated[int, typer.Option(min=32, max=4096, help="Image height [px].")] = 320,
     moving_cars: Annotated[int, typer.Option(min=0, max=40)] = 4,
     parked_cars: Annotated[int, typer.Option(min=0, max=80)] = 14,
+    pedestrians: Annotated[int, typer.Option(min=0, max=60, help="People on foot.")] = 0,
+    cyclists: Annotated[int, typer.Option(min=0, max=20)] = 0,
     json: JsonFile = None,
 ) -> None:
     """Generate a driving log of a procedural street: cameras, LiDAR, exact poses and boxes."""
@@ -38,6 +40,8 @@ def synth(
             height=height,
             moving_cars=moving_cars,
             parked_cars=parked_cars,
+            pedestrians=pedestrians,
+            cyclists=cyclists,
         )
     except ValueError as error:
         raise CommandError(str(error)) from error

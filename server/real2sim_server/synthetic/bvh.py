@@ -62,6 +62,60 @@ def build_geometry(meshes: list[Mesh]) -> tuple[Geometry, NDArray[np.int64]]:
     )
 
 
+def append_geometry(
+    geometry: Geometry, meshes: list[Mesh]
+) -> tuple[Geometry, list[tuple[NDArray[np.int64], int, tuple[int, int]]]]:
+    """More meshes behind those of a geometry, for :func:`refit`.
+
+    Returns:
+        The geometry; of each mesh the order of its triangles, the row of the first, and its first
+        node and the one behind its last.
+    """
+    parts: list[tuple[NDArray[np.generic], ...]] = [geometry]
+    places = []
+    node_base, triangle_base = len(geometry.children), len(geometry.edges)
+    for mesh in meshes:
+        bounds, child, count, order = _build(mesh.corners.min(axis=1), mesh.corners.max(axis=1))
+        child = np.where(count > 0, child + triangle_base, child + node_base).astype(np.uint32)
+        parts.append((bounds, child, count.astype(np.uint32), *_arrange(mesh, order)))
+        places.append((order, triangle_base, (node_base, node_base + len(child))))
+        node_base += len(child)
+        triangle_base += len(order)
+    return Geometry(*(np.concatenate(columns) for columns in zip(*parts, strict=True))), places
+
+
+@kernel
+def refit(
+    bounds, children, counts, edges, normals, vertices, vertex_normals, triangles, order,
+    first, start, end,
+):  # fmt: skip
+    """Move a mesh of :func:`append_geometry` to vertices [V, 3] with normals [V, 3], in place."""
+    for i in range(len(order)):
+        row, triangle = first + i, order[i]
+        a, b, c = triangles[triangle, 0], triangles[triangle, 1], triangles[triangle, 2]
+        for axis in range(3):
+            edges[row, axis] = vertices[a, axis]
+            edges[row, 3 + axis] = vertices[b, axis] - vertices[a, axis]
+            edges[row, 6 + axis] = vertices[c, axis] - vertices[a, axis]
+            normals[row, axis] = vertex_normals[a, axis]
+            normals[row, 3 + axis] = vertex_normals[b, axis]
+            normals[row, 6 + axis] = vertex_normals[c, axis]
+    # Children come behind their node.
+    for node in range(end - 1, start - 1, -1):
+        child, count = int(children[node]), int(counts[node])
+        for axis in range(3):
+            low, high = np.inf, -np.inf
+            if count > 0:
+                for row in range(child, child + count):
+                    for corner in range(3):
+                        place = vertices[triangles[order[row - first], corner], axis]
+                        low, high = min(low, place), max(high, place)
+            else:
+                low = min(bounds[child, axis], bounds[child + 1, axis])
+                high = max(bounds[child, axis + 3], bounds[child + 1, axis + 3])
+            bounds[node, axis], bounds[node, axis + 3] = low, high
+
+
 def _arrange(mesh: Mesh, order: NDArray[np.int64]) -> tuple[NDArray[np.generic], ...]:
     corners = mesh.corners[order]
     edges = np.concatenate(

@@ -56,6 +56,8 @@ class SyntheticConfig:
         lidar_beams, lidar_columns: beams, and azimuth steps per turn; 0 beams for no LiDAR.
         lidar_range: farthest return [m].
         lidar_noise: standard deviation of the measured range [m].
+        pedestrians, cyclists: who walk, wait, cross and run, and who ride; a street with them has
+            the vehicles of the one without.
 
     Raises:
         ValueError: a value that gives no drive.
@@ -75,6 +77,8 @@ class SyntheticConfig:
     lidar_columns: int = 1024
     lidar_range: float = 80.0
     lidar_noise: float = 0.02
+    pedestrians: int = 0
+    cyclists: int = 0
 
     def __post_init__(self) -> None:
         least = {
@@ -88,6 +92,8 @@ class SyntheticConfig:
             "lidar_beams": 0,
             "lidar_columns": 1,
             "lidar_noise": 0,
+            "pedestrians": 0,
+            "cyclists": 0,
         }
         for name, bound in least.items():
             if not getattr(self, name) >= bound:

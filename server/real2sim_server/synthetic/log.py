@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,19 @@ from .bvh import build_geometry
 from .casting import Instances
 from .config import SyntheticConfig
 from .lanes import street_lanes
+from .people import PlannedPerson
+from .people_casting import PeopleCast, add_people
+from .people_truth import PeopleTruth, people_truth, trace_flow, trace_parts
 from .sensors import shoot_image, shoot_lidar, shoot_rays
 from .shading import RaycastWorld
 from .surroundings import build_surroundings
 from .traffic import DrivePlan, PlannedVehicle, plan_drive, poses_at
 from .vehicles import SHAPES, build_vehicle, roof_heights, shape_row
 
+SWEEP_STEP_US = 4000.0
+"""How long a sweep takes people to stand still in their walk, not in their way [us]."""
+SHUTTER_STEP_US = 2000
+"""Likewise of a rolling shutter [us]."""
 LIDAR_POSITION = (0.9, 0.0, 1.73)
 LIDAR_ELEVATION = (np.radians(-25.0), np.radians(3.0))
 
@@ -72,9 +80,17 @@ class SyntheticLog(DrivingLog):
 
         Returns:
             As :meth:`render`; instances are 1 + index into ``vehicles``.
+
+        Raises:
+            ValueError: an index of somebody on foot or on a bicycle.
         """
         source = self.source
         assert isinstance(source, SyntheticSource)
+        if len(vehicles) and max(vehicles) >= len(source.drive.vehicles):
+            raise ValueError(
+                f"only vehicles can be placed, tracks 0 to {len(source.drive.vehicles) - 1}; "
+                f"{max(vehicles)} is somebody on foot or on a bicycle"
+            )
         return shoot_image(
             source.world,
             source.placed(vehicles, np.asarray(T_world_objects, dtype=np.float64)),
@@ -103,6 +119,48 @@ class SyntheticLog(DrivingLog):
         assert isinstance(source, SyntheticSource)
         return source.render_through(camera, motion, t_us, samples)
 
+    def people(self, t_us: int) -> PeopleTruth:
+        """Joints, keypoints and tracks of everybody on foot or on a bicycle at ``t_us`` [us]."""
+        source = self.source
+        assert isinstance(source, SyntheticSource)
+        return people_truth(source.drive.people, len(source.drive.vehicles), t_us)
+
+    def render_parts(
+        self, T_world_camera: ArrayLike, k: ArrayLike, width: int, height: int, t_us: int
+    ) -> NDArray[np.uint8]:
+        """Parts of people uint8 [H, W]: 1 + index into ``people_casting.part_names``, else 0.
+
+        Arguments are those of :meth:`render`.
+        """
+        source = self.source
+        assert isinstance(source, SyntheticSource)
+        return source.parts(np.asarray(T_world_camera), np.asarray(k), (width, height), t_us)
+
+    def flow(  # noqa: PLR0917 - two views of one camera
+        self,
+        T_world_camera: ArrayLike,
+        T_world_next: ArrayLike,
+        k: ArrayLike,
+        width: int,
+        height: int,
+        times_us: tuple[int, int],
+    ) -> NDArray[np.float32]:
+        """The true optical flow from a picture to the next one.
+
+        Args:
+            T_world_camera, T_world_next: [4, 4], where the camera is in both.
+            k, width, height: as of :meth:`render`.
+            times_us: of both.
+
+        Returns:
+            [H, W, 2] float32, where the surface seen at a pixel's centre goes [px], whether it is
+            hidden then or not; NaN in the sky and for what gets behind the camera.
+        """
+        source = self.source
+        assert isinstance(source, SyntheticSource)
+        poses = np.asarray(T_world_camera), np.asarray(T_world_next)
+        return source.flow(poses, np.asarray(k), (width, height), times_us)
+
     def sweep(self, lidar: Lidar, t_us: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """The true sweep of a LiDAR on the vehicle about ``t_us`` [us], without noise or losses.
 
@@ -125,10 +183,11 @@ class SyntheticSource:
     Attributes:
         config: of the drive.
         world: surroundings and vehicle shapes.
-        drive: vehicles in the order of the log's tracks.
+        drive: vehicles, then people, in the order of the log's tracks.
         roots: node [S] of each vehicle shape's mesh.
         body_paints: row [I] of each vehicle's body in the paint table.
         rig: as in the log.
+        people: in the world's arrays; None where there are none.
     """
 
     config: SyntheticConfig
@@ -137,6 +196,7 @@ class SyntheticSource:
     roots: NDArray[np.int64]
     body_paints: NDArray[np.int64]
     rig: CameraRig
+    people: PeopleCast | None = None
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         """RGB uint8 [H, W, 3] of a camera."""
@@ -149,15 +209,45 @@ class SyntheticSource:
         self, T_world_camera: Float, k: Float, width: int, height: int, t_us: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
         """See :meth:`SyntheticLog.render`."""
-        return shoot_image(
-            self.world,
-            self.instances(t_us),
-            np.ascontiguousarray(T_world_camera, dtype=np.float64),
-            np.ascontiguousarray(k, dtype=np.float64),
-            width,
-            height,
-            self.config.samples,
-        )
+        with self.world_at(t_us) as world:
+            return shoot_image(
+                world,
+                self.instances(t_us),
+                np.ascontiguousarray(T_world_camera, dtype=np.float64),
+                np.ascontiguousarray(k, dtype=np.float64),
+                width,
+                height,
+                self.config.samples,
+            )
+
+    @contextmanager
+    def world_at(self, t_us: float) -> Iterator[RaycastWorld]:
+        """All that rays meet, people in their poses of an instant [us]."""
+        if self.people is None:
+            yield self.world
+            return
+        with self.people.at(t_us) as world:
+            yield world
+
+    def parts(
+        self, T_world_camera: Float, k: Float, size: tuple[int, int], t_us: int
+    ) -> NDArray[np.uint8]:
+        """See :meth:`SyntheticLog.render_parts`."""
+        if self.people is None:
+            return np.zeros(size[::-1], np.uint8)
+        with self.world_at(t_us) as world:
+            return trace_parts(
+                world, self.instances(t_us), self.people.meshes, T_world_camera, k, size
+            )
+
+    def flow(
+        self, poses: tuple[Float, Float], k: Float, size: tuple[int, int], times_us: tuple[int, int]
+    ) -> NDArray[np.float32]:
+        """See :meth:`SyntheticLog.flow`."""
+        places = self.instances(times_us[0]), self.instances(times_us[1])
+        meshes = () if self.people is None else self.people.meshes
+        with self.world_at(times_us[0]) as world:
+            return trace_flow(world, places, meshes, poses, k, size, times_us[1] * 1e-6)
 
     def render_through(
         self, camera: Camera, motion: CameraMotion, t_us: int, samples: int
@@ -197,13 +287,14 @@ class SyntheticSource:
         size = np.linalg.norm(beside - rays, axis=-1) / 1e-3 / samples
         directions = (rays @ turn.T).reshape(-1, 3)
         seen = np.asarray(seen.all(-1))
-        colours, ranges = shoot_rays(
-            self.world,
-            self.instances(t_us),
-            np.broadcast_to(place, directions.shape).copy(),
-            np.where(np.repeat(seen, samples**2)[:, None], directions, [0.0, 0.0, 1.0]),
-            size.reshape(-1),
-        )
+        with self.world_at(t_us // SHUTTER_STEP_US * SHUTTER_STEP_US) as world:
+            colours, ranges = shoot_rays(
+                world,
+                self.instances(t_us),
+                np.broadcast_to(place, directions.shape).copy(),
+                np.where(np.repeat(seen, samples**2)[:, None], directions, [0.0, 0.0, 1.0]),
+                size.reshape(-1),
+            )
         colours = colours.reshape(len(corners), -1, 3).mean(1) * seen[:, None]
         ranges = ranges.reshape(len(corners), -1)
         solid = seen & (ranges > 0).all(1)
@@ -212,7 +303,7 @@ class SyntheticSource:
         return rgb, (ranges.mean(1) * solid).astype(np.float32).reshape(shape)
 
     def instances(self, t_us: int) -> Instances:
-        """Where all vehicles are at ``t_us``."""
+        """Where all vehicles and people are at ``t_us``."""
         sweeps = self._instances_over(np.array([float(t_us)]))
         return sweeps._replace(to_object=sweeps.to_object[0], to_world=sweeps.to_world[0])
 
@@ -220,7 +311,25 @@ class SyntheticSource:
         to_world = np.zeros((len(times_us), len(self.drive.vehicles), 4, 4))
         for i, vehicle in enumerate(self.drive.vehicles):
             to_world[:, i] = poses_at(vehicle.trajectory, times_us)
-        return self.placed(range(len(self.drive.vehicles)), to_world)
+        vehicles = self.placed(range(len(self.drive.vehicles)), to_world)
+        if self.people is None:
+            return vehicles
+        return _joined(vehicles, self._people_over(self.people, times_us))
+
+    def _people_over(self, people: PeopleCast, times_us: Float) -> Instances:
+        every = self.drive.people
+        to_world = np.stack([poses_at(p.trajectory, times_us) for p in every], axis=1)
+        half = np.array([p.size for p in every]) / 2
+        return Instances(
+            to_object=np.ascontiguousarray(invert_transform(to_world)[..., :3, :]),
+            to_world=np.ascontiguousarray(to_world[..., :3, :]),
+            radius=np.linalg.norm(half, axis=1) + 0.05,
+            root=people.roots(),
+            shape=np.zeros(len(every), np.int64),
+            paint=np.zeros(len(every), np.int64),
+            # What darkens the ground about them is their feet, not their box.
+            half_size=np.column_stack([np.full((len(every), 2), 0.1), half[:, 2]]),
+        )
 
     def placed(self, vehicles: Sequence[int], to_world: Float) -> Instances:
         """Vehicles [N] at poses [..., N, 4, 4]."""
@@ -241,14 +350,32 @@ class SyntheticSource:
         times_us = t_us + lidar.beams.time_us[0]
         poses = poses_at(self.drive.ego, times_us) @ lidar.T_vehicle_lidar
         local = lidar.beams.directions.swapaxes(0, 1)
-        ranges, reflected = shoot_lidar(
-            self.world,
-            self._instances_over(times_us),
+        ranges, reflected = self._shoot(
+            times_us,
             np.ascontiguousarray(poses[:, :3, 3]),
             np.ascontiguousarray(np.einsum("cij,cbj->cbi", poses[:, :3, :3], local)),
             lidar.max_range,
         )
         return np.ascontiguousarray(ranges.T), np.ascontiguousarray(reflected.T)
+
+    def _shoot(
+        self, times_us: Float, origins: Float, directions: Float, limit: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Ranges and reflectivity [C, B] of columns at instants [C]."""
+        every = self._instances_over(times_us)
+        if self.people is None:
+            ranges, reflected = shoot_lidar(self.world, every, origins, directions, limit)
+            return ranges, reflected
+        ranges = np.zeros(directions.shape[:2], np.float32)
+        reflected = np.zeros_like(ranges)
+        slots, of_slot = np.unique(np.floor(times_us / SWEEP_STEP_US), return_inverse=True)
+        for slot, world in enumerate(self.people.over((slots + 0.5) * SWEEP_STEP_US)):
+            own = np.flatnonzero(of_slot == slot)
+            moved = every._replace(to_object=every.to_object[own], to_world=every.to_world[own])
+            ranges[own], reflected[own] = shoot_lidar(
+                world, moved, origins[own], directions[own], limit
+            )
+        return ranges, reflected
 
     def lidar(self, frame: int) -> LidarSweep:
         """One turn of the LiDAR, clockwise, looking ahead at the frame's time stamp.
@@ -265,9 +392,8 @@ class SyntheticSource:
         local = _beam_directions(np.pi - 2 * np.pi * step, config.lidar_beams)
         directions = np.einsum("cij,cbj->cbi", poses[:, :3, :3], local)
         origins = apply_transform(poses, np.array([LIDAR_POSITION]))[:, 0]
-        ranges, reflected = shoot_lidar(
-            self.world,
-            self._instances_over(t_us + offsets_us),
+        ranges, reflected = self._shoot(
+            t_us + offsets_us,
             np.ascontiguousarray(origins),
             np.ascontiguousarray(directions),
             config.lidar_range,
@@ -279,6 +405,18 @@ class SyntheticSource:
         points = origins[column] + directions[column, beam] * measured[kept][:, None]
         in_vehicle = apply_transform(invert_transform(self.drive.ego.transform(t_us)), points)
         return _sweep(in_vehicle, reflected[kept], offsets_us[column])
+
+
+def _joined(vehicles: Instances, people: Instances) -> Instances:
+    """One after the other; poses have an axis of instants in front."""
+    return Instances(
+        *(
+            np.concatenate(
+                [getattr(vehicles, n), getattr(people, n)], axis=int(n.startswith("to_"))
+            )
+            for n in Instances._fields
+        )
+    )
 
 
 def _beam_directions(azimuth: Float, beams: int) -> Float:
@@ -320,6 +458,7 @@ def generate_log(config: SyntheticConfig) -> SyntheticLog:
     body_paints = len(paints) + np.arange(len(drive.vehicles), dtype=np.int64)
     paints += [(*v.colour, 0.0, 0.0, 0.0, 0.0, 0.0) for v in drive.vehicles]
     geometry, roots = build_geometry(meshes)
+    geometry, people = add_people(geometry, drive.people, paints)
     world = RaycastWorld(
         *geometry,
         np.array(paints),
@@ -327,13 +466,14 @@ def generate_log(config: SyntheticConfig) -> SyntheticLog:
         np.array([roof_heights(shape) for shape in SHAPES]),
         config.seed % 1_000_003 * 131,
     )
-    source = SyntheticSource(config, world, drive, roots[1:], body_paints, config.rig())
+    cast = PeopleCast(world, people) if people else None
+    source = SyntheticSource(config, world, drive, roots[1:], body_paints, config.rig(), cast)
     return SyntheticLog(
         name=f"synthetic_{config.seed}",
         rig=source.rig,
         frame_times_us=drive.frame_times_us,
         ego=drive.ego,
-        tracks=_tracks(drive.vehicles),
+        tracks=_tracks(drive.vehicles, drive.people),
         source=source,
         lanes=street_lanes(drive.street),
         provenance={
@@ -345,7 +485,9 @@ def generate_log(config: SyntheticConfig) -> SyntheticLog:
     )
 
 
-def _tracks(vehicles: tuple[PlannedVehicle, ...]) -> tuple[ObjectTrack, ...]:
+def _tracks(
+    vehicles: tuple[PlannedVehicle, ...], people: tuple[PlannedPerson, ...]
+) -> tuple[ObjectTrack, ...]:
     seen: Counter[str] = Counter()
     tracks = []
     for vehicle in vehicles:
@@ -353,6 +495,10 @@ def _tracks(vehicles: tuple[PlannedVehicle, ...]) -> tuple[ObjectTrack, ...]:
         object_id = f"{shape.category}_{seen[shape.category]}"
         seen[shape.category] += 1
         tracks.append(ObjectTrack(object_id, shape.category, shape.size, vehicle.trajectory))
+    for person in people:
+        object_id = f"{person.category}_{seen[person.category]}"
+        seen[person.category] += 1
+        tracks.append(ObjectTrack(object_id, person.category, person.size, person.trajectory))
     return tuple(tracks)
 
 

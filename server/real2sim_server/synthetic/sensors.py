@@ -144,6 +144,31 @@ def shoot_rays(world, instances, origins, directions, sizes):
     return colours, ranges
 
 
+@kernel(parallel=True)
+def trace(world, instances, m, k, width, height):
+    """What pixel centres see: triangle [N], u, v [N], instance [N] and distance [N] of the hit.
+
+    Triangles are rows of the world's arrays, -1 in the sky; instances are -1 for the static world.
+    """
+    n = width * height
+    triangle, instance = np.empty(n, np.int64), np.empty(n, np.int64)
+    place = np.empty((n, 3))
+    for row in prange(height):
+        stack = new_stack()
+        for column in range(width):
+            i = row * width + column
+            x = (column + 0.5 - k[0, 2]) / k[0, 0]
+            y = (row + 0.5 - k[1, 2]) / k[1, 1]
+            s = 1.0 / math.sqrt(x * x + y * y + 1.0)
+            dx = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) * s
+            dy = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * s
+            dz = (m[2, 0] * x + m[2, 1] * y + m[2, 2]) * s
+            hit = cast(world, instances, m[0, 3], m[1, 3], m[2, 3], dx, dy, dz, FAR, stack)
+            triangle[i], instance[i] = hit[1], hit[4]
+            place[i, 0], place[i, 1], place[i, 2] = hit[2], hit[3], hit[0]
+    return triangle, instance, place
+
+
 @kernel
 def _find_edges(keys, planes):
     """Which pixels [H, W] show another surface than one of their eight neighbours."""

@@ -13,10 +13,13 @@ from ..geometry.transform import transform_from
 from ..scene import Trajectory
 from .config import SyntheticConfig
 from .materials import PARKING_BAY
+from .people import PlannedPerson, plan_people
 from .street import EGO_OFFSET, KERB, LANE, Street, lay_street
 from .vehicles import SHAPES
 
 PARKED_OFFSET = (LANE + KERB) / 2 + 0.05
+EGO_SPACE = (7.6, 1.9)
+"""Length and width that people leave to the ego vehicle, whose origin is its rear axle [m]."""
 COLOURS = (
     (0.62, 0.62, 0.61), (0.62, 0.62, 0.61), (0.3, 0.31, 0.32), (0.1, 0.105, 0.11),
     (0.022, 0.022, 0.025), (0.32, 0.02, 0.018), (0.025, 0.07, 0.24), (0.06, 0.16, 0.3),
@@ -35,12 +38,14 @@ class DrivePlan:
         frame_times_us: [F] int64 [us].
         ego: ``T_world_vehicle``.
         vehicles: all others, moving ones first.
+        people: on foot, then on bicycles.
     """
 
     street: Street
     frame_times_us: NDArray[np.int64]
     ego: Trajectory
     vehicles: tuple[PlannedVehicle, ...]
+    people: tuple[PlannedPerson, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +71,9 @@ def plan_drive(config: SyntheticConfig) -> DrivePlan:
     street = lay_street(street_rng, drive_length=float(distance(np.array(config.duration))))
     ego = _drive_ego(street, distance, times_us)
     vehicles = _place_vehicles(street, distance, config, times_us, traffic_rng)
-    return DrivePlan(street, times_us, ego, tuple(vehicles))
+    driving = [(v.trajectory, *SHAPES[v.shape].size[:2]) for v in vehicles]
+    people = plan_people(config, street, times_us, [(ego, *EGO_SPACE), *driving])
+    return DrivePlan(street, times_us, ego, tuple(vehicles), people)
 
 
 def _drive_distance(config: SyntheticConfig, rng: np.random.Generator) -> Distance:
