@@ -207,7 +207,7 @@ def people(_: Path, __: Path) -> None:
     """``people.jpg``: a stride, and who else is on a synthetic street."""
     log = generate_log(SyntheticConfig(seed=3, frames=40, samples=3, pedestrians=10, cyclists=2))
     first = int(log.people(0).tracks[0])
-    stride = [(first + 7, 1_000_000 + k * 150_000, 1.5) for k in range(8)]
+    stride = [(first + 7, 1_000_000 + k * 150_000, -1.5) for k in range(8)]
     others = [(first + i, 1_500_000, -0.9 + 0.5 * (i % 4)) for i in (0, 1, 2, 3, 6)]
     others += [(first + 10, 1_500_000, 0.5), (first + 11, 1_500_000, 1.4)]
     others += [(first + 11, 1_500_000, 2.6)]
