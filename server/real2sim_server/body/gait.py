@@ -297,51 +297,50 @@ class _Motion:
 
     def _foot(self, side: int) -> tuple[Float, Float, Float]:
         """Ankle [T, 3], rotation [T, 3, 3] and bend of the toes [T] of a foot, body frame."""
-        foot = Foot(self.body, "lr"[side])
+        foot, walk = Foot(self.body, "lr"[side]), self.gait.feet[side]
+        begun = np.searchsorted(walk.lift, self.steps, side="right")
+        swinging = (begun > 0) & (self.steps < np.append(0.0, walk.land)[begun])
+        ankle, yaw, pitch, toes = self._stance(foot, side, np.where(swinging, begun - 1, begun))
+        if swinging.any():
+            flown = self._swing(foot, side, np.maximum(begun - 1, 0))
+            ankle = np.where(swinging[:, None], flown[0], ankle)
+            stood = zip(flown[1:], (yaw, pitch, toes), strict=True)
+            yaw, pitch, toes = (np.where(swinging, one, other) for one, other in stood)
+        return self._to_body(ankle), foot.turned(yaw - self.place[:, 3], pitch), toes
+
+    def _stance(
+        self, foot: Foot, side: int, spot: NDArray[np.int64]
+    ) -> tuple[Float, Float, Float, Float]:
+        """Ankle [T, 3], yaw, pitch and bend of the toes [T] on a spot, from heel to ball."""
         walk = self.gait.feet[side]
-        swings = len(walk.lift)
-        k = (
-            np.searchsorted(walk.lift, self.steps, side="right")
-            if swings
-            else np.zeros(len(self.steps), np.int64)
-        )
-        swinging = (k > 0) & (self.steps < np.append(0.0, walk.land)[k])
-        # Before and after this instant: strike of the spot, and the leaving of it.
-        spot = np.where(swinging, k - 1, k)
-        size = np.append(np.append(0.0, self._sizes(walk)), 0.0)
+        size = np.concatenate([[0.0], self._sizes(walk), [0.0]])
         leaving, striking = self._off_angle(size[spot + 1]), self._strike_angle(size[spot])
-        since = np.append(-1e9, walk.land)[spot]
-        until = np.append(walk.lift, 1e9)[spot]
+        since, until = np.append(-1e9, walk.land)[spot], np.append(walk.lift, 1e9)[spot]
         share = np.clip((self.steps - since) / np.maximum(until - since, 1e-9), 0, 1)
-        pitch = (
-            striking * (1 - smooth(share / 0.16))
-            + leaving * np.clip((share - 0.4) / 0.6, 0, 1) ** 1.5
-        )
-        stance = foot.standing(self._spot(walk, spot, side), self._yaw(walk, spot, side), pitch)
-        toes = -np.maximum(pitch, 0.0)
-        if swings:
-            j = np.clip(k - 1, 0, swings - 1)
-            p = np.clip((self.steps - walk.lift[j]) / (walk.land[j] - walk.lift[j]), 0, 1)
-            off, strike = self._off_angle(size[j + 1]), self._strike_angle(size[j + 1])
-            angle = off * (1 - smooth(p / 0.75)) + strike * smooth((p - 0.45) / 0.55)
-            away = foot.standing(self._spot(walk, j, side), self._yaw(walk, j, side), off)
-            down = foot.standing(
-                self._spot(walk, j + 1, side), self._yaw(walk, j + 1, side), strike
-            )
-            # A foot that has to overtake a running body must not dwell where it was.
-            linear = 0.35 + 0.4 * self.running
-            flown = away + (smooth(p) + linear * (p - smooth(p)))[:, None] * (down - away)
-            flown[:, 2] += self._lift_height(size[j + 1], p)
-            stance = np.where(swinging[:, None], flown, stance)
-            pitch = np.where(swinging, angle, pitch)
-            toes = np.where(swinging, -np.maximum(off, 0) * (1 - smooth(p / 0.4)), toes)
-            from_yaw, to_yaw = self._yaw(walk, j, side), self._yaw(walk, j + 1, side)
-            yaw = np.where(
-                swinging, from_yaw + smooth(p) * (to_yaw - from_yaw), self._yaw(walk, spot, side)
-            )
-        else:
-            yaw = self._yaw(walk, spot, side)
-        return self._to_body(stance), foot.turned(yaw - self.place[:, 3], pitch), toes
+        down = striking * (1 - smooth(share / 0.16))
+        pitch = down + leaving * np.clip((share - 0.4) / 0.6, 0, 1) ** 1.5
+        yaw = self._yaw(walk, spot, side)
+        ankle = foot.standing(self._spot(walk, spot, side), yaw, pitch)
+        return ankle, yaw, pitch, -np.maximum(pitch, 0.0)
+
+    def _swing(
+        self, foot: Foot, side: int, spot: NDArray[np.int64]
+    ) -> tuple[Float, Float, Float, Float]:
+        """As :meth:`_stance`, on the way from a spot to the next one."""
+        walk = self.gait.feet[side]
+        p = np.clip((self.steps - walk.lift[spot]) / (walk.land[spot] - walk.lift[spot]), 0, 1)
+        size = self._sizes(walk)[spot]
+        off, strike = self._off_angle(size), self._strike_angle(size)
+        start, end = self._yaw(walk, spot, side), self._yaw(walk, spot + 1, side)
+        away = foot.standing(self._spot(walk, spot, side), start, off)
+        down = foot.standing(self._spot(walk, spot + 1, side), end, strike)
+        # A foot that has to overtake a running body must not dwell where it was.
+        linear = 0.35 + 0.4 * self.running
+        ankle = away + (smooth(p) + linear * (p - smooth(p)))[:, None] * (down - away)
+        ankle[:, 2] += self._lift_height(size, p)
+        pitch = off * (1 - smooth(p / 0.75)) + strike * smooth((p - 0.45) / 0.55)
+        toes = -np.maximum(off, 0) * (1 - smooth(p / 0.4))
+        return ankle, start + smooth(p) * (end - start), pitch, toes
 
     def _sizes(self, walk: Footsteps) -> Float:
         """Lengths of a foot's swings against the leg's [K]."""
