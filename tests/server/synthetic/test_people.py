@@ -133,7 +133,7 @@ def test_lidar_points_lie_on_their_surface(log):
         own &= local[:, 2] > 0.2 - track.size[2] / 2
         for point, offset in zip(local[own][::3], sweep.offset_us[own][::3], strict=True):
             vertices = mesh.person.vertices(np.array([(t_us + int(offset)) * 1e-6]))[0]
-            assert _away(vertices[mesh.triangles], point) < 0.02
+            assert _away(vertices[mesh.triangles], point) < 0.035
             found += 1
     assert found > 20
 
