@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +28,8 @@ from .stereo import sweep_planes
 from .surfels import Surfels, fit_surfels, round_surfels
 from .triangulate import TriangulatedPoints, triangulate
 from .vehicle_body import VehicleBody, faced, fitted_body
+from .vehicle_light import FROM_ABOVE, LIGHT, pose_amid
+from .vehicle_paint import VehicleSurface, fill_vehicles
 from .views import PlacedSurfels, ProjectedView, chosen_frames, gather_views
 from .walls import continue_walls, real_walls
 
@@ -142,9 +145,9 @@ def initialise_scene(
     with stages("colour") as report_step:
         colours, known, sky_samples = _sample_colours(log, parts, options, report_step)
     with stages("fill"):
-        colours = _inpaint(log, parts, fitted.surface, colours, known)
+        colours, light = _inpaint(log, parts, fitted.surface, colours, known)
         sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
-    scene = _assemble(log, parts, colours, sky, options)
+    scene = _assemble(log, parts, colours, sky, {LIGHT: light.tolist(), "options": asdict(options)})
     lanes = None if log.lanes is None else laid_on(log.lanes, fitted.ground)
     return replace(scene, stored_ground=fitted.ground, lanes=lanes)
 
@@ -327,7 +330,8 @@ def _inpaint(
     surface: Ground,
     colours: NDArray[np.float32],
     known: NDArray[np.bool_],
-) -> NDArray[np.float32]:
+) -> tuple[NDArray[np.float32], Float]:
+    """Colours [N, 3] of all Gaussians, and the light [3] on vehicles."""
     points, filled = parts.surfels.points, colours.copy()
     ground = slice(0, parts.ground_count)
     filled[ground] = fill_ground(surface, points[ground], colours[ground], known[ground])
@@ -344,12 +348,12 @@ def _inpaint(
 
 def _inpaint_objects(
     log: DrivingLog, parts: _SurfelSet, colours: NDArray[np.float32], known: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """Fill each object's body from itself, then its underside, in place."""
+) -> tuple[NDArray[np.float32], Float]:
+    """Fill each object's body from itself, then its underside, in place; the light on vehicles."""
     bodies = ~parts.is_underside
     members = [np.flatnonzero((parts.instance == i + 1) & bodies) for i in range(len(log.tracks))]
     if not members:
-        return colours
+        return colours, np.array(FROM_ABOVE)
     relative = np.zeros(len(colours), dtype=np.float32)
     for track, mine in zip(log.tracks, members, strict=True):
         relative[mine] = parts.surfels.points[mine, 2] / track.size[2]
@@ -358,43 +362,34 @@ def _inpaint_objects(
         relative[every], parts.intensity[every], colours[every], known[every], OBJECT_HEIGHTS
     )
     frames = chosen_frames(log, FACED_FRAMES)
-    for track, mine, shape in zip(log.tracks, members, parts.bodies, strict=True):
-        points, seen = parts.surfels.points[mine], known[mine]
-        if shape is not None:
+    closed: list[int] = []
+    surfaces: list[VehicleSurface] = []
+    for k, (track, mine, body) in enumerate(zip(log.tracks, members, parts.bodies, strict=True)):
+        if body is not None:
+            closed.append(k)
+            places = parts.surfels.points[mine].astype(np.float64)
+            nearest = body.nearest(places)
             # A side seen edge on has the colours of what lies beside its outline.
-            places = points.astype(np.float64)
-            normals = shape.normals[shape.nearest(places)]
-            seen = seen & faced(log, track, places, normals, frames)
-        mirrored, now_known = fill_from_mirror(points, colours[mine], seen)
-        likely = prior.colour(relative[mine], parts.intensity[mine])
-        if shape is None:
-            body = body_color(relative[mine], mirrored, now_known, likely, OBJECT_HEIGHTS)
-            colours[mine] = fill_from_neighbours(
-                points, mirrored, now_known, body, trust_reach=BODY_COLOR_REACH
+            seen = known[mine] & faced(log, track, places, body.normals[nearest], frames)
+            normals = body.unit_normals()[nearest] @ pose_amid(track.trajectory)[:3, :3].T
+            surfaces.append(
+                VehicleSurface(parts.surfels.points[mine], normals, colours[mine], seen, body)
             )
+    filled, light = fill_vehicles(surfaces)
+    for k, found in zip(closed, filled, strict=True):
+        colours[members[k]] = found
+    for mine, body in zip(members, parts.bodies, strict=True):
+        if body is not None:
             continue
-        colours[mine] = paint_colours(points, mirrored, now_known, shape, likely=likely)
+        points = parts.surfels.points[mine]
+        mirrored, now_known = fill_from_mirror(points, colours[mine], known[mine])
+        likely = prior.colour(relative[mine], parts.intensity[mine])
+        plain = body_color(relative[mine], mirrored, now_known, likely, OBJECT_HEIGHTS)
+        colours[mine] = fill_from_neighbours(
+            points, mirrored, now_known, plain, trust_reach=BODY_COLOR_REACH
+        )
     colours[parts.is_underside & ~known] = UNDERSIDE_COLOUR
-    return colours
-
-
-def paint_colours(
-    points: NDArray[np.float32],
-    colours: NDArray[np.float32],
-    known: NDArray[np.bool_],
-    body: VehicleBody,
-    *,
-    likely: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Colours [N, 3] where ``known`` [N], else those of the body's parts and one even paint.
-
-    Args:
-        points: [N, 3] in the object frame [m].
-        likely: [N, 3], the paint where too little of it was seen.
-    """
-    part, is_part = body.part_colours(points)
-    paint = body_color(points[:, 2], colours, known & ~is_part, likely, ())
-    return np.where(known[:, None], colours, np.where(is_part[:, None], part, paint))
+    return colours, light
 
 
 def _median_colour(colours: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -408,7 +403,7 @@ def _assemble(
     parts: _SurfelSet,
     colours: NDArray[np.float32],
     sky: Sky,
-    options: InitialiseOptions,
+    made: dict[str, Any],
 ) -> Scene:
     clouds = [
         _cloud(parts, colours, np.flatnonzero(parts.instance == i))
@@ -429,7 +424,7 @@ def _assemble(
         ego_size=log.ego_size,
         provenance={
             **log.provenance,
-            "reconstruction": {"stage": 0, "iterations": 0, "options": asdict(options)},
+            "reconstruction": {"stage": 0, "iterations": 0, **made},
         },
     )
 

@@ -19,7 +19,8 @@ from ...logs import DrivingLog, ObjectTrack
 from ...scene import Scene
 from ...synthetic.materials import BODY, WHEEL
 from ...synthetic.vehicles import SHAPES, VehicleShape, build_vehicle, roof_heights
-from .inpainting import MIN_OBSERVED, modal_colour
+from .inpainting import GREY, MIN_OBSERVED, modal_colour
+from .vehicle_light import brightness
 
 SPACING = 0.05
 """Distance between points on a body [m]."""
@@ -36,9 +37,6 @@ WHITE_LAMP, RED_LAMP = (0.65, 0.65, 0.65), (0.45, 0.1, 0.1)
 PLATE = (0.6, 0.6, 0.58)
 GRAZING = 0.35
 """Cosine to a surface's normal up to which a camera hardly sees it: 20 degrees from edge on."""
-SKY_LIGHT, SHADE = 0.18, 0.4
-"""Of its brightness a surface that faces up gains the first and one that faces down loses the
-second, against an upright one."""
 PAINT_REACH = 0.2
 """Points farther from a body say nothing by its parts [m]."""
 
@@ -58,6 +56,11 @@ class VehicleBody:
     normals: Float
     colours: NDArray[np.float32]
     is_paint: NDArray[np.bool_]
+
+    def unit_normals(self) -> Float:
+        """[N, 3] of length 1."""
+        length = np.linalg.norm(self.normals, axis=1, keepdims=True)
+        return np.asarray(self.normals / length.clip(1e-9))
 
     def nearest(self, points: Float) -> NDArray[np.int64]:
         """Indices [N] of the body's points nearest to ``points`` [N, 3]."""
@@ -110,21 +113,27 @@ def scene_bodies(scene: Scene) -> list[VehicleBody | None]:
 
 
 def body_colours(
-    body: VehicleBody, points: NDArray[np.float32], colours: NDArray[np.float32]
+    body: VehicleBody,
+    points: NDArray[np.float32],
+    colours: NDArray[np.float32],
+    *,
+    light: Float,
 ) -> NDArray[np.float32]:
-    """Colours [B, 3] of the points of a body: its parts' own, and one paint in soft light.
+    """Colours [B, 3] of the points of a body: its parts' own, and one paint, in the given light.
 
     Args:
         points: [N, 3] of a vehicle in that box, stage 0's.
-        colours: [N, 3] of these; the commonest where there is paint becomes the paint.
+        colours: [N, 3] of these; the commonest where there is paint becomes the paint, the light
+            taken off.
+        light: slopes [3] in the frame of the box, see :func:`.vehicle_light.fit_light`.
     """
     _, is_part = body.part_colours(points)
-    painted = colours[~is_part] if (~is_part).sum() >= MIN_OBSERVED else colours
-    paint = modal_colour(painted) if len(painted) else np.full(3, 0.4, np.float32)
-    up = body.normals[:, 2:]
-    light = 1 + np.where(up > 0, SKY_LIGHT, SHADE) * up
+    lit = brightness(light, body.unit_normals())
+    plain = colours / lit[body.nearest(points.astype(np.float64))] if len(points) else colours
+    painted = plain[~is_part] if (~is_part).sum() >= MIN_OBSERVED else plain
+    paint = modal_colour(painted) if len(painted) else GREY
     mixed = np.where(body.is_paint[:, None], paint, body.colours)
-    return np.clip(mixed * light, 0, 1).astype(np.float32)
+    return np.clip(mixed * lit, 0, 1).astype(np.float32)
 
 
 def faced(

@@ -1,9 +1,10 @@
-"""Vehicles that training shows from one direction alone, closed.
+"""Vehicles, closed where no image shows them.
 
+The body that fits a vehicle's box stands, in its paint, wherever no image shows what was learnt.
 Where all images look along one direction, none tells how deep what they show lies: the tail of a
 vehicle that was followed is learnt as a cloud metres deep, and falls apart when the vehicle turns.
 Here that cloud is pressed along the viewing rays onto the body that fits the vehicle's box, which
-hardly changes an image, and the body closes the rest as far as no image shows it.
+hardly changes an image.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ...geometry.rotation import matrix_to_quaternion
+from ...geometry.rotation import Float, matrix_to_quaternion
 from ...scene import GaussianCloud, SceneObject
 from ...scene.spherical_harmonics import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
+from ..initialise.vehicle_light import light_on
 from .directions import ViewingDirections, constant_colours, viewing_directions
 from .gaussians import FIELDS, OBJECT_FIELDS
 from .model import SceneModel
@@ -54,43 +56,71 @@ def close_followed(
     optimizer: SelectiveAdam,
     viewpoints: Sequence[Viewpoint],
     bodies: Sequence[VehicleBody | None],
-) -> OfferedPriors:
-    """Press what was followed onto its body, in place, and offer the body as its prior.
+) -> list[bool]:
+    """Press what was followed onto its body, in place.
 
     Args:
         bodies: of the objects; None where there is none.
+
+    Returns:
+        Of which objects that was done.
     """
     seen = viewing_directions(model, viewpoints, objects_only=True)
-    objects, alternatives = dict(model.scene.objects), [_no_choice(len(model.scene.background))]
-    for index, (name, item) in enumerate(model.scene.objects.items()):
+    followed = []
+    for index, item in enumerate(model.scene.objects.values()):
         body, rows = bodies[index], _followed_rows(model, seen, index)
+        followed.append(body is not None and len(rows) > 0)
         if body is not None and len(rows):
             _press(model, optimizer, rows, seen.means[rows], _surface(body, item.size))
-            objects[name] = replace(item, cloud=body_cloud(body, item))
-            alternatives.append(torch.arange(len(body.points)).repeat(len(INSETS)))
+    return followed
+
+
+def offer_bodies(
+    model: SceneModel, followed: Sequence[bool], bodies: Sequence[VehicleBody | None]
+) -> OfferedPriors:
+    """Bodies as the priors of all vehicles that have one, in the paint of stage 0.
+
+    Args:
+        followed: by object, whether its outline alone says how wide it is: bodies come in INSETS.
+        bodies: of the objects; None where there is none.
+    """
+    scene = model.scene
+    reconstruction = scene.provenance.get("reconstruction")
+    objects, alternatives = dict(scene.objects), [_no_choice(len(scene.background))]
+    for index, (name, item) in enumerate(scene.objects.items()):
+        body, insets = bodies[index], INSETS if followed[index] else INSETS[:1]
+        if body is not None:
+            light = light_on(item, reconstruction)
+            cloud = body_cloud(body, item, light=light, insets=insets)
+            objects[name] = replace(item, cloud=cloud)
+            alternatives.append(torch.arange(len(body.points)).repeat(len(insets)))
         else:
             alternatives.append(_no_choice(len(item.cloud)))
     # Of a body's point one inset is taken; numbers tell the points of all objects apart.
     numbered = [a + (a >= 0) * (i << 32) for i, a in enumerate(alternatives)]
-    return OfferedPriors(replace(model.scene, objects=objects), torch.cat(numbered))
+    return OfferedPriors(replace(scene, objects=objects), torch.cat(numbered))
 
 
-def body_cloud(body: VehicleBody, item: SceneObject) -> GaussianCloud:
-    """The whole of a body once for each of INSETS, in the paint that ``item`` shows.
+def body_cloud(
+    body: VehicleBody, item: SceneObject, *, light: Float, insets: Sequence[float]
+) -> GaussianCloud:
+    """The whole of a body once for each inset, in the paint that ``item`` shows.
 
     Args:
         item: of stage 0.
+        light: slopes [3] in its frame, see :func:`.vehicle_light.fit_light`.
     """
     shown = constant_colours(item.cloud)
-    colours = body_colours(body, item.cloud.means.cpu().numpy(), shown.cpu().numpy())
-    insets = np.array([(1 - 0.4 * (1 - f), f, f) for f in INSETS])
-    normals = body.normals / np.linalg.norm(body.normals, axis=1, keepdims=True).clip(1e-9)
+    points = item.cloud.means.cpu().numpy()
+    colours = body_colours(body, points, shown.cpu().numpy(), light=light)
+    factors = np.array([(1 - 0.4 * (1 - f), f, f) for f in insets])
+    normals = body.unit_normals()
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0, 1]], [[1.0, 0, 0]])
     first = np.cross(helper, normals)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     axes = np.stack([first, np.cross(normals, first), normals], axis=2)
-    count, copies = len(body.points), len(INSETS)
-    means = (insets[:, None] * body.points).reshape(-1, 3)
+    count, copies = len(body.points), len(insets)
+    means = (factors[:, None] * body.points).reshape(-1, 3)
     cloud = GaussianCloud(
         means=torch.from_numpy(means).float(),
         quats=torch.from_numpy(matrix_to_quaternion(axes)).float().repeat(copies, 1),

@@ -86,6 +86,10 @@ class SceneModel:
         half = [np.array(o.size) / 2 for o in scene.objects.values()]
         self.half_sizes = torch.from_numpy(np.array(half).reshape(-1, 3)).float().to(self.device)
 
+    def stop_mirroring(self) -> None:
+        """From now on no image of a vehicle's other side counts as seen or teaches anything."""
+        self.mirrored = tuple(False for _ in self.mirrored)
+
     def parameters(self) -> dict[str, Tensor]:
         """Every trainable tensor by name."""
         return {

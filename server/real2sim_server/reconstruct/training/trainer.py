@@ -20,7 +20,7 @@ from ..initialise.vehicle_body import scene_bodies
 from ..options import ReconstructError
 from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from .closed_vehicles import close_followed
+from .closed_vehicles import close_followed, offer_bodies
 from .data import TrainingView, TrainingViews, held_out_frames, image_time
 from .densify import STRATEGIES, ScreenSums, TrainingStep
 from .directions import (
@@ -79,16 +79,14 @@ class Trainer:
             iterations=options.iterations,
         )
         self.strategy.initialize_state(len(self.model.gaussians))
+        bodies = scene_bodies(scene)
         self.occlusion_pruning = OcclusionPruning(
             options.densify,
             options.iterations,
             self.views.sample_viewpoints,
-            unseen=partial(unseen_sides, bodies=scene_bodies(scene))
-            if options.directions.sides
-            else None,
-            close=partial(close_followed, bodies=scene_bodies(scene))
-            if options.directions.close
-            else None,
+            unseen=partial(unseen_sides, bodies=bodies) if options.directions.sides else None,
+            close=partial(close_followed, bodies=bodies) if options.directions.close else None,
+            offer=partial(offer_bodies, bodies=bodies) if options.directions.close else None,
         )
         self.iteration = 0
         self.running = RunningMeans()
@@ -340,6 +338,8 @@ class Trainer:
         self.model.load(parts["model"], held.counts)
         if held.prior_counts:
             self.model.priors = Gaussians(**parts["priors"], counts=held.prior_counts)
+            if self.options.directions.close:
+                self.model.stop_mirroring()
         self.optimizer.restore(parts["adam"], held.optimizer_steps)
         self.strategy.state = ScreenSums(**parts["sums"])
         self.iteration = held.iteration

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +43,8 @@ SHOWN_FRACTION = 0.05
 """Trained Gaussians of which more is visible than this say what the ground is like."""
 BARE_REACH = 2.5
 """They say so up to so many standard deviations of a Gaussian of the ground from its centre."""
+HARDLY_SEEN = 25.0
+"""Vehicles of which an image shows less on average are not learnt from images [px]."""
 VISIBILITY_VIEWS = 64
 """Views that decide which Gaussians are hidden."""
 EPS2D = RasterOptions().eps2d
@@ -61,10 +63,12 @@ class GaussianVisibility:
             before a camera.
         depths: [N] float32, from the surface in the pixels that show it back to its centre, mean
             by blending weight [m]; negative before the surface, 0 for what no pixel shows.
+        pixels: [N] float32, sums of blending weights over all pixels, by view [px].
     """
 
     fractions: Tensor
     depths: Tensor
+    pixels: Tensor
 
     def hidden(self, limits: VisibilityLimits) -> Tensor:
         """[N] bool."""
@@ -75,7 +79,7 @@ class GaussianVisibility:
 
 
 @torch.no_grad()
-def visibility(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> GaussianVisibility:
+def visibility(model: SceneModel, viewpoints: Sequence[Viewpoint]) -> GaussianVisibility:
     """What ``viewpoints`` show of each Gaussian of ``model``.
 
     Where training shows vehicles mirrored, both sides count: what is hidden on one is learnt on
@@ -101,7 +105,9 @@ def visibility(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> GaussianVi
             unoccluded[rows] += alone
             depth_sums[rows] += counted * (_depths(instance, viewmat) - surface)
     return GaussianVisibility(
-        visible / unoccluded.clamp(min=1e-9), depth_sums / visible.clamp(min=1e-9)
+        visible / unoccluded.clamp(min=1e-9),
+        depth_sums / visible.clamp(min=1e-9),
+        visible / max(1, len(viewpoints)),
     )
 
 
@@ -234,6 +240,26 @@ def behind_objects(model: SceneModel, seen: GaussianVisibility, limits: Visibili
     return found
 
 
+def hardly_seen(model: SceneModel, seen: GaussianVisibility, offered: OfferedPriors) -> Tensor:
+    """[1 + objects] bool: those offered as bodies of which images show next to nothing.
+
+    From a few pixels anything is learnt but a vehicle.
+    """
+    owners = torch.arange(len(model.gaussians.counts), device=seen.pixels.device)
+    shown = torch.zeros(len(owners), device=seen.pixels.device)
+    shown.index_add_(0, model.gaussians.owners.to(shown.device), seen.pixels)
+    found = shown < HARDLY_SEEN
+    found[0] = False
+    counts = [
+        len(offered.scene.background),
+        *(len(o.cloud) for o in offered.scene.objects.values()),
+    ]
+    if offered.alternatives is None:
+        return torch.zeros_like(found)
+    is_body = [bool((part >= 0).any()) for part in offered.alternatives.split(counts)]
+    return found & torch.tensor(is_body, device=found.device)
+
+
 @dataclass(frozen=True, eq=False)
 class OfferedPriors:
     """What may take the places that no image shows.
@@ -242,10 +268,12 @@ class OfferedPriors:
         scene: of stage 0, or with other clouds of its objects.
         alternatives: [N] int64 by Gaussian of ``scene``: of those of one number only the first
             that fits is taken; negative for any that fits. None: all are of the latter kind.
+        whole: [1 + objects] bool, of whom all are taken, visible or not; None: of nobody.
     """
 
     scene: Scene
     alternatives: Tensor | None = None
+    whole: Tensor | None = None
 
 
 def occluded_priors(
@@ -334,8 +362,10 @@ class OcclusionPruning:
         sample: draws so many training views.
         unseen: of a model, which Gaussians lie on sides that no view shows, see
             :func:`.directions.unseen_sides`; None knows of no such sides.
-        close: changes a model before its priors are chosen and says which are offered, see
-            :func:`.closed_vehicles.close_followed`; None offers stage 0.
+        close: changes a model before its priors are chosen and says of which objects, see
+            :func:`.closed_vehicles.close_followed`; None changes nothing.
+        offer: says, given these, which priors there are, see
+            :func:`.closed_vehicles.offer_bodies`; None offers stage 0.
     """
 
     def __init__(
@@ -345,10 +375,11 @@ class OcclusionPruning:
         sample: Callable[[int], list[Viewpoint]],
         *,
         unseen: Callable[[SceneModel, list[Viewpoint]], Tensor] | None = None,
-        close: Callable[[SceneModel, SelectiveAdam, list[Viewpoint]], OfferedPriors] | None = None,
+        close: Callable[[SceneModel, SelectiveAdam, list[Viewpoint]], list[bool]] | None = None,
+        offer: Callable[[SceneModel, list[bool]], OfferedPriors] | None = None,
     ) -> None:
         self._options, self._sample = options, sample
-        self._unseen, self._close = unseen, close
+        self._unseen, self._close, self._offer = unseen, close, offer
         self._hidden_rounds = {round(fraction * iterations) for fraction in options.hidden_rounds}
         self._prior_round = round(options.prior_round * iterations)
 
@@ -374,18 +405,22 @@ class OcclusionPruning:
                 sides = self._unseen(model, viewpoints)
                 model.gaussians = prune(model.gaussians, optimizer, sides)
             offered = OfferedPriors(model.scene)
-            if self._close is not None:
-                offered = self._close(model, optimizer, viewpoints)
+            if self._close is not None and self._offer is not None:
+                offered = self._offer(model, self._close(model, optimizer, viewpoints))
+                model.stop_mirroring()
             seen = visibility(model, viewpoints)
             # Priors first: they are to stand behind what is pruned then, too.
+            scarce = hardly_seen(model, seen, offered)
+            offered = replace(offered, whole=scarce)
             self._insert_priors(model, optimizer, viewpoints, offered, seen)
+            besides = behind_objects(model, seen, self._options.last_background_limits)
             model.gaussians = prune_hidden(
                 model.gaussians,
                 optimizer,
                 seen,
                 background_limits=self._options.background_limits,
                 object_limits=self._options.last_object_limits,
-                besides=behind_objects(model, seen, self._options.last_background_limits),
+                besides=besides | scarce[model.gaussians.owners],
             )
         return hidden_round or prior_round
 
@@ -405,7 +440,10 @@ class OcclusionPruning:
         model.sky.data[hidden] = first.sky.data[hidden]
         optimizer.reset_moments("sky")
         limit = self._options.background_limits.fraction
-        wanted = None if self._unseen is None else self._unseen(first, viewpoints)
+        wanted = None if offered.whole is None else offered.whole[first.gaussians.owners]
+        if self._unseen is not None:
+            unseen = self._unseen(first, viewpoints)
+            wanted = unseen if wanted is None else wanted | unseen
         model.priors = occluded_priors(
             model,
             first,

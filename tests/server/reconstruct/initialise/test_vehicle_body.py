@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 
 from real2sim_server.reconstruct.initialise.points import PointSet
-from real2sim_server.reconstruct.initialise.stage0 import paint_colours
 from real2sim_server.reconstruct.initialise.vehicle_body import (
     GLASS,
     RED_LAMP,
@@ -15,7 +14,6 @@ from real2sim_server.reconstruct.initialise.vehicle_body import (
 from ..conftest import painted_log
 
 SALOON, ESTATE = (4.7, 1.82, 1.46), (4.65, 1.84, 1.68)
-GREEN = np.array([0.1, 0.4, 0.2], np.float32)
 
 
 def near(body, place) -> np.ndarray:
@@ -47,16 +45,6 @@ def test_glass_tyres_and_lamps_are_no_paint():
 def test_other_categories_and_odd_boxes_have_no_body():
     assert fitted_body(np.zeros((0, 3), np.float32), (0.6, 0.6, 1.7), "pedestrian") is None
     assert fitted_body(np.zeros((0, 3), np.float32), (9.0, 1.8, 1.5), "car") is None
-
-
-def test_a_flank_that_no_camera_saw_is_even_and_in_the_colour_of_the_tail():
-    body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
-    points = body.points.astype(np.float32)
-    colours = np.tile(GREEN, (len(points), 1))
-    known = points[:, 0] < -2.2
-    filled = paint_colours(points, colours, known, body, likely=np.full_like(colours, 0.5))
-    doors = body.is_paint & (np.abs(points[:, 0]) < 1) & (np.abs(points[:, 2]) < 0.2)
-    np.testing.assert_allclose(filled[doors], np.broadcast_to(GREEN, (doors.sum(), 3)), atol=0.02)
 
 
 def test_a_body_fills_where_nothing_was_measured():

@@ -9,7 +9,11 @@ import torch
 from real2sim_server.geometry.transform import invert_transform
 from real2sim_server.reconstruct.initialise.vehicle_body import VehicleBody, fitted_body
 from real2sim_server.reconstruct.training import SceneModel
-from real2sim_server.reconstruct.training.closed_vehicles import INSETS, close_followed
+from real2sim_server.reconstruct.training.closed_vehicles import (
+    INSETS,
+    close_followed,
+    offer_bodies,
+)
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
 from real2sim_server.scene.spherical_harmonics import SH_C0
@@ -89,16 +93,23 @@ def test_what_is_seen_from_many_sides_stays(tiny_scene, ahead, body):
     near.T_vehicle_camera[:2, 3] += [4.0, 1.5]
     model = model_of(tiny_scene, pose, means)
     views = [(camera, t_us), (near, t_us)]
-    offered = close_followed(model, SelectiveAdam(model.parameters()), views, [body])
+    assert close_followed(model, SelectiveAdam(model.parameters()), views, [body]) == [False]
     assert torch.equal(model.gaussians.means.detach()[model.gaussians.counts[0] :], means)
+
+
+def test_a_vehicle_without_a_body_is_offered_what_stage_0_has(tiny_scene, ahead, body):
+    camera, t_us, pose = ahead
+    model = model_of(tiny_scene, pose, deep_tail(body, camera, tiny_scene, t_us, pose))
+    offered = offer_bodies(model, [False], [None])
     assert offered.scene.objects["car"] is model.scene.objects["car"]
+    assert (offered.alternatives < 0).all()
 
 
 def test_the_whole_body_is_offered_in_one_paint_and_once_for_each_inset(tiny_scene, ahead, body):
     camera, t_us, pose = ahead
     means = deep_tail(body, camera, tiny_scene, t_us, pose)
     model = model_of(tiny_scene, pose, means)
-    offered = close_followed(model, SelectiveAdam(model.parameters()), [(camera, t_us)], [body])
+    offered = offer_bodies(model, [True], [body])
     cloud, count = offered.scene.objects["car"].cloud, len(body.points)
     assert len(cloud) == len(INSETS) * count
     np.testing.assert_allclose(cloud.means[:count], body.points, atol=1e-5)
@@ -109,3 +120,5 @@ def test_the_whole_body_is_offered_in_one_paint_and_once_for_each_inset(tiny_sce
     assert (numbers == numbers[0]).all()
     assert len(numbers[0].unique()) == count
     assert (offered.alternatives[: len(model.scene.background)] < 0).all()
+    seen_round = offer_bodies(model, [False], [body])
+    assert len(seen_round.scene.objects["car"].cloud) == count

@@ -13,8 +13,10 @@ from real2sim_server.reconstruct.training.gaussians import Gaussians, concatenat
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.reconstruct.training.visibility import (
     GaussianVisibility,
+    OfferedPriors,
     bare_ground,
     behind_objects,
+    hardly_seen,
     hidden_sky,
     occluded_priors,
     prune_hidden,
@@ -145,7 +147,7 @@ def test_hidden_ones_go_by_the_limits_of_their_owners_with_their_moments():
     optimizer: SelectiveAdam = marked(gaussians)
     fractions = torch.full((len(gaussians),), 0.03)
     fractions[:5] = 0.001
-    seen = GaussianVisibility(fractions, torch.zeros(len(gaussians)))
+    seen = GaussianVisibility(fractions, *torch.zeros(2, len(gaussians)))
     left = dropped(gaussians, optimizer, seen, object_limits=VisibilityLimits(fraction=0.05))
     assert left.counts == (COUNTS[0] - 5, 0, 0)
     torch.testing.assert_close(optimizer.first["means"], left.means.detach())
@@ -156,7 +158,7 @@ def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
     gaussians = some_gaussians()
     fractions, depths = torch.full((len(gaussians),), 0.02), torch.zeros(len(gaussians))
     depths[2], depths[3], fractions[3] = 0.5, 0.5, 0.5
-    seen = GaussianVisibility(fractions, depths)
+    seen = GaussianVisibility(fractions, depths, torch.zeros_like(depths))
     left = dropped(gaussians, marked(gaussians), seen)
     kept = [i for i in range(len(gaussians)) if i != 2]
     torch.testing.assert_close(left.means, gaussians.means[kept])
@@ -164,7 +166,7 @@ def test_what_little_is_seen_of_goes_only_deep_behind_the_surface():
 
 def test_inside_of_objects_goes_at_less_depth_and_more_share_than_in_the_background():
     gaussians = some_gaussians()
-    seen = GaussianVisibility(*(torch.full((len(gaussians),), value) for value in (0.2, 0.25)))
+    seen = GaussianVisibility(*(torch.full((len(gaussians),), value) for value in (0.2, 0.25, 0)))
     left = dropped(gaussians, marked(gaussians), seen, object_limits=LIMITS.last_object_limits)
     assert left.counts == (COUNTS[0], 0, 0)
 
@@ -256,16 +258,34 @@ def test_of_alternatives_the_first_that_is_hidden_is_taken(model, viewpoints):
     assert torch.equal(taken.means[-1], first.gaussians.means[-2])
 
 
+@pytest.mark.parametrize(
+    ("scale", "bodies", "hardly"), [(0.02, True, True), (0.02, False, False), (1.0, True, False)]
+)
+def test_of_bodies_that_images_hardly_show_all_is_offered(model, viewpoints, scale, bodies, hardly):
+    wall = [ahead(model, 40, 3.0, 0.99)]
+    trained = model_of(model, wall, subject=[ahead(model, 10, scale, 0.9)])
+    numbers = torch.tensor([-1, 7 if bodies else -1])
+    seen = visibility(trained, viewpoints)
+    found = hardly_seen(trained, seen, OfferedPriors(trained.scene, numbers))
+    assert found.tolist() == [False, hardly]
+
+
+def test_after_priors_no_mirrored_image_counts(model):
+    model.mirrored = (True, False)
+    model.stop_mirroring()
+    assert model.mirrored == (False, False)
+
+
 def test_low_background_that_shows_from_deep_behind_goes_and_high_background_stays(model):
     count = len(model.gaussians)
-    deep = GaussianVisibility(torch.full((count,), 0.08), torch.full((count,), 9.0))
+    deep = GaussianVisibility(*(torch.full((count,), value) for value in (0.08, 9.0, 0)))
     found = behind_objects(model, deep, LIMITS.last_background_limits)
     heights = model.gaussians.means.detach()[:, 2]
     background = model.gaussians.owners == 0
     assert found[background & (heights < 0.5) & (heights > -0.1)].float().mean() > 0.9
     assert not found[heights > 6].any()
     assert not found[~background].any()
-    shallow = GaussianVisibility(deep.fractions, torch.ones(count))
+    shallow = replace(deep, depths=torch.ones(count))
     assert not behind_objects(model, shallow, LIMITS.last_background_limits).any()
 
 
@@ -275,7 +295,7 @@ def test_ground_is_bare_where_images_show_none(model, tiny_scene):
     first = SceneModel(tiny_scene, model.options, np.zeros(0, np.int64), backend="cpu")
     model.gaussians = model.gaussians.select(kept.nonzero()[:, 0])
     ones = torch.ones(len(model.gaussians))
-    bare = bare_ground(model, first, GaussianVisibility(ones, torch.zeros_like(ones)))
+    bare = bare_ground(model, first, GaussianVisibility(ones, *torch.zeros(2, len(ones))))
     means = first.gaussians.means.detach()
     height = tiny_scene.ground.height_at(means[:, :2].double().numpy())
     on_ground = torch.from_numpy(np.abs(means[:, 2].numpy() - height) < 0.01)

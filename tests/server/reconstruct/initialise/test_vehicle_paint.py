@@ -1,0 +1,118 @@
+"""Paint and light of vehicles: what one side says of the others, and other vehicles of one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
+from real2sim_server.reconstruct.initialise.vehicle_light import (
+    FROM_ABOVE,
+    brightness,
+    fit_light,
+    light_on,
+)
+from real2sim_server.reconstruct.initialise.vehicle_light import LIGHT as LIGHT_KEY
+from real2sim_server.reconstruct.initialise.vehicle_paint import VehicleSurface, fill_vehicles
+from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
+
+SALOON = (4.7, 1.82, 1.46)
+GREEN = np.array([0.1, 0.4, 0.2], np.float32)
+LIGHT = np.array([-0.3, 0.2, 0.35])
+
+
+@pytest.fixture(scope="module")
+def body():
+    found = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+    assert found is not None
+    return found
+
+
+def surface(body, paint, *, light, seen_from=(-1, 0, 0), turned=0.0) -> VehicleSurface:
+    """A car in one paint, its box turned [rad], seen from one side of it."""
+    c, s = np.cos(turned), np.sin(turned)
+    normals = body.unit_normals() @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
+    colours = (paint * brightness(light, normals)).astype(np.float32)
+    seen = body.unit_normals() @ np.array(seen_from, float) > 0.4
+    return VehicleSurface(body.points.astype(np.float32), normals, colours, seen, body)
+
+
+def doors(body) -> np.ndarray:
+    return body.is_paint & (np.abs(body.points[:, 0]) < 1) & (np.abs(body.points[:, 2]) < 0.2)
+
+
+def test_light_is_found_on_vehicles_of_different_paints_that_stand_differently(body):
+    cars = [
+        surface(body, paint, light=LIGHT, turned=turned, seen_from=side)
+        for paint, turned, side in (
+            (GREEN, 0.3, (-1, 0, 1)),
+            (GREEN[::-1], 2.0, (0, 1, 1)),
+            (np.full(3, 0.5, np.float32), 4.0, (0, -1, 1)),
+        )
+        for _ in range(4)
+    ]
+    painted = [c.seen_paint() for c in cars]
+    found = fit_light(
+        [c.normals[p] for c, p in zip(cars, painted, strict=True)],
+        [c.colours[p] for c, p in zip(cars, painted, strict=True)],
+    )
+    # Light from above is believed until vehicles say otherwise.
+    np.testing.assert_allclose(found, LIGHT, atol=0.06)
+
+
+def test_without_vehicles_light_comes_from_above():
+    np.testing.assert_array_equal(fit_light([], []), FROM_ABOVE)
+
+
+def test_a_flank_that_no_camera_saw_is_even_and_in_the_colour_of_the_tail(body):
+    dark = np.zeros(3)
+    [filled], _ = fill_vehicles([surface(body, GREEN, light=dark)])
+    flank = filled[doors(body)]
+    assert np.ptp(flank, axis=0).max() < 0.05
+    np.testing.assert_allclose(flank.mean(0) / flank.mean(), GREEN / GREEN.mean(), atol=0.1)
+
+
+def test_the_mirrored_flank_has_the_light_of_its_own_side(body):
+    towards = np.array([0.0, 0.8, 0.0])
+    left = surface(body, GREEN, light=towards, seen_from=(0, 1, 0))
+    cars = [left, *(surface(body, GREEN, light=towards, seen_from=(0, s, 0)) for s in (-1, 1) * 4)]
+    filled, light = fill_vehicles(cars)
+    assert light[1] > 0.5
+    near, far = (doors(body) & (side * body.points[:, 1] > 0) for side in (1, -1))
+    bright = filled[0][far].mean() / filled[0][near].mean()
+    assert bright < np.exp(-2 * 0.8 * 0.5)
+
+
+def test_a_vehicle_that_was_never_seen_has_the_paint_of_the_others(body):
+    dark = np.zeros(3)
+    hidden = surface(body, GREEN, light=dark)
+    hidden = VehicleSurface(
+        hidden.points,
+        hidden.normals,
+        np.zeros_like(hidden.colours),
+        np.zeros_like(hidden.seen),
+        body,
+    )
+    filled, light = fill_vehicles([surface(body, GREEN, light=dark), hidden])
+    flank = doors(body)
+    np.testing.assert_allclose(filled[1][flank], filled[0][flank], atol=0.04)
+    assert np.isfinite(light).all()
+
+
+def test_light_turns_with_the_vehicle_and_comes_from_above_where_none_is_known():
+    times = np.array([0, 1_000_000])
+    pose = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    path = Trajectory.from_transforms(times, np.stack([pose, pose]))
+    cloud = GaussianCloud(
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.ones(1, 3),
+        torch.ones(1),
+        torch.zeros(1, 1, 3),
+    )
+    car = SceneObject("car", "car", SALOON, cloud, path)
+    np.testing.assert_allclose(
+        light_on(car, {LIGHT_KEY: [0.0, 0.3, 0.2]}), (0.3, 0, 0.2), atol=1e-9
+    )
+    np.testing.assert_allclose(light_on(car, None), FROM_ABOVE, atol=1e-9)
