@@ -14,7 +14,7 @@ from .errors import MalformedReplyError
 from .images import Frame, frames_by_camera
 
 if TYPE_CHECKING:
-    from real2sim_proto.drive import AgentState, EgoState, Event, Obs
+    from real2sim_proto.drive import AgentState, EgoState, Event, LaneShown, Obs, SignalShown
     from real2sim_proto.drive import Frame as WireFrame
     from real2sim_proto.drive import PointCloud as WireCloud
 
@@ -111,6 +111,9 @@ class Observation(View):
         route: [R, 2] float64, x and y of the route ahead in the vehicle frame [m].
         command: ``straight``, ``left`` or ``right``.
         agents: other road users in the world frame; filled when reset with ``privileged=True``.
+        lanes: pieces of the map's lanes near the vehicle, the nearest first; filled when reset with
+            ``privileged=True`` on a scene with a map.
+        signals: traffic signals of the storyboard.
         events: what happened in this step.
         metrics: scores so far, by name.
         terminated: the episode ended by something that happened in it.
@@ -135,6 +138,8 @@ class Observation(View):
     route: NDArray[np.float64] = field(repr=False)
     command: str
     agents: Sequence[AgentState] = field(default=(), repr=False)
+    lanes: Sequence[LaneShown] = field(default=(), repr=False)
+    signals: Sequence[SignalShown] = ()
     events: Sequence[Event] = ()
     metrics: Mapping[str, float] = field(default_factory=dict, repr=False)
     terminated: bool = False
@@ -181,6 +186,8 @@ def observation_from_wire(obs: Obs, pixels: Sequence[memoryview | None] = ()) ->
         frames=frames_by_camera(obs.frames, pixels),
         clouds=clouds_by_sensor(obs.clouds),
         agents=tuple(obs.agents),
+        lanes=tuple(obs.lanes),
+        signals=tuple(obs.signals),
         events=tuple(obs.events),
         metrics=obs.metrics,
         terminated=obs.terminated,

@@ -19,6 +19,7 @@ from pydantic import (
 
 from .base import Codec, Identifier, Microseconds, Modality, Model, Quaternion, Vector3, one_of
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
+from .lanes import LaneKind
 from .operations import Operation
 from .plans import Gear, Plan, PlanPoses, PlanTimes, check_times
 from .ranging import (
@@ -147,6 +148,25 @@ class SignalShown(ServerModel):
     stop_line: Vector3 | None = Field(
         default=None, description="x, y [m], heading [rad] where vehicles are to stop, world"
     )
+
+
+class LaneShown(ServerModel):
+    """A piece of a lane of the scene's map, near the vehicle."""
+
+    lane_id: str
+    kind: LaneKind
+    places: Array = Field(
+        description="[K, 4] float64: x, y [m], heading [rad] of the centre line as its traffic "
+        "drives, world; width [m]"
+    )
+    speed_limit: float | None = Field(default=None, description="[m/s]; None: not known")
+    successors: list[str] = Field(default_factory=list)
+    left: str | None = Field(default=None, description="neighbour of the same direction")
+    right: str | None = None
+    opposite: str | None = Field(default=None, description="neighbour that runs the other way")
+    may_change_left: bool = True
+    may_change_right: bool = True
+    junction: str | None = None
 
 
 class Score(ServerModel):
@@ -400,6 +420,11 @@ class Obs(ServerEnvelope):
     events: list[Event] = Field(default_factory=list)
     signals: list[SignalShown] = Field(
         default_factory=list, description="traffic signals of the storyboard"
+    )
+    lanes: list[LaneShown] = Field(
+        default_factory=list,
+        description="of privileged episodes on a scene with a map: within 60 m, the nearest first, "
+        "at most 32",
     )
     metrics: dict[str, float] = Field(default_factory=dict)
     terminated: bool = False

@@ -21,6 +21,7 @@ from .drive import (
     Envelope,
     Error,
     Event,
+    LaneShown,
     Progress,
     Result,
     ServerEnvelope,
@@ -248,6 +249,7 @@ class WorldDetail(ServerModel):
     drawn: dict[str, float] = Field(default_factory=dict, description="as of `obs`")
     ego_truth: EgoState | None = Field(default=None, description="as of `obs`")
     agents: list[AgentState] = Field(default_factory=list, description="of privileged episodes")
+    lanes: list[LaneShown] = Field(default_factory=list, description="as of `obs`")
 
 
 class WorldError(ServerModel):

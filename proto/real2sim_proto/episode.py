@@ -570,7 +570,10 @@ class ResetSpec(Model):
         default=None,
         description="what entities do, and when; they are moved by it and by no driver of `agents`",
     )
-    privileged: bool = Field(default=False, description="fill `agents` of every observation")
+    privileged: bool = Field(
+        default=False,
+        description="fill `agents` of every observation, and `lanes` where the scene has a map",
+    )
     deadline_ms: int | None = Field(
         default=None, ge=1, le=3_600_000, description="wall-clock time for a plan; None: any"
     )

@@ -12,6 +12,7 @@ from .agents import Agents, agent_fields
 from .ego.motion import Motion
 from .ego.route import Command
 from .events import Event
+from .lanes_around import LanePiece
 from .path import Float
 from .storyboard.shown_signal import ShownSignal
 
@@ -38,6 +39,7 @@ class Observation:
         truth: of an ego whose ``motion`` and ``T_world_vehicle`` are an estimate with errors; None
             where they are the truth, or the episode is not privileged.
         signals: traffic signals of the storyboard.
+        lanes: of the map near the ego, of privileged episodes.
     """
 
     step: int
@@ -59,6 +61,7 @@ class Observation:
     drawn: Mapping[str, float] = field(default_factory=dict)
     truth: tuple[Motion, Float] | None = None
     signals: tuple[ShownSignal, ...] = ()
+    lanes: tuple[LanePiece, ...] = ()
 
     def ego_fields(self) -> dict[str, Any]:
         """The wire's EgoState as a plain map."""
@@ -81,6 +84,8 @@ class Observation:
             extra["ego_truth"] = self.truth_fields()
         if self.signals:
             extra["signals"] = [_signal_fields(signal) for signal in self.signals]
+        if self.lanes:
+            extra["lanes"] = [piece.fields() for piece in self.lanes]
         return {
             "step": self.step,
             "t_us": self.t_us,

@@ -46,6 +46,7 @@ from .errors import WorldError
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .events import Event
 from .evolve import evolved
+from .lanes_around import LanePiece, lanes_around
 from .observation import Observation
 from .path import Float, LoggedPath, PathPoint
 from .placement import placed
@@ -365,7 +366,12 @@ class World:
             drawn=self._step_drawn,
             truth=truth,
             signals=() if self.storyboard is None else self.storyboard.signals(),
+            lanes=self._lanes_around(motion),
         )
+
+    def _lanes_around(self, motion: Motion) -> tuple[LanePiece, ...]:
+        lanes = self.scene.lanes if self.spec.privileged else None
+        return () if lanes is None else lanes_around(lanes, motion.x, motion.y)
 
     def metrics(self) -> dict[str, float]:
         """Scores so far, see :func:`~.scoring.running_metrics`."""

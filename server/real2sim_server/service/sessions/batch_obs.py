@@ -89,4 +89,6 @@ def _detail(world: int, seen: Observation) -> dict[str, Any]:
         found["ego_truth"] = seen.truth_fields()
     if seen.agents is not None:
         found["agents"] = agent_fields(seen.agents)
+    if seen.lanes:
+        found["lanes"] = [piece.fields() for piece in seen.lanes]
     return {"world": world, **found} if found else {}
