@@ -44,7 +44,7 @@ class Fleet:
         self.url = url
         self.workers = workers
         self.gaps: list[float] = []
-        self._engine = sa.create_engine(store_url)
+        self._engine = sa.create_engine(store_url, poolclass=sa.NullPool)
 
     def busiest(self) -> str:
         """The worker that has most open sessions."""
