@@ -93,6 +93,12 @@ def post(
     return Request("POST", path, params or {}, headers, content, long_timeout=long_timeout)
 
 
+def file_put(path: str, content: bytes, media_type: str, *, if_match: str) -> Request:
+    """A PUT of a file's content that may be tried again, as a POST may."""
+    headers = {"Idempotency-Key": new_key(), "Content-Type": media_type, "If-Match": if_match}
+    return Request("PUT", path, {}, headers, content, long_timeout=True)
+
+
 def upload(path: str, file: Path, form: dict[str, str]) -> Request:
     """A POST of a file with form fields."""
     key = new_key()

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from real2sim_proto.base import Pose, Track
@@ -30,6 +30,7 @@ from real2sim_proto.operations import (
     Scale,
     SetPhysics,
     SetPose,
+    SetStoryboard,
     SetTime,
     SetTrajectory,
     SetVelocity,
@@ -37,6 +38,7 @@ from real2sim_proto.operations import (
     Translate,
 )
 from real2sim_proto.scenes import ObjectInfo
+from real2sim_proto.storyboard import Storyboard
 
 from ._call import checked
 
@@ -466,6 +468,20 @@ class ScenarioEdits(Generic[R]):
             True
         """
         return self._edit(checked(Restore, object_id=thing_id))
+
+    def set_storyboard(self, storyboard: Storyboard | Mapping[str, Any] | None) -> R:
+        """Say what road users do in sessions of the scenario, and when; None: nothing is written.
+
+        Args:
+            storyboard: a model of ``real2sim_proto.storyboard``, or its fields.
+
+        Examples:
+            >>> ego = {"name": "Ego", "kind": "ego"}
+            >>> result = scenario.set_storyboard({"entities": [ego, {"name": "lead"}]})
+            >>> [entity.name for entity in scenario.storyboard.entities]
+            ['Ego', 'lead']
+        """
+        return self._edit(checked(SetStoryboard, storyboard=storyboard))
 
     def _edit(self, operation: Operation) -> R:
         raise NotImplementedError

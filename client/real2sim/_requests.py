@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
 from real2sim_proto.episode import SensorSpec
@@ -25,6 +26,8 @@ from real2sim_proto.jobs import (
 from real2sim_proto.lanes import SceneLanes
 from real2sim_proto.operations import Operation
 from real2sim_proto.scenarios import (
+    CornerCaseChoice,
+    Gallery,
     History,
     OperationBatch,
     OperationResult,
@@ -34,6 +37,7 @@ from real2sim_proto.scenarios import (
     ScenarioInfo,
     ScenarioList,
     ScenarioRename,
+    StoryboardResult,
 )
 from real2sim_proto.scenes import (
     Fleet,
@@ -60,6 +64,7 @@ from ._call import (
     ViewRequest,
     bearer,
     checked,
+    file_put,
     image,
     json_of,
     post,
@@ -229,6 +234,34 @@ def scenario_points(scenario_id: str, t_us: int | None, part: str) -> Call[bytes
 
 def import_scenario(document: ScenarioDocument) -> Call[ScenarioInfo]:
     return Call(post("/v1/scenarios/import", document, long_timeout=True), model_of(ScenarioInfo))
+
+
+def gallery() -> Call[Gallery]:
+    return Call(Request("GET", "/v1/gallery"), model_of(Gallery))
+
+
+def apply_corner_case(
+    scenario_id: str, name: str, parameters: Mapping[str, float], etag: str
+) -> Call[OperationResult]:
+    body = checked(CornerCaseChoice, name=name, parameters=dict(parameters))
+    request = post(f"{_scenario(scenario_id)}/corner-case", body, if_match=etag)
+    return Call(request, model_of(OperationResult))
+
+
+def read_xosc(
+    scenario_id: str, content: bytes, leave_out: Sequence[str], ego: str | None, etag: str
+) -> Call[StoryboardResult]:
+    query = [("leave_out", name) for name in leave_out]
+    query += [] if ego is None else [("ego", ego)]
+    path = f"{_scenario(scenario_id)}/storyboard.xosc"
+    path += f"?{urlencode(query)}" if query else ""
+    request = file_put(path, content, "application/xml", if_match=etag)
+    return Call(request, model_of(StoryboardResult))
+
+
+def write_xosc(scenario_id: str) -> Call[bytes]:
+    path = f"{_scenario(scenario_id)}/storyboard.xosc"
+    return Call(Request("GET", path, long_timeout=True), lambda reply: reply.content)
 
 
 def simulate(scenario_id: str, body: SimulateRequest) -> Call[JobInfo]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Generic, TypeVar
 
 from real2sim_proto.scenarios import OperationResult, ScenarioInfo
+from real2sim_proto.storyboard import Storyboard
 
 H = TypeVar("H")
 
@@ -38,6 +39,11 @@ class ScenarioState:
     def revision(self) -> int:
         """Revision that the next edit is sent against."""
         return self._revision
+
+    @property
+    def storyboard(self) -> Storyboard | None:
+        """What happens in sessions that bring no storyboard of their own; None: nothing."""
+        return self._info.storyboard
 
     def __repr__(self) -> str:
         return (

@@ -12,7 +12,7 @@ from importlib.metadata import entry_points
 
 import typer
 
-from ._commands import adapter, drive, edit, ros2, scenes, status
+from ._commands import adapter, drive, edit, ros2, scenario, scenes, status
 
 COMMAND_GROUP = "real2sim.commands"
 DEBUG_VARIABLE = "REAL2SIM_DEBUG"
@@ -41,7 +41,7 @@ def build_app() -> typer.Typer:
         rich_markup_mode="markdown",
     )
     app.callback(invoke_without_command=True)(_options)
-    for module in (status, scenes, edit, drive, ros2, adapter):
+    for module in (status, scenes, scenario, edit, drive, ros2, adapter):
         app.add_typer(module.app)
     for entry in sorted(entry_points(group=COMMAND_GROUP), key=lambda e: e.name):
         try:

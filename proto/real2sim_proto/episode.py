@@ -568,7 +568,8 @@ class ResetSpec(Model):
     agents: AgentsSpec = AgentsSpec()
     storyboard: Storyboard | None = Field(
         default=None,
-        description="what entities do, and when; they are moved by it and by no driver of `agents`",
+        description="what entities do, and when; they are moved by it and by no driver of "
+        "`agents`. Default: that of the scenario; one without entities runs none",
     )
     privileged: bool = Field(
         default=False,

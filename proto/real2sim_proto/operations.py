@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, field_validator, model
 
 from .base import Identifier, Metres, Microseconds, Model, Pose, Quaternion, Track, Vector3
 from .episode import AgentDriver, IdmDriver
+from .storyboard import Storyboard
 
 Frame = Literal["world", "object"]
 
@@ -437,6 +438,13 @@ class SetTime(Model):
         return self
 
 
+class SetStoryboard(Model):
+    """What road users do in sessions of the scenario, and when; a reset may bring its own."""
+
+    op: Literal["set_storyboard"] = "set_storyboard"
+    storyboard: Storyboard | None = Field(default=None, description="default: none")
+
+
 def _direction(vector: Vector3, name: str) -> Vector3:
     if sum(a * a for a in vector) < 1e-12:
         raise ValueError(f"{name} {vector!r} has no direction; give a vector that is not zero")
@@ -460,7 +468,8 @@ Operation = Annotated[
     | SetPhysics
     | SetVelocity
     | AddCollider
-    | SetTime,
+    | SetTime
+    | SetStoryboard,
     Field(discriminator="op"),
 ]
 

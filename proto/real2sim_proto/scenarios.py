@@ -9,6 +9,8 @@ from pydantic import Field
 from .base import Identifier, Model, one_of
 from .operations import AddCollider, EraseRegion, Operation
 from .scenes import ObjectInfo, Reply
+from .storyboard import Storyboard
+from .storyboard_values import Name
 
 MAX_OPERATIONS_PER_REQUEST = 256
 
@@ -43,6 +45,9 @@ class ScenarioInfo(Reply):
     objects: list[ObjectInfo] = Field(default_factory=list)
     erased: list[EraseRegion] = Field(default_factory=list, description="of the background")
     colliders: list[AddCollider] = Field(default_factory=list)
+    storyboard: Storyboard | None = Field(
+        default=None, description="that its sessions run; single views only"
+    )
 
 
 class ScenarioFork(Model):
@@ -82,6 +87,38 @@ class OperationResult(Reply):
     inverse: list[Operation] = Field(default_factory=list, description="what takes it back")
     warnings: list[EditWarning] = Field(default_factory=list)
     dry_run: bool = False
+
+
+class StoryboardResult(OperationResult):
+    """Answer to an OpenSCENARIO file."""
+
+    notes: list[str] = Field(
+        default_factory=list, description="what of the file has no effect, in sentences"
+    )
+
+
+class CornerCaseInfo(Reply):
+    """A ready corner case of the gallery."""
+
+    name: str
+    title: str = Field(description="what happens, in a sentence")
+    family: str
+    parameters: dict[str, float] = Field(description="default values; [m], [m/s], [s]")
+
+
+class Gallery(Reply):
+    """Answer of `GET /v1/gallery`."""
+
+    cases: list[CornerCaseInfo]
+
+
+class CornerCaseChoice(Model):
+    """Body of `POST /v1/scenarios/{id}/corner-case`."""
+
+    name: Name = Field(description="of the gallery, such as cut_in")
+    parameters: dict[Name, float] = Field(
+        default_factory=dict, max_length=100, description="other values than the default ones"
+    )
 
 
 class HistoryEntry(Reply):

@@ -1,7 +1,8 @@
 """JSON Schema of every message, for planners in other languages.
 
 ``python -m real2sim_proto.schema DIR`` writes one file a message; the committed copies live in
-``proto/schema`` and a test holds them against the models.
+``proto/schema`` and a test holds them against the models. A file is whole in itself, save that it
+refers to ``Storyboard.json`` beside it where a storyboard may stand.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from . import (
     scenarios,
     scenes,
     sessions,
+    storyboard,
     views,
 )
 
@@ -96,6 +98,7 @@ MODELS: dict[str, type[BaseModel]] = {
         sessions.SessionEdited,
         sessions.SessionState,
         sessions.SessionRender,
+        storyboard.Storyboard,
     )
 }
 
@@ -107,15 +110,48 @@ UNIONS: dict[str, TypeAdapter[Any]] = {
     "BatchServerMessage": drive_batch.BATCH_SERVER_MESSAGE,
 }
 
+SHARED = ("Storyboard",)
+"""Messages that others hold and that are long: a file that holds one refers to its file."""
+
 
 def schemas() -> dict[str, dict[str, Any]]:
-    """JSON Schema (draft 2020-12) by message name."""
+    """JSON Schema (draft 2020-12) by message name; files of SHARED are referred to by name."""
     named = {name: model.model_json_schema() for name, model in MODELS.items()}
     named |= {name: adapter.json_schema() for name, adapter in UNIONS.items()}
     return {
-        name: {"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema
+        name: {"$schema": "https://json-schema.org/draft/2020-12/schema"} | _referring(schema)
         for name, schema in sorted(named.items())
     }
+
+
+def _referring(schema: dict[str, Any]) -> dict[str, Any]:
+    """The schema with references to the files of SHARED, and without what only those need."""
+    files = {f"#/$defs/{name}": f"{name}.json" for name in SHARED}
+    definitions = _renamed(schema.pop("$defs", {}), files)
+    found: dict[str, Any] = _renamed(schema, files)
+    needed: dict[str, Any] = {}
+    wanted = _references(found)
+    while wanted:
+        name = wanted.pop()
+        if name not in needed:
+            needed[name] = definitions[name]
+            wanted |= _references(definitions[name])
+    return found | {"$defs": needed} if needed else found
+
+
+def _renamed(part: Any, files: dict[str, str]) -> Any:
+    if isinstance(part, dict):
+        return {k: files.get(v, v) if k == "$ref" else _renamed(v, files) for k, v in part.items()}
+    return [_renamed(each, files) for each in part] if isinstance(part, list) else part
+
+
+def _references(part: Any) -> set[str]:
+    """Names of the definitions of the same file that a part refers to."""
+    if isinstance(part, dict):
+        own = part.get("$ref", "")
+        found = {own.rsplit("/", 1)[1]} if own.startswith("#/$defs/") else set()
+        return found.union(*map(_references, part.values()))
+    return set().union(*map(_references, part)) if isinstance(part, list) else set()
 
 
 def schema_text(schema: dict[str, Any]) -> str:

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+import referencing
 
-from real2sim_proto.schema import schema_text, schemas
+from real2sim_proto.schema import SHARED, schema_text, schemas
 
 SCHEMAS = schemas()
 FOLDER = Path(__file__).resolve().parents[2] / "proto" / "schema"
@@ -22,8 +23,27 @@ def test_every_schema_is_valid_json_schema(name):
     jsonschema.Draft202012Validator.check_schema(SCHEMAS[name])
 
 
+def validator(name: str) -> jsonschema.Draft202012Validator:
+    """As whoever has the folder: references are files beside the one that refers."""
+    files = {f"{name}.json": referencing.Resource.from_contents(s) for name, s in SCHEMAS.items()}
+    registry = referencing.Registry().with_resources(files.items())
+    return jsonschema.Draft202012Validator(SCHEMAS[name], registry=registry)
+
+
 def test_a_schema_refuses_what_the_model_refuses():
-    validator = jsonschema.Draft202012Validator(SCHEMAS["Operation"])
-    validator.validate({"op": "translate", "object_id": "car_1", "y": 3.2})
+    operation = validator("Operation")
+    operation.validate({"op": "translate", "object_id": "car_1", "y": 3.2})
     with pytest.raises(jsonschema.ValidationError):
-        validator.validate({"op": "translate", "object_id": "car_1", "y": 3.2, "w": 1})
+        operation.validate({"op": "translate", "object_id": "car_1", "y": 3.2, "w": 1})
+
+
+def test_a_reference_to_the_file_of_a_storyboard_is_followed():
+    operation = validator("Operation")
+    operation.validate({"op": "set_storyboard", "storyboard": {"entities": [{"name": "Ego"}]}})
+    with pytest.raises(jsonschema.ValidationError):
+        operation.validate({"op": "set_storyboard", "storyboard": {"entities": [{"nam": "Ego"}]}})
+
+
+@pytest.mark.parametrize("name", sorted(SCHEMAS))
+def test_definitions_of_a_shared_message_stand_in_its_file_alone(name):
+    assert set(SHARED).isdisjoint(SCHEMAS[name].get("$defs", {}))

@@ -14,7 +14,14 @@ from typing import Any
 
 from real2sim_proto.jobs import CalibrateRequest, Observations, SimulateRequest
 from real2sim_proto.operations import Operation, PhysicsValues
-from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument, ScenarioInfo
+from real2sim_proto.scenarios import (
+    CornerCaseInfo,
+    History,
+    OperationResult,
+    ScenarioDocument,
+    ScenarioInfo,
+    StoryboardResult,
+)
 from real2sim_proto.scenes import ObjectInfo
 
 from .. import _requests
@@ -108,6 +115,16 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         """
         call = _requests.rename_scenario(scenario_id_of(scenario), name)
         return await self._transport.send(call)
+
+    async def gallery(self) -> Sequence[CornerCaseInfo]:
+        """Ready corner cases, for :meth:`AsyncScenario.apply_corner_case`.
+
+        Examples:
+            >>> cases = {case.name: case for case in await client.scenarios.gallery()}
+            >>> cases["cut_in"].title, cases["cut_in"].parameters["gap"]
+            ('Cut-in: a car moves in from the left, close ahead', 12.0)
+        """
+        return (await self._transport.send(_requests.gallery())).cases
 
     async def delete(self, scenario: ScenarioRef) -> None:
         """Remove a scenario and its history.
@@ -208,6 +225,74 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         )
         result = await self.apply([operation])
         return self.objects[result.created[0]]
+
+    async def apply_corner_case(self, name: str, **parameters: float) -> OperationResult:
+        """Let a corner case of the gallery happen in sessions of the scenario.
+
+        Args:
+            name: of the gallery, see :meth:`AsyncScenarios.gallery`.
+            parameters: other values than its default ones [m], [m/s], [s].
+
+        Raises:
+            InvalidRequestError: no such case, or it has no such parameter.
+
+        Examples:
+            >>> result = await scenario.apply_corner_case("cut_in", gap=6.0)
+            >>> scenario.storyboard.parameters["gap"]
+            6.0
+        """
+        call = _requests.apply_corner_case(self.scenario_id, name, parameters, self._etag)
+        return await self._applied(await self._transport.send(call))
+
+    async def read_xosc(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        leave_out: Sequence[str] = (),
+        ego: str | None = None,
+    ) -> StoryboardResult:
+        """Let an OpenSCENARIO file say what happens in sessions of the scenario.
+
+        Its roads are laid along the recorded drive, so that the ego begins where it was recorded.
+
+        Args:
+            path: of a file of version 1.0 to 1.3, without catalogs.
+            leave_out: names of elements to leave out that are not supported.
+            ego: entity that is the ego; default: the one that is called so.
+
+        Raises:
+            InvalidRequestError: no such scenario, or something in it that is not supported, with
+                its name and line.
+
+        Examples:
+            >>> result = await scenario.apply_corner_case("ccrb")
+            >>> path = await scenario.write_xosc(folder / "ccrb.xosc")
+            >>> result = await scenario.read_xosc(path)
+            >>> result.notes, len(scenario.storyboard.entities)
+            ([], 2)
+        """
+        content = await run_blocking(Path(path).read_bytes)
+        call = _requests.read_xosc(self.scenario_id, content, leave_out, ego, self._etag)
+        result = await self._transport.send(call)
+        await self._applied(result)
+        return result
+
+    async def write_xosc(self, path: str | os.PathLike[str]) -> Path:
+        """Write what happens in the scenario as an OpenSCENARIO 1.3 file.
+
+        Raises:
+            InvalidRequestError: nothing is written that happens, or OpenSCENARIO has no words for
+                it.
+
+        Examples:
+            >>> result = await scenario.apply_corner_case("cut_in")
+            >>> path = await scenario.write_xosc(folder / "cut_in.xosc")
+            >>> path.read_bytes()[:5]
+            b'<?xml'
+        """
+        content = await self._transport.send(_requests.write_xosc(self.scenario_id))
+        await run_blocking(write_atomically, Path(path), content)
+        return Path(path)
 
     async def simulate(
         self,

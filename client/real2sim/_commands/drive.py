@@ -277,7 +277,8 @@ def _print_summary(out: Console, summary: EpisodeSummary) -> None:
         highlight=False,
     )
     for event in summary.events:
-        what = f"{event.type} {event.object_id or ''}".strip()
+        subject = event.object_id or f"{event.element or ''} {event.change or ''}".strip()
+        what = f"{event.type} {subject}".strip()
         out.print(f"{(event.t_us - summary.start_us) * 1e-6:8.1f} s  {what}", highlight=False)
     table = Table(box=None, pad_edge=False)
     table.add_column("milliseconds")

@@ -15,7 +15,14 @@ from typing import Any
 
 from real2sim_proto.jobs import CalibrateRequest, Observations, SimulateRequest
 from real2sim_proto.operations import Operation, PhysicsValues
-from real2sim_proto.scenarios import History, OperationResult, ScenarioDocument, ScenarioInfo
+from real2sim_proto.scenarios import (
+    CornerCaseInfo,
+    History,
+    OperationResult,
+    ScenarioDocument,
+    ScenarioInfo,
+    StoryboardResult,
+)
 from real2sim_proto.scenes import ObjectInfo
 
 from .. import _requests
@@ -107,6 +114,16 @@ class Scenarios(Collection[ScenarioInfo]):
         """
         call = _requests.rename_scenario(scenario_id_of(scenario), name)
         return self._transport.send(call)
+
+    def gallery(self) -> Sequence[CornerCaseInfo]:
+        """Ready corner cases, for :meth:`Scenario.apply_corner_case`.
+
+        Examples:
+            >>> cases = {case.name: case for case in client.scenarios.gallery()}
+            >>> cases["cut_in"].title, cases["cut_in"].parameters["gap"]
+            ('Cut-in: a car moves in from the left, close ahead', 12.0)
+        """
+        return (self._transport.send(_requests.gallery())).cases
 
     def delete(self, scenario: ScenarioRef) -> None:
         """Remove a scenario and its history.
@@ -207,6 +224,74 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
         )
         result = self.apply([operation])
         return self.objects[result.created[0]]
+
+    def apply_corner_case(self, name: str, **parameters: float) -> OperationResult:
+        """Let a corner case of the gallery happen in sessions of the scenario.
+
+        Args:
+            name: of the gallery, see :meth:`Scenarios.gallery`.
+            parameters: other values than its default ones [m], [m/s], [s].
+
+        Raises:
+            InvalidRequestError: no such case, or it has no such parameter.
+
+        Examples:
+            >>> result = scenario.apply_corner_case("cut_in", gap=6.0)
+            >>> scenario.storyboard.parameters["gap"]
+            6.0
+        """
+        call = _requests.apply_corner_case(self.scenario_id, name, parameters, self._etag)
+        return self._applied(self._transport.send(call))
+
+    def read_xosc(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        leave_out: Sequence[str] = (),
+        ego: str | None = None,
+    ) -> StoryboardResult:
+        """Let an OpenSCENARIO file say what happens in sessions of the scenario.
+
+        Its roads are laid along the recorded drive, so that the ego begins where it was recorded.
+
+        Args:
+            path: of a file of version 1.0 to 1.3, without catalogs.
+            leave_out: names of elements to leave out that are not supported.
+            ego: entity that is the ego; default: the one that is called so.
+
+        Raises:
+            InvalidRequestError: no such scenario, or something in it that is not supported, with
+                its name and line.
+
+        Examples:
+            >>> result = scenario.apply_corner_case("ccrb")
+            >>> path = scenario.write_xosc(folder / "ccrb.xosc")
+            >>> result = scenario.read_xosc(path)
+            >>> result.notes, len(scenario.storyboard.entities)
+            ([], 2)
+        """
+        content = run_blocking(Path(path).read_bytes)
+        call = _requests.read_xosc(self.scenario_id, content, leave_out, ego, self._etag)
+        result = self._transport.send(call)
+        self._applied(result)
+        return result
+
+    def write_xosc(self, path: str | os.PathLike[str]) -> Path:
+        """Write what happens in the scenario as an OpenSCENARIO 1.3 file.
+
+        Raises:
+            InvalidRequestError: nothing is written that happens, or OpenSCENARIO has no words for
+                it.
+
+        Examples:
+            >>> result = scenario.apply_corner_case("cut_in")
+            >>> path = scenario.write_xosc(folder / "cut_in.xosc")
+            >>> path.read_bytes()[:5]
+            b'<?xml'
+        """
+        content = self._transport.send(_requests.write_xosc(self.scenario_id))
+        run_blocking(write_atomically, Path(path), content)
+        return Path(path)
 
     def simulate(
         self,

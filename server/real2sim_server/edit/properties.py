@@ -1,4 +1,5 @@
-"""Operations on what objects are for the physics, on the background, and on the clock."""
+"""Operations on what objects are for the physics, on the background, on the clock and on what
+happens."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ from real2sim_proto.operations import (
     EraseRegion,
     MeshShape,
     SetPhysics,
+    SetStoryboard,
     SetTime,
     SetVelocity,
 )
@@ -100,3 +102,10 @@ def set_time(state: ScenarioState, operation: SetTime) -> AppliedOperation:
     if state.clock[0] >= state.clock[1]:
         inverse = SetTime()
     return AppliedOperation(replace(state, clock=(start, end)), inverse)
+
+
+@operation(SetStoryboard)
+def set_storyboard(state: ScenarioState, operation: SetStoryboard) -> AppliedOperation:
+    """Set what happens in episodes; whether they can run it shows when one begins."""
+    after = replace(state, storyboard=operation.storyboard)
+    return AppliedOperation(after, SetStoryboard(storyboard=state.storyboard))

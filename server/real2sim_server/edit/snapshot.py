@@ -11,6 +11,7 @@ from pydantic import TypeAdapter
 from real2sim_proto import CodecError, ErrorCode, decode, encode
 from real2sim_proto.episode import AgentDriver
 from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
+from real2sim_proto.storyboard import Storyboard
 
 from ..scene import Trajectory
 from .errors import EditError
@@ -23,6 +24,7 @@ _DRIVER: TypeAdapter[AgentDriver] = TypeAdapter(AgentDriver)
 def pack_state(state: ScenarioState) -> bytes:
     """What differs from the recording, as msgpack; the recording itself is not in it."""
     changed = [o for o in state.objects.values() if state.recorded.get(o.object_id) is not o]
+    story = {} if (board := state.storyboard) is None else {"story": board.model_dump(mode="json")}
     return encode(
         {
             "objects": [_packed_object(o) for o in changed],
@@ -32,6 +34,7 @@ def pack_state(state: ScenarioState) -> bytes:
             "colliders": [c.model_dump(mode="json") for c in state.colliders.values()],
             "gone": sorted(state.tombstones),
         }
+        | story
     )
 
 
@@ -52,6 +55,8 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
         first, last = document["clock"]
         regions = [EraseRegion.model_validate(r) for r in document["regions"]]
         colliders = [AddCollider.model_validate(c) for c in document["colliders"]]
+        story = document.get("story")
+        board = None if story is None else Storyboard.model_validate(story)
         tombstones, next_instance_id = frozenset(document["gone"]), document["next_instance_id"]
     except (CodecError, KeyError, TypeError, ValueError) as error:
         raise EditError(
@@ -67,6 +72,7 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
         regions=MappingProxyType({str(r.region_id): r for r in regions}),
         colliders=MappingProxyType({str(c.collider_id): c for c in colliders}),
         tombstones=tombstones,
+        storyboard=board,
     )
 
 

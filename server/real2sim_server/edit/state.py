@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.episode import AgentDriver
 from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
+from real2sim_proto.storyboard import Storyboard
 
 from ..scene import GaussianCloud, Ground, Scene, Trajectory
 from .tracks import PackedTracks
@@ -135,6 +136,7 @@ class ScenarioState:
         regions: boxes erased from the background, by id, deleted ones too.
         colliders: by id, deleted ones too.
         tombstones: ids of deleted regions and colliders.
+        storyboard: that episodes run which bring none of their own; None: none.
         recorded: the objects as the scene has them, by id.
         ground: of the scene.
         assets: the asset library, or None where there is none.
@@ -152,6 +154,7 @@ class ScenarioState:
     regions: Mapping[str, EraseRegion] = field(default_factory=dict)
     colliders: Mapping[str, AddCollider] = field(default_factory=dict)
     tombstones: frozenset[str] = frozenset()
+    storyboard: Storyboard | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, scene: SceneSource, *, assets: AssetLookup | None = None) -> ScenarioState:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Protocol
 
 from real2sim_proto.storyboard import MapRoads, RouteLanes, Storyboard, resolved
 from real2sim_proto.storyboard_actions import (
@@ -13,12 +13,21 @@ from real2sim_proto.storyboard_actions import (
     WorldPosition,
 )
 
-from ..scene import Scene
+from ..scene import Trajectory
 from ..world.path import LoggedPath
 from .errors import ScenarioError
 
 
-def fitted_to_scene(board: Storyboard, scene: Scene, *, start_us: int | None = None) -> Storyboard:
+class Recorded(Protocol):
+    """What is needed of a scene: a Scene, or the summary of one."""
+
+    @property
+    def ego(self) -> Trajectory: ...  # noqa: D102
+
+
+def fitted_to_scene(
+    board: Storyboard, scene: Recorded, *, start_us: int | None = None
+) -> Storyboard:
     """The storyboard with its roads laid along the scene's route, so that the ego begins where it
     was recorded: places on roads by lane and s, places of the world by a rigid motion. Where the
     storyboard does not place the ego nothing is moved.
@@ -46,7 +55,7 @@ def fitted_to_scene(board: Storyboard, scene: Scene, *, start_us: int | None = N
                 "right. Turn the scenario round, or run it without a scene"
             )
         path = LoggedPath(scene.ego)
-        position, _ = scene.ego.pose(scene.start_us if start_us is None else start_us)
+        position, _ = scene.ego.pose(scene.ego.start_us if start_us is None else start_us)
         here = path.nearest(float(position[0]), float(position[1])).s
         lanes = lanes.model_copy(update={"ego_lane": lane, "s": float(place.s) - here})
     if isinstance(place, LanePosition | RoadPosition) or isinstance(board.roads, MapRoads):
@@ -64,9 +73,11 @@ def _ego_place(board: Storyboard) -> Any:
     return places[-1] if places else None
 
 
-def _origin(place: WorldPosition, scene: Scene, start_us: int | None) -> tuple[float, float, float]:
+def _origin(
+    place: WorldPosition, scene: Recorded, start_us: int | None
+) -> tuple[float, float, float]:
     """Where the file's frame is in the scene's, so that the ego's place is where it begins."""
-    T = scene.ego.transform(scene.start_us if start_us is None else start_us)
+    T = scene.ego.transform(scene.ego.start_us if start_us is None else start_us)
     yaw = math.atan2(T[1, 0], T[0, 0]) - float(place.h)
     x, y = float(place.x), float(place.y)
     cos, sin = math.cos(yaw), math.sin(yaw)

@@ -35,6 +35,7 @@ from .routes import (
     scenes,
     server,
     sessions,
+    storyboards,
     ui,
     view,
 )
@@ -45,6 +46,7 @@ PROTECTED: tuple[APIRouter, ...] = (
     scenes.router,
     scene_imports.router,
     scenarios.router,
+    storyboards.router,
     assets.router,
     jobs.router,
     exports.router,
@@ -93,6 +95,7 @@ def create_app(settings: Settings) -> FastAPI:
         responses={"default": {"model": Problem, "description": "problem+json (RFC 9457)"}},
         docs_url=None,
         redoc_url=None,
+        separate_input_output_schemas=False,
     )
     app.state.worker = worker
     upload_paths = (*scene_imports.UPLOAD_PATHS, assets.UPLOAD_PATH)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from real2sim_proto import ErrorCode
 from real2sim_proto.base import Pose
-from real2sim_proto.operations import Operation, Spawn
+from real2sim_proto.operations import Operation, SetStoryboard, Spawn
 
+from ..edit import EditError
 from ..geometry.rotation import yaw_quaternion
 from ..scene import Ground
 from .path import LoggedPath
@@ -24,7 +26,16 @@ def placed(
         s: where the ego is along it [m].
         ground: of the scene.
         t_us: now [us].
+
+    Raises:
+        EditError: INVALID_OPERATION for a storyboard, which an episode has from its start.
     """
+    if isinstance(operation, SetStoryboard):
+        raise EditError(
+            ErrorCode.INVALID_OPERATION,
+            "an episode has its storyboard from its start; it cannot be set while it runs",
+            hint="set it of the scenario, or send it with the next reset",
+        )
     if not isinstance(operation, Spawn):
         return operation
     known: dict[str, Any] = {}

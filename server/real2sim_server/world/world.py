@@ -114,6 +114,8 @@ class World:
         """
         self.scene = scene
         self.state = state
+        if spec.storyboard is None and state.storyboard is not None:
+            spec = spec.model_copy(update={"storyboard": state.storyboard})
         self.spec = spec
         self.steps = 0
         self.revision = revision

@@ -28,6 +28,7 @@ from real2sim_proto.operations import (
     Scale,
     SetPhysics,
     SetPose,
+    SetStoryboard,
     SetTime,
     SetTrajectory,
     SetVelocity,
@@ -35,6 +36,7 @@ from real2sim_proto.operations import (
     Translate,
     subject_of,
 )
+from real2sim_proto.storyboard import Entity, Storyboard
 from real2sim_server.edit import (
     EditError,
     LogEntry,
@@ -89,6 +91,10 @@ SHAPES = st.sampled_from(
     [PlaneShape(point=(0, 0, 0)), BoxShape(position=(1, 2, 3), size=(1, 1, 1)), GroundShape()]
 )
 
+STORYBOARDS = st.sampled_from(
+    [None, Storyboard(entities=[Entity(name="Ego", kind="ego")]), Storyboard(name="nobody")]
+)
+
 OPERATIONS: st.SearchStrategy[Operation] = st.one_of(
     st.builds(Translate, object_id=IDS, time_range=TIME_RANGES, snap=SNAPS, **SHIFTS),
     st.builds(
@@ -141,6 +147,7 @@ OPERATIONS: st.SearchStrategy[Operation] = st.one_of(
         INSTANTS,
         st.integers(1, 3_000_000),
     ),
+    st.builds(SetStoryboard, storyboard=STORYBOARDS),
 )
 
 
@@ -165,7 +172,7 @@ def same_bits(a: ScenarioState, b: ScenarioState) -> bool:
     return (
         list(a.objects) == list(b.objects)
         and (a.regions, a.colliders, a.tombstones) == (b.regions, b.colliders, b.tombstones)
-        and a.clock == b.clock
+        and (a.clock, a.storyboard) == (b.clock, b.storyboard)
         and a.next_instance_id == b.next_instance_id
         and all(
             _identity(a.objects[i]) == _identity(b.objects[i])

@@ -24,12 +24,14 @@ from real2sim_proto.operations import (
     Scale,
     SetPhysics,
     SetPose,
+    SetStoryboard,
     SetTime,
     SetTrajectory,
     SetVelocity,
     Spawn,
     Translate,
 )
+from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import EditError, ScenarioState, apply_operations
 from real2sim_server.edit.operation import (
     APPLY,
@@ -81,6 +83,7 @@ def examples(state: ScenarioState) -> list[Any]:
         SetVelocity(object_id=car, linear=(1.0, 0.0, 0.0)),
         AddCollider(shape=PlaneShape(point=(0.0, 0.0, 0.0))),
         SetTime(start_us=first, end_us=last - 1),
+        SetStoryboard(storyboard=Storyboard(entities=[{"name": "Ego", "kind": "ego"}])),
         Mirror(object_id=car),
     ]
 
@@ -107,6 +110,7 @@ def described(state: ScenarioState) -> list[Any]:
         state.erased,
         state.standing_colliders,
         state.clock,
+        state.storyboard,
     ]
 
 
@@ -120,7 +124,7 @@ def test_there_is_an_example_of_every_operation(state):
     assert {type(o) for o in examples(state)} == set(APPLY) - NEEDS_MORE
 
 
-@pytest.mark.parametrize("index", range(15))
+@pytest.mark.parametrize("index", range(16))
 def test_an_operation_makes_a_new_state_and_leaves_the_old_one(state, index):
     before = described(state)
     after = apply_operations(state, [examples(state)[index]]).state
@@ -129,7 +133,7 @@ def test_an_operation_makes_a_new_state_and_leaves_the_old_one(state, index):
     assert described(state) == before
 
 
-@pytest.mark.parametrize("index", range(15))
+@pytest.mark.parametrize("index", range(16))
 def test_the_inverse_takes_an_operation_back(state, index):
     outcome = apply_operations(state, [examples(state)[index]])
     back = apply_operations(outcome.state, outcome.inverse).state

@@ -106,6 +106,10 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
     "sessions-reset": (*_OF_EPISODES, C.UNKNOWN_CAMERA),
     "sessions-state": _OF_EPISODES,
     "sessions-step": _OF_EPISODES,
+    "storyboards-apply_corner_case": _OF_EDITS,
+    "storyboards-import_xosc": _OF_EDITS,
+    "storyboards-remove": _OF_EDITS,
+    "storyboards-replace": _OF_EDITS,
 }
 """What does not follow from parameters, by operation id."""
 

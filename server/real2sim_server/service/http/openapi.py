@@ -58,6 +58,23 @@ BODIES: dict[str, Any] = {
             {"op": "rotate", "object_id": "car_6", "angle": 0.2618},
         ]
     },
+    "CornerCaseChoice": {"name": "cut_in", "parameters": {"gap": 8.0}},
+    "Storyboard": {
+        "parameters": {"gap": 25.0},
+        "entities": [
+            {"name": name, "kind": kind, "box": {"size": [4.6, 1.9, 1.5], "centre": [1.4, 0, 0.75]}}
+            for name, kind in (("Ego", "ego"), ("lead", "new"))
+        ],
+        "init": [
+            {
+                "entity": "lead",
+                "action": {
+                    "kind": "teleport",
+                    "position": {"kind": "relative_object", "entity": "Ego", "dx": "$gap", "dy": 0},
+                },
+            }
+        ],
+    },
     "SimulateRequest": {"start_us": 0, "end_us": 2_000_000, "objects": ["car_0", "van_0"]},
     "DriveRequest": {"planner": "idm"},
     "SessionClock": {"state": "held", "steps": 5},
@@ -99,6 +116,9 @@ BODIES: dict[str, Any] = {
     "SessionRender": {"sensors": [{"camera": "front", "width": 640, "codec": "jpeg"}]},
 }
 """An example of each JSON body, by the name of its schema."""
+
+FILES = {"application/xml": "scenario.xosc"}
+"""A file of the caller that a sample sends, by its media type."""
 
 SAMPLE_QUERY: dict[str, tuple[str, ...]] = {"sessions-create": ("scene",)}
 """Query parameters of a call's sample, by operation, though none of them alone is required."""
@@ -162,6 +182,9 @@ def curl(path: str, method: str, operation: dict[str, Any]) -> str:
     example = content.get("application/json", {}).get("example")
     if example is not None:
         words += ["-H", "'Content-Type: application/json'", "-d", shlex.quote(json.dumps(example))]
+    for media_type in content.keys() & FILES.keys():
+        words += ["-H", f"'Content-Type: {media_type}'"]
+        words += ["--data-binary", f"@{FILES[media_type]}"]
     return " ".join(words)
 
 
@@ -185,9 +208,7 @@ def _add_worker_token(operation: dict[str, Any]) -> None:
 
 def _schema_name(schema: dict[str, Any]) -> str:
     references = [schema, *schema.get("anyOf", ()), *schema.get("oneOf", ())]
-    name = next((r["$ref"].rsplit("/", 1)[1] for r in references if "$ref" in r), "")
-    # Models whose answers look otherwise than what is sent have two.
-    return name.removesuffix("-Input")
+    return next((r["$ref"].rsplit("/", 1)[1] for r in references if "$ref" in r), "")
 
 
 def text_of(made: dict[str, Any]) -> str:

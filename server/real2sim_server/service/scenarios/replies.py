@@ -42,6 +42,7 @@ class ScenarioView:
             objects=edited_objects(self.state.visible, self.summary, tracks=tracks),
             erased=list(self.state.erased),
             colliders=list(self.state.standing_colliders),
+            storyboard=self.state.storyboard,
         )
 
 

@@ -11,11 +11,13 @@ from hypothesis import HealthCheck, given, settings
 from real2sim_proto.assets import AssetCut
 from real2sim_proto.jobs import DatasetRequest, ExportRequest, SimulateRequest
 from real2sim_proto.scenarios import (
+    CornerCaseChoice,
     OperationBatch,
     ScenarioCreate,
     ScenarioDocument,
     ScenarioFork,
 )
+from real2sim_proto.storyboard import Storyboard
 from real2sim_server.service.app import create_app
 from real2sim_server.service.http.documented_errors import OF_OPERATION
 from real2sim_server.service.http.openapi import BODIES, document, operations, text_of
@@ -93,6 +95,8 @@ def test_every_post_that_changes_something_takes_an_idempotency_key(made):
         SimulateRequest,
         ExportRequest,
         DatasetRequest,
+        CornerCaseChoice,
+        Storyboard,
     ],
 )
 def test_examples_are_valid(model):

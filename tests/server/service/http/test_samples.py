@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from real2sim_server.scenarios.gallery import corner_case
+from real2sim_server.scenarios.openscenario import write_openscenario
 from real2sim_server.scene import Lane, LaneGraph
 from real2sim_server.scene.io import save_scene
 from real2sim_server.service.app import create_app
@@ -21,8 +23,17 @@ from real2sim_server.service.http.openapi import document, operations
 TOKEN = "a long enough secret"
 STREAMS = ("jobs-events",)
 """Answers that last as long as a job."""
-ENDS = ("sessions-delete", "scenarios-delete", "assets-delete", "jobs-cancel", "scenes-unload")
+ENDS = (
+    "sessions-delete",
+    "storyboards-remove",
+    "scenarios-delete",
+    "assets-delete",
+    "jobs-cancel",
+    "scenes-unload",
+)
 """Called last: others need what they take away."""
+FILES = {"@scenario.xosc": write_openscenario(corner_case("ccrb").storyboard())}
+"""What a caller has beside the shell."""
 REFUSED = {400, 401, 403, 404, 405, 406, 410, 413, 415, 422}
 """Statuses that say that the call itself was wrong."""
 OBJECTS = {"van_0": "car_red", "car_0": "car_blue", "car_3": "car_red", "car_6": "post"}
@@ -82,6 +93,8 @@ def call(client: TestClient, sample: str, variables: dict[str, str]) -> Any:
                 headers[name] = value
             case "-d":
                 data = words.pop(0)
+            case "--data-binary":
+                data = FILES[words.pop(0)]
             case other:
                 url = other
     return client.request(method, url, headers=headers, content=data)

@@ -1,0 +1,125 @@
+"""``real2sim scenario``: what happens in scenarios of a worker, as OpenSCENARIO files and by the
+gallery."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .options import DEFAULT_URL, JsonFile, Timeout, Token, Url, connected, console, write_json
+
+app = typer.Typer()
+scenario = typer.Typer(no_args_is_help=True, help="What happens in scenarios of a worker.")
+app.add_typer(scenario, name="scenario")
+
+Scenario = Annotated[str, typer.Argument(help="Id of the scenario.")]
+
+
+@scenario.command("gallery")
+def gallery(
+    *,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+    timeout: Timeout = 30.0,
+    json_file: JsonFile = None,
+) -> None:
+    """List ready corner cases with their parameters."""
+    with connected(url, token, timeout) as client:
+        cases = client.scenarios.gallery()
+    if json_file is not None:
+        write_json(json_file, {"cases": [case.model_dump(mode="json") for case in cases]})
+        return
+    from rich.table import Table
+
+    table = Table("name", "what happens", "parameters")
+    for case in cases:
+        values = ", ".join(f"{name}={value:g}" for name, value in case.parameters.items())
+        table.add_row(case.name, case.title, values)
+    console().print(table)
+
+
+@scenario.command("apply")
+def apply(
+    *,
+    case: Annotated[str, typer.Argument(help="Corner case of the gallery.")],
+    scenario_id: Annotated[
+        str | None, typer.Option("--scenario", help="Of this scenario; or --scene.")
+    ] = None,
+    scene: Annotated[str | None, typer.Option(help="Of a new scenario on this scene.")] = None,
+    values: Annotated[
+        list[str] | None, typer.Option("--set", help="Parameter, name=value; repeat it.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+    timeout: Timeout = 30.0,
+) -> None:
+    """Let a corner case happen in sessions of a scenario."""
+    if (scene is None) == (scenario_id is None):
+        raise typer.BadParameter("give exactly one of --scene and --scenario")
+    from real2sim import Real2SimError
+
+    given = dict(_parameter(text) for text in values or ())
+    with connected(url, token, timeout) as client:
+        if scene is None:
+            handle = client.scenarios.get(str(scenario_id))
+        else:
+            handle = client.scenarios.create(scene=scene, name=case)
+        try:
+            handle.apply_corner_case(case, **given)
+        except Real2SimError:
+            if scene is not None:
+                with contextlib.suppress(Real2SimError):
+                    client.scenarios.delete(handle)
+            raise
+    typer.echo(f"{case} happens in scenario {handle.scenario_id}, revision {handle.revision}")
+
+
+@scenario.command("import")
+def import_(
+    *,
+    scenario_id: Scenario,
+    file: Annotated[Path, typer.Argument(help="OpenSCENARIO 1.0 to 1.3 (.xosc).")],
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option("--leave-out", help="Element of the file to leave out; repeat it."),
+    ] = None,
+    ego: Annotated[str | None, typer.Option(help="Entity that is the ego; default: Ego.")] = None,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+    timeout: Timeout = 30.0,
+) -> None:
+    """Let an OpenSCENARIO file say what happens in sessions of a scenario."""
+    with connected(url, token, timeout) as client:
+        handle = client.scenarios.get(scenario_id)
+        result = handle.read_xosc(file, leave_out=leave_out or (), ego=ego)
+    typer.echo(f"{file.name} happens in scenario {scenario_id}, revision {result.revision}")
+    for note in result.notes:
+        typer.echo(f"note: {note}", err=True)
+
+
+@scenario.command("export")
+def export(
+    *,
+    scenario_id: Scenario,
+    file: Annotated[Path, typer.Argument(help="OpenSCENARIO 1.3 (.xosc) to write.")],
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+    timeout: Timeout = 30.0,
+) -> None:
+    """Write what happens in a scenario as an OpenSCENARIO file."""
+    with connected(url, token, timeout) as client:
+        client.scenarios.get(scenario_id).write_xosc(file)
+    typer.echo(f"wrote {file}")
+
+
+def _parameter(text: str) -> tuple[str, float]:
+    name, equals, value = text.partition("=")
+    try:
+        if name and equals:
+            return name, float(value)
+    except ValueError:
+        pass
+    raise typer.BadParameter(f"--set {text!r}; allowed is name=number, such as gap=12")

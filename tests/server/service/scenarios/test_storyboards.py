@@ -1,0 +1,95 @@
+"""Storyboards of scenarios over REST: as JSON, as OpenSCENARIO files, and from the gallery."""
+
+from __future__ import annotations
+
+import pytest
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.storyboard import Storyboard
+from real2sim_server.scenarios.gallery import GALLERY, corner_case
+from real2sim_server.scenarios.openscenario import write_openscenario
+
+XOSC = {"Content-Type": "application/xml"}
+FILE = write_openscenario(corner_case("ccrb").storyboard(gap=9.0))
+
+
+@pytest.fixture
+def url(client) -> str:
+    scenario = client.post("/v1/scenarios", json={"scene": "tiny"}).json()["scenario_id"]
+    return f"/v1/scenarios/{scenario}"
+
+
+def stored(client, url) -> Storyboard | None:
+    found = client.get(f"{url}/storyboard").json()
+    return None if found is None else Storyboard.model_validate(found)
+
+
+def test_a_storyboard_is_stored_with_its_scenario(client, url):
+    assert stored(client, url) is None
+    board = corner_case("cut_in").storyboard()
+    answer = client.put(f"{url}/storyboard", json=board.model_dump(mode="json"))
+
+    assert answer.headers["ETag"] == '"r1"'
+    assert stored(client, url) == board
+    assert Storyboard.model_validate(client.get(url).json()["storyboard"]) == board
+    client.post(f"{url}/undo")
+    assert stored(client, url) is None
+    client.post(f"{url}/redo")
+    client.delete(f"{url}/storyboard")
+    assert stored(client, url) is None
+
+
+def test_a_storyboard_survives_a_fork_and_an_export(client, url):
+    client.post(f"{url}/corner-case", json={"name": "cpna_25", "parameters": {"speed": 1.1}})
+    fork = client.post(f"{url}/fork").headers["Location"]
+    copy = client.post("/v1/scenarios/import", json=client.get(f"{url}/export").json())
+
+    board = corner_case("cpna_25").storyboard(speed=1.1)
+    assert stored(client, fork) == board
+    assert stored(client, copy.headers["Location"]) == board
+
+
+def test_a_file_goes_in_and_comes_out(client, url):
+    answer = client.put(f"{url}/storyboard.xosc", content=FILE, headers=XOSC)
+
+    assert (answer.status_code, answer.json()["notes"]) == (200, [])
+    assert stored(client, url).parameters["gap"] == 9.0
+    out = client.get(f"{url}/storyboard.xosc")
+    assert out.headers["content-type"] == "application/xml"
+    assert out.content == FILE
+
+
+def test_a_file_is_refused_by_element_and_line(client, url):
+    text = FILE.decode().replace("LongitudinalAction>", "AppearanceAction>")
+    line = text[: text.index("<AppearanceAction>")].count("\n") + 1
+    refused = client.put(f"{url}/storyboard.xosc", content=text.encode(), headers=XOSC)
+    problem = refused.json()
+
+    assert problem["code"] == ErrorCode.INVALID_REQUEST
+    assert f"line {line}: <AppearanceAction> is not supported" in problem["detail"]
+    assert stored(client, url) is None
+
+
+def test_what_is_not_there_is_refused(client, url):
+    assert "nothing is written" in client.get(f"{url}/storyboard.xosc").json()["detail"]
+    for body, message in (
+        ({"name": "cut_on"}, "the gallery has no 'cut_on'"),
+        ({"name": "cut_in", "parameters": {"gab": 3}}, "no parameter 'gab'"),
+    ):
+        assert message in client.post(f"{url}/corner-case", json=body).json()["detail"]
+
+
+def test_a_change_for_an_older_revision_is_refused(client, url):
+    client.post(f"{url}/corner-case", json={"name": "ccrs"})
+    headers = XOSC | {"If-Match": '"r0"'}
+    stale = client.put(f"{url}/storyboard.xosc", content=FILE, headers=headers)
+    assert stale.json()["code"] == ErrorCode.STALE_REVISION
+
+
+def test_the_gallery_is_listed(client):
+    cases = client.get("/v1/gallery").json()["cases"]
+    assert [case["name"] for case in cases] == list(GALLERY)
+    assert cases[0] == {
+        "name": "ccrs", "title": GALLERY["ccrs"].title, "family": "ahead",
+        "parameters": {"gap": 40.0, "offset": 0.0},
+    }  # fmt: skip
