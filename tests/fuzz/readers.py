@@ -398,6 +398,7 @@ def _message(parts: Parts, folder: Path) -> Path:
 def _targets() -> list[Target]:
     from real2sim_server.logs import LogError
     from real2sim_server.reconstruct.imports.torch_file import TorchFileError
+    from real2sim_server.scenarios.errors import ScenarioError
     from real2sim_server.world.recording.recording import RecordingError
 
     scene_errors, log_errors = (SceneError,), (LogError,)
@@ -458,6 +459,13 @@ def _targets() -> list[Target]:
         Target(
             "sweep_space", sweep_space_sample, plain(".yaml"), read_sweep_space, (CommandError,)
         ),
+        Target(
+            "openscenario",
+            openscenario_sample,
+            plain(".xosc"),
+            read_scenario_file,
+            (ScenarioError,),
+        ),
         Target("episode_journal", journal_sample, plain(".journal"), read_journal, (ValueError,)),
         *map_targets(),
     ]
@@ -482,6 +490,23 @@ def read_sweep_space(path: Path) -> Any:
     from real2sim_server.sweeps import load_sweep
 
     return load_sweep(path)
+
+
+def openscenario_sample(_folder: Path) -> list[Parts]:
+    """A file of each family of the gallery."""
+    from real2sim_server.scenarios.gallery import GALLERY
+    from real2sim_server.scenarios.openscenario import write_openscenario
+
+    families = {case.family: case for case in GALLERY.values()}
+    return [{"file": write_openscenario(case.storyboard())} for case in families.values()]
+
+
+def read_scenario_file(path: Path) -> Any:
+    """As a worker reads an uploaded file: its values are those of its parameters."""
+    from real2sim_proto.storyboard import resolved
+    from real2sim_server.scenarios.openscenario import read_openscenario_text
+
+    return resolved(read_openscenario_text(path.read_bytes(), path.name).board)
 
 
 def journal_sample(folder: Path) -> list[Parts]:

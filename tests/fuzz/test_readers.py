@@ -29,7 +29,7 @@ NAMES = (
     "ply", "playcanvas_ply", "spz", "spz_packed", "spz4", "splat", "bundle", "asset", "packed",
     "packed_zip", "recording", "recording_zip", "mcap", "pickle", "checkpoint", "checkpoint_zip",
     "old_checkpoint", "image", "sweep", "protobuf", "tfrecord", "parquet", "feather", "message",
-    "sweep_space", "episode_journal",
+    "sweep_space", "openscenario", "episode_journal",
     "map_native", "map_opendrive", "map_lanelet2", "map_argoverse2", "map_nuscenes",
 )  # fmt: skip
 

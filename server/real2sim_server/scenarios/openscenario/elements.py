@@ -254,7 +254,10 @@ def read_elements(data: bytes, file: str, leave_out: frozenset[str] = frozenset(
     builder = _Builder(file)
     try:
         builder.parser.Parse(data, True)
-    except xml.parsers.expat.ExpatError as error:
+    except ScenarioError:
+        raise
+    except (xml.parsers.expat.ExpatError, LookupError, ValueError) as error:
+        # Of the last two kind are encodings that Python does not know, or has no table of.
         raise ScenarioError(f"{file}: is no XML file ({error})") from error
     if builder.root is None:
         raise ScenarioError(f"{file}: is empty")
