@@ -20,7 +20,7 @@ def worker(make_settings):
         yield running
 
 
-def told(worker, *words: str) -> str:
+def printed(worker, *words: str) -> str:
     """What a command prints, whatever its exit code."""
     result = CliRunner().invoke(build_app(), [*words, "--url", worker.url])
     return result.output + str(result.exception or "")
@@ -28,21 +28,21 @@ def told(worker, *words: str) -> str:
 
 def test_a_case_of_the_gallery_goes_out_as_a_file_comes_in_and_is_driven(worker, tmp_path):
     file = tmp_path / "ccrb.xosc"
-    applied = told(worker, "scenario", "apply", "ccrb", "--scene", "tiny", "--set", "gap=9")
+    applied = printed(worker, "scenario", "apply", "ccrb", "--scene", "tiny", "--set", "gap=9")
     scenario = re.search(r"sc_\w+", applied).group()
-    told(worker, "scenario", "export", scenario, str(file))
+    printed(worker, "scenario", "export", scenario, str(file))
     text = re.sub(r'(name="gap" [^>]*value=)"[^"]*"', r'\1"30"', file.read_text())
     file.write_text(text)
 
-    assert "revision 2" in told(worker, "scenario", "import", scenario, str(file))
+    assert "revision 2" in printed(worker, "scenario", "import", scenario, str(file))
     with real2sim.connect(worker.url) as client:
         assert client.scenarios.get(scenario).storyboard.parameters["gap"] == 30.0
-    driven = told(worker, "drive", "--scenario", scenario, "--cameras", "", "--steps", "5")
+    driven = printed(worker, "drive", "--scenario", scenario, "--cameras", "", "--steps", "5")
     assert re.search(r"storyboard \S+ start", driven), driven
 
 
 def test_a_case_that_is_refused_leaves_no_scenario(worker):
     words = ("scenario", "apply", "ccrb", "--scene", "tiny", "--set", "gab=9")
-    assert "no parameter 'gab'" in told(worker, *words)
+    assert "no parameter 'gab'" in printed(worker, *words)
     with real2sim.connect(worker.url) as client:
         assert not client.scenarios.list()
