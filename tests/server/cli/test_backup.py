@@ -35,7 +35,8 @@ def url_of(folder: Path) -> str:
 
 
 def revisions(folder: Path) -> int | None:
-    return run(url_of(folder), lambda store: store.revision("sc_1"))
+    newest = run(url_of(folder), lambda store: store.newest_of_scenario("sc_1"))
+    return newest and newest[0]
 
 
 def test_a_backup_of_a_store_that_is_written_to_is_whole(data, tmp_path):
@@ -96,7 +97,8 @@ def test_a_store_that_is_there_is_replaced_when_that_is_asked_for_and_moved_asid
     restore(tmp_path / "a.backup", data=data, overwrite=True)
     assert revisions(data) == 0
     (aside,) = data.glob("real2sim.db.before-*Z")
-    assert run(f"sqlite:///{aside}", lambda store: store.revision("sc_1")) == 1
+    newest = run(f"sqlite:///{aside}", lambda store: store.newest_of_scenario("sc_1"))
+    assert newest is not None and newest[0] == 1
 
 
 def test_a_damaged_backup_is_refused_and_leaves_the_store_alone(data, tmp_path):

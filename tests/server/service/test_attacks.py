@@ -602,16 +602,16 @@ def test_failed_tokens_are_counted(start_worker):
 
 
 @pytest.mark.parametrize(
-    ("path", "allowed"),
+    ("path", "method", "allowed"),
     [
-        ("/v1/scenarios", "GET, HEAD, POST"),
-        ("/v1/scenarios/any", "GET, HEAD, DELETE"),
-        ("/v1/scenes/tiny/residency", "PUT, DELETE"),
-        ("/v1/sessions", "GET, HEAD, POST"),
+        ("/v1/scenarios", "PATCH", "GET, HEAD, POST"),
+        ("/v1/scenarios/any", "PUT", "GET, HEAD, PATCH, DELETE"),
+        ("/v1/scenes/tiny/residency", "PATCH", "PUT, DELETE"),
+        ("/v1/sessions", "PATCH", "GET, HEAD, POST"),
     ],
 )
-def test_allow_names_all_methods(client, path, allowed):
-    answer = client.request("PATCH", path)
+def test_allow_names_all_methods(client, path, method, allowed):
+    answer = client.request(method, path)
     assert (answer.status_code, answer.headers["Allow"]) == (405, allowed)
 
 
