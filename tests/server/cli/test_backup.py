@@ -98,7 +98,8 @@ def test_a_store_that_is_there_is_replaced_when_that_is_asked_for_and_moved_asid
     assert revisions(data) == 0
     (aside,) = data.glob("real2sim.db.before-*Z")
     newest = run(f"sqlite:///{aside}", lambda store: store.newest_of_scenario("sc_1"))
-    assert newest is not None and newest[0] == 1
+    assert newest is not None
+    assert newest[0] == 1
 
 
 def test_a_damaged_backup_is_refused_and_leaves_the_store_alone(data, tmp_path):
