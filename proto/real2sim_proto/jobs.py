@@ -51,6 +51,10 @@ class JobInfo(Reply):
     event: int = Field(default=0, description="number of its newest event")
     who: str = Field(default="", description="who asked for it")
     owner: str = Field(default="default", description="name of the token it was asked for with")
+    worker: str = Field(default="", description="that has it, and its files")
+    attempt: int = Field(
+        default=1, ge=1, description="which one: a job is begun anew where its worker died"
+    )
     request: dict[str, Any] = Field(default_factory=dict)
     result: dict[str, Any] | None = Field(default=None, description="once it has succeeded")
     files: list[JobFile] = Field(default_factory=list)

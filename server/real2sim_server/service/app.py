@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from functools import partial
 from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, FastAPI
@@ -12,8 +13,10 @@ from starlette.exceptions import HTTPException
 from starlette.types import Message
 
 from real2sim_proto import Problem
+from real2sim_proto.jobs import JobInfo
 
 from ..settings import Settings
+from .accounts import PAYER, Payer
 from .http.accounting import Accounting
 from .http.auth import require_token
 from .http.hosts import LoopbackOnly
@@ -22,6 +25,7 @@ from .http.openapi import published
 from .http.origins import OwnPagesOnly
 from .http.problems import install_problem_handlers
 from .http.requests import BodyLimit, RequestContext
+from .jobs.jobs import Work
 from .routes import (
     assets,
     docs,
@@ -72,6 +76,7 @@ def create_app(settings: Settings) -> FastAPI:
         RenderError: the backend of the settings cannot be used here.
     """
     worker = Worker.build(settings)
+    worker.jobs.work_again = partial(_work_again, worker)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -133,3 +138,11 @@ def operation_id(route: APIRoute) -> str:
     """Name of a call in OpenAPI, stable as long as its function's name is: ``scenes-render``."""
     subject = str(route.tags[0]) if route.tags else "worker"
     return f"{subject}-{route.name}"
+
+
+async def _work_again(worker: Worker, info: JobInfo) -> Work:
+    """The work of a job on record, for the account that it was asked for with."""
+    PAYER.set(Payer(worker.accounts.of_owner(info.owner), waits=True))
+    if info.kind == "simulate":
+        return await worker.simulations.work_again(info)
+    return await exports.work_again(worker, info)

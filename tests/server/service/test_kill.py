@@ -101,11 +101,63 @@ def _without_answer(client: httpx2.Client, request: dict) -> None:
         client.post(**request)
 
 
-@pytest.mark.slow
-def test_a_killed_worker_leaves_its_jobs_interrupted(start):
-    client = start()
-    video = {"scene": "tiny", "camera": "front", "width": 2048, "fps": 60}
-    job = client.post("/v1/exports", json=video).headers["Location"]
-    client = start()
+@pytest.fixture
+def two_workers(scenes_dir, tmp_path):
+    """Two workers in processes of their own on one store."""
+    shared = {
+        "REAL2SIM_STORE_URL": f"sqlite:///{tmp_path / 'shared.db'}",
+        "REAL2SIM_LEASE_SECONDS": "1",
+    }
+    with ExitStack() as stack:
+        workers = []
+        for name in ("w0", "w1"):
+            worker = KillableWorker(
+                scenes=scenes_dir,
+                data=tmp_path / name,
+                log_file=tmp_path / f"{name}.log",
+                settings=shared | {"REAL2SIM_WORKER_ID": name},
+            )
+            stack.callback(worker.kill)
+            worker.start()
+            worker.wait_listening()
+            client = httpx2.Client(base_url=worker.url, trust_env=False, timeout=60)
+            workers.append((worker, stack.enter_context(client)))
+        yield workers
 
-    assert client.get(job).json()["state"] == "interrupted"
+
+VIDEO = {"scene": "tiny", "camera": "front", "width": 960, "fps": 30}
+
+
+def running(client: httpx2.Client) -> str:
+    """Address of a job that draws."""
+    job = client.post("/v1/exports", json=VIDEO).headers["Location"]
+    wait_until(lambda: client.get(job).json()["progress"] > 0, 60)
+    return job
+
+
+@pytest.mark.slow
+def test_a_job_of_a_killed_worker_is_done_by_another(two_workers):
+    (first, client), (_, other) = two_workers
+    job = running(client)
+    assert other.get(job).json()["worker"] == "w0"
+    first.kill()
+    wait_until(lambda: other.get(job).json()["state"] == "succeeded", 120)
+    done = other.get(job).json()
+    assert (done["worker"], done["attempt"], done["result"]["frames"]) == ("w1", 2, 61)
+    assert other.get(f"{job}/files/video.webm").status_code == 200
+
+
+@pytest.mark.slow
+def test_a_job_is_cancelled_by_way_of_another_worker(two_workers):
+    (_, client), (_, other) = two_workers
+    job = running(client)
+    assert other.delete(job).json()["state"] == "cancelled"
+    assert client.get(job).json()["state"] == "cancelled"
+
+
+@pytest.mark.slow
+def test_a_worker_that_was_killed_goes_on_with_its_jobs(start):
+    job = running(start())
+    client = start()
+    assert client.get(job).json()["attempt"] == 2
+    wait_until(lambda: client.get(job).json()["state"] == "succeeded", 120)

@@ -200,6 +200,8 @@ def _export(
     context = backend.context
     context.folder.mkdir(parents=True, exist_ok=True)
     folder = context.folder / FOLDER
+    # Left half packed by a worker that died; the clips that it had finished are kept beside it.
+    shutil.rmtree(folder, ignore_errors=True)
     frames = sum(len(clip.times_us) for clip in planned_shards(source.variants, plan))
     if frames > FEW_FRAMES:
         quota.check(added_bytes=_estimate(source.variants, plan, backend).nbytes, entries=0)

@@ -9,7 +9,7 @@ import secrets
 import shutil
 import threading
 from collections import OrderedDict, deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 
 import structlog
 
-from real2sim_proto import ErrorCode, Problem
+from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import JobFile, JobInfo, JobKind, JobState
 
 from ..accounts import PAYER, Payer, owner_name
@@ -25,8 +25,9 @@ from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, problem_of, service_error
 from ..library.quotas import Quota
 from ..scenarios.replies import iso_time
-from ..storage.job_log import JobLog
-from ..storage.store import StoreTroubleError, now_us
+from ..storage.job_log import ClaimedJob, JobLog
+from ..storage.store import FencedError, StoreError, StoreTroubleError, now_us
+from .endings import ended, given_up, interruption
 
 MAX_QUEUED_JOBS = 32
 """Jobs that may wait for their turn; more are refused."""
@@ -39,6 +40,15 @@ UNKNOWN_EVENTS = 1_000_000
 
 STORE_RETRY_S = 1.0
 """Between tries to put on record what has become of a job, while the store is in trouble."""
+
+LOOK_S = 1.0
+"""Between two looks for jobs of workers that are gone, and for word about the worker's own."""
+
+FOLLOW_S = 0.5
+"""Between two looks at a job that another worker has."""
+
+MAX_DEATHS = 3
+"""Of workers at one job; it is not begun once more."""
 
 MAX_FINISHED_JOBS = 64
 """Ended jobs in memory; others are read from the store."""
@@ -107,12 +117,19 @@ class JobContext:
 
 Work = Callable[[JobContext], Awaitable[JobResult]]
 
+WorkAgain = Callable[[JobInfo], Awaitable[Work]]
+"""Makes the work of a job from its record, on any worker."""
+
 
 @dataclass(eq=False)
 class _Job:
     info: JobInfo
     context: JobContext
     work: Work
+    epoch: int = 0
+    portable: bool = False
+    lost: bool = False
+    stored_event: int = 0
     task: asyncio.Task[None] | None = None
     events: deque[JobInfo] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     changed: asyncio.Condition = field(default_factory=asyncio.Condition)
@@ -120,13 +137,19 @@ class _Job:
 
 @dataclass(frozen=True)
 class NewJob:
-    """What a job is asked to do."""
+    """What a job is asked to do.
+
+    Attributes:
+        light: begins at once.
+        portable: its work can be made from its record alone, see ``Jobs.work_again``.
+    """
 
     kind: JobKind
     subject: str
     request: Mapping[str, Any] = field(default_factory=dict)
     who: str = ""
     light: bool = False
+    portable: bool = False
 
 
 class Jobs:
@@ -151,6 +174,7 @@ class Jobs:
         self._jobs: OrderedDict[str, _Job] = OrderedDict()
         self._turns = {lane: asyncio.Semaphore(many) for lane, many in JOBS_AT_A_TIME.items()}
         self._closing = False
+        self.work_again: WorkAgain | None = None
 
     @property
     def quota(self) -> Quota:
@@ -159,18 +183,17 @@ class Jobs:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Jobs]:
-        """Marks what an earlier run left unfinished; cancels what is unfinished at the end."""
-        for info in await self._log.unfinished():
-            ended = _ended(info, JobState.INTERRUPTED, error=_interruption())
-            newest = {"event": info.event + UNKNOWN_EVENTS}
-            await self._log.update(ended.model_copy(update=newest))
-            folder = self._folder / info.job_id
-            await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
-            log.warning("job interrupted", job_id=info.job_id, kind=info.kind)
+        """Goes on with what an earlier run or a worker that is gone left unfinished, or marks it;
+        leaves what is unfinished at the end to other workers, or marks that."""
+        await self._take_over(await self._log.left_behind(own=True), own=True)
+        looking = asyncio.create_task(self._look_after(), name="jobs")
         try:
             yield self
         finally:
             self._closing = True
+            looking.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await looking
             tasks = [job.task for job in self._jobs.values() if job.task and not job.task.done()]
             for job in self._jobs.values():
                 job.context.cancel()
@@ -213,6 +236,7 @@ class Jobs:
             event=1,
             who=new.who,
             owner=owner_name(),
+            worker=self._log.worker_id,
             request=dict(new.request),
             created_at=iso_time(now_us()),
         )
@@ -221,8 +245,9 @@ class Jobs:
             if idempotent
             else None
         )
-        await self._log.add(info, reply=reply)
-        job = self._hold(info, work)
+        portable = new.portable and self.work_again is not None
+        await self._log.add(info, reply=reply, portable=portable)
+        job = self._hold(info, work, portable=portable)
         job.task = asyncio.create_task(
             self._run(job, light=new.light), name=info.job_id, context=_waiting_context()
         )
@@ -236,14 +261,15 @@ class Jobs:
         """
         info = await self.get(job_id)
         job = self._jobs.get(job_id)
-        if info.over or job is None:
+        if job is None and not info.over:
+            await self._log.ask_to_cancel(job_id)
+            return await self.wait(job_id, 3 * LOOK_S)
+        if job is None or info.over:
             self._jobs.pop(job_id, None)
             await self._log.remove(job_id)
             await asyncio.to_thread(shutil.rmtree, self._folder / job_id, ignore_errors=True)
             return None
-        job.context.cancel()
-        if job.info.state is JobState.QUEUED and job.task:
-            job.task.cancel()
+        self._cancel(job)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(2.0):
                 await self._wait_until_over(job)
@@ -272,6 +298,12 @@ class Jobs:
         for file in info.files:
             if file.name == name and (path := self._folder / job_id / name).is_file():
                 return path, file
+            if file.name == name:
+                raise ServiceError(
+                    ErrorCode.NOT_FOUND,
+                    f"{name!r} of job {job_id!r} lies with worker {info.worker!r}",
+                    hint="ask that worker",
+                )
         names = ", ".join(f.name for f in info.files) or "none"
         raise ServiceError(
             ErrorCode.NOT_FOUND, f"job {job_id!r} left no {name!r}; it left: {names}"
@@ -279,11 +311,12 @@ class Jobs:
 
     async def wait(self, job_id: str, seconds: float) -> JobInfo:
         """The job when it is over, or after ``seconds``. Raises ServiceError: UNKNOWN_JOB."""
-        job = self._jobs.get(job_id)
-        if job is not None:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(seconds):
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                if (job := self._jobs.get(job_id)) is not None:
                     await self._wait_until_over(job)
+                while not (await self.get(job_id)).over:
+                    await asyncio.sleep(FOLLOW_S)
         return await self.get(job_id)
 
     async def events(self, job_id: str, *, after: int) -> AsyncIterator[JobInfo]:
@@ -292,21 +325,19 @@ class Jobs:
         Raises:
             ServiceError: UNKNOWN_JOB.
         """
-        job = self._jobs.get(job_id)
-        if job is None:
-            info = await self.get(job_id)
-            if info.event > after:
-                yield info
-            return
         while True:
-            async with job.changed:
-                await job.changed.wait_for(
-                    lambda seen=after: job.info.event > seen or job.info.over  # type: ignore[misc]
-                )
-            for event in [e for e in job.events if e.event > after]:
+            if (job := self._jobs.get(job_id)) is None:
+                # It is over, or with another worker.
+                events = [await self.get(job_id)]
+                over = events[0].over
+                await asyncio.sleep(0 if over else FOLLOW_S)
+            else:
+                await _next_event(job, after)
+                events, over = list(job.events), job.info.over
+            for event in [e for e in events if e.event > after]:
                 after = event.event
                 yield event
-            if job.info.over and job.info.event <= after:
+            if over and events[-1].event <= after:
                 return
 
     async def forget_before(self, created_us: int) -> int:
@@ -320,13 +351,101 @@ class Jobs:
 
     # --- inside -----------------------------------------------------------------------------
 
-    def _hold(self, info: JobInfo, work: Work) -> _Job:
+    async def _look_after(self) -> None:
+        while True:
+            await asyncio.sleep(LOOK_S)
+            try:
+                await self._hear_of_own()
+                await self._take_over(await self._log.left_behind(own=False))
+                if kinds := [kind for kind, lane in LANE_OF.items() if self._has_room(lane)]:
+                    # One at a time: those who have room as well get the others.
+                    await self._take_over((await self._log.overdue(kinds))[:1])
+            except StoreError:
+                continue  # it tells of its trouble itself
+            except Exception:
+                log.exception("looking after jobs failed")
+
+    async def _hear_of_own(self) -> None:
+        """Cancel what somebody has cancelled at another worker, leave what another worker has, and
+        put progress on record for those who ask others."""
+        held = {key: job for key, job in self._jobs.items() if not (job.info.over or job.lost)}
+        if not held:
+            return
+        epochs = {key: job.epoch for key, job in held.items()}
+        cancelled, lost = await self._log.asked_to_cancel(epochs)
+        for job_id in cancelled:
+            self._cancel(held[job_id])
+        for job_id in lost:
+            await self._let_go(held[job_id])
+        for job in held.values():
+            if job.info.state is JobState.RUNNING and job.info.event > job.stored_event:
+                info = job.info
+                await self._log.update_progress(info, epoch=job.epoch)
+                job.stored_event = info.event
+
+    async def _take_over(self, job_ids: Iterable[str], *, own: bool = False) -> None:
+        for job_id in job_ids:
+            if (claimed := await self._log.claim(job_id, own=own)) is not None:
+                with contextlib.suppress(FencedError):
+                    await self._go_on(claimed)
+
+    async def _go_on(self, claimed: ClaimedJob) -> None:
+        """Begin a job anew that was another worker's, or say why not."""
+        newest = {"event": claimed.info.event + UNKNOWN_EVENTS, "attempt": claimed.deaths + 1}
+        info = claimed.info.model_copy(update=newest | {"worker": self._log.worker_id})
+        again = self.work_again
+        if claimed.cancelled:
+            last = ended(info, JobState.CANCELLED)
+        elif claimed.deaths >= MAX_DEATHS:
+            last = ended(info, JobState.FAILED, error=given_up(claimed.deaths))
+        elif not claimed.portable or again is None:
+            last = ended(info, JobState.INTERRUPTED, error=interruption())
+        else:
+            log.warning("job taken over", job_id=info.job_id, kind=info.kind, deaths=claimed.deaths)
+            await self._begin_again(info, again, claimed.epoch)
+            return
+        await self._log.update(last, epoch=claimed.epoch)
+        await asyncio.to_thread(shutil.rmtree, self._folder / info.job_id, ignore_errors=True)
+        log.warning("job ended in its worker's place", job_id=info.job_id, state=last.state.value)
+
+    async def _begin_again(self, info: JobInfo, again: WorkAgain, epoch: int) -> None:
+        begun = {"state": JobState.QUEUED, "progress": 0.0, "stage": "", "started_at": None}
+        info = info.model_copy(update=begun)
+
+        async def work(context: JobContext) -> JobResult:
+            return await (await again(info))(context)
+
+        await self._log.update(info, epoch=epoch)
+        job = self._hold(info, work, epoch=epoch, portable=True)
+        job.task = asyncio.create_task(self._run(job, light=False), name=info.job_id)
+
+    def _has_room(self, lane: str) -> bool:
+        return not self._turns[lane].locked()
+
+    def _cancel(self, job: _Job) -> None:
+        job.context.cancel()
+        if job.info.state is JobState.QUEUED and job.task:
+            job.task.cancel()
+
+    async def _let_go(self, job: _Job) -> None:
+        """Leave a job that another worker has; who follows it here follows the record."""
+        log.warning("job gone on elsewhere", job_id=job.info.job_id)
+        job.lost = True
+        job.context.cancel()
+        if job.task is not None and job.task is not asyncio.current_task():
+            job.task.cancel()
+        if self._jobs.get(job.info.job_id) is job:
+            del self._jobs[job.info.job_id]
+        await _notify_readers(job)
+
+    def _hold(self, info: JobInfo, work: Work, *, epoch: int = 0, portable: bool = False) -> _Job:
         loop = asyncio.get_running_loop()
 
         def report(share: float, stage: str) -> None:
             loop.call_soon_threadsafe(self._report, job, share, stage)
 
-        job = _Job(info, JobContext(self._folder / info.job_id, report), work)
+        context = JobContext(self._folder / info.job_id, report)
+        job = _Job(info, context, work, epoch=epoch, portable=portable)
         job.events.append(info)
         self._jobs[info.job_id] = job
         over = [key for key, other in self._jobs.items() if other.info.over]
@@ -342,10 +461,24 @@ class Jobs:
                 async with self._turns[LANE_OF[job.info.kind]]:
                     await self._work(job)
         except asyncio.CancelledError:
-            # Cancelled while it waited for its turn, or the worker stops.
+            # Cancelled while it waited for its turn, or the worker stops, or has the job no more.
+            if job.lost:
+                return
+            if self._closing and job.portable:
+                await asyncio.shield(self._leave(job))
+                return
             state = JobState.INTERRUPTED if self._closing else JobState.CANCELLED
-            error = _interruption() if self._closing else None
-            await asyncio.shield(self._become(job, _ended(job.info, state, error=error)))
+            error = interruption() if self._closing else None
+            with contextlib.suppress(FencedError):
+                await asyncio.shield(self._become(job, ended(job.info, state, error=error)))
+        except FencedError:
+            await self._let_go(job)
+
+    async def _leave(self, job: _Job) -> None:
+        """Put a job back in the queue, for another worker or the next run."""
+        waits = {"state": JobState.QUEUED, "stage": "", "started_at": None}
+        with contextlib.suppress(FencedError):
+            await self._become(job, job.info.model_copy(update=waits))
 
     async def _work(self, job: _Job) -> None:
         started = {"state": JobState.RUNNING, "started_at": iso_time(now_us())}
@@ -355,25 +488,25 @@ class Jobs:
             result = await job.work(job.context)
             files = await asyncio.to_thread(_files, job.context.folder, result.files)
             done = {"result": result.values, "files": files, "progress": 1.0, "stage": ""}
-            ended = _ended(job.info.model_copy(update=done), JobState.SUCCEEDED)
+            last = ended(job.info.model_copy(update=done), JobState.SUCCEEDED)
         except JobCancelled:
-            ended = _ended(job.info, JobState.CANCELLED)
+            last = ended(job.info, JobState.CANCELLED)
         except Exception as error:
             failure = service_error(error)
             if failure.status == 500:
                 log.error("job failed", job_id=job.info.job_id, exc_info=error)
             problem = problem_of(failure, path=f"/v1/jobs/{job.info.job_id}", request_id=None)
-            ended = _ended(job.info, JobState.FAILED, error=problem)
-        if ended.state is not JobState.SUCCEEDED:
+            last = ended(job.info, JobState.FAILED, error=problem)
+        if last.state is not JobState.SUCCEEDED:
             await asyncio.to_thread(shutil.rmtree, job.context.folder, ignore_errors=True)
-        await self._become(job, ended)
+        await self._become(job, last)
 
     async def _become(self, job: _Job, info: JobInfo) -> None:
         info = info.model_copy(update={"event": job.info.event + 1})
         # Stored first: what a client was sent is true after a crash as well.
         while True:
             try:
-                await self._log.update(info)
+                await self._log.update(info, epoch=job.epoch)
                 break
             except StoreTroubleError as error:
                 if self._closing:
@@ -399,7 +532,13 @@ class Jobs:
 
     async def _wait_until_over(self, job: _Job) -> None:
         async with job.changed:
-            await job.changed.wait_for(lambda: job.info.over)
+            await job.changed.wait_for(lambda: job.info.over or job.lost)
+
+
+async def _next_event(job: _Job, after: int) -> None:
+    """Wait until there is an event behind ``after``, or there will be none here."""
+    async with job.changed:
+        await job.changed.wait_for(lambda: job.info.event > after or job.info.over or job.lost)
 
 
 async def _notify_readers(job: _Job) -> None:
@@ -440,19 +579,6 @@ def require_success(info: JobInfo) -> None:
         f"job {info.job_id!r} is {info.state.value}, {info.progress:.0%} done",
         hint=f"follow GET /v1/jobs/{info.job_id}/events",
     )
-
-
-def _ended(info: JobInfo, state: JobState, *, error: Problem | None = None) -> JobInfo:
-    return info.model_copy(
-        update={"state": state, "finished_at": iso_time(now_us()), "error": error}
-    )
-
-
-def _interruption() -> Problem:
-    failure = ServiceError(
-        ErrorCode.DRAINING, "the worker stopped before this job was done", hint="start it again"
-    )
-    return problem_of(failure, path="", request_id=None)
 
 
 def _files(folder: Path, names: Mapping[str, str]) -> list[JobFile]:

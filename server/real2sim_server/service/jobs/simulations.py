@@ -20,7 +20,7 @@ from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..scenarios.scenarios import Scenarios
 from .exports import VideoSource
-from .jobs import JobCancelled, JobContext, JobResult, Jobs, NewJob, require_success
+from .jobs import JobCancelled, JobContext, JobResult, Jobs, NewJob, Work, require_success
 from .rollouts import PLAYBACK, RolloutPlayback, plan_rollout, run_rollout
 
 MAX_CACHED_PLAYBACKS = 4
@@ -46,9 +46,24 @@ class Simulations:
             ServiceError: as scenarios, scene cache and jobs do; INVALID_REQUEST, UNKNOWN_OBJECT or
                 TIME_OUT_OF_RANGE for what cannot be simulated.
         """
+        revision = (await self._scenarios.view(scenario_id)).revision
+        work = await self._work(scenario_id, revision, request)
+        fields = request.model_dump(mode="json", exclude_none=True)
+        fields |= {"scenario": scenario_id, "revision": revision}
+        new = NewJob("simulate", scenario_id, fields, who, portable=True)
+        return await self._jobs.start(new, work, idempotent=idempotent)
+
+    async def work_again(self, info: JobInfo) -> Work:
+        """The rollout of a job on record, of the scenario as it was then."""
+        fields = dict(info.request)
+        scenario_id, revision = fields.pop("scenario"), fields.pop("revision")
+        return await self._work(scenario_id, revision, SimulateRequest.model_validate(fields))
+
+    async def _work(self, scenario_id: str, revision: int, request: SimulateRequest) -> Work:
         view = await self._scenarios.view(scenario_id)
+        state = await self._scenarios.state_at(scenario_id, revision)
         scene = await self._scene_cache.get(view.row.scene)
-        plan = await asyncio.to_thread(plan_rollout, scene, view.state, request)
+        plan = await asyncio.to_thread(plan_rollout, scene, state, request)
 
         async def work(context: JobContext) -> JobResult:
             values, files = await asyncio.to_thread(
@@ -63,10 +78,7 @@ class Simulations:
                 raise JobCancelled
             return JobResult(values, files)
 
-        fields = request.model_dump(mode="json", exclude_none=True)
-        fields |= {"scenario": scenario_id, "revision": view.revision}
-        new = NewJob("simulate", scenario_id, fields, who)
-        return await self._jobs.start(new, work, idempotent=idempotent)
+        return work
 
     async def video_source(self, job_id: str) -> VideoSource:
         """What a finished rollout shows.

@@ -8,7 +8,13 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from real2sim_proto.jobs import DatasetRequest, ExportBody, ExportRequest, JobInfo
+from real2sim_proto.jobs import (
+    EXPORT_BODY,
+    DatasetRequest,
+    ExportBody,
+    ExportRequest,
+    JobInfo,
+)
 
 from ...datasets.drive import EpisodeDrive, ScenarioDrive
 from ...datasets.variants import Variant, swept
@@ -48,14 +54,41 @@ async def create(
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
-        if isinstance(body, DatasetRequest):
-            work = await _dataset_work(worker, body, request)
-        else:
-            work = await _video_work(worker, body)
+        revision = None
+        if body.scenario is not None:
+            revision = (await worker.scenarios.view(body.scenario)).revision
+        work = await _work(worker, body, revision, request)
         fields = body.model_dump(mode="json", exclude_none=True, exclude={"recording"})
-        new = NewJob("export", _subject(body), fields, who)
+        if revision is not None:
+            fields["revision"] = revision
+        new = NewJob("export", _subject(body), fields, who, portable=_is_portable(body))
         info = await worker.jobs.start(new, work, idempotent=idempotent)
         return info_response(info, status=202, headers=accepted_headers(info))
+
+
+async def work_again(worker: Worker, info: JobInfo) -> Work:
+    """The export of a job on record, of the scenario as it was then."""
+    fields = dict(info.request)
+    revision = fields.pop("revision", None)
+    return await _work(worker, EXPORT_BODY.validate_python(fields), revision, None)
+
+
+async def _work(
+    worker: Worker,
+    body: ExportRequest | DatasetRequest,
+    revision: int | None,
+    request: Request | None,
+) -> Work:
+    if isinstance(body, DatasetRequest):
+        return await _dataset_work(worker, body, revision, request)
+    return await _video_work(worker, body, revision)
+
+
+def _is_portable(body: ExportRequest | DatasetRequest) -> bool:
+    """Whether all that it shows is in the store, and the same for all workers."""
+    if isinstance(body, DatasetRequest):
+        return body.session is None and body.recording is None
+    return body.simulation is None
 
 
 def _subject(body: ExportRequest | DatasetRequest) -> str:
@@ -66,8 +99,8 @@ def _subject(body: ExportRequest | DatasetRequest) -> str:
 # --- videos -----------------------------------------------------------------------------------
 
 
-async def _video_work(worker: Worker, body: ExportRequest) -> Work:
-    video_source = await _video_source(worker, body)
+async def _video_work(worker: Worker, body: ExportRequest, revision: int | None) -> Work:
+    video_source = await _video_source(worker, body, revision)
     check_camera(video_source, body, max_pixels=worker.settings.max_pixels_per_step)
     frame_times(video_source, body)
 
@@ -77,26 +110,29 @@ async def _video_work(worker: Worker, body: ExportRequest) -> Work:
     return work
 
 
-async def _video_source(worker: Worker, request: ExportRequest) -> VideoSource:
+async def _video_source(
+    worker: Worker, request: ExportRequest, revision: int | None
+) -> VideoSource:
     if request.simulation is not None:
         return await worker.video_source(request.simulation)
-    if request.scenario is not None:
+    if request.scenario is not None and revision is not None:
         view = await worker.scenarios.view(request.scenario)
         scene = await worker.scene_cache.get(view.row.scene)
-        return VideoSource(
-            scene, lambda t_us: instances_at(scene, view.state, t_us), view.state.clock
-        )
-    scene = await worker.scene_cache.get(request.scene or "")
-    state = await asyncio.to_thread(ScenarioState.of, scene)
+        state = await worker.scenarios.state_at(request.scenario, revision)
+    else:
+        scene = await worker.scene_cache.get(request.scene or "")
+        state = await asyncio.to_thread(ScenarioState.of, scene)
     return VideoSource(scene, lambda t_us: instances_at(scene, state, t_us), state.clock)
 
 
 # --- data sets --------------------------------------------------------------------------------
 
 
-async def _dataset_work(worker: Worker, body: DatasetRequest, request: Request) -> Work:
+async def _dataset_work(
+    worker: Worker, body: DatasetRequest, revision: int | None, request: Request | None
+) -> Work:
     plan = plan_of(body)
-    source = await _dataset_source(worker, body, request)
+    source = await _dataset_source(worker, body, revision, request)
     max_pixels = worker.settings.max_pixels_per_step
     await asyncio.to_thread(check_dataset, source.variants, plan, max_pixels=max_pixels)
     loop = asyncio.get_running_loop()
@@ -110,8 +146,10 @@ async def _dataset_work(worker: Worker, body: DatasetRequest, request: Request) 
     return work
 
 
-async def _dataset_source(worker: Worker, body: DatasetRequest, request: Request) -> DatasetSource:
-    if body.session is not None:
+async def _dataset_source(
+    worker: Worker, body: DatasetRequest, revision: int | None, request: Request | None
+) -> DatasetSource:
+    if body.session is not None and request is not None:
         return await _session_source(worker, body.session, request)
     if body.recording is not None:
         recording = await asyncio.to_thread(_read_recording, body.recording)
@@ -120,8 +158,11 @@ async def _dataset_source(worker: Worker, body: DatasetRequest, request: Request
         view = await worker.scenarios.view(body.scenario)
         document = await worker.scenarios.export(body.scenario)
         scene = await worker.scene_cache.get(view.row.scene)
-        entries = [entry.model_dump(mode="json", exclude_none=True) for entry in document.entries]
-        return await _edited_source(scene, view.state, body, _made_of(entries))
+        done = document.entries[:revision]
+        entries = [entry.model_dump(mode="json", exclude_none=True) for entry in done]
+        assert revision is not None
+        state = await worker.scenarios.state_at(body.scenario, revision)
+        return await _edited_source(scene, state, body, _made_of(entries))
     scene = await worker.scene_cache.get(body.scene or "")
     state = await asyncio.to_thread(ScenarioState.of, scene)
     return await _edited_source(scene, state, body, {"operations": []})

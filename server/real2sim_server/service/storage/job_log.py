@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import sqlalchemy as sa
@@ -9,9 +11,33 @@ import sqlalchemy as sa
 from real2sim_proto.jobs import JobInfo, JobState
 
 from . import tables as t
+from .leases import clock_of, is_alive
 from .store import Store, StoredReply, Write, now_us
 
 UNFINISHED = (JobState.QUEUED.value, JobState.RUNNING.value)
+
+
+OVERDUE_US = 1_000_000
+"""That a job has waited with a worker when others may take it from there [us]."""
+
+
+@dataclass(frozen=True)
+class ClaimedJob:
+    """A job that a worker has taken over.
+
+    Attributes:
+        info: as it was last on record.
+        epoch: under which the worker may write it.
+        deaths: workers that died at it.
+        portable: whether it can be begun anew from ``info``.
+        cancelled: whether somebody has cancelled it.
+    """
+
+    info: JobInfo
+    epoch: int
+    deaths: int
+    portable: bool
+    cancelled: bool
 
 
 class JobLog:
@@ -26,15 +52,97 @@ class JobLog:
         self._store = store
         self._worker_id = worker_id
 
-    async def add(self, job: JobInfo, *, reply: StoredReply | None) -> None:
-        """Put a new job on record, with the answer to the request for it."""
+    @property
+    def worker_id(self) -> str:
+        """Whose jobs they are."""
+        return self._worker_id
+
+    async def add(self, job: JobInfo, *, reply: StoredReply | None, portable: bool = False) -> None:
+        """Put a new job on record, with the answer to the request for it.
+
+        Args:
+            job: what it is.
+            reply: stored for a repeated request.
+            portable: whether any worker can begin it from its document.
+        """
         row = _row(job) | {"worker_id": self._worker_id, "created_us": now_us()}
+        row["portable"] = int(portable)
         await self._store.write(Write(sa.insert(t.jobs), [row]), reply=reply)
 
-    async def update(self, job: JobInfo) -> None:
-        """Keep what the job is now."""
-        change = sa.update(t.jobs).where(t.jobs.c.job_id == job.job_id).values(_row(job))
+    async def update(self, job: JobInfo, *, epoch: int) -> None:
+        """Keep what the job is now. Raises FencedError: another worker has it, or it is gone."""
+        mine = (t.jobs.c.job_id == job.job_id) & (t.jobs.c.epoch == epoch)
+        change = sa.update(t.jobs).where(mine).values(_row(job))
+        await self._store.write(Write(change, fenced=1))
+
+    async def update_progress(self, job: JobInfo, *, epoch: int) -> None:
+        """Keep how far a job is, unless it has ended meanwhile."""
+        mine = (t.jobs.c.job_id == job.job_id) & (t.jobs.c.epoch == epoch)
+        running = t.jobs.c.state == JobState.RUNNING.value
+        change = sa.update(t.jobs).where(mine & running).values(_row(job))
         await self._store.write(Write(change))
+
+    async def ask_to_cancel(self, job_id: str) -> None:
+        """Leave word for whichever worker has the job."""
+        change = sa.update(t.jobs).where(t.jobs.c.job_id == job_id).values(cancelled=1)
+        await self._store.write(Write(change))
+
+    async def asked_to_cancel(self, epochs: Mapping[str, int]) -> tuple[set[str], set[str]]:
+        """Which jobs somebody has cancelled, and which this worker has no more.
+
+        Args:
+            epochs: of jobs that the worker had, by their ids.
+        """
+        j = t.jobs.c
+        rows = await self._store.read(
+            sa.select(j.job_id, j.epoch, j.cancelled).where(j.job_id.in_(epochs))
+        )
+        kept = {r["job_id"]: r for r in rows if r["epoch"] == epochs[r["job_id"]]}
+        return {name for name, row in kept.items() if row["cancelled"]}, set(epochs) - set(kept)
+
+    async def left_behind(self, *, own: bool) -> list[str]:
+        """Unfinished jobs whose worker is dead, oldest first; or those of an earlier run of this
+        worker."""
+        return await self._ids(self._is_left_behind(own=own))
+
+    async def overdue(self, kinds: Collection[str]) -> list[str]:
+        """Jobs of some kinds that wait with another worker though any could begin them."""
+        return await self._ids(self._is_overdue() & t.jobs.c.kind.in_(kinds))
+
+    async def claim(self, job_id: str, *, own: bool = False) -> ClaimedJob | None:
+        """Take over a job that is left behind or overdue, in one statement: of several workers that
+        try, one gets it; None for the others."""
+        j = t.jobs.c
+        free = self._is_left_behind(own=own) | self._is_overdue()
+        died = sa.case((j.state == JobState.RUNNING.value, 1), else_=0)
+        values = {"worker_id": self._worker_id, "epoch": j.epoch + 1, "deaths": j.deaths + died}
+        claimed = sa.update(t.jobs).where((j.job_id == job_id) & free).values(values)
+        (count,) = await self._store.write(Write(claimed))
+        query = sa.select(t.jobs).where((j.job_id == job_id) & (j.worker_id == self._worker_id))
+        rows = await self._store.read(query) if count else []
+        if not rows:
+            return None
+        (row,) = rows
+        info = JobInfo.model_validate_json(row["document"])
+        whether = bool(row["portable"]), bool(row["cancelled"])
+        return ClaimedJob(info, row["epoch"], row["deaths"], *whether)
+
+    def _is_left_behind(self, *, own: bool) -> sa.ColumnElement[bool]:
+        j = t.jobs.c
+        mine = j.worker_id == self._worker_id
+        gone = mine if own else ~mine & ~is_alive(j.worker_id, self._store)
+        return j.state.in_(UNFINISHED) & gone
+
+    def _is_overdue(self) -> sa.ColumnElement[bool]:
+        j = t.jobs.c
+        waits = (j.state == JobState.QUEUED.value) & (j.portable == 1)
+        late = j.created_us < clock_of(self._store) - OVERDUE_US
+        return waits & late & (j.worker_id != self._worker_id)
+
+    async def _ids(self, condition: sa.ColumnElement[bool]) -> list[str]:
+        j = t.jobs.c
+        query = sa.select(j.job_id).where(condition).order_by(j.created_us, j.job_id).limit(100)
+        return [row["job_id"] for row in await self._store.read(query)]
 
     async def remove(self, job_id: str) -> None:
         """Forget a job."""
@@ -54,11 +162,6 @@ class JobLog:
         """Jobs on record."""
         rows = await self._store.read(sa.select(sa.func.count().label("jobs")).select_from(t.jobs))
         return int(rows[0]["jobs"])
-
-    async def unfinished(self) -> list[JobInfo]:
-        """Jobs that this worker has not ended."""
-        own = t.jobs.c.worker_id == self._worker_id
-        return await self._select(own & t.jobs.c.state.in_(UNFINISHED), limit=100_000)
 
     async def ended_before(self, created_us: int, *, limit: int = 100) -> list[str]:
         """Ids of ended jobs of this worker that were begun before."""

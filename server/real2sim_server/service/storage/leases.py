@@ -63,9 +63,8 @@ class Leases:
     async def take_over(self, session_id: str) -> SessionRow | None:
         """Claim an open session that is this worker's, or whose worker has not kept its promise;
         None where there is none, or another one has it."""
-        s, w = t.sessions.c, t.workers.c
-        is_held = sa.exists().where((w.worker_id == s.worker_id) & (w.lease_until_us > self._now()))
-        is_free = (s.worker_id == self._worker_id) | ~is_held
+        s = t.sessions.c
+        is_free = (s.worker_id == self._worker_id) | ~is_alive(s.worker_id, self._store)
         claimed = sa.update(t.sessions).where((s.session_id == session_id) & s.closed_us.is_(None))
         claimed = claimed.where(is_free).values(worker_id=self._worker_id, epoch=s.epoch + 1)
         (count,) = await self._store.write(Write(claimed))
@@ -82,7 +81,7 @@ class Leases:
     async def workers(self) -> list[WorkerRow]:
         """All workers that ever shared the store, by name."""
         w = t.workers.c
-        alive = (w.lease_until_us > self._now()).label("alive")
+        alive = (w.lease_until_us > clock_of(self._store)).label("alive")
         query = sa.select(w.worker_id, alive, w.document).order_by(w.worker_id)
         return [
             WorkerRow(row["worker_id"], bool(row["alive"]), json.loads(row["document"]))
@@ -91,7 +90,7 @@ class Leases:
 
     async def _promise(self, seconds: float, document: Mapping[str, Any]) -> None:
         text = json.dumps(document, allow_nan=False)
-        until = self._now() + round(seconds * 1e6)
+        until = clock_of(self._store) + round(seconds * 1e6)
         mine = t.workers.c.worker_id == self._worker_id
         values = {"lease_until_us": until, "document": text}
         renewed = Write(sa.update(t.workers).where(mine).values(values))
@@ -105,9 +104,16 @@ class Leases:
 
         await self._store.database.on_thread(promise)
 
-    def _now(self) -> sa.ColumnElement[int]:
-        """Wall clock [us], as an expression."""
-        if self._store.database.is_server:
-            seconds = sa.func.extract("epoch", sa.func.clock_timestamp())
-            return sa.cast(seconds * 1_000_000, sa.BigInteger)
-        return sa.literal(now_us(), sa.BigInteger)
+
+def is_alive(worker_id: sa.ColumnElement[str], store: Store) -> sa.ColumnElement[bool]:
+    """Whether the worker that a column names keeps its promise, as a condition."""
+    w = t.workers.c
+    return sa.exists().where((w.worker_id == worker_id) & (w.lease_until_us > clock_of(store)))
+
+
+def clock_of(store: Store) -> sa.ColumnElement[int]:
+    """Wall clock that all compare times by [us], as an expression."""
+    if store.database.is_server:
+        seconds = sa.func.extract("epoch", sa.func.clock_timestamp())
+        return sa.cast(seconds * 1_000_000, sa.BigInteger)
+    return sa.literal(now_us(), sa.BigInteger)

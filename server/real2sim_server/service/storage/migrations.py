@@ -72,10 +72,19 @@ def _add_leases(connection: Connection) -> None:
     )
 
 
+def _add_leases_of_jobs(connection: Connection) -> None:
+    """Jobs may go from one worker to another; those of before end with theirs."""
+    for column in ("epoch", "deaths", "portable", "cancelled"):
+        connection.exec_driver_sql(
+            f"ALTER TABLE jobs ADD COLUMN {column} INTEGER DEFAULT 0 NOT NULL"
+        )
+
+
 MIGRATIONS: tuple[Migration, ...] = (
     Migration(2, "tokens of sessions are kept as hashes", _hash_tokens),
     Migration(3, "sessions keep the name of the token they were made with", _add_owners),
     Migration(4, "sessions may go from one worker to another", _add_leases),
+    Migration(5, "jobs may go from one worker to another", _add_leases_of_jobs),
 )
 
 OLDEST = MIGRATIONS[0].version - 1

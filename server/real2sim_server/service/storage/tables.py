@@ -15,7 +15,7 @@ from sqlalchemy import (
     Text,
 )
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Raised with every change of a table, together with an entry in `migrations`."""
 
 metadata = MetaData()
@@ -119,6 +119,13 @@ jobs = Table(
     Column("state", String(16), nullable=False),
     Column("document", Text, nullable=False),
     Column("created_us", BigInteger, nullable=False),
+    # Raised whenever a worker takes the job over, as of a session.
+    Column("epoch", Integer, nullable=False, server_default="0"),
+    # Times that a worker died at it.
+    Column("deaths", Integer, nullable=False, server_default="0"),
+    # Whether any worker can begin it anew from its document, and whether somebody has cancelled it.
+    Column("portable", Integer, nullable=False, server_default="0"),
+    Column("cancelled", Integer, nullable=False, server_default="0"),
 )
 Index("ix_jobs_created", jobs.c.created_us)
 Index("ix_jobs_state", jobs.c.worker_id, jobs.c.state)

@@ -1,0 +1,236 @@
+"""Jobs of several workers on one store: each is done by one, also where another one died."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, asynccontextmanager
+
+import pytest
+import sqlalchemy as sa
+
+from real2sim_proto.jobs import JobInfo, JobState
+from real2sim_server.service.jobs import jobs as module
+from real2sim_server.service.jobs.jobs import MAX_DEATHS, JobResult, Jobs, NewJob
+from real2sim_server.service.library.quotas import Quota
+from real2sim_server.service.storage import job_log, tables
+from real2sim_server.service.storage.job_log import JobLog
+from real2sim_server.service.storage.leases import Leases
+from real2sim_server.service.storage.store import FencedError, Store, Write
+
+from ..postgres import Postgres
+
+SIMULATION = NewJob("simulate", "sc_1", {"scenario": "sc_1"}, portable=True)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request, tmp_path) -> str:
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'store.db'}"
+    server: Postgres = request.getfixturevalue("postgres")
+    return server.new_database()
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(module, "LOOK_S", 0.05)
+    monkeypatch.setattr(module, "FOLLOW_S", 0.02)
+    monkeypatch.setattr(job_log, "OVERDUE_US", 50_000)
+
+
+@pytest.fixture
+def fleet(url, tmp_path):
+    """Runs ``work(start)``, where ``start(name)`` gives the jobs of a worker that lives."""
+
+    def run(work):
+        async def inside():
+            async with AsyncExitStack() as stack:
+
+                async def start(name: str, alive: bool = True) -> Jobs:
+                    return await stack.enter_async_context(worker(url, name, tmp_path, alive))
+
+                return await asyncio.wait_for(work(start), 30)
+
+        return asyncio.run(inside())
+
+    return run
+
+
+@asynccontextmanager
+async def worker(url, name, tmp_path, alive):
+    store = Store(url)
+    await store.open()
+    try:
+        await Leases(store, name, seconds=60 if alive else 0).renew({})
+        quota = Quota(tmp_path / name, "jobs", 1000, 1 << 30, "JOBS_QUOTA", "delete jobs")
+        jobs = Jobs(JobLog(store, name), quota)
+        jobs.work_again = remade(name)
+        async with jobs.running():
+            yield jobs
+    finally:
+        await store.close()
+
+
+def remade(name: str):
+    async def work_again(info: JobInfo):
+        async def work(_context) -> JobResult:
+            return JobResult({"by": name, "asked": info.request})
+
+        return work
+
+    return work_again
+
+
+async def for_ever(context) -> JobResult:
+    while True:
+        context.progress(0.5, "waiting")
+        await asyncio.sleep(0.005)
+
+
+async def die(jobs: Jobs) -> None:
+    """What a killed worker leaves: nothing of it moves any more, and its lease runs out."""
+    jobs._closing = True
+    for job in jobs._jobs.values():
+        job.lost = True
+        job.task.cancel()
+    await Leases(jobs._log._store, jobs._log.worker_id, seconds=0).renew({})
+
+
+async def running(jobs: Jobs, job: JobInfo) -> None:
+    while (await jobs.get(job.job_id)).state is not JobState.RUNNING:
+        await asyncio.sleep(0.01)
+
+
+def test_a_job_of_a_worker_that_died_is_done_by_another(fleet):
+    async def work(start):
+        first, second = await start("w0"), await start("w1")
+        job = await first.start(SIMULATION, for_ever)
+        await running(first, job)
+        await die(first)
+        return await second.wait(job.job_id, 20)
+
+    done = fleet(work)
+    assert (done.state, done.attempt, done.worker) == (JobState.SUCCEEDED, 2, "w1")
+    assert done.result == {"by": "w1", "asked": {"scenario": "sc_1"}}
+
+
+def test_of_several_workers_that_try_one_gets_a_job(url):
+    left = JobInfo(job_id="job_1", kind="export", subject="a", state="running", created_at="then")
+
+    async def work():
+        stores = [Store(url) for _ in range(4)]
+        for store in stores:
+            await store.open()
+        logs = [JobLog(store, f"w{k}") for k, store in enumerate(stores)]
+        try:
+            await logs[0].add(left, reply=None)
+            for k in (1, 2, 3):
+                await Leases(stores[k], f"w{k}", seconds=60).renew({})
+            return await asyncio.gather(*(log.claim("job_1") for log in logs[1:]))
+        finally:
+            for store in stores:
+                await store.close()
+
+    claims = asyncio.run(work())
+    assert [claim.deaths for claim in claims if claim is not None] == [1]
+
+
+def test_a_job_that_cannot_be_made_again_is_marked_by_another(fleet):
+    async def work(start):
+        first, second = await start("w0"), await start("w1")
+        job = await first.start(NewJob("drive", "tiny"), for_ever)
+        await running(first, job)
+        await die(first)
+        return await second.wait(job.job_id, 20)
+
+    left = fleet(work)
+    assert left.state is JobState.INTERRUPTED
+    assert left.error.retryable
+
+
+def test_a_job_that_kills_workers_is_given_up_with_the_reason(fleet):
+    async def work(start):
+        first, second = await start("w0"), await start("w1")
+        job = await first.start(SIMULATION, for_ever)
+        await running(first, job)
+        died = sa.update(tables.jobs).values(deaths=MAX_DEATHS - 1)
+        await first._log._store.write(Write(died))
+        await die(first)
+        return await second.wait(job.job_id, 20)
+
+    left = fleet(work)
+    assert left.state is JobState.FAILED
+    assert f"{MAX_DEATHS} workers died" in left.error.detail
+
+
+def test_cancelling_reaches_the_worker_that_has_the_job(fleet):
+    async def work(start):
+        first, second = await start("w0"), await start("w1")
+        job = await first.start(NewJob("export", "tiny"), for_ever)
+        await running(first, job)
+        told = await second.cancel(job.job_id)
+        return told, await first.get(job.job_id)
+
+    told, there = fleet(work)
+    assert told.state is there.state is JobState.CANCELLED
+
+
+def test_any_worker_tells_how_far_a_job_is_until_it_is_over(fleet):
+    async def work(start):
+        first, second = await start("w0"), await start("w1")
+        gate = asyncio.Event()
+
+        async def half(context) -> JobResult:
+            context.progress(0.5, "half")
+            await gate.wait()
+            return JobResult({"answer": 42})
+
+        job = await first.start(NewJob("export", "tiny"), half)
+        seen = []
+        async for info in second.events(job.job_id, after=0):
+            seen.append(info)
+            if info.progress == 0.5:
+                gate.set()
+        return seen
+
+    seen = fleet(work)
+    assert (seen[-1].state, seen[-1].result) == (JobState.SUCCEEDED, {"answer": 42})
+    assert [info.event for info in seen] == sorted({info.event for info in seen})
+
+
+def test_a_worker_with_room_takes_what_waits_with_another(fleet):
+    async def work(start):
+        first, second = await start("w0"), await start("w1")
+        busy = await first.start(NewJob("simulate", "tiny"), for_ever)
+        await running(first, busy)
+        waiting = await first.start(SIMULATION, for_ever)
+        return await first.wait(waiting.job_id, 20), await second.get(busy.job_id)
+
+    done, busy = fleet(work)
+    assert (done.worker, done.attempt, done.state) == ("w1", 1, JobState.SUCCEEDED)
+    assert (busy.worker, busy.state) == ("w0", JobState.RUNNING)
+
+
+def test_a_worker_that_slept_cannot_end_a_job_that_went_on_elsewhere(fleet):
+    async def work(start):
+        first, second = await start("w0"), await start("w1")
+        job = await first.start(SIMULATION, for_ever)
+        await running(first, job)
+        await Leases(first._log._store, "w0", seconds=0).renew({})
+        done = await second.wait(job.job_id, 20)
+        late = done.model_copy(update={"state": JobState.FAILED})
+        with pytest.raises(FencedError):
+            await first._log.update(late, epoch=0)
+        return await first.wait(job.job_id, 20)
+
+    assert fleet(work).result["by"] == "w1"
+
+
+def test_a_worker_that_stops_leaves_its_jobs_to_others(fleet, url, tmp_path):
+    async def work(start):
+        async with worker(url, "w0", tmp_path, alive=False) as first:
+            job = await first.start(SIMULATION, for_ever)
+            await running(first, job)
+        return await (await start("w1")).wait(job.job_id, 20)
+
+    done = fleet(work)
+    assert (done.state, done.attempt) == (JobState.SUCCEEDED, 1)
