@@ -161,3 +161,26 @@ def test_a_worker_that_was_killed_goes_on_with_its_jobs(start):
     client = start()
     assert client.get(job).json()["attempt"] == 2
     wait_until(lambda: client.get(job).json()["state"] == "succeeded", 120)
+
+
+@pytest.mark.slow
+def test_a_data_set_goes_on_with_the_clips_that_it_had(start):
+    body = {"kind": "dataset", "scene": "tiny", "formats": ["kitti"], "width": 320}
+    client = start()
+
+    def archive(job: str) -> bytes:
+        wait_until(lambda: client.get(job).json()["state"] == "succeeded", 120)
+        return client.get(f"{job}/files/dataset.tar").content
+
+    def begun() -> str:
+        asked = body | {"clip_s": 0.3, "period_us": 50_000}
+        return client.post("/v1/exports", json=asked).headers["Location"]
+
+    undisturbed = archive(begun())
+    job = begun()
+    wait_until(lambda: client.get(job).json()["progress"] > 0.4, 120)
+    client = start()
+    seen: list[float] = []
+    wait_until(lambda: seen.append(client.get(job).json()["progress"]) or seen[-1] > 0, 120)
+    assert seen[-1] > 0.2
+    assert archive(job) == undisturbed
