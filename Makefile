@@ -18,7 +18,7 @@ WITH_TORCH := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cub
 	nvidia-cufile nvidia-curand nvidia-cusolver nvidia-cusparse nvidia-cusparselt-cu13 \
 	nvidia-nccl-cu13 nvidia-nvjitlink nvidia-nvshmem-cu13 nvidia-nvtx
 
-.PHONY: demo check test test-slow lint lint-studio format schema coverage bench pins docs clean
+.PHONY: demo check test kernels kernels-drawing kernels-physics test-slow lint lint-studio format schema coverage bench pins docs clean
 
 demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
@@ -28,6 +28,12 @@ check: lint
 
 test: $(STAMP)
 	$(PYTEST) $(PARALLEL)
+
+# Compiled kernels, by two processes beside one another with make -j; tests find them on disk.
+kernels: kernels-drawing kernels-physics
+
+kernels-drawing kernels-physics: kernels-%: $(STAMP)
+	$(BIN)/python scripts/compile_kernels.py $*
 
 test-slow: $(STAMP)
 	$(PYTEST) -n 0 --run-slow -m "slow or gpu or ray"

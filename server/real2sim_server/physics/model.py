@@ -109,7 +109,7 @@ def _assemble(
         material=np.concatenate(index),
         body=body,
         table=np.stack([m.row() for m in materials]),
-        friction=np.array([min(b.friction, float(STICKS)) for b in bodies]),
+        friction=np.array([min(b.friction, float(STICKS)) for b in bodies], np.float64),
         dx=dx,
         gravity=gravity,
         dtype=dtype,

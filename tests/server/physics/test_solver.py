@@ -282,3 +282,8 @@ def test_regions_of_one_body_may_differ_in_stiffness():
     run.step(0.05)
     strain = np.abs(run.particles().F_elastic - np.eye(3)).max(axis=(1, 2))
     assert strain[front == 1].mean() > 5 * strain[front == 0].mean()
+
+
+def test_whole_numbers_of_friction_need_no_kernels_of_their_own():
+    slippery = model._assemble([cube(friction=0)], 0.1, (0, 0, -9.81), np.float64)
+    assert slippery.friction.dtype == np.float64
