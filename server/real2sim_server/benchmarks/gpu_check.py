@@ -39,8 +39,10 @@ from ..reconstruct.training.schedule import TrainOptions
 from ..reconstruct.training.trainer import Trainer
 from ..render import Instance, RigView, encode_rgb, render_rigs, select_backend
 from ..render.backends.base import Backend, device_of
+from ..render.cast import CastBackend, select_caster
+from ..render.cast.call import checked_request
 from ..render.jpeg import JpegEncoder, jpeg_encoder_for
-from ..scene import Camera, Sky
+from ..scene import Beams, Camera, Lidar, Sky
 from ..scene.camera import T_VEHICLE_OPTICAL
 from ..synthetic import CameraSpec, SyntheticConfig, generate_log
 from .gaussian_street import StreetScene, street_scene
@@ -79,6 +81,7 @@ class Scale:
         compared: Gaussians of the street whose pictures are compared, in images of
             ``compared_width``.
         frames: cases that are timed, each ``repeats`` times.
+        rays: rows and columns of the sweep that is compared and timed.
         particles: of the block that falls, in numbers tried one after the other.
         train_steps, train_width, train_frames, train_gaussians: of the short training; the last is
             how many the background has at most.
@@ -92,6 +95,7 @@ class Scale:
         FrameCase(5, 1920, 1280, 3_000_000, 40, wanted_ms=12.0, jpeg=True),
     )
     repeats: int = 40
+    rays: tuple[int, int] = (64, 1024)
     particles: tuple[int, ...] = (100_000, 1_000_000)
     train_steps: int = 50
     train_width: int = 160
@@ -107,12 +111,14 @@ class Devices:
         serving: makes the backend that draws frames.
         training: name of the backend that trains, or the backend.
         physics: name of the solver's backend.
+        casting: makes the backend that casts LiDARs.
         name: of the device, for the table.
     """
 
     serving: Callable[[], Backend]
     training: str | Backend
     physics: str
+    casting: Callable[[], CastBackend]
     name: str
 
 
@@ -146,7 +152,7 @@ class GpuCheck:
     @property
     def right(self) -> bool:
         """Whether every part ran and all that is compared agrees; speed is not asked."""
-        compared = (f.holds for f in self.findings if f.part in ("pictures", "training"))
+        compared = (f.holds for f in self.findings if f.part in ("pictures", "lidar", "training"))
         return not self.failed and False not in compared
 
     def markdown(self) -> str:
@@ -166,7 +172,9 @@ def this_gpu() -> Devices:
     """The GPU of this machine: serving kernels, gsplat for training, the solver on CUDA."""
     properties = torch.cuda.get_device_properties(0)
     name = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB"
-    return Devices(partial(select_backend, "nvrtc"), "cuda", "cuda", name)
+    return Devices(
+        partial(select_backend, "nvrtc"), "cuda", "cuda", partial(select_caster, "cuda"), name
+    )
 
 
 def run(
@@ -248,6 +256,28 @@ def _pictures(devices: Devices, scale: Scale) -> Iterator[Finding]:
         yield Finding(
             "", f"median depths 1 mm apart, {where}", f"{share:.2%}", "0.1 %", share <= 1e-3
         )
+
+
+def _lidar(devices: Devices, scale: Scale) -> Iterator[Finding]:
+    """A sweep of a moving sensor against that of the CPU backend, and its time."""
+    rows, columns = scale.rays
+    beams = Beams.spinning(np.radians(np.linspace(-24.0, 4.0, rows)), columns=columns)
+    lidar = Lidar("check", beams, min_range=1.0, max_range=120.0, returns=2)
+    view = _view(_street(scale.compared), FrameCase(1, 16, 16, 0, 24))
+    ahead = np.stack(
+        [15e-6 * beams.slots[0], 0 * beams.slots[0], np.full(len(beams.slots[0]), 1.8)]
+    )
+    poses = np.asarray(view.T_world_vehicle) @ transform_from(ahead.T, yaw_quaternion(0.0))
+    request = checked_request(view.instances, lidar, poses)
+    caster = devices.casting()
+    found, expected = caster.cast(request), select_caster("cpu").cast(request)
+    differ = float((found.member != expected.member).mean())
+    yield Finding("", "rays that end elsewhere", f"{differ:.3%}", "0.1 %", differ <= 1e-3)
+    same = (found.member == expected.member) & expected.hit
+    apart = float(np.abs(found.range - expected.range)[same].max(initial=0.0))
+    yield Finding("", "ranges of the others apart", f"{apart * 1e3:.3f} mm", "1 mm", apart <= 1e-3)
+    times = _times_ms(partial(caster.cast, request), scale.repeats)
+    yield _timed(f"{beams.count:,} rays, two returns", times, None)
 
 
 def _frames(devices: Devices, scale: Scale) -> Iterator[Finding]:
@@ -355,6 +385,7 @@ def _memory(devices: Devices, scale: Scale) -> Iterator[Finding]:
 PARTS: dict[str, Callable[[Devices, Scale], Iterator[Finding]]] = {
     "install": _install,
     "pictures": _pictures,
+    "lidar": _lidar,
     "frames": _frames,
     "physics": _physics,
     "training": _training,

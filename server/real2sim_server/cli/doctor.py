@@ -65,8 +65,9 @@ def doctor(
         bool,
         typer.Option(
             "--serving-kernels",
-            help="Compile the kernels of --backend nvrtc for --arch, by default for all that are "
-            "tested, and say what each takes; fails where one spills. Needs no GPU.",
+            help="Compile the kernels of --backend nvrtc, for images and LiDAR, for --arch, by "
+            "default for all that are tested, and say what each takes; fails where one spills. "
+            "Needs no GPU.",
         ),
     ] = False,
     solver_kernels: Annotated[
@@ -217,10 +218,12 @@ def _compile_serving(*, report: _Report, arch: list[str] | None) -> None:
     _require_compiler()
     from ..render.backends.nvrtc.compile import ARCHITECTURES, compile_kernels
     from ..render.backends.nvrtc.records import THREADS
+    from ..render.cast.cuda.compile import compile_kernels as compile_casting
 
     for architecture in _given(arch) or ARCHITECTURES:
         _, usages = compile_kernels(architecture)
-        _put_down(report, architecture, usages, THREADS)
+        _, casting = compile_casting(architecture)
+        _put_down(report, architecture, usages | casting, THREADS)
     _refuse_spills(report)
 
 

@@ -149,6 +149,7 @@ class Worker:
                 deformation=kernels.deformation,
                 max_pixels=settings.max_pixels_per_step,
                 max_rays=settings.max_rays_per_step,
+                caster="cuda" if backend.name == "nvrtc" else "auto",
             ),
             kernels=kernels,
             store=store,

@@ -118,15 +118,18 @@ def test_doctor_says_what_the_serving_kernels_take_without_a_gpu(
     pytest.importorskip("cuda.core")
     from real2sim_server.render.backends.nvrtc import compile as compiling
     from real2sim_server.render.backends.nvrtc.usage import Usage
+    from real2sim_server.render.cast.cuda import compile as casting
 
     taken = {"blend": Usage(64, 0, 0, 0), "find_seen": Usage(32, 0, 0, 0)}
     monkeypatch.setattr(compiling, "compile_kernels", lambda name: (b"", taken))
+    casts = {"follow": Usage(64, 0, 0, 0)}
+    monkeypatch.setattr(casting, "compile_kernels", lambda name: (b"", casts))
     report = tmp_path / "report.json"
     code, output = doctor("--serving-kernels", "--arch", "9.0", "--json", str(report))
     assert code == 0, output
     rows = json.loads(report.read_text())["kernels"]
     found = [(row["architecture"], row["kernel"], row["occupancy"]) for row in rows]
-    assert found == [("sm_90", "blend", 0.5), ("sm_90", "find_seen", 1.0)]
+    assert found == [("sm_90", "blend", 0.5), ("sm_90", "find_seen", 1.0), ("sm_90", "follow", 0.5)]
     assert "blend" in output
     taken["blend"] = Usage(255, 0, 0, 64)
     code, output = doctor("--serving-kernels", "--arch", "9.0")

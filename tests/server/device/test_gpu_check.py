@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
 from real2sim_server.benchmarks.gpu_check import PARTS, Devices, FrameCase, Scale, run
 from real2sim_server.render.backends import Backend
 from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
+from real2sim_server.render.cast.cuda.backend import CudaCaster
 
 from ..render.kernel_twin import COMPILER, NEEDS_COMPILER
 from . import pretended
-from .pretended_launcher import PretendedLauncher
+from .pretended_launcher import PretendedCastLauncher, PretendedLauncher
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason=NEEDS_COMPILER)
 SMALL = Scale(
@@ -23,6 +25,7 @@ SMALL = Scale(
         FrameCase(5, 32, 16, 1000, 3, wanted_ms=1e9, jpeg=True),
     ),
     repeats=2,
+    rays=(8, 32),
     particles=(1000,),
     train_steps=2,
     train_width=32,
@@ -32,19 +35,21 @@ SMALL = Scale(
 
 
 def devices(training: str | Backend = "cpu") -> Devices:
-    return Devices(lambda: NvrtcBackend(PretendedLauncher()), training, "cpu", "pretended")
+    casting = partial(CudaCaster, PretendedCastLauncher())
+    return Devices(lambda: NvrtcBackend(PretendedLauncher()), training, "cpu", casting, "pretended")
 
 
 def test_pictures_and_times_are_checked_and_told_as_a_table(
     device_counts: pretended.Counts,
 ) -> None:
-    check = run(devices(), SMALL, parts=["pictures", "frames", "memory"])
+    check = run(devices(), SMALL, parts=["pictures", "lidar", "frames", "memory"])
     assert check.failed == {}
     assert check.right
     text = check.markdown()
     assert text.startswith(f"Checked on {check.date}: pretended\n\n| Part |")
     assert ": jpeg by libjpeg-turbo" in text
     assert "10 km from the origin | 0 | 0 (holds) |" in text
+    assert "rays that end elsewhere | 0.000% | 0.1 % (holds) |" in text
 
 
 def test_a_part_that_fails_says_why_and_the_others_go_on() -> None:

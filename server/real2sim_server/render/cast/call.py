@@ -43,10 +43,11 @@ def cast(
         attributes: for each instance [N, 2] float32, reflectivity and share of lost rays.
         incidence: share of the reflectivity that does not mind how squarely the light meets a
             surface, 0 to 1; the rest goes with the cosine to its normal.
-        backend: ``cpu``, ``reference``, or ``auto``.
+        backend: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``.
 
     Raises:
-        RenderError: poses or attributes of other shapes or values, or an unknown backend.
+        RenderError: poses or attributes of other shapes or values, a backend that is unknown or
+            lacks what it needs.
     """
     request = checked_request(
         instances,
@@ -96,7 +97,7 @@ def select_caster(name: str = "auto") -> CastBackend:
     """The backend of that name, made on first use.
 
     Raises:
-        RenderError: unknown.
+        RenderError: unknown, or something that it needs is not here.
     """
     chosen = "cpu" if name == "auto" else name
     if chosen not in CASTERS:
@@ -116,7 +117,22 @@ def _reference() -> CastBackend:
     return ReferenceCaster()
 
 
-CASTERS: Mapping[str, Callable[[], CastBackend]] = {"cpu": _cpu, "reference": _reference}
+def _cuda() -> CastBackend:
+    from ..backends.nvrtc.needs import unmet_need
+
+    need = unmet_need()
+    if need is not None:
+        raise RenderError(f"cast backend 'cuda': {need.found}; {need.remedy}")
+    from .cuda.backend import CudaCaster
+
+    return CudaCaster()
+
+
+CASTERS: Mapping[str, Callable[[], CastBackend]] = {
+    "cpu": _cpu,
+    "cuda": _cuda,
+    "reference": _reference,
+}
 
 
 def _poses(given: ArrayLike, lidar: Lidar, what: str) -> Float:

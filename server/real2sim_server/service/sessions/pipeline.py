@@ -82,6 +82,7 @@ class StepPipeline:
         deformation: kernels that images after impacts need.
         max_pixels: over all images of one instant.
         max_rays: over all LiDARs and radars of one instant.
+        caster: name of the backend that casts their rays, see :func:`.cast`.
     """
 
     def __init__(
@@ -93,13 +94,14 @@ class StepPipeline:
         deformation: DeformationKernels,
         max_pixels: int,
         max_rays: int,
+        caster: str = "auto",
     ) -> None:
         self._engine = engine
         self._renderer = renderer
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._images = WorldImages(renderer)
-        self._clouds = WorldClouds(engine, max_rays=max_rays)
+        self._clouds = WorldClouds(engine, max_rays=max_rays, caster=caster)
         self._phases = StepPhases(self._images, self._clouds, deformation)
         self._joint = JointDrawing(self._phases, self._images)
         self._blind = BlindSteps(self._phases)

@@ -58,10 +58,12 @@ class WorldClouds:
     Args:
         engine: loads the kernels.
         max_rays: over all LiDARs and radars of one observation.
+        caster: name of the backend that casts, see :func:`.cast`.
     """
 
-    def __init__(self, engine: Engine, *, max_rays: int) -> None:
+    def __init__(self, engine: Engine, *, max_rays: int, caster: str = "auto") -> None:
         self._max_rays = max_rays
+        self._name = caster
         self._caster: CastBackend | None = None
         self._kernels = KernelsBeside(
             engine,
@@ -110,7 +112,7 @@ class WorldClouds:
 
     def _chosen(self) -> CastBackend:
         if self._caster is None:
-            self._caster = select_caster()
+            self._caster = select_caster(self._name)
         return self._caster
 
 

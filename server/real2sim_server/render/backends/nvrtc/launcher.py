@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,9 +27,9 @@ class Launcher(Protocol):
         """Queue ``kernel`` for that many blocks.
 
         Args:
-            kernel: one of KERNELS.
+            kernel: one of its kernels.
             blocks: at least one.
-            frame: address of a Frame on the device.
+            frame: address of what the kernel is given, on the device.
             argument: see the kernel.
         """
         ...
@@ -59,11 +59,19 @@ class Launcher(Protocol):
 class CudaLauncher:
     """The current CUDA device of torch, on torch's current stream.
 
+    Args:
+        kernels: names of those to be launched.
+        compiled: gives the cubin that has them for an architecture; that of serving if None.
+
     Raises:
         RenderError: the kernels do not compile for it.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        kernels: Sequence[str] = KERNELS,
+        compiled: Callable[[str], bytes] | None = None,
+    ) -> None:
         from cuda.core import Device, ObjectCode
 
         index = torch.cuda.current_device()
@@ -71,8 +79,8 @@ class CudaLauncher:
         torch.cuda.synchronize(self.device)  # torch makes the context that all share.
         Device(index).set_current()
         major, minor = torch.cuda.get_device_capability(index)
-        code = ObjectCode.from_cubin(compiled_kernels(f"sm_{major}{minor}"))
-        self._kernels = {name: code.get_kernel(name) for name in KERNELS}
+        code = ObjectCode.from_cubin((compiled or compiled_kernels)(f"sm_{major}{minor}"))
+        self._kernels = {name: code.get_kernel(name) for name in kernels}
         self._streams: dict[int, Any] = {}
         self._copying = torch.cuda.Stream(self.device)
         self._threads = threading.local()

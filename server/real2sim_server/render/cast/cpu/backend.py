@@ -52,7 +52,7 @@ class CpuCaster:
                 lists, starts = self._tile(records, order, layout)
             with timed(timing, "follow"):
                 lights = _follow(request, motions, records, lists, starts, layout)
-        return _echo(request, lights, timing)
+        return echo_of(request, lights, timing)
 
     def meetings(self, request: CastRequest, reach: NDArray[np.float32]) -> Meetings:
         """What the rays of a request meet, each up to its ``reach`` [R] [m], or where that is 0
@@ -75,7 +75,7 @@ class CpuCaster:
                 starts,
                 layout,
                 np.array(motions.of_body or [0], np.int64),
-                _rows(invert_transform(motions.to_sensor)),
+                rows_of(invert_transform(motions.to_sensor)),
                 _limits(request),
                 (np.cumsum(counts) - counts).astype(np.int64),
                 np.ascontiguousarray(reach, dtype=np.float32),
@@ -99,7 +99,7 @@ class CpuCaster:
             space.array("counts", (total,), np.int64),
         )
         motions = motions_of(request)
-        layout, sensor = layout_of(request.lidar.beams), _sensor(request)
+        layout, sensor = layout_of(request.lidar.beams), sensor_of(request)
         base = 0
         for index, count in enumerate(chunks):
             if count:
@@ -122,7 +122,8 @@ class CpuCaster:
         return lists, starts
 
 
-def _sensor(request: CastRequest) -> Sensor:
+def sensor_of(request: CastRequest) -> Sensor:
+    """The LiDAR of a request as kernels take it."""
     lidar = request.lidar
     layout = layout_of(lidar.beams)
     times = lidar.beams.slots[0]
@@ -151,7 +152,7 @@ def _body(request: CastRequest, motions: Motion, index: int) -> Body:
         attributes=NO_ATTRIBUTES if attributes is None else attributes,
         linear=np.ascontiguousarray(motions.linear[index]),
         offset=np.ascontiguousarray(motions.offset[index]),
-        frames=_rows(motions.to_sensor[motion]),
+        frames=rows_of(motions.to_sensor[motion]),
         speed=np.float32(motions.speed[motion]),
         turn=np.float32(motions.turn[motion]),
         number=np.float32(index),
@@ -163,7 +164,7 @@ def _limits(request: CastRequest) -> NDArray[np.float32]:
     return np.array([lidar.min_range, lidar.max_range, lidar.pulse], np.float32)
 
 
-def _rows(transforms: Float) -> NDArray[np.float32]:
+def rows_of(transforms: Float) -> NDArray[np.float32]:
     """[..., 4, 4] as [..., 12] float32."""
     rows = transforms[..., :3, :].reshape(*transforms.shape[:-2], 12)
     return np.ascontiguousarray(rows, dtype=np.float32)
@@ -184,7 +185,7 @@ def _follow(  # noqa: PLR0917
         np.empty((count, 2), np.int32),
         np.empty((count if lidar.returns > 1 else 0, 9), np.float32),
     )
-    origins = _rows(invert_transform(motions.to_sensor))
+    origins = rows_of(invert_transform(motions.to_sensor))
     limits = _limits(request)
     of_body = np.array(motions.of_body or [0], np.int64)
     follow_rays(
@@ -193,7 +194,8 @@ def _follow(  # noqa: PLR0917
     return lights
 
 
-def _echo(request: CastRequest, lights: Lights, timing: dict[str, float]) -> Echo:
+def echo_of(request: CastRequest, lights: Lights, timing: dict[str, float]) -> Echo:
+    """Lights in the order of the sensor's rays, their owners by what they are called outside."""
     shape = request.lidar.shape
     values = np.ascontiguousarray(lights.values.T).reshape(VALUES, *shape)
     body, member = lights.owners[:, 0], lights.owners[:, 1]

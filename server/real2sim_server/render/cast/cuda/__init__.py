@@ -1,0 +1,1 @@
+"""The CUDA backend of cast(): kernels of our own, compiled by NVRTC."""
