@@ -30,7 +30,7 @@ test: $(STAMP)
 	$(PYTEST) $(PARALLEL)
 
 # Compiled kernels, by two processes beside one another with make -j; tests find them on disk.
-kernels: kernels-drawing kernels-physics
+kernels: kernels-physics kernels-drawing
 
 kernels-drawing kernels-physics: kernels-%: $(STAMP)
 	$(BIN)/python scripts/compile_kernels.py $*
