@@ -66,7 +66,8 @@ coverage: $(STAMP)
 # and what comes with it are apart: builds for CPU and CUDA differ.
 pins: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(BIN)/uv pip compile pyproject.toml --quiet --extra server --extra postgres -c constraints.txt \
+	$(BIN)/uv pip compile pyproject.toml --quiet --extra server --extra postgres \
+	  --extra objects --extra tracing -c constraints.txt \
 	  --generate-hashes --universal --python-version 3.11 --no-annotate --no-header \
 	  $(patsubst %,--no-emit-package %,$(WITH_TORCH)) -o docker/requirements.txt
 	$(BIN)/python scripts/third_party.py

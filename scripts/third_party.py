@@ -6,6 +6,7 @@ installed here; ``--check`` only says whether the file is what it would write.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import sys
 from collections.abc import Iterator
@@ -14,13 +15,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PINS = ROOT / "docker" / "requirements.txt"
+VENDOR = ROOT / "server" / "real2sim_server" / "service" / "ui" / "vendor"
 NOTICES = ROOT / "THIRD_PARTY.md"
 
 HEAD = """\
 # Third-party software
 
-What `pip install 'real2sim[server,postgres]'` and the images bring along. Real2Sim's own licence is
-in `LICENSE`. Written by `scripts/third_party.py`; a CycloneDX SBOM is attached to each release.
+What `pip install 'real2sim[server,postgres,objects,tracing]'` and the images bring along.
+Real2Sim's own licence is in `LICENSE`. Written by `scripts/third_party.py`; a CycloneDX SBOM is
+attached to each release.
 
 ## Native libraries inside wheels that have conditions of their own
 
@@ -40,6 +43,18 @@ in `LICENSE`. Written by `scripts/third_party.py`; a CycloneDX SBOM is attached 
 - **The body model** (CC0-1.0), `real2sim_server/body/asset.npz`, made from data of MakeHuman; where
   they come from is in `ASSET.md` beside it.
 
+## Modules of the studio
+
+Served as they were published on npm, from `real2sim_server/service/ui/vendor`, where their licences
+lie beside them: `three` (MIT, the authors of three.js) draws, `@sparkjsdev/spark` (MIT, the
+authors of Spark) draws Gaussians with it, with `fflate` (MIT) inside.
+
+| file | sha256 |
+|---|---|
+"""
+
+DISTRIBUTIONS = """\
+
 ## Python distributions
 
 | name | version | licence |
@@ -49,7 +64,8 @@ in `LICENSE`. Written by `scripts/third_party.py`; a CycloneDX SBOM is attached 
 
 def main() -> int:
     """Write or check the file; the exit code."""
-    text = HEAD + "".join(
+    text = HEAD + "".join(f"| {name} | `{digest}` |\n" for name, digest in vendored())
+    text += DISTRIBUTIONS + "".join(
         f"| {name} | {version} | {licence_of(name)} |\n" for name, version in pins()
     )
     if "--check" not in sys.argv:
@@ -57,8 +73,16 @@ def main() -> int:
         return 0
     if NOTICES.read_text(encoding="utf-8") == text:
         return 0
-    print("THIRD_PARTY.md is not that of docker/requirements.txt: python scripts/third_party.py")
+    print("THIRD_PARTY.md is not that of what is installed: python scripts/third_party.py")
     return 1
+
+
+def vendored() -> Iterator[tuple[str, str]]:
+    """Path and SHA-256 of each file of other projects that the studio serves."""
+    for path in sorted(VENDOR.rglob("*")):
+        if path.is_file():
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            yield path.relative_to(VENDOR).as_posix(), digest
 
 
 def pins() -> Iterator[tuple[str, str]]:

@@ -28,6 +28,7 @@ from real2sim_proto.operations import (
     Retime,
     Rotate,
     Scale,
+    SetGait,
     SetPhysics,
     SetPose,
     SetStoryboard,
@@ -258,6 +259,34 @@ class ObjectEdits(Generic[R]):
             >>> result = car.set_velocity(linear=(8.0, 0.0, 0.0), frame="object")
         """
         return self._make(SetVelocity, linear=linear, angular=angular, frame=frame)
+
+    def set_gait(
+        self,
+        *,
+        stride: float | None = None,
+        arms: float | None = None,
+        lean: float | None = None,
+        width: float | None = None,
+        phase: int | None = None,
+    ) -> R:
+        """Say how a person of the body model walks; what is left out goes back to its own way.
+
+        Args:
+            stride: factor on the length of strides, 0.5 to 1.6.
+            arms: factor on the swing of the arms.
+            lean: further lean forward [rad].
+            width: factor on the distance between the feet's tracks.
+            phase: 1 starts with the other foot.
+
+        Raises:
+            InvalidOperationError: it is nobody who walks.
+
+        Examples:
+            >>> info = client.assets.person("tom", build="man")
+            >>> tom = scenario.insert("tom", position=(12.0, 2.0, 0.0))
+            >>> result = tom.set_gait(stride=0.8, lean=0.15)
+        """
+        return self._make(SetGait, stride=stride, arms=arms, lean=lean, width=width, phase=phase)
 
     def delete(self) -> R:
         """Remove the object; :meth:`restore` or undo brings it back.

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
+from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetPerson, AssetUpload
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.jobs import (
     CalibrateRequest,
@@ -56,6 +56,7 @@ from real2sim_proto.sessions import (
     SessionState,
     StepRequest,
 )
+from real2sim_proto.sweeps import SweepRequest
 from real2sim_proto.views import SceneView
 
 from ._call import (
@@ -110,6 +111,23 @@ def get_scene(scene: str) -> Call[SceneInfo]:
 
 def scene_lanes(scene: str) -> Call[SceneLanes]:
     return Call(Request("GET", f"/v1/scenes/{segment(scene)}/lanes"), model_of(SceneLanes))
+
+
+def scene_splats(scene: str, params: Mapping[str, str]) -> Call[bytes]:
+    path = f"/v1/scenes/{segment(scene)}/splats"
+    request = Request("GET", path, dict(params), long_timeout=True)
+    return Call(request, lambda reply: reply.content)
+
+
+def object_splats(scenario_id: str, object_id: str, t_us: int | None) -> Call[bytes]:
+    params = {"object_id": object_id} | ({} if t_us is None else {"t_us": str(t_us)})
+    request = Request("GET", f"{_scenario(scenario_id)}/splats", params, long_timeout=True)
+    return Call(request, lambda reply: reply.content)
+
+
+def scene_sky(scene: str) -> Call[Image]:
+    path = f"/v1/scenes/{segment(scene)}/sky"
+    return Call(Request("GET", path, long_timeout=True), lambda reply: parse_image(reply, "rgb"))
 
 
 def load_scene(scene: str) -> Call[None]:
@@ -248,6 +266,11 @@ def apply_corner_case(
     return Call(request, model_of(OperationResult))
 
 
+def gallery_picture(name: str) -> Call[bytes]:
+    path = f"/v1/gallery/{segment(name)}/picture"
+    return Call(Request("GET", path), lambda reply: reply.content)
+
+
 def read_xosc(
     scenario_id: str, content: bytes, leave_out: Sequence[str], ego: str | None, etag: str
 ) -> Call[StoryboardResult]:
@@ -288,6 +311,10 @@ def create_dataset(body: DatasetRequest, token: str | None) -> Call[JobInfo]:
     return Call(replace(request, headers=request.headers | bearer(token)), model_of(JobInfo))
 
 
+def create_sweep(body: SweepRequest) -> Call[JobInfo]:
+    return Call(post("/v1/sweeps", body, long_timeout=True), model_of(JobInfo))
+
+
 def list_jobs(subject: str | None) -> Call[JobList]:
     params = {} if subject is None else {"subject": subject}
     return Call(Request("GET", "/v1/jobs", params), model_of(JobList))
@@ -318,6 +345,10 @@ def get_asset(asset_id: str) -> Call[AssetInfo]:
 
 
 def cut_asset(body: AssetCut) -> Call[AssetInfo]:
+    return Call(post("/v1/assets", body, long_timeout=True), model_of(AssetInfo))
+
+
+def make_person(body: AssetPerson) -> Call[AssetInfo]:
     return Call(post("/v1/assets", body, long_timeout=True), model_of(AssetInfo))
 
 

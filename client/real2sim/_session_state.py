@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Frame, Result, Welcome
 from real2sim_proto.sessions import SessionInfo
 
@@ -46,6 +47,16 @@ def is_transient(error: Real2SimError) -> bool:
     return isinstance(error, UnreachableError | CapacityError | ReplyTimeoutError)
 
 
+def is_away(error: Real2SimError) -> bool:
+    """Whether nothing has happened because what the worker writes to is away, or because a proxy
+    finds no worker that may take anything new meanwhile."""
+    if not isinstance(error, StatusError):
+        return False
+    return error.code == ErrorCode.STORAGE_UNAVAILABLE or (
+        error.status == 503 and error.code == "UNKNOWN"
+    )
+
+
 @dataclass(frozen=True)
 class SessionPlan:
     """Which session to open and how.
@@ -56,7 +67,8 @@ class SessionPlan:
         token: of the session that is joined.
         role: ``controller`` or ``observer``.
         codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
-        reconnect: seconds for which a lost connection is tried again; 0 gives up at once.
+        reconnect: seconds for which a lost connection, or a store that is away, is tried again;
+            0 gives up at once.
         shared_memory: True must have it, False must not; None has it where it can, unless the
             client says otherwise.
     """

@@ -7,7 +7,7 @@ Chromium on the PATH (or in ``CHROMIUM``) for the studio::
 
 NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars, people, jam;
 without one, all but jam are made. It takes about a quarter of an hour on two cores. ``jam`` trains
-for another five minutes, on the KITTI drive whose folder ``KITTI_LOG`` names.
+for another ten, on the KITTI drive whose folder ``KITTI_LOG`` names.
 """
 
 from __future__ import annotations
@@ -233,7 +233,8 @@ def jam(work: Path, _: Path) -> None:
     """``jam.jpg``: the car ahead in a KITTI drive, which was only ever seen from behind."""
     log, scene = os.environ["KITTI_LOG"], work / "jam"
     if not scene.exists():
-        command("reconstruct", log, "--out", scene, "--iterations", "1200", "--width", "621")
+        sizes = ["--width", "1242", "--iterations", "4000", "--preset", "cpu-small"]
+        command("reconstruct", log, "--out", scene, *sizes)
     loaded = load_scene(scene)
     car, times = "car_0", loaded.frame_times_us
     rows = {

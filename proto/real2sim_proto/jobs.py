@@ -28,7 +28,10 @@ class JobState(StrEnum):
 OVER = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED})
 """States that last."""
 
-JobKind = Literal["load_scene", "simulate", "calibrate", "export", "drive"]
+JobKind = Literal["load_scene", "simulate", "calibrate", "export", "drive", "sweep"]
+
+PlannerName = Literal["follow_route", "pid", "idm", "depth_sampling"]
+"""Planners of the SDK that a worker starts itself."""
 
 
 class JobFile(Reply):
@@ -78,7 +81,7 @@ class JobList(Reply):
 class DriveRequest(Model):
     """Body of `POST /v1/sessions/{id}/drive`: a planner drives the session, and is recorded."""
 
-    planner: Literal["follow_route", "pid", "idm", "depth_sampling"] | None = Field(
+    planner: PlannerName | None = Field(
         default="follow_route",
         description="of the SDK, run in a process of its own: it resets the session as it was made "
         "and drives from there; null waits for a planner of yours, on the drive socket "

@@ -338,6 +338,22 @@ class SetVelocity(Model):
     frame: Frame = Field(default="world", description="axes of both; 'object' counts x forward")
 
 
+class SetGait(Model):
+    """How a person walks; what is left out goes back to what the person was made with."""
+
+    op: Literal["set_gait"] = "set_gait"
+    object_id: ObjectId
+    stride: float | None = Field(default=None, ge=0.5, le=1.6, description="factor on strides")
+    arms: float | None = Field(default=None, ge=0, le=3, description="factor on the arms' swing")
+    lean: float | None = Field(
+        default=None, ge=-0.3, le=0.6, description="further lean forward [rad]"
+    )
+    width: float | None = Field(
+        default=None, ge=0.2, le=3, description="factor on the distance of the feet's tracks"
+    )
+    phase: int | None = Field(default=None, ge=0, le=1, description="1 starts with the other foot")
+
+
 class PlaneShape(Model):
     """A half-space; objects stay on the side that the normal points to."""
 
@@ -467,6 +483,7 @@ Operation = Annotated[
     | EraseRegion
     | SetPhysics
     | SetVelocity
+    | SetGait
     | AddCollider
     | SetTime
     | SetStoryboard,

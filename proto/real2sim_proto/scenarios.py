@@ -104,6 +104,9 @@ class CornerCaseInfo(Reply):
     title: str = Field(description="what happens, in a sentence")
     family: str
     parameters: dict[str, float] = Field(description="default values; [m], [m/s], [s]")
+    picture: str = Field(
+        default="", description="path of a picture from above: an SVG document, 3 by 1"
+    )
 
 
 class Gallery(Reply):

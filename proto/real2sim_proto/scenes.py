@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from .base import Track
 from .cameras import OpticsSpec
-from .operations import SetPhysics, SetVelocity
+from .operations import SetGait, SetPhysics, SetVelocity
 
 
 class Reply(BaseModel):
@@ -57,6 +57,7 @@ class ObjectInfo(Reply):
     asset_id: str | None = Field(default=None, description="asset that it shows instead")
     physics: SetPhysics | None = Field(default=None, description="what an edit said of it")
     velocity: SetVelocity | None = Field(default=None, description="with which it enters physics")
+    gait: SetGait | None = Field(default=None, description="how an edit lets a person walk")
 
 
 class SceneInfo(Reply):
@@ -154,6 +155,13 @@ class FleetMember(Reply):
     sessions: int = Field(default=0, description="open in its memory")
     max_sessions: int = 0
     scenes: list[str] = Field(default_factory=list, description="in its memory")
+    scene_sessions: dict[str, int] = Field(
+        default_factory=dict, description="open in its memory, by scene"
+    )
+    load: float = Field(
+        default=0.0, ge=0, description="share of the time since it last told that its engine worked"
+    )
+    queue: int = Field(default=0, description="that wait for its engine")
 
 
 class Fleet(Reply):

@@ -26,6 +26,7 @@ from . import (
     scenes,
     sessions,
     storyboard,
+    sweeps,
     views,
 )
 
@@ -71,6 +72,7 @@ MODELS: dict[str, type[BaseModel]] = {
         lanes.SceneLanes,
         views.SceneView,
         assets.AssetCut,
+        assets.AssetPerson,
         assets.AssetInfo,
         assets.AssetList,
         jobs.JobInfo,
@@ -99,6 +101,7 @@ MODELS: dict[str, type[BaseModel]] = {
         sessions.SessionState,
         sessions.SessionRender,
         storyboard.Storyboard,
+        sweeps.SweepRequest,
     )
 }
 

@@ -7,10 +7,11 @@ import os
 import re
 import secrets
 import shutil
+import tarfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<purpose>tmp|old)-[0-9a-f]{12}")
@@ -129,3 +130,29 @@ def _flush_folder(folder: Path) -> None:
 def _sibling(path: Path, purpose: str) -> Path:
     """A hidden name beside ``path``: on the same file system, so that renaming is atomic."""
     return path.parent / f".{path.name}.{purpose}-{secrets.token_hex(6)}"
+
+
+def unpack_tar(tar: tarfile.TarFile, folder: Path, *, members: Iterable[tarfile.TarInfo]) -> None:
+    """Write files and folders of an archive below ``folder``; others may not write them.
+
+    As ``extractall(filter="data")``, which Python has from 3.11.4 on.
+
+    Raises:
+        tarfile.ExtractError: a link or a device, or a name that leads out of ``folder``.
+        OSError: nothing can be written there.
+    """
+    for member in members:
+        path = PurePosixPath(member.name)
+        if path.is_absolute() or ".." in path.parts:
+            raise tarfile.ExtractError(f"{member.name!r} leads out of the folder")
+        target = folder / path
+        if member.isdir():
+            target.mkdir(parents=True, exist_ok=True)
+            continue
+        content = tar.extractfile(member) if member.isfile() else None
+        if content is None:
+            raise tarfile.ExtractError(f"{member.name!r} is neither a file nor a folder")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with content, target.open("xb") as file:
+            os.fchmod(file.fileno(), member.mode & 0o755)
+            shutil.copyfileobj(content, file)

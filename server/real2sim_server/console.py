@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -89,6 +90,28 @@ def staged_progress() -> Iterator[Callable[..., None]]:
             bar.update(tasks[stage], completed=done, total=total, description=text or stage)
 
         yield report
+
+
+@contextmanager
+def told_progress(*, follow: bool) -> Iterator[Callable[..., None]]:
+    """As :func:`staged_progress`, or for a program that follows: a line of JSON on standard output
+    for each report; the process ends when its standard input does, as when who follows has died."""
+    if not follow:
+        with staged_progress() as report:
+            yield report
+        return
+    threading.Thread(target=_end_with_input, daemon=True).start()
+
+    def tell(stage: str, done: int, total: int, _text: str | None = None) -> None:
+        print(json.dumps({"stage": stage, "done": done, "total": total}), flush=True)
+
+    yield tell
+
+
+def _end_with_input() -> None:
+    while os.read(0, 4096):
+        pass
+    os._exit(1)
 
 
 def print_figures(title: str, figures: Mapping[str, Any]) -> None:

@@ -36,12 +36,22 @@ class Settings(BaseSettings):
         assets_dir: folder of asset bundles.
         jobs_dir: folder of the files that jobs leave.
         store_url: SQLAlchemy URL of scenarios and sessions.
+        agent_port: where the worker tells HAProxy's agent-check how much it takes; none by default.
+        agent_weight: of the worker there, in per cent.
+        hot_scene_sessions: sessions in a scene, over all workers on a store, from which on two of
+            them have it in memory; 0 for never.
+        objects_url: store of objects by which workers share scenes, assets and files of jobs:
+            ``file:///folder`` or ``s3://bucket/prefix?endpoint=...``; none by default.
+        objects_cache_bytes: disk for what came out of it.
+        objects_url_seconds: for which a signed address of a file is good.
         lease_seconds: for which a worker promises others on its store to be alive, again and again;
             once it does not, they may take its sessions over.
         store_timeout_seconds: after which a database that does not answer is in trouble.
         durability: what is on the disk before it is acknowledged: ``all``; ``edits``, which is all
             but the steps of sessions; or ``process``, nothing. The rest is safe when the process
             is killed, and its last seconds are lost when the machine loses power. SQLite only.
+        store_migration: whether a worker brings a store of an older schema up to date (``auto``),
+            or refuses it with the command to run (``refuse``).
         store_max_bytes: size above which the oldest ended sessions are removed.
         session_retention_days: after which ended sessions are removed, and unused ones ended.
         job_retention_days: after which ended jobs are removed, with their files.
@@ -77,6 +87,8 @@ class Settings(BaseSettings):
         write_seconds: time for a client to read what it was sent, beside the time at that rate.
         keep_alive_seconds: how long a connection stays open between requests.
         metrics: whether `/metrics` is served.
+        traces_url: collector of OpenTelemetry that gets spans, ``http://host:4318/v1/traces``; none
+            by default.
         log_level, log_format: ``auto`` is text on a terminal and JSON elsewhere.
     """
 
@@ -96,8 +108,15 @@ class Settings(BaseSettings):
     assets_dir: Path | None = None
     jobs_dir: Path | None = None
     store_url: str | None = None
+    agent_port: int | None = Field(default=None, ge=0, le=65535)
+    agent_weight: int = Field(default=100, ge=1, le=100)
+    hot_scene_sessions: int = Field(default=4, ge=0)
+    objects_url: str | None = None
+    objects_cache_bytes: int = Field(default=50 * GIB, ge=MIB)
+    objects_url_seconds: float = Field(default=300.0, gt=0, le=604_800)
     lease_seconds: float = Field(default=3.0, ge=0.2, le=600)
     store_timeout_seconds: float = Field(default=5.0, ge=0.1, le=600)
+    store_migration: Literal["auto", "refuse"] = "auto"
     store_max_bytes: int = Field(default=8 * GIB, ge=MIB)
     session_retention_days: float = Field(default=30.0, gt=0, le=36_500)
     job_retention_days: float = Field(default=30.0, gt=0, le=36_500)
@@ -132,6 +151,7 @@ class Settings(BaseSettings):
     write_seconds: float = Field(default=30.0, gt=0)
     keep_alive_seconds: int = Field(default=60, gt=0)
     metrics: bool = True
+    traces_url: str | None = None
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["auto", "json", "text"] = "auto"
 

@@ -6,7 +6,7 @@ import pytest
 
 import real2sim
 from real2sim._session_state import is_transient
-from real2sim._sync.reconnecting import reconnect
+from real2sim._sync.reconnecting import outlast, reconnect
 from real2sim.errors import ErrorDetails, error_for
 
 
@@ -47,3 +47,36 @@ def test_a_refusal_is_final():
 
     with pytest.raises(real2sim.SessionClosedError):
         reconnect(lambda: None, connect, seconds=60.0)
+
+
+@pytest.mark.parametrize(
+    ("status", "code"), [(503, "STORAGE_UNAVAILABLE"), (503, "UNKNOWN")], ids=["worker", "proxy"]
+)
+def test_a_store_that_is_away_is_waited_for(monkeypatch, status, code):
+    monkeypatch.setattr("real2sim._sync.reconnecting.sleep", lambda _seconds: None)
+    away = error_for(ErrorDetails(status, code, "away"))
+    outcomes = [away, away, "obs"]
+
+    def ask() -> str:
+        found = outcomes.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    assert outlast(ask, seconds=60.0) == "obs"
+    assert not outcomes
+
+
+@pytest.mark.parametrize(
+    ("code", "seconds"), [("STORAGE_UNAVAILABLE", 0.0), ("TOO_MANY_SESSIONS", 60.0)]
+)
+def test_nobody_waits_who_does_not_want_to_or_for_room(code, seconds):
+    asked = []
+
+    def ask() -> None:
+        asked.append(1)
+        raise error_for(ErrorDetails(503, code, "no"))
+
+    with pytest.raises(real2sim.CapacityError):
+        outlast(ask, seconds=seconds)
+    assert len(asked) == 1

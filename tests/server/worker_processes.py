@@ -12,6 +12,7 @@ import os
 import re
 import socket
 import time
+import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
@@ -101,6 +102,7 @@ class KillableWorker:
 
     Attributes:
         url, port: where it listens.
+        scenes: folder of its scenes.
         process: the latest.
     """
 
@@ -115,6 +117,7 @@ class KillableWorker:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port: int = probe.getsockname()[1]
+        self.scenes = scenes
         self._folders = ["--scenes", str(scenes), "--data", str(data)]
         self._log_file = log_file
         self._settings = dict(settings or {})
@@ -139,6 +142,23 @@ class KillableWorker:
                 return
             time.sleep(0.05)
         raise AssertionError(f"not listening: {self._log_file.read_text()}")
+
+    def wait_ready(self, seconds: float = 60) -> None:
+        """Return once it takes work."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            with contextlib.suppress(OSError), urllib.request.urlopen(f"{self.url}/readyz"):
+                return
+            time.sleep(0.1)
+        raise AssertionError(f"not ready: {self._log_file.read_text()}")
+
+    def stop(self, seconds: float) -> None:
+        """Ask it to end, by SIGTERM, and wait until it has."""
+        assert self.process is not None
+        self.process.terminate()
+        self.process.join(seconds)
+        assert self.process.exitcode is not None, self._log_file.read_text()
+        self.process = None
 
     def kill(self) -> None:
         """End it as it is, by SIGKILL."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from real2sim_proto.assets import AssetCut, AssetInfo, AssetUpload
+from real2sim_proto.assets import AssetCut, AssetInfo, AssetPerson, AssetUpload
 
 from .. import _requests
 from .._call import checked
@@ -68,6 +68,43 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
             category=category,
         )
         return await self._transport.send(_requests.cut_asset(cut))
+
+    async def person(
+        self,
+        asset_id: str,
+        *,
+        build: str = "woman",
+        height: float | None = None,
+        clothes: Mapping[str, tuple[float, float, float]] | None = None,
+        worn: Sequence[str] = (),
+    ) -> AssetInfo:
+        """Make a person who walks wherever a trajectory leads, at its speed.
+
+        Args:
+            asset_id: a free id.
+            build: for example ``woman``, ``tall_man``, ``old_woman``, ``boy``.
+            height: of the person [m]; default: of the build.
+            clothes: RGB in [0, 1] of ``skin``, ``hair``, ``top``, ``trousers``, ``shoes``.
+            worn: ``long_hair``, ``skirt``.
+
+        Raises:
+            ConflictError: the id is taken.
+
+        Examples:
+            >>> asset = await client.assets.person("anna", build="woman", height=1.7)
+            >>> asset.category, round(asset.size[2], 1)
+            ('pedestrian', 1.7)
+            >>> await client.assets.delete("anna")
+        """
+        asked = checked(
+            AssetPerson,
+            asset_id=asset_id,
+            build=build,
+            height=height,
+            clothes=dict(clothes or {}),
+            worn=list(worn),
+        )
+        return await self._transport.send(_requests.make_person(asked))
 
     async def upload(
         self,

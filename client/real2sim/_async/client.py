@@ -23,6 +23,7 @@ from .jobs import AsyncJobs
 from .scenarios import AsyncScenarios
 from .scenes import AsyncScenes
 from .sessions import AsyncSessions
+from .sweeps import AsyncSweeps
 from .transport import AsyncTransport
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ class AsyncClient:
         assets: :class:`AsyncAssets`.
         jobs: :class:`AsyncJobs`.
         sessions: :class:`AsyncSessions`.
+        sweeps: :class:`AsyncSweeps`.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -95,6 +97,7 @@ class AsyncClient:
         self.assets = AsyncAssets(transport)
         self.jobs = AsyncJobs(transport)
         self.sessions = AsyncSessions(transport)
+        self.sweeps = AsyncSweeps(transport)
 
     async def server(self) -> ServerInfo:
         """Versions, device, limits, conventions.
@@ -160,8 +163,9 @@ class AsyncClient:
             scenario: a scenario or its id.
             codec: of cameras that name none: ``auto`` (raw when the worker is on this machine,
                 else jpeg), ``raw``, ``jpeg`` or ``png``.
-            reconnect: seconds for which a lost connection is tried again: the session goes on as
-                if nothing had happened, also after the worker was restarted. 0 gives up.
+            reconnect: seconds for which a lost connection is tried again, and a worker whose store
+                is away is asked again: the session goes on as if nothing had happened, also after
+                the worker was restarted. 0 gives up.
             shared_memory: raw images come by memory shared with a worker on this machine: None,
                 where both can; True, or opening the session fails; False, never. The images are
                 the same, and are good for as long as anybody holds them.

@@ -36,7 +36,7 @@ from ..errors import Real2SimError, ReplyTimeoutError, StatusError
 from ..images import write_atomically
 from ..observation import Observation, View, observation_from_wire, view_from_frames
 from .concurrency import AsyncSocket, connect_socket, receive, run_blocking
-from .reconnecting import reconnect
+from .reconnecting import outlast, reconnect
 from .transport import AsyncTransport
 
 A = TypeVar("A", bound=Envelope)
@@ -78,7 +78,8 @@ class AsyncDriveSession(SessionBase):
         session_id = self._plan.session_id
         if session_id is None:
             call = _requests.create_session(self._plan.scene, self._plan.scenario, None)
-            self._info = await self._transport.send(call)
+            create = partial(self._transport.send, call)
+            self._info = await outlast(create, seconds=self._plan.reconnect)
             session_id, self._token = self._info.session_id, self._info.token
         try:
             await self._connect_first(session_id)
@@ -319,6 +320,10 @@ class AsyncDriveSession(SessionBase):
         return observation_from_wire(obs, self._pixels_of(obs.frames))
 
     async def _request(self, request: PendingRequest[A]) -> A:
+        """The answer to a request, once the worker can write down what it changes."""
+        return await outlast(partial(self._sent, request), seconds=self._plan.reconnect)
+
+    async def _sent(self, request: PendingRequest[A]) -> A:
         """The answer to a request, over a new connection where the old one is lost."""
         try:
             return await self._exchange(request)

@@ -4,10 +4,36 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable
+from typing import TypeVar
 
-from .._session_state import MAX_RECONNECTS, backoff, is_transient
+from .._session_state import MAX_RECONNECTS, backoff, is_away, is_transient
 from ..errors import Real2SimError
 from .concurrency import sleep
+
+A = TypeVar("A")
+
+
+async def outlast(ask: Callable[[], Awaitable[A]], *, seconds: float) -> A:
+    """Ask again while the worker's store is away; each time nothing has happened.
+
+    Args:
+        ask: sends the same request each time.
+        seconds: within which the last try begins.
+
+    Raises:
+        CapacityError: STORAGE_UNAVAILABLE, of the last try.
+        Real2SimError: another one, at once.
+    """
+    until = time.monotonic() + seconds
+    for attempt in range(MAX_RECONNECTS):
+        try:
+            return await ask()
+        except Real2SimError as error:
+            wait = backoff(attempt)
+            if not is_away(error) or time.monotonic() + wait > until:
+                raise
+            await sleep(wait)
+    return await ask()
 
 
 async def reconnect(

@@ -126,6 +126,20 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         """
         return (await self._transport.send(_requests.gallery())).cases
 
+    async def gallery_picture(self, name: str) -> bytes:
+        """A corner case from above, an SVG document: who comes from where, and where an ego that
+        goes straight on (blue) meets them.
+
+        Raises:
+            NotFoundError: the gallery has no such case.
+
+        Examples:
+            >>> picture = await client.scenarios.gallery_picture("cut_in")
+            >>> picture[:4]
+            b'<svg'
+        """
+        return await self._transport.send(_requests.gallery_picture(name))
+
     async def delete(self, scenario: ScenarioRef) -> None:
         """Remove a scenario and its history.
 
@@ -443,6 +457,25 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         content = await self._transport.send(call)
         await run_blocking(write_atomically, Path(path), content)
         return Path(path)
+
+    async def splats(self, object_id: str, *, t_us: int | None = None) -> bytes:
+        """The Gaussians of an object as it is now, as an spz file (version 3, axes kept: z up) in
+        the frame of its box, those that cover most first.
+
+        Args:
+            object_id: of the scenario.
+            t_us: how far a person is in walking; default: the start.
+
+        Raises:
+            NotFoundError: no such object.
+
+        Examples:
+            >>> import gzip
+            >>> gzip.decompress(await scenario.splats("post"))[:4]
+            b'NGSP'
+        """
+        call = _requests.object_splats(self.scenario_id, object_id, t_us)
+        return await self._transport.send(call)
 
     async def undo(self) -> OperationResult:
         """Take the newest edit back.

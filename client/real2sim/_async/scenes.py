@@ -68,6 +68,46 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         """
         return await self._transport.send(_requests.scene_lanes(scene_name(scene)))
 
+    async def splats(
+        self,
+        scene: SceneRef,
+        *,
+        object_id: str | None = None,
+        first: int = 0,
+        count: int = 32_768,
+    ) -> bytes:
+        """Gaussians as an spz file (version 3, axes kept: z up), those that cover most first.
+
+        Args:
+            scene: a scene or its name.
+            object_id: of which, in the frame of its box; default: of the background, in the world.
+            first: how many of the more important ones to skip.
+            count: at most, up to 262144; empty files follow the last one.
+
+        Raises:
+            NotFoundError: no such scene or object.
+
+        Examples:
+            >>> import gzip
+            >>> gzip.decompress(await client.scenes.splats("street", object_id="car_red"))[:4]
+            b'NGSP'
+        """
+        params = {"first": str(first), "count": str(count)}
+        params |= {} if object_id is None else {"object_id": object_id}
+        return await self._transport.send(_requests.scene_splats(scene_name(scene), params))
+
+    async def sky(self, scene: SceneRef) -> Image:
+        """The cube map of the sky: [R, 6 R, 3] uint8, faces +x -x +y -y +z -z side by side.
+
+        Raises:
+            NotFoundError: no such scene, or it has no sky.
+
+        Examples:
+            >>> (await client.scenes.sky("street")).array.shape[2]
+            3
+        """
+        return await self._transport.send(_requests.scene_sky(scene_name(scene)))
+
     async def load(self, scene: SceneRef, *, timeout: float | None = None) -> SceneInfo:
         """Bring a scene into the worker's memory and wait until it is there.
 

@@ -24,6 +24,7 @@ from .jobs import Jobs
 from .scenarios import Scenarios
 from .scenes import Scenes
 from .sessions import Sessions
+from .sweeps import Sweeps
 from .transport import Transport
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ class Client:
         assets: :class:`Assets`.
         jobs: :class:`Jobs`.
         sessions: :class:`Sessions`.
+        sweeps: :class:`Sweeps`.
 
     Examples:
         >>> client = real2sim.connect()
@@ -96,6 +98,7 @@ class Client:
         self.assets = Assets(transport)
         self.jobs = Jobs(transport)
         self.sessions = Sessions(transport)
+        self.sweeps = Sweeps(transport)
 
     def server(self) -> ServerInfo:
         """Versions, device, limits, conventions.
@@ -161,8 +164,9 @@ class Client:
             scenario: a scenario or its id.
             codec: of cameras that name none: ``auto`` (raw when the worker is on this machine,
                 else jpeg), ``raw``, ``jpeg`` or ``png``.
-            reconnect: seconds for which a lost connection is tried again: the session goes on as
-                if nothing had happened, also after the worker was restarted. 0 gives up.
+            reconnect: seconds for which a lost connection is tried again, and a worker whose store
+                is away is asked again: the session goes on as if nothing had happened, also after
+                the worker was restarted. 0 gives up.
             shared_memory: raw images come by memory shared with a worker on this machine: None,
                 where both can; True, or opening the session fails; False, never. The images are
                 the same, and are good for as long as anybody holds them.

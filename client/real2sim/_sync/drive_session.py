@@ -37,7 +37,7 @@ from ..errors import Real2SimError, ReplyTimeoutError, StatusError
 from ..images import write_atomically
 from ..observation import Observation, View, observation_from_wire, view_from_frames
 from .concurrency import Socket, connect_socket, receive, run_blocking
-from .reconnecting import reconnect
+from .reconnecting import outlast, reconnect
 from .transport import Transport
 
 A = TypeVar("A", bound=Envelope)
@@ -79,7 +79,8 @@ class DriveSession(SessionBase):
         session_id = self._plan.session_id
         if session_id is None:
             call = _requests.create_session(self._plan.scene, self._plan.scenario, None)
-            self._info = self._transport.send(call)
+            create = partial(self._transport.send, call)
+            self._info = outlast(create, seconds=self._plan.reconnect)
             session_id, self._token = self._info.session_id, self._info.token
         try:
             self._connect_first(session_id)
@@ -320,6 +321,10 @@ class DriveSession(SessionBase):
         return observation_from_wire(obs, self._pixels_of(obs.frames))
 
     def _request(self, request: PendingRequest[A]) -> A:
+        """The answer to a request, once the worker can write down what it changes."""
+        return outlast(partial(self._sent, request), seconds=self._plan.reconnect)
+
+    def _sent(self, request: PendingRequest[A]) -> A:
         """The answer to a request, over a new connection where the old one is lost."""
         try:
             return self._exchange(request)

@@ -114,10 +114,11 @@ class Ros2Bridge:
         self._is_fresh = self._is_fresh and self.real_time is not None
         while True:
             left = due - time.monotonic() if self.real_time else 0.2
+            # Also with no time left: a simulation behind its clock still hears what was said.
+            if not self.node.spin(min(max(left, 0.0), 0.2)):
+                return None
             if self.real_time and left <= 0:
                 return self._plan(obs) or standing(self.action, obs)
-            if not self.node.spin(min(left, 0.2)):
-                return None
             if not self.real_time and self._is_fresh:
                 self._is_fresh = False
                 plan = self._plan(obs)

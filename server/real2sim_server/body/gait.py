@@ -32,8 +32,9 @@ TURN_RADIUS = 0.25
 """Turning on the spot makes steps as going round a circle of this radius would [m]."""
 STANDING = 0.04
 """Below this speed a person stands [m/s]."""
+LEAD = 3.0
+"""Before and after a path a gait goes straight on for this time [s]."""
 _STEP = 0.01
-_MARGIN = 3.0
 
 
 @dataclass(frozen=True)
@@ -179,11 +180,15 @@ def _extended(times: Float, path: Float) -> tuple[Float, Float]:
     for near, beyond, sign in ((0, 1, -1.0), (-1, -2, 1.0)):
         velocity = (path[near] - path[beyond]) / (times[near] - times[beyond])
         velocity[3] = 0.0
-        ends.append((times[near] + sign * _MARGIN, path[near] + sign * _MARGIN * velocity))
+        ends.append((times[near] + sign * LEAD, path[near] + sign * LEAD * velocity))
     times = np.concatenate([[ends[0][0]], times, [ends[1][0]]])
     path = np.concatenate([[ends[0][1]], path, [ends[1][1]]])
     fine = np.linspace(times[0], times[-1], max(round((times[-1] - times[0]) / _STEP), 2) + 1)
-    fine = np.union1d(fine, times)
+    # Two instants that only rounding tells apart would have no speed between them.
+    apart = np.abs(fine[:, None] - times[np.searchsorted(times, fine)[:, None] - [0, 1]]).min(
+        axis=1
+    )
+    fine = np.union1d(fine[apart > _STEP / 100], times)
     return fine, np.stack([np.interp(fine, times, path[:, i]) for i in range(4)], axis=-1)
 
 

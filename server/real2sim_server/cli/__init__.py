@@ -30,6 +30,7 @@ from . import (  # noqa: I001 - the order of the help
     replay,
     serve,
     token,
+    store,
     backup,
     demo,
     doctor,
@@ -38,6 +39,7 @@ from . import (  # noqa: I001 - the order of the help
 from .command import app
 
 app.add_typer(token.app, name="token")
+app.add_typer(store.app, name="store")
 app.add_typer(bench.app, name="bench")
 
 __all__ = [
@@ -65,6 +67,7 @@ __all__ = [
     "search",
     "serve",
     "simulate",
+    "store",
     "sweep",
     "synth",
     "token",

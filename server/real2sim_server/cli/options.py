@@ -26,6 +26,14 @@ LogCameras = Annotated[
     str | None, typer.Option(help="Of the log, such as front,front_left; default: all.")
 ]
 LogEvery = Annotated[int, typer.Option(min=1, help="Of the log's frames, each so many-th.")]
+Follow = Annotated[
+    bool,
+    typer.Option(
+        "--follow",
+        help="For programs: progress as lines of JSON on standard output, and an end with the end "
+        "of standard input.",
+    ),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 RenderBackend = Annotated[str, typer.Option(help="auto, cpu, cuda or reference")]
 RenderDevice = Annotated[

@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ..console import console, print_figures, refuse_existing, staged_progress, write_json
+from ..console import (
+    CommandError,
+    console,
+    print_figures,
+    refuse_existing,
+    staged_progress,
+    write_json,
+)
 from .command import command
 from .device import chosen_backend
 from .options import (
@@ -27,6 +34,8 @@ from .options import (
 )
 
 if TYPE_CHECKING:
+    from ..maps import LaneSource
+    from ..reconstruct import InitialiseOptions
     from ..reconstruct.training.progress import TrainingProgress
 
 
@@ -50,6 +59,13 @@ def reconstruct(
     box_noise: Annotated[
         float, typer.Option(min=0, max=1, help="Scatter added to boxes, a share of their size.")
     ] = 0.0,
+    lanes: Annotated[
+        str,
+        typer.Option(
+            help="Of the scene: map (that the log comes with), log (gathered from the drive where "
+            "there is no map) or none."
+        ),
+    ] = "map",
     backend: RenderBackend = "auto",
     device: RenderDevice = None,
     frames: LogFrames = ":",
@@ -62,7 +78,7 @@ def reconstruct(
 ) -> None:
     """Turn a driving log into a scene of Gaussians."""
     from ..logs import inspect_log, open_log, select_from_log
-    from ..reconstruct import ReconstructOptions, reconstruct
+    from ..reconstruct import InitialiseOptions, ReconstructOptions, reconstruct
     from ..reconstruct.training.schedule import at_width
     from ..reconstruct.training.schedule import preset as training_preset
 
@@ -70,6 +86,7 @@ def reconstruct(
     selection = log_selection(frames, cameras, every)
     drawn_by = chosen_backend(backend, device)
     training = training_preset(preset)
+    training = replace(training, initialise=_with_lanes(training.initialise, lanes))
     if iterations:
         training = replace(training, iterations=iterations)
     opened = open_log(log, format=log_format, sequence=sequence)
@@ -85,7 +102,10 @@ def reconstruct(
             opened,
             out,
             ReconstructOptions(
-                training=training if iterations else None, box_noise=box_noise, backend=drawn_by
+                initialise=None if iterations else _with_lanes(InitialiseOptions(), lanes),
+                training=training if iterations else None,
+                box_noise=box_noise,
+                backend=drawn_by,
             ),
             resume=resume,
             overwrite=overwrite,
@@ -96,6 +116,14 @@ def reconstruct(
     print_figures(f"scene {out}", {k: v for k, v in figures.items() if v is not None})
     console.print(f"next: real2sim render {out} --log {log} -o {out.name}.png")
     write_json(json, figures)
+
+
+def _with_lanes(options: InitialiseOptions, lanes: str) -> InitialiseOptions:
+    from ..maps import LANE_SOURCES
+
+    if lanes not in LANE_SOURCES:
+        raise CommandError(f"--lanes {lanes!r}; give one of {', '.join(LANE_SOURCES)}")
+    return replace(options, lanes=cast("LaneSource", lanes))
 
 
 def _training_bar(report: Callable[..., None]) -> Callable[[TrainingProgress], None]:

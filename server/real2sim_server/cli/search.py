@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from ..console import console, print_figures, staged_progress
+from ..console import console, print_figures, told_progress
 from .command import command
-from .options import JsonFile
+from .options import Follow, JsonFile
 
 
 @command("search")
@@ -32,6 +32,7 @@ def search(
         Path | None, typer.Option("--scenes", help="Folder of bundles, for scenes by name.")
     ] = None,
     json: JsonFile = None,
+    follow: Follow = False,
 ) -> None:
     """Find collisions that are a planner's fault and that a driver who knows what comes avoids.
 
@@ -50,9 +51,11 @@ def search(
         scenes=scenes,
     )
     asked = [load_space(name, scenes) for name in spaces]
-    with staged_progress() as report:
+    with told_progress(follow=follow) as report:
         found = run_search(asked, planner, out, options, on_progress=report)
+    write_json(json, found)
+    if follow:
+        return
     keys = ("episodes", "first_failure", "at_fault", "avoidable", "cells")
     print_figures(f"failures of {planner}", {k: found[k] for k in keys})
     console.print(f"wrote {out / 'failures.html'} and {out / 'failures.json'}")
-    write_json(json, found)

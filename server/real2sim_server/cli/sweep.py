@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from ..console import CommandError, print_figures, staged_progress
+from ..console import CommandError, print_figures, told_progress
 from .command import command
-from .options import JsonFile
+from .options import Follow, JsonFile
 
 
 @command("sweep")
@@ -26,11 +26,13 @@ def sweep(
         str | None, typer.Option(help="Of a Ray cluster; default: one on this machine.")
     ] = None,
     json: JsonFile = None,
+    follow: Follow = False,
 ) -> None:
     """Drive points of a parameter space with planners, without images unless they need some.
 
-    Leaves episodes.parquet, a row an episode, and recordings of the worst. Killed, the same command
-    goes on; the table is the same bytes whoever drove, and however often it was killed.
+    Leaves episodes.parquet, a row an episode, and recordings and scenario files of the worst.
+    Killed, the same command goes on; the table is the same bytes whoever drove, and however often
+    it was killed.
     """
     from ..console import write_json
     from ..executors import ExecutorError, executor_of
@@ -39,9 +41,10 @@ def sweep(
     asked = load_sweep(spec, scenes)
     try:
         who = executor_of(executor, workers=workers, address=ray_address)
-        with staged_progress() as report:
+        with told_progress(follow=follow) as report:
             figures = run_sweep(asked, out, who, scenes=scenes, on_progress=report)
     except ExecutorError as error:
         raise CommandError(str(error)) from error
-    print_figures(f"sweep of {asked.case.name}", figures)
     write_json(json, figures)
+    if not follow:
+        print_figures(f"sweep of {asked.case.name}", figures)

@@ -34,25 +34,32 @@ def add(
         float | None, typer.Option(help="Of the device's thread, or of steps without images.")
     ] = None,
     sessions: Annotated[int | None, typer.Option(help="Open at a time.")] = None,
+    jobs: Annotated[int | None, typer.Option(help="Not over, at a time.")] = None,
+    role: Annotated[
+        str, typer.Option(help="What its holder may do: observe, drive, edit or administer.")
+    ] = "administer",
 ) -> None:
     """Make a token and print it, this once; the file keeps its hash."""
     from pydantic import ValidationError
 
-    from ..service.token_file import TokenLimits, add_token
+    from ..service.token_file import ROLES, TokenLimits, add_token
 
+    if role not in ROLES:
+        raise CommandError(f"--role: one of {', '.join(ROLES)}, not {role!r}")
     try:
         limits = TokenLimits(
             requests_per_second=requests_per_second,
             bytes_per_day=bytes_per_day,
             engine_seconds_per_minute=engine_seconds_per_minute,
             sessions=sessions,
+            jobs=jobs,
         )
     except ValidationError as error:
         first = error.errors()[0]
         option = str(first["loc"][0]).replace("_", "-")
         raise CommandError(f"--{option}: {first['msg']}, not {first['input']!r}") from None
     path = _file(file)
-    token = add_token(path, name, limits)
+    token = add_token(path, name, limits, role=role)
     errors.print(
         f"token {name!r} is in {path}; a worker with REAL2SIM_TOKENS_FILE={path} takes it within "
         "a second. It is shown this once:",
@@ -70,7 +77,7 @@ def list_(*, file: TokensFile = None) -> None:
 
     known = read_token_file(_file(file)).tokens
     for token in known:
-        line = f"{token.name:20} {token.created_at:26} {_limits(token)}"
+        line = f"{token.name:20} {token.created_at:26} {token.role:10} {_limits(token)}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 

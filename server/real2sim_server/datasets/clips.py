@@ -47,7 +47,9 @@ from .labels import (
     views_of,
 )
 from .labels.boxes import in_frame
+from .labels.keypoints import keypoints_at, keypoints_in_image
 from .labels.noise import noisy_boxes
+from .labels.views import ObjectView
 from .perturbed import PerturbedDrive, perturbed
 from .plan import ExportPlan, PlannedClip, planned_lidar
 from .variants import Variant
@@ -231,6 +233,7 @@ def _frame_labels(
     in_ego = [in_frame(box, to_ego) for box in boxes]
     counts = points_in_boxes(points.points, [pose for pose, _ in in_ego], [b.size for b in boxes])
     futures = futures_at(drive, moment.t_us, [box.object_id for box in boxes])
+    joints = keypoints_at(drive.scene, moment.placed, moment.t_us, strides=moment.strides)
     return {
         "index": index,
         "t_us": moment.t_us,
@@ -250,11 +253,16 @@ def _frame_labels(
                 "velocity_ego": velocity.tolist(),
                 "points": count,
                 "future": futures[box.object_id],
+                **_if_known("keypoints", joints.get(box.object_id)),
             }
             for box, (pose, velocity), count in zip(boxes, in_ego, counts, strict=True)
         ],
-        "views": {view.images.camera.name: _view_labels(view, boxes) for view in views},
+        "views": {view.images.camera.name: _view_labels(view, boxes, joints) for view in views},
     }
+
+
+def _if_known(name: str, points: Float | None) -> dict[str, Any]:
+    return {} if points is None else {name: points.tolist()}
 
 
 def _beside(drive: Drive, t_us: int) -> dict[str, Any]:
@@ -273,7 +281,15 @@ def _detections(
     return noisy_boxes(here.boxes, poses, plan.noise, (plan.seed, *place))
 
 
-def _view_labels(view: CameraView, boxes: Sequence[ObjectBox]) -> list[dict[str, Any]]:
+def _view_labels(
+    view: CameraView, boxes: Sequence[ObjectBox], joints: Mapping[str, Float]
+) -> list[dict[str, Any]]:
+    def keypoints(seen: ObjectView) -> dict[str, Any]:
+        points = joints.get(seen.object_id)
+        if points is None:
+            return {}
+        return {"keypoints_2d": keypoints_in_image(points, view.images, seen.instance_id)}
+
     to_camera: Float = invert_transform(view.images.T_world_camera)
     poses = {box.object_id: to_camera @ box.T_world_object for box in boxes}
     return [
@@ -287,6 +303,7 @@ def _view_labels(view: CameraView, boxes: Sequence[ObjectBox]) -> list[dict[str,
             "alone_pixels": seen.alone_pixels,
             "visibility": seen.visibility,
             "truncation": seen.truncation,
+            **keypoints(seen),
         }
         for seen in view.objects
     ]

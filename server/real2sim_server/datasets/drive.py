@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
+from ..edit.compose import NO_STRIDES
 from ..edit.sweep import met_background, met_object, sweep_of
 from ..geometry.rotation import Float, matrix_to_quaternion
 from ..render.cast.recorded import SweepScene, incidence_of, sensor_poses, transforms_at
 from ..render.types import Instance
-from ..scene import Lidar, Scene, Trajectory
+from ..scene import Lidar, Scene, Stride, Trajectory
 from ..world import World
 from ..world.recording.recording import Recording
 from .errors import DatasetError
@@ -30,12 +31,14 @@ class Moment:
         instances: what is drawn.
         placed: every object that is there.
         T_world_ego: [4, 4] pose of the ego (rear axle centre on the ground).
+        strides: of people whom no trajectory leads, by object id.
     """
 
     t_us: int
     instances: Sequence[Instance]
     placed: PlacedObjects[ObjectState]
     T_world_ego: Float
+    strides: Mapping[str, Stride] = field(default_factory=lambda: NO_STRIDES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +163,8 @@ class EpisodeDrive:
     def at(self, t_us: int) -> Moment:
         """See :class:`Drive`."""
         world = self._world(t_us)
-        return Moment(t_us, world.instances(), world.agents, np.array(world.T_world_body))
+        ego, strides = np.array(world.T_world_body), world.strides.made
+        return Moment(t_us, world.instances(), world.agents, ego, strides)
 
     def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
         """See :class:`Drive`."""
@@ -187,9 +191,11 @@ class EpisodeDrive:
         place = self._place(t_us)
         near = self.worlds[max(place - 1, 0) : place + 2]
         world, times = self.worlds[place], t_us + lidar.beams.slots[0]
+        shown_us = min(world.t_us, self.scene.end_us)
         found, moved = [met_background(self.scene, world.state)], list[Float | None]([None])
         for subject, transform in zip(world.agents.objects, world.agents.transforms, strict=True):
-            found.append(met_object(self.scene, subject, transform))
+            stride = world.strides.made.get(subject.object_id)
+            found.append(met_object(self.scene, subject, transform, shown_us, stride=stride))
             moved.append(transforms_at(_way(near, subject.object_id), times))
         instances, known = zip(*found, strict=True)
         ego = _trajectory([(w.t_us, np.array(w.T_world_body)) for w in near])

@@ -1,7 +1,7 @@
 """Edits: typed operations onto objects, and scenarios as append-only logs of them."""
 
 from .apply import EditOutcome, apply_operations, replay_operations
-from .compose import cloud_of, compose, instances_at, things_at_start, things_of
+from .compose import cloud_of, compose, figure_of, instances_at, things_at_start, things_of
 from .errors import EditError
 from .ground_inpainting import vacated_parking
 from .posed import posed_instances
@@ -25,6 +25,7 @@ __all__ = [
     "apply_operations",
     "cloud_of",
     "compose",
+    "figure_of",
     "instances_at",
     "pack_state",
     "posed_instances",

@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
@@ -18,7 +19,7 @@ from real2sim_proto.semantics import semantic_class
 from ..geometry.rotation import Float
 from ..geometry.transform import invert_transform, transform_from
 from ..render.types import Instance
-from ..scene import GaussianCloud, Scene
+from ..scene import Figure, GaussianCloud, Scene, Stride
 from .ground_inpainting import inpaint_ground, vacated_parking
 from .shadow import contact_shadow
 from .state import ObjectState, ScenarioState
@@ -26,6 +27,7 @@ from .tracks import PlacedObjects
 
 T = TypeVar("T")
 
+NO_STRIDES: Mapping[str, Stride] = MappingProxyType({})
 KEPT_BACKGROUNDS = 4
 """Backgrounds with erased regions that are kept for each scene; one costs 4 bytes a Gaussian, and
 that of its colours too where parked objects were moved."""
@@ -51,14 +53,18 @@ def compose(
     state: ScenarioState,
     placed: PlacedObjects[ObjectState],
     t_us: int,
+    *,
+    strides: Mapping[str, Stride] = NO_STRIDES,
 ) -> list[Instance]:
-    """The same for objects that are ``placed`` already, wherever. Raises like
+    """The same for objects that are ``placed`` already, wherever, people among them as far in
+    walking as ``strides`` say by id, others as their trajectories lead them. Raises like
     :func:`instances_at`."""
     poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
     instances = [Instance(composed_background(scene, state, poses))]
     edited = []
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
-        instances.append(_standing(scene, subject, transform, t_us))
+        stride = strides.get(subject.object_id)
+        instances.append(_standing(scene, subject, transform, t_us, stride=stride))
         if subject.edited:
             edited.append((subject, transform))
     return instances + contact_shadows(scene, edited, t_us)
@@ -68,12 +74,15 @@ def things_of(
     scene: Scene, state: ScenarioState, objects: Iterable[ObjectState]
 ) -> tuple[Instance, ...] | None:
     """The background and ``objects`` as :func:`compose` draws them, wherever they stand; None
-    where edits make the background hang on where they do, or put shadows under them.
+    where edits make the background hang on where they do, or put shadows under them, or where
+    somebody walks.
 
     Raises:
         UnknownObjectError: ``state`` is of another scene.
     """
     shown = tuple(objects)
+    if any(figure_of(scene, subject) is not None for subject in shown):
+        return None
     as_recorded = all(state.objects.get(name) is known for name, known in state.recorded.items())
     if state.erased or not as_recorded or any(subject.edited for subject in shown):
         return None
@@ -94,13 +103,16 @@ def _anywhere(scene: Scene, objects: Iterable[ObjectState]) -> Iterable[Instance
     return (_standing(scene, subject, nowhere, scene.start_us) for subject in objects)
 
 
-def _standing(scene: Scene, subject: ObjectState, transform: Float, t_us: int) -> Instance:
+def _standing(
+    scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
+) -> Instance:
     placement = (transform, subject.instance_id, subject.scale)
     semantic = semantic_class(subject.category)
+    cloud = _posed(scene, subject, t_us, stride)
     if subject.asset is not None:
-        return Instance(subject.asset.cloud_in(scene), *placement, semantic=semantic)
-    source = scene.object(subject.source_id)
-    return Instance(source.cloud, *placement, colour=source.colour, t_us=t_us, semantic=semantic)
+        return Instance(cloud, *placement, semantic=semantic)
+    colour = scene.object(subject.source_id).colour
+    return Instance(cloud, *placement, colour=colour, t_us=t_us, semantic=semantic)
 
 
 def contact_shadows(
@@ -116,15 +128,44 @@ def contact_shadows(
     return [shadow for shadow in shadows if shadow is not None]
 
 
-def cloud_of(scene: Scene, subject: ObjectState, t_us: int) -> GaussianCloud:
-    """The Gaussians an object shows at ``t_us``, before its own scale, in its own frame.
+def cloud_of(
+    scene: Scene, subject: ObjectState, t_us: int, *, stride: Stride | None = None
+) -> GaussianCloud:
+    """The Gaussians an object shows at ``t_us``, before its own scale, in its own frame; of a
+    person as far in walking as ``stride`` says, or else as the trajectory leads.
 
     Raises:
         UnknownObjectError: ``subject`` is of another scene.
     """
+    cloud = _posed(scene, subject, t_us, stride)
     if subject.asset is not None:
-        return subject.asset.cloud_in(scene)
-    return scene.object(subject.source_id).cloud_at(t_us)
+        return cloud
+    colour = scene.object(subject.source_id).colour
+    return cloud if colour is None else colour.at(cloud, t_us)
+
+
+def _posed(scene: Scene, subject: ObjectState, t_us: int, stride: Stride | None) -> GaussianCloud:
+    asset = subject.asset
+    cloud = scene.object(subject.source_id).cloud if asset is None else asset.cloud_in(scene)
+    figure = figure_of(scene, subject)
+    if figure is None:
+        return cloud
+    if stride is not None:
+        return figure.striding(cloud, stride)
+    return figure.posed(cloud, subject.trajectory, t_us)
+
+
+def figure_of(scene: Scene, subject: ObjectState) -> Figure | None:
+    """The figure of an object that is a person who walks, as edits let it walk, else None.
+
+    Raises:
+        UnknownObjectError: ``subject`` is of another scene.
+    """
+    asset = subject.asset
+    figure = asset.figure if asset is not None else scene.object(subject.source_id).figure
+    if figure is None or subject.gait is None:
+        return figure
+    return figure.styled(**subject.gait.model_dump(exclude={"op", "object_id"}, exclude_none=True))
 
 
 def composed_background(

@@ -11,6 +11,7 @@ from real2sim_proto.operations import (
     Delete,
     EraseRegion,
     MeshShape,
+    SetGait,
     SetPhysics,
     SetStoryboard,
     SetTime,
@@ -28,6 +29,9 @@ from .operation import (
     operation,
 )
 from .state import ObjectState, ScenarioState
+
+PEOPLE = frozenset({"pedestrian", "person"})
+"""Categories of scenes' objects that may be walking bodies."""
 
 
 @object_operation(SetPhysics)
@@ -52,6 +56,23 @@ def set_velocity(
     return object_changed(
         state,
         replace(subject, velocity=operation),
+        inverse.model_copy(update={"object_id": subject.object_id}),
+    )
+
+
+@object_operation(SetGait)
+def set_gait(state: ScenarioState, subject: ObjectState, operation: SetGait) -> AppliedOperation:
+    """Say how a person walks."""
+    walks = subject.asset.figure is not None if subject.asset else subject.category in PEOPLE
+    if not walks:
+        raise invalid_operation(
+            f"{subject.object_id!r} is a {subject.category} and does not walk",
+            hint="set_gait is for people of the body model: POST /v1/assets with a build makes one",
+        )
+    inverse = subject.gait or SetGait(object_id=subject.object_id)
+    return object_changed(
+        state,
+        replace(subject, gait=operation),
         inverse.model_copy(update={"object_id": subject.object_id}),
     )
 

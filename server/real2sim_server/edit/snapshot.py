@@ -10,7 +10,13 @@ from pydantic import TypeAdapter
 
 from real2sim_proto import CodecError, ErrorCode, decode, encode
 from real2sim_proto.episode import AgentDriver
-from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
+from real2sim_proto.operations import (
+    AddCollider,
+    EraseRegion,
+    SetGait,
+    SetPhysics,
+    SetVelocity,
+)
 from real2sim_proto.storyboard import Storyboard
 
 from ..scene import Trajectory
@@ -78,22 +84,27 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
 
 def _packed_object(subject: ObjectState) -> dict[str, Any]:
     driver = {"driver": subject.driver.model_dump(mode="json")} if subject.driver else {}
-    return driver | {
-        "object_id": subject.object_id,
-        "source_id": subject.source_id,
-        "category": subject.category,
-        "size": list(subject.size),
-        "scale": list(subject.scale),
-        "times_us": subject.trajectory.times_us,
-        "positions": subject.trajectory.positions,
-        "quaternions": subject.trajectory.quaternions,
-        "instance_id": subject.instance_id,
-        "deleted": subject.deleted,
-        "asset_id": subject.asset.asset_id if subject.asset else None,
-        "physics": subject.physics.model_dump(mode="json") if subject.physics else None,
-        "velocity": subject.velocity.model_dump(mode="json") if subject.velocity else None,
-        "placed": subject.edited,
-    }
+    gait = {"gait": subject.gait.model_dump(mode="json")} if subject.gait else {}
+    return (
+        driver
+        | gait
+        | {
+            "object_id": subject.object_id,
+            "source_id": subject.source_id,
+            "category": subject.category,
+            "size": list(subject.size),
+            "scale": list(subject.scale),
+            "times_us": subject.trajectory.times_us,
+            "positions": subject.trajectory.positions,
+            "quaternions": subject.trajectory.quaternions,
+            "instance_id": subject.instance_id,
+            "deleted": subject.deleted,
+            "asset_id": subject.asset.asset_id if subject.asset else None,
+            "physics": subject.physics.model_dump(mode="json") if subject.physics else None,
+            "velocity": subject.velocity.model_dump(mode="json") if subject.velocity else None,
+            "placed": subject.edited,
+        }
+    )
 
 
 def _unpacked_object(packed: dict[str, Any], assets: AssetLookup | None) -> ObjectState:
@@ -120,6 +131,7 @@ def _unpacked_object(packed: dict[str, Any], assets: AssetLookup | None) -> Obje
         asset=asset,
         physics=SetPhysics.model_validate(physics) if physics else None,
         velocity=SetVelocity.model_validate(velocity) if velocity else None,
+        gait=SetGait.model_validate(packed["gait"]) if "gait" in packed else None,
         edited=packed["placed"],
         driver=_DRIVER.validate_python(packed["driver"]) if "driver" in packed else None,
     )

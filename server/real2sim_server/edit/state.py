@@ -12,10 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from real2sim_proto.episode import AgentDriver
-from real2sim_proto.operations import AddCollider, EraseRegion, SetPhysics, SetVelocity
+from real2sim_proto.operations import (
+    AddCollider,
+    EraseRegion,
+    SetGait,
+    SetPhysics,
+    SetVelocity,
+)
 from real2sim_proto.storyboard import Storyboard
 
-from ..scene import GaussianCloud, Ground, Scene, Trajectory
+from ..scene import Figure, GaussianCloud, Ground, Scene, Trajectory
 from .tracks import PackedTracks
 
 
@@ -43,6 +49,8 @@ class AssetSource(Protocol):
     def size(self) -> tuple[float, float, float]: ...  # noqa: D102
     @property
     def gaussians(self) -> int: ...  # noqa: D102
+    @property
+    def figure(self) -> Figure | None: ...  # noqa: D102
 
     def cloud_in(self, scene: Scene) -> GaussianCloud:
         """Its Gaussians in the light of ``scene``."""
@@ -80,6 +88,7 @@ class ObjectState:
         asset: what it shows instead of an object of the scene.
         physics: what it is for the physics; None for defaults throughout.
         velocity: with which it enters the physics; None for that of its trajectory.
+        gait: how it walks; None where no edit has said so.
         edited: whether an edit gave it its trajectory or its appearance.
         driver: that moves it in sessions; None where those say who does.
     """
@@ -95,6 +104,7 @@ class ObjectState:
     asset: AssetSource | None = None
     physics: SetPhysics | None = None
     velocity: SetVelocity | None = None
+    gait: SetGait | None = None
     edited: bool = False
     driver: AgentDriver | None = None
 

@@ -13,8 +13,8 @@ from ..render.cast.recorded import (
     transforms_at,
 )
 from ..render.types import Instance
-from ..scene import GaussianCloud, Lidar, Scene
-from .compose import kept, without_regions
+from ..scene import GaussianCloud, Lidar, Scene, Stride
+from .compose import cloud_of, figure_of, kept, without_regions
 from .state import ObjectState, ScenarioState
 
 
@@ -32,7 +32,7 @@ def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> Swe
     found = [met_background(scene, state)]
     moved: list[Float | None] = [None]
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
-        found.append(met_object(scene, subject, transform))
+        found.append(met_object(scene, subject, transform, t_us))
         moved.append(transforms_at(subject.trajectory, times))
     instances, known = zip(*found, strict=True)
     return SweepScene(instances, tuple(moved), known, incidence_of(scene))
@@ -47,16 +47,19 @@ def met_background(scene: Scene, state: ScenarioState) -> tuple[Instance, Attrib
 
 
 def met_object(
-    scene: Scene, subject: ObjectState, transform: Float
+    scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
 ) -> tuple[Instance, Attributes | None]:
-    """What rays meet of an object at ``transform``, and its attributes."""
-    cloud, attributes = _met(scene, subject)
+    """What rays meet of an object at ``transform``, in its pose of ``t_us`` or, of a person, as far
+    in walking as ``stride`` says, and its attributes."""
+    cloud, attributes = _met(scene, subject, t_us, stride)
     semantic = semantic_class(subject.category)
     instance = Instance(cloud, transform, subject.instance_id, subject.scale, semantic=semantic)
     return instance, attributes
 
 
-def _met(scene: Scene, subject: ObjectState) -> tuple[GaussianCloud, Attributes | None]:
-    if subject.asset is not None:
-        return subject.asset.cloud_in(scene), None
+def _met(
+    scene: Scene, subject: ObjectState, t_us: int, stride: Stride | None
+) -> tuple[GaussianCloud, Attributes | None]:
+    if subject.asset is not None or figure_of(scene, subject) is not None:
+        return cloud_of(scene, subject, t_us, stride=stride), None
     return met_by_lidar(scene, subject.source_id)

@@ -4,7 +4,14 @@ The generator lives in :mod:`.synthetic` and is not imported here: it compiles k
 """
 
 from .check import check_log
-from .driving_log import DrivingLog, FrameSource, LidarSweep, LogError, ObjectTrack
+from .driving_log import (
+    DrivingLog,
+    FrameSource,
+    LidarSweep,
+    LogError,
+    LoggedMap,
+    ObjectTrack,
+)
 from .inspect import CameraReport, LogReport, inspect_log
 from .native_writer import write_native_log
 from .open import open_log
@@ -18,6 +25,7 @@ __all__ = [
     "LogError",
     "LogReport",
     "LogSelection",
+    "LoggedMap",
     "ObjectTrack",
     "check_log",
     "inspect_log",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -94,6 +95,19 @@ class FrameSource(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class LoggedMap:
+    """A map of its own format that lies beside a log.
+
+    Attributes:
+        path: the file or folder, as ``maps.read_map`` takes it.
+        T_world_map: [4, 4] from the map's frame to the log's world [m].
+    """
+
+    path: Path
+    T_world_map: Float
+
+
+@dataclass(frozen=True, eq=False)
 class DrivingLog:
     """A recorded drive; images and sweeps are read when they are asked for.
 
@@ -112,6 +126,7 @@ class DrivingLog:
         image_times_us: [F] int64 [us] by camera, when its images were really taken, where that
             differs from the frame's time stamp; see :meth:`image_time_us`.
         lanes: of the map that the log comes with, in its world frame; None without one.
+        logged_map: where such a map is that has not been read; None without one.
     """
 
     name: str
@@ -124,6 +139,7 @@ class DrivingLog:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     image_times_us: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
     lanes: LaneGraph | None = field(default=None, repr=False)
+    logged_map: LoggedMap | None = field(default=None, repr=False)
 
     @property
     def frame_count(self) -> int:

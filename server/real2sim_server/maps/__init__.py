@@ -3,13 +3,16 @@
 from .align import Alignment, align, driven_poses, laid_on
 from .errors import MapError
 from .from_log import lanes_from_log
+from .of_log import LANE_SOURCES, LaneSource, lanes_of_log
 from .opendrive import OpenDriveReader
 from .read import MAP_READERS, read_map, register_map_reader
 from .reader import MapReader
 
 __all__ = [
+    "LANE_SOURCES",
     "MAP_READERS",
     "Alignment",
+    "LaneSource",
     "MapError",
     "MapReader",
     "OpenDriveReader",
@@ -17,6 +20,7 @@ __all__ = [
     "driven_poses",
     "laid_on",
     "lanes_from_log",
+    "lanes_of_log",
     "read_map",
     "register_map_reader",
 ]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
+from ..maps import LANE_SOURCES, LaneSource
+
 
 class ReconstructError(ValueError):
     """A log that cannot be reconstructed as asked; the message says what is missing or allowed."""
@@ -30,6 +32,8 @@ class InitialiseOptions:
             beam went; 0 for none.
         stereo_images: images of each camera, at most, whose depths are found by sweeping planes
             where no LiDAR beam went; 0 for none.
+        lanes: ``map``: of the map that the log comes with; ``log``: where there is none, gathered
+            from the drive; ``none``.
 
     Raises:
         ReconstructError: for a value out of range.
@@ -49,6 +53,7 @@ class InitialiseOptions:
     sky_resolution: int = 512
     feature_images: int = 60
     stereo_images: int = 60
+    lanes: LaneSource = "map"
 
     def __post_init__(self) -> None:
         may_be_zero = {
@@ -58,6 +63,9 @@ class InitialiseOptions:
             "feature_images",
             "stereo_images",
         }
-        for name, value in asdict(self).items():
+        if self.lanes not in LANE_SOURCES:
+            raise ReconstructError(f"lanes must be one of {LANE_SOURCES}, not {self.lanes!r}")
+        numbers = {name: value for name, value in asdict(self).items() if name != "lanes"}
+        for name, value in numbers.items():
             if not (value > 0 or (value == 0 and name in may_be_zero)) or value == float("inf"):
                 raise ReconstructError(f"{name}={value!r} of InitialiseOptions must be positive")

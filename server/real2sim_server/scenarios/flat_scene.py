@@ -25,6 +25,7 @@ from ..scene import (
     Trajectory,
 )
 from ..scene.lane_graph import LaneGraph
+from ..scene.person import person_asset
 from ..world.path import LoggedPath
 from ..world.storyboard.entities import BOXES
 from ..world.storyboard.graph_roads import GraphNetwork
@@ -203,15 +204,22 @@ def _lane_lines(graph: LaneGraph | None) -> list[GaussianCloud]:
 
 
 def _looks() -> dict[str, SceneObject]:
-    """A box of each category, which lends its look. It stands out of sight before the drive; what
-    stands may be taken to do so for longer where an episode goes on beyond the log."""
+    """A person, and a box of each other category, which lend their looks. They stand out of sight
+    before the drive; what stands may be taken to do so for longer where an episode goes on beyond
+    the log."""
     found = {}
     for name, (size, _) in BOXES.items():
         before = Trajectory(
             np.array([-2_000_000], np.int64), np.array([AWAY]), np.array([[1.0, 0.0, 0.0, 0.0]])
         )
-        cloud = _box(size, COLOURS[name])
-        found[f"look_{name}"] = SceneObject(f"look_{name}", name, size, cloud, before)
+        look = f"look_{name}"
+        if name == "pedestrian":
+            person = person_asset(look, "man", clothes={"top": COLOURS[name]})
+            found[look] = SceneObject(
+                look, name, person.size, person.cloud, before, figure=person.figure
+            )
+        else:
+            found[look] = SceneObject(look, name, size, _box(size, COLOURS[name]), before)
     return found
 
 

@@ -17,6 +17,7 @@ from .errors import (
     TimeOutOfRangeError,
     UnknownObjectError,
 )
+from .figure import Figure, Stride
 from .ground import Ground
 from .lane import Area, Lane, LanePlace, Signal, StopLine
 from .lane_graph import LaneGraph
@@ -43,6 +44,7 @@ __all__ = [
     "CameraRig",
     "Detection",
     "FTheta",
+    "Figure",
     "Fisheye",
     "GaussianCloud",
     "Ground",
@@ -67,6 +69,7 @@ __all__ = [
     "Signal",
     "Sky",
     "StopLine",
+    "Stride",
     "TimeColour",
     "TimeOutOfRangeError",
     "Trajectory",

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from .cloud import GaussianCloud
+from .figure import Figure
 from .scene import box_size
 
 
@@ -24,9 +25,10 @@ class Asset:
         cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
         provenance: where it comes from (JSON values only).
         content_hash: SHA-256 of the bundle it was read from or written to; empty before that.
+        figure: of a person who walks, whose ``cloud`` is in the rest pose; or None.
 
     Raises:
-        SceneError: when ``size`` is not three positive lengths.
+        SceneError: when ``size`` is not three positive lengths, or the figure is of another cloud.
     """
 
     asset_id: str
@@ -35,15 +37,18 @@ class Asset:
     cloud: GaussianCloud
     provenance: Mapping[str, Any] = field(default_factory=dict)
     content_hash: str = ""
+    figure: Figure | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "size", box_size(self.size, f"asset {self.asset_id!r}"))
+        if self.figure is not None:
+            self.figure.check_cloud(self.cloud, f"asset {self.asset_id!r}")
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
 
     @property
     def nbytes(self) -> int:
         """Memory of the Gaussians [bytes]."""
-        return self.cloud.nbytes
+        return self.cloud.nbytes + (self.figure.nbytes if self.figure else 0)
 
     def to(self, device: torch.device | str) -> Asset:
         """The asset on another device."""

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..geometry.rotation import matrix_to_quaternion
+from ..geometry.rotation import matrix_to_quaternion, quaternion_to_matrix
 from ..geometry.transform import is_rigid
 from .errors import SceneError
 from .spherical_harmonics import rotate_sh
@@ -119,6 +119,12 @@ class GaussianCloud:
         """The Gaussians picked by a mask [N] bool or indices [M] int64."""
         return GaussianCloud(**{name: t[index].contiguous() for name, t in self.tensors().items()})
 
+    def by_importance(self) -> Tensor:
+        """Indices [N] int64, what covers most first: by opacity times the area [m^2] of the
+        largest ellipse; equals keep their order."""
+        largest = self.scales.sort(dim=1, descending=True).values[:, :2]
+        return torch.argsort(self.opacities * largest.prod(dim=1), descending=True, stable=True)
+
     def with_sh_degree(self, degree: int) -> GaussianCloud:
         """The same Gaussians with SH padded by zeros, or cut, to ``degree``."""
         k = (degree + 1) ** 2
@@ -162,6 +168,32 @@ class GaussianCloud:
             self.opacities,
             rotate_sh(self.sh, matrix[:3, :3]),
             self.uncertainties,
+        )
+
+    def stretched(self, factors: tuple[float, float, float]) -> GaussianCloud:
+        """The Gaussians multiplied about the origin along the axes of their frame; colours keep
+        their directions.
+
+        Args:
+            factors: of x, y and z, > 0.
+
+        Raises:
+            SceneError: for a factor that is not positive.
+        """
+        if not all(np.isfinite(f) and f > 0 for f in factors):
+            raise SceneError(f"factors of a cloud must be positive, not {factors}")
+        by = torch.tensor(factors, dtype=torch.float64, device=self.device)
+        turns = torch.from_numpy(quaternion_to_matrix(self.quats.cpu().numpy())).to(self.device)
+        # Columns: the axes of each ellipsoid, as long as it is; its covariance is axes axes^T.
+        axes = by[:, None] * turns * self.scales.double()[:, None, :]
+        variances, vectors = torch.linalg.eigh(axes @ axes.transpose(1, 2))
+        vectors = vectors * torch.linalg.det(vectors).sign()[:, None, None]
+        quats = torch.from_numpy(matrix_to_quaternion(vectors.cpu().numpy())).to(self.device)
+        return replace(
+            self,
+            means=(self.means.double() * by).float(),
+            quats=quats.float(),
+            scales=variances.clamp(min=1e-16).sqrt().float(),
         )
 
     def check_values(self, what: str) -> None:

@@ -18,6 +18,7 @@ from .camera import CameraRig
 from .cloud import GaussianCloud
 from .colour import TimeColour
 from .errors import SceneError, UnknownObjectError
+from .figure import Figure
 from .ground import Ground, of_bundle
 from .ground_fit import fit_scene_ground
 from .lane_graph import LaneGraph
@@ -52,9 +53,10 @@ class SceneObject:
         cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
         trajectory: ``T_world_object`` over time; the object exists only in its range.
         colour: how the cloud's colour changes over time, or None; see :meth:`cloud_at`.
+        figure: of a person who walks, whose ``cloud`` is in the rest pose; or None.
 
     Raises:
-        SceneError: for a size that is none, or a colour of another number of Gaussians.
+        SceneError: for a size that is none, or a colour or figure of another number of Gaussians.
     """
 
     object_id: str
@@ -63,6 +65,7 @@ class SceneObject:
     cloud: GaussianCloud
     trajectory: Trajectory
     colour: TimeColour | None = None
+    figure: Figure | None = None
 
     def __post_init__(self) -> None:
         if self.colour is not None and len(self.colour.coefficients) != len(self.cloud):
@@ -70,11 +73,22 @@ class SceneObject:
                 f"object {self.object_id!r}: a colour of {len(self.colour.coefficients)} rows "
                 f"for {len(self.cloud)} Gaussians"
             )
+        if self.figure is not None:
+            self.figure.check_cloud(self.cloud, f"object {self.object_id!r}")
         object.__setattr__(self, "size", box_size(self.size, f"object {self.object_id!r}"))
 
     def cloud_at(self, t_us: int) -> GaussianCloud:
-        """The cloud with the colours of ``t_us``; the cloud itself where they do not change."""
-        return self.cloud if self.colour is None else self.colour.at(self.cloud, t_us)
+        """The cloud as it is at ``t_us``, with its colours and in the pose of its own trajectory;
+        the cloud itself where nothing changes."""
+        cloud = self.posed_at(t_us, self.trajectory)
+        return cloud if self.colour is None else self.colour.at(cloud, t_us)
+
+    def posed_at(self, t_us: int, trajectory: Trajectory) -> GaussianCloud:
+        """The cloud in the pose that it has at ``t_us`` along a trajectory, that of an edit for
+        example; the cloud itself, with colours unchanged, where it is rigid."""
+        return (
+            self.cloud if self.figure is None else self.figure.posed(self.cloud, trajectory, t_us)
+        )
 
     def box_at(self, t_us: int) -> Float:
         """Corners [8, 3] [m] of the box in the world at ``t_us``; order of ``box_corners``.
@@ -87,7 +101,8 @@ class SceneObject:
     @property
     def nbytes(self) -> int:
         """Memory of the Gaussians [bytes]."""
-        return self.cloud.nbytes + (self.colour.nbytes if self.colour else 0)
+        parts = [part for part in (self.colour, self.figure) if part is not None]
+        return self.cloud.nbytes + sum(part.nbytes for part in parts)
 
     def to(self, device: torch.device | str) -> SceneObject:
         """The object on another device."""

@@ -11,17 +11,17 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import structlog
 
 from .storage.tokens import token_hash
-from .token_file import DEFAULT_NAME, TokenFileError, TokenLimits, read_token_file
+from .token_file import DEFAULT_NAME, Role, TokenFileError, TokenLimits, read_token_file
 
 T = TypeVar("T")
 
@@ -40,6 +40,7 @@ class Limit(StrEnum):
     BYTES = "bytes"
     ENGINE = "engine"
     SESSIONS = "sessions"
+    JOBS = "jobs"
 
 
 class OverLimitError(Exception):
@@ -92,6 +93,16 @@ class Meter:
         return max((more - room) / self._per_s, 1e-3)
 
 
+class Held(NamedTuple):
+    """What somebody has that is limited in number."""
+
+    sessions: int = 0
+    jobs: int = 0
+
+
+NOTHING = Held()
+
+
 @dataclass(eq=False)
 class Account:
     """What the holder of a token has taken since the worker started.
@@ -99,24 +110,28 @@ class Account:
     Attributes:
         name: of the token.
         limits: what its holder may take.
+        role: what its holder may do.
         requests: and messages of sockets, those that were let in.
         received_bytes, sent_bytes: bodies and messages, and images by shared memory.
         engine_seconds: written by the engine's thread alone.
         world_seconds: of the processor, for what needs no engine; written by the thread of worlds
             alone.
         refusals: by limit.
+        elsewhere: sessions and unfinished jobs on other workers of the fleet, as they last told.
         revoked: whether the token is no more.
         on_revoked: called on the event loop when that comes to be.
     """
 
     name: str
     limits: TokenLimits = field(default_factory=TokenLimits)
+    role: Role = "administer"
     requests: int = 0
     received_bytes: int = 0
     sent_bytes: int = 0
     engine_seconds: float = 0.0
     world_seconds: float = 0.0
     refusals: dict[Limit, int] = field(default_factory=lambda: dict.fromkeys(Limit, 0))
+    elsewhere: Held = NOTHING
     revoked: bool = False
     on_revoked: set[Callable[[], object]] = field(default_factory=set)
 
@@ -166,11 +181,20 @@ class Account:
             raise self._over(Limit.ENGINE, f"more than {allowed:g} s of the engine a minute", wait)
 
     def check_sessions(self, present: int) -> None:
-        """Raises OverLimitError where ``present`` sessions are as many as may be open."""
-        most = self.limits.sessions
+        """Raises OverLimitError where ``present`` sessions of this worker, with those of others,
+        are as many as may be open."""
+        most, present = self.limits.sessions, present + self.elsewhere.sessions
         if most is not None and present >= most:
             detail = f"{present} sessions are open, {most} may be"
             raise self._over(Limit.SESSIONS, detail, 5.0)
+
+    def check_jobs(self, present: int) -> None:
+        """Raises OverLimitError where ``present`` unfinished jobs of this worker, with those of
+        others, are as many as there may be."""
+        most, present = self.limits.jobs, present + self.elsewhere.jobs
+        if most is not None and present >= most:
+            detail = f"{present} jobs are not over, {most} may be"
+            raise self._over(Limit.JOBS, detail, 5.0)
 
     def _over(self, limit: Limit, what: str, wait_s: float) -> OverLimitError:
         self.refusals[limit] += 1
@@ -323,6 +347,25 @@ class Accounts:
             raise RevokedError(name)
         return account
 
+    @property
+    def counts(self) -> bool:
+        """Whether anybody's sessions or jobs are limited in number."""
+        return any(a.limits.sessions is not None or a.limits.jobs is not None for a in self)
+
+    def take_word(self, told: Iterable[Mapping[str, Any]]) -> None:
+        """Take over what other workers have told of who has how much on them.
+
+        Args:
+            told: by worker ``{name: [sessions, jobs]}``.
+        """
+        sums: dict[str, Held] = {}
+        for held in told:
+            for name, (sessions, jobs) in held.items():
+                before = sums.get(name, NOTHING)
+                sums[name] = Held(before.sessions + sessions, before.jobs + jobs)
+        for account in self:
+            account.elsewhere = sums.get(account.name, NOTHING)
+
     async def watch(self) -> None:
         """Follow the file of tokens for ever; one that cannot be used changes nothing."""
         while self._file is not None:
@@ -351,6 +394,7 @@ class Accounts:
             account = self._by_name.get(token.name)
             if account is None or account.revoked:
                 account = self._again(account, token.name)
+            account.role = token.role
             if account.limits != token.limits:
                 account.limit(token.limits)
             by_hash[token.hash] = account

@@ -6,18 +6,19 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from functools import partial
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
-from starlette.types import Message
+from starlette.types import Message, Scope
 
 from real2sim_proto import Problem
 from real2sim_proto.jobs import JobInfo
 
 from ..settings import Settings
 from .accounts import PAYER, Payer
-from .http.accounting import Accounting
+from .http.accounting import Accounting, usage_of
 from .http.auth import require_token
 from .http.hosts import LoopbackOnly
 from .http.idempotency import install_replay_handler
@@ -25,6 +26,7 @@ from .http.openapi import published
 from .http.origins import OwnPagesOnly
 from .http.problems import install_problem_handlers
 from .http.requests import BodyLimit, RequestContext
+from .http.roles import READING
 from .jobs.jobs import Work
 from .routes import (
     assets,
@@ -34,26 +36,41 @@ from .routes import (
     exports,
     health,
     jobs,
+    object_splats,
     scenarios,
     scene_imports,
+    scene_splats,
     scenes,
     server,
     sessions,
     storyboards,
+    sweeps,
     ui,
     view,
 )
+from .storage.audit_log import AuditEntry
+from .storage.store import now_us
+from .tracing import Tracing, engine_spans, traces_to
 from .worker import Worker
+
+if TYPE_CHECKING:
+    from opentelemetry.sdk.trace import TracerProvider
+
+STEPS = ("/step", "/render", "/reset")
+"""Ends of paths of what happens many times a second, and changes nothing that others see."""
 
 PROTECTED: tuple[APIRouter, ...] = (
     server.router,
     scenes.router,
+    scene_splats.router,
+    object_splats.router,
     scene_imports.router,
     scenarios.router,
     storyboards.router,
     assets.router,
     jobs.router,
     exports.router,
+    sweeps.router,
 )
 """Routers behind the worker's token."""
 
@@ -112,7 +129,9 @@ def create_app(settings: Settings) -> FastAPI:
         app.add_middleware(LoopbackOnly)
     app.add_middleware(OwnPagesOnly)
     app.add_middleware(Accounting)
-    app.add_middleware(RequestContext, metrics=worker.metrics)
+    if settings.traces_url is not None:
+        trace(app, worker, traces_to(settings.traces_url, worker_id=settings.worker_id))
+    app.add_middleware(RequestContext, metrics=worker.metrics, on_end=partial(note_request, worker))
     for router in OPEN:
         app.include_router(router)
     for router in PROTECTED:
@@ -140,9 +159,39 @@ def operation_id(route: APIRoute) -> str:
     return f"{subject}-{route.name}"
 
 
+def trace(app: FastAPI, worker: Worker, provider: TracerProvider) -> None:
+    """Let requests and what the engine does for them leave spans."""
+    app.add_middleware(Tracing, provider=provider)
+    worker.engine.on_queued = engine_spans(provider)
+
+
+def note_request(worker: Worker, scope: Scope, method: str, status: int, request_id: str) -> None:
+    """Put on record who changed something, and who was refused for their token or role. What a
+    session does step by step is on record with the session."""
+    path = scope["path"]
+    refused = status in (401, 403)
+    if not refused and (method in READING or status >= 400 or path.endswith(STEPS)):
+        return
+    account = usage_of(scope).account
+    worker.audit.note(
+        AuditEntry(
+            account=account.name if account is not None else "",
+            client=(scope.get("client") or ("",))[0],
+            worker_id=worker.settings.worker_id,
+            method=method,
+            path=path[:1000],
+            status=status,
+            request_id=request_id,
+            at_us=now_us(),
+        )
+    )
+
+
 async def _work_again(worker: Worker, info: JobInfo) -> Work:
     """The work of a job on record, for the account that it was asked for with."""
     PAYER.set(Payer(worker.accounts.of_owner(info.owner), waits=True))
     if info.kind == "simulate":
         return await worker.simulations.work_again(info)
+    if info.kind == "sweep":
+        return await worker.sweeps.work_again(info)
     return await exports.work_again(worker, info)

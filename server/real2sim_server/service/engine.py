@@ -128,6 +128,7 @@ class _EngineJob:
     account: Account | None
     companions: Companions | None = None
     queued_at: float = field(default_factory=time.perf_counter)
+    on_end: Callable[[str, float, float], None] | None = None
 
 
 class Engine:
@@ -147,6 +148,7 @@ class Engine:
 
     Attributes:
         on_failure: called on the engine thread when the device is lost.
+        on_queued: asked by whoever queues a job; its answer is called as ``on_job`` after that job.
     """
 
     def __init__(
@@ -158,6 +160,7 @@ class Engine:
     ) -> None:
         self.queue_length = queue_length
         self.on_failure: Callable[[], object] = lambda: None
+        self.on_queued: Callable[[], Callable[[str, float, float], None] | None] | None = None
         self._threads = threads
         self._on_job = on_job
         self._jobs: Lanes[_EngineJob] = Lanes(queue_length)
@@ -355,6 +358,8 @@ class Engine:
         payer = PAYER.get()
         account = payer.account if payer is not None else None
         job = _EngineJob(run, label, future, account, companions)
+        if self.on_queued is not None:
+            job.on_end = self.on_queued()
         with self._changed:
             if self._failure is not None:
                 raise DeviceLostError(f"the device was lost: {self._failure}")
@@ -468,9 +473,10 @@ class Engine:
             self._running = interrupted
         # The awaiting thread has been woken, and gets the interpreter before metrics are updated.
         time.sleep(0)
-        if self._on_job is not None:
-            for job in jobs:
-                self._on_job(job.label, started - job.queued_at, time.perf_counter() - started)
+        for job in jobs:
+            for told in (self._on_job, job.on_end):
+                if told is not None:
+                    told(job.label, started - job.queued_at, time.perf_counter() - started)
 
     def _hand_over(self, job: _EngineJob, result: Any) -> None:
         if job.companions is None or not isinstance(result, Exception):

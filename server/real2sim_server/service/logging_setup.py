@@ -51,5 +51,5 @@ def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
     root.setLevel(level.upper())
     # One line a request is ours; the server's own would double it.
     logging.getLogger("uvicorn.access").disabled = True
-    for name in ("uvicorn", "uvicorn.error", "asyncio"):
+    for name in ("uvicorn", "uvicorn.error", "asyncio", "alembic"):
         logging.getLogger(name).setLevel(max(logging.WARNING, root.level))

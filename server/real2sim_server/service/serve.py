@@ -29,11 +29,14 @@ from .http.protocol import LimitedHttpProtocol
 from .http.websocket import ScatterGatherProtocol
 from .logging_setup import configure_logging
 from .preflight import bind, check_scenes, listen, url_of
+from .storage.errors import StoreError
 from .worker import Worker
 
 PING_INTERVAL_S = 10.0
 PING_TIMEOUT_S = 20.0
 POLL_S = 0.02
+LINGER_S = 1.5
+"""For which a worker that has handed its sessions over tells clients so, until its proxy knows."""
 
 
 @dataclass(frozen=True)
@@ -165,8 +168,18 @@ class DrainingServer(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Ten times a second: whether it is time to stop."""
         if self._stops_at is not None and time.monotonic() >= self._stops_at:
-            self.should_exit = True
+            if not self._worker.handed_over and await self._handed_over():
+                self._stops_at = time.monotonic() + LINGER_S
+            else:
+                self.should_exit = True
         return await super().on_tick(counter)
+
+    async def _handed_over(self) -> bool:
+        """Whether other workers have what this one had."""
+        try:
+            return await self._worker.hand_over()
+        except StoreError:
+            return False
 
 
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:

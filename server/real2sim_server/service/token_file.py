@@ -22,6 +22,11 @@ MAX_TOKENS = 1000
 TOKEN_BYTES = 24
 MAX_FILE_BYTES = 1 << 20
 
+Role = Literal["observe", "drive", "edit", "administer"]
+"""What the holder of a token may do."""
+ROLES: tuple[Role, ...] = ("observe", "drive", "edit", "administer")
+"""Each may all that the one before it may."""
+
 Rate = Annotated[float, Field(gt=0, le=1e15, allow_inf_nan=False)]
 
 
@@ -42,12 +47,14 @@ class TokenLimits(_Strict):
         engine_seconds_per_minute: of the thread that owns the device, and of the processor for
             steps that need none; a minute's worth at once.
         sessions: open at a time.
+        jobs: not over, at a time.
     """
 
     requests_per_second: Rate | None = None
     bytes_per_day: Rate | None = None
     engine_seconds_per_minute: Rate | None = None
     sessions: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    jobs: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
 
 
 class NamedToken(_Strict):
@@ -58,12 +65,14 @@ class NamedToken(_Strict):
         hash: of the token, as :func:`~.storage.tokens.token_hash` makes it.
         created_at: UTC, ISO 8601.
         limits: what its holder may take.
+        role: what its holder may do.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,39}$")]
     hash: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     created_at: str = ""
     limits: TokenLimits = TokenLimits()
+    role: Role = "administer"
 
     @model_validator(mode="after")
     def _is_free(self) -> NamedToken:
@@ -116,7 +125,7 @@ def read_token_file(path: Path) -> TokenFile:
         ) from error
 
 
-def add_token(path: Path, name: str, limits: TokenLimits) -> str:
+def add_token(path: Path, name: str, limits: TokenLimits, *, role: Role = "administer") -> str:
     """Make a token, and add its hash to a file, which is made where it is missing.
 
     Returns:
@@ -133,7 +142,9 @@ def add_token(path: Path, name: str, limits: TokenLimits) -> str:
     token = secrets.token_urlsafe(TOKEN_BYTES)
     now = datetime.now(UTC).isoformat(timespec="seconds")
     try:
-        added = NamedToken(name=name, hash=token_hash(token), created_at=now, limits=limits)
+        added = NamedToken(
+            name=name, hash=token_hash(token), created_at=now, limits=limits, role=role
+        )
         changed = TokenFile(tokens=(*present.tokens, added))
     except ValidationError as error:
         message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
@@ -23,6 +24,8 @@ from ..render.backends import device_of
 from ..scene.io import StagingLimits
 from ..settings import Settings
 from .accounts import Accounts
+from .agent import Agent, Willingness
+from .audit import Audit
 from .drives.drives import Drives
 from .engine import Engine
 from .http.connections import ConnectionLimits, Connections, connection_limit
@@ -38,17 +41,26 @@ from .library.memory import MemoryBudget
 from .library.quotas import Quota
 from .library.scene_cache import SceneCache
 from .library.scene_catalog import SceneCatalog
+from .library.splat_files import SplatFiles
 from .membership import Membership
+from .objects.object_store import open_objects
+from .objects.shared_bundles import BundleFolders
+from .prewarming import Prewarming, takes_work
 from .rendering.renderer import Renderer
 from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .sessions.segment import Segments
+from .sharing import Sharing
+from .storage.audit_log import AuditLog
+from .storage.bundle_log import BundleLog
 from .storage.job_log import JobLog
 from .storage.leases import Leases
+from .storage.notices import Notices
 from .storage.ownership import owned_folder
 from .storage.store import Store
 from .storage.tokens import worker_key
+from .sweeps.sweeps import Sweeps
 from .upkeep import Upkeep
 from .warm_up import KernelWarmUp
 
@@ -65,6 +77,7 @@ class Worker:
         device: what draws, and why.
         waiting_for: what has to happen before the worker is ready.
         draining: whether the worker is on its way out.
+        handed_over: whether its sessions and jobs are others' by now.
         start_error: why it did not start.
         on_ready: called on the event loop when all is there that the worker starts with.
     """
@@ -82,6 +95,7 @@ class Worker:
     simulations: Simulations
     calibrations: Calibrations
     drives: Drives
+    sweeps: Sweeps
     idempotency: Idempotency
     leases: Leases
     kernels: KernelWarmUp
@@ -89,11 +103,17 @@ class Worker:
     sessions: Sessions
     backend: Backend
     device: DeviceInfo
+    audit: Audit
+    sharing: Sharing | None = None
+    membership: Membership | None = None
     imports: ImportQueue = field(default_factory=ImportQueue)
+    splat_files: SplatFiles = field(default_factory=SplatFiles)
     waiting_for: set[str] = field(default_factory=lambda: {"start"})
     draining: bool = False
+    handed_over: bool = False
     start_error: Exception | None = None
     on_ready: Callable[[], object] = lambda: None
+    _last_load: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def build(cls, settings: Settings) -> Worker:
@@ -102,6 +122,7 @@ class Worker:
         Raises:
             RenderError: the backend of the settings cannot be used here.
             TokenFileError: the file of tokens cannot be used.
+            ValueError: the store of objects is none.
         """
         metrics = Metrics()
         secret = settings.token.get_secret_value() if settings.token is not None else None
@@ -125,6 +146,7 @@ class Worker:
             worker_id=settings.worker_id,
             timeout_s=settings.store_timeout_seconds,
             durability=settings.durability,
+            migration=settings.store_migration,
             on_call=metrics.observe_store,
         )
         assets = AssetLibrary(settings.assets_path, budget)
@@ -179,9 +201,12 @@ class Worker:
             renderer=renderer,
             sessions=sessions,
             drives=Drives(jobs, sessions, scene_cache, assets.find),
+            sweeps=Sweeps(jobs, scene_cache),
             backend=backend,
             device=_device_info(backend, settings),
+            audit=Audit(AuditLog(store)),
         )
+        worker._share(job_log)
         worker._connect_gauges()
         return worker
 
@@ -215,10 +240,26 @@ class Worker:
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.connections.watch()))
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.accounts.watch()))
+            await at_exit.enter_async_context(self.audit.running())
             await at_exit.enter_async_context(self.sessions.running())
-            await at_exit.enter_async_context(self._membership().running())
+            self.membership = self._membership()
+            await at_exit.enter_async_context(self.membership.running())
+            await at_exit.enter_async_context(self._hear())
             await at_exit.enter_async_context(self.jobs.running())
+            if self.sharing is not None:
+                await at_exit.enter_async_context(self.sharing.running())
             at_exit.push_async_callback(_cancel, asyncio.create_task(upkeep.run()))
+            prewarming = Prewarming(
+                self.leases,
+                self.scene_cache,
+                worker_id=self.settings.worker_id,
+                hot=self.settings.hot_scene_sessions,
+            )
+            at_exit.push_async_callback(_cancel, asyncio.create_task(prewarming.run()))
+            if self.settings.agent_port is not None:
+                agent = Agent(self._willingness, weight=self.settings.agent_weight)
+                listening = agent.running(self.settings.host, self.settings.agent_port)
+                await at_exit.enter_async_context(listening)
             at_exit.callback(self.drain)
             yield self
 
@@ -293,12 +334,77 @@ class Worker:
         """Show that the worker is on its way out, and begin no sessions; open ones go on."""
         self.draining = self.sessions.draining = True
 
+    @asynccontextmanager
+    async def _hear(self) -> AsyncIterator[None]:
+        """Word from other workers reaches who waits for it, for the length of the block."""
+        settings = self.settings
+        notices = Notices(settings.database_url, timeout_s=settings.store_timeout_seconds)
+        if notices.can_hear:
+            self.jobs.listen = partial(notices.listener, "jobs")
+            if self.sharing is not None:
+                self.sharing.listen = partial(notices.listener, "bundles")
+        async with notices.running():
+            yield
+
+    def _share(self, job_log: JobLog) -> None:
+        """Connect to the store of objects, where there is one."""
+        settings = self.settings
+        if settings.objects_url is None:
+            return
+        folders = {
+            "scene": settings.scenes_path,
+            "asset": settings.assets_path,
+            "job": settings.jobs_path,
+        }
+        self.sharing = Sharing(
+            BundleFolders(
+                open_objects(settings.objects_url),
+                folders,
+                max_bytes=settings.objects_cache_bytes,
+            ),
+            BundleLog(self.store),
+            job_log,
+            catalog=self.scene_cache.catalog,
+            assets=self.assets,
+        )
+        self.scene_cache.fetch = partial(self.sharing.take_out, "scene")
+        self.jobs.fetch = partial(self.sharing.take_out, "job")
+        self.jobs.on_forget = partial(self.sharing.forget, "job")
+
+    async def hand_over(self) -> bool:
+        """Leave sessions and jobs to other workers; False where there are none that would take
+        them: they go on when this one is back.
+
+        Raises:
+            StoreError: of the database; nothing was left.
+        """
+        rows = await self.leases.workers()
+        others = [w for w in rows if w.alive and w.worker_id != self.settings.worker_id]
+        if not any(takes_work(w.document) for w in others):
+            return False
+        self.drain()
+        self.handed_over = True
+        await self.jobs.leave()
+        self.sessions.hand_over()
+        if self.membership is not None:
+            await self.membership.leave()
+        log.info("handed over", to=len(others))
+        return True
+
+    def _willingness(self) -> Willingness:
+        return Willingness(
+            ready=self.readiness().ready,
+            full=len(self.sessions) >= self.settings.max_sessions,
+            handed_over=self.handed_over,
+        )
+
     def _membership(self) -> Membership:
         return Membership(
             self.leases,
             self.sessions,
             seconds=self.settings.lease_seconds,
             document=self._about,
+            accounts=self.accounts,
         )
 
     def _about(self) -> dict[str, Any]:
@@ -310,8 +416,26 @@ class Worker:
             "draining": self.draining,
             "sessions": len(self.sessions),
             "max_sessions": self.settings.max_sessions,
+            "load": self._load(),
+            "queue": self.engine.queue_depth,
             "scenes": self.scene_cache.resident_names,
+            "scene_sessions": dict(Counter(session.row.scene for session in self.sessions)),
+            "held": self._held(),
         }
+
+    def _held(self) -> dict[str, list[int]]:
+        """Sessions and unfinished jobs by the name of whose they are."""
+        sessions, jobs = self.sessions.owned(), self.jobs.unfinished()
+        return {
+            name: [sessions[name], jobs[name]] for name in sorted(sessions.keys() | jobs.keys())
+        }
+
+    def _load(self) -> float:
+        """Share of the time since the last call in which the engine worked."""
+        now, worked = time.monotonic(), self.metrics.engine_seconds
+        since, before = self._last_load
+        self._last_load = (now, worked)
+        return round(min(1.0, (worked - before) / max(now - since, 1e-3)), 3)
 
     async def _warm_up(self) -> None:
         started = time.perf_counter()
@@ -324,6 +448,8 @@ class Worker:
         self.on_ready()
         self.waiting_for = set()
         seconds = round(time.perf_counter() - started, 2)
+        if self.membership is not None:
+            await self.membership.tell()
         log.info("ready", backend=self.backend.name, warm_up_s=seconds)
         try:
             await self.kernels.run_planning()

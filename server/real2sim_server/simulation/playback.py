@@ -103,7 +103,9 @@ class Playback:
             if subject.object_id in self.result.objects:
                 instances.append(self._simulated(subject, frame))
             elif subject.trajectory.covers(t_us):
-                cloud = self.scene.object(subject.source_id).cloud_at(t_us)
+                source = self.scene.object(subject.source_id)
+                cloud = source.posed_at(t_us, subject.trajectory)
+                cloud = cloud if source.colour is None else source.colour.at(cloud, t_us)
                 pose = subject.trajectory.transform(t_us)
                 instances.append(_placed(cloud, pose, subject, subject.scale))
         return instances + self._fragments(frame, without)

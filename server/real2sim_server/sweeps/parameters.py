@@ -4,45 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from real2sim_proto.sweeps import (
+    ChoiceParameter,
+    DerivedParameter,
+    FloatParameter,
+    IntParameter,
+    NormalParameter,
+    ParameterName,
+    ParameterValue,
+)
 
 from .expression import evaluate, names_in
 
-Value = float | int | str | bool
-Number = Annotated[float, Field(ge=-1e18, le=1e18)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")]
+Value = ParameterValue
+Name = ParameterName
 
 
-class _Parameter(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    path: str | list[str] | None = None
-
-    @property
-    def paths(self) -> list[str]:
-        """Where its value is put in a case; none for one that only others are derived from."""
-        if self.path is None:
-            return []
-        return [self.path] if isinstance(self.path, str) else self.path
-
-
-class FloatRange(_Parameter):
+class FloatRange(FloatParameter):
     """Uniform between two numbers, or uniform in its logarithm."""
-
-    kind: Literal["float"] = "float"
-    low: Number
-    high: Number
-    log: bool = False
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if not self.low < self.high or (self.log and self.low <= 0):
-            raise ValueError(
-                f"low {self.low:g} and high {self.high:g}; low is below high, and above 0 with log"
-            )
-        return self
 
     def at(self, u: float) -> float:
         """The value at a coordinate."""
@@ -61,18 +44,8 @@ class FloatRange(_Parameter):
         return [k / (count - 1) for k in range(count)] if count > 1 else [0.5]
 
 
-class IntRange(_Parameter):
+class IntRange(IntParameter):
     """Whole numbers from ``low`` to ``high``, both included, each as likely."""
-
-    kind: Literal["int"]
-    low: int = Field(ge=-(2**53), le=2**53)
-    high: int = Field(ge=-(2**53), le=2**53)
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.low > self.high:
-            raise ValueError(f"low {self.low} is above high {self.high}")
-        return self
 
     def at(self, u: float) -> int:
         """The value at a coordinate."""
@@ -90,11 +63,8 @@ class IntRange(_Parameter):
         return [self.coordinate(v) for v in dict.fromkeys(values)]
 
 
-class Choice(_Parameter):
+class Choice(ChoiceParameter):
     """One of a list, each as likely."""
-
-    kind: Literal["choice"]
-    values: list[Value] = Field(min_length=1, max_length=1000)
 
     def at(self, u: float) -> Value:
         """The value at a coordinate."""
@@ -109,20 +79,8 @@ class Choice(_Parameter):
         return [(k + 0.5) / len(self.values) for k in range(len(self.values))]
 
 
-class Normal(_Parameter):
+class Normal(NormalParameter):
     """Normal, cut off at ``low`` and ``high``."""
-
-    kind: Literal["normal"]
-    mean: Number
-    std: Annotated[float, Field(gt=0, le=1e9)]
-    low: Number
-    high: Number
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if not self.low < self.high:
-            raise ValueError(f"low {self.low:g} is not below high {self.high:g}")
-        return self
 
     def at(self, u: float) -> float:
         """The value at a coordinate, which is its cumulative probability."""
@@ -146,14 +104,11 @@ class Normal(_Parameter):
         return [(k + 0.5) / count for k in range(count)]
 
 
-class Derived(_Parameter):
+class Derived(DerivedParameter):
     """Computed from other parameters, by arithmetic."""
 
-    kind: Literal["derived"]
-    expression: str
-
     @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check_expression(self) -> Self:
         names_in(self.expression)
         return self
 

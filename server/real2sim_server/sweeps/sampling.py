@@ -5,79 +5,33 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from .parameters import Drawn, Name
+from real2sim_proto.sweeps import MOST_POINTS, GridMethod, ImportanceMethod, SpreadMethod
+
+from .parameters import Drawn
 
 Points = NDArray[np.float64]
-MOST_POINTS = 1_000_000
 
-
-class Grid(BaseModel):
-    """Every combination of values."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    kind: Literal["grid"]
-    levels: int | dict[Name, int] = Field(
-        default=5, description="values of each parameter; of a choice all are taken"
-    )
-
-
-class Spread(BaseModel):
-    """So many points: independent ones, a Latin hypercube, or a low-discrepancy sequence."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    kind: Literal["random", "latin_hypercube", "sobol", "halton"] = "sobol"
-    count: int = Field(default=64, ge=1, le=MOST_POINTS)
-    seed: int = Field(default=0, ge=0, lt=2**63)
-
-
-class Bump(BaseModel):
-    """Where importance sampling looks: a normal of values, cut off at the parameter's ends."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    mean: float
-    std: Annotated[float, Field(gt=0)]
-
-
-class Importance(BaseModel):
-    """Points drawn where failures are thought to be, with weights that take it back.
-
-    A share of ``defensive`` of the points is drawn from the parameters' own distributions, so that
-    no weight is above 1 / ``defensive`` (Hesterberg 1995).
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    kind: Literal["importance"]
-    count: int = Field(default=64, ge=1, le=MOST_POINTS)
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    towards: dict[Name, Bump] = Field(min_length=1)
-    defensive: Annotated[float, Field(gt=0, le=1)] = 0.1
-
-
-Method = Annotated[Grid | Spread | Importance, Field(discriminator="kind")]
+Method = Annotated[GridMethod | SpreadMethod | ImportanceMethod, Field(discriminator="kind")]
 
 
 def points_of(
-    method: Grid | Spread | Importance, drawn: Mapping[str, Drawn]
+    method: GridMethod | SpreadMethod | ImportanceMethod, drawn: Mapping[str, Drawn]
 ) -> tuple[Points, Points]:
     """Points [N, D] with coordinates from 0 to 1, and their weights [N], 1 where all are alike.
 
     Raises:
         ValueError: too many points, or a parameter that is none.
     """
-    if isinstance(method, Grid):
+    if isinstance(method, GridMethod):
         points = _grid(method, drawn)
         return points, np.ones(len(points))
-    if isinstance(method, Importance):
+    if isinstance(method, ImportanceMethod):
         return _weighted(method, drawn)
     points = spread(method.kind, method.count, len(drawn), seed=method.seed)
     return points, np.ones(len(points))
@@ -101,7 +55,7 @@ def spread(kind: str, count: int, dimensions: int, *, seed: int) -> Points:
     return np.asarray(makers[kind](dimensions, rng=seed).random(count), np.float64)
 
 
-def _grid(method: Grid, drawn: Mapping[str, Drawn]) -> Points:
+def _grid(method: GridMethod, drawn: Mapping[str, Drawn]) -> Points:
     levels = method.levels
     given = levels if isinstance(levels, dict) else dict.fromkeys(drawn, levels)
     _check_names(given, drawn)
@@ -111,7 +65,7 @@ def _grid(method: Grid, drawn: Mapping[str, Drawn]) -> Points:
     return np.array(list(itertools.product(*axes)), np.float64).reshape(count, len(drawn))
 
 
-def _weighted(method: Importance, drawn: Mapping[str, Drawn]) -> tuple[Points, Points]:
+def _weighted(method: ImportanceMethod, drawn: Mapping[str, Drawn]) -> tuple[Points, Points]:
     """In coordinates the nominal density is 1, whatever a parameter's distribution."""
     _check_names(method.towards, drawn)
     rng, names = np.random.default_rng(method.seed), list(drawn)

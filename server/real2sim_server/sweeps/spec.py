@@ -19,25 +19,16 @@ from pydantic import (
 )
 
 from real2sim_proto.base import Identifier
+from real2sim_proto.sweeps import SpreadMethod, StopRule, with_kinds
 
 from ..console import CommandError
 from ..policies.suite import Case
 from .parameters import Name, Parameter, Value, check_derived, drawn_parameters, values_at
-from .sampling import Method, Spread, points_of
+from .sampling import Method, points_of
 from .storyboard_space import StoryboardSpace, is_scenario, with_storyboard
 
 MOST_BYTES = 1 << 20
 SHIPPED_SPACES = Path(__file__).with_name("spaces")
-
-
-class StopRule(BaseModel):
-    """When enough is known. Episodes are counted in the order of the table, whoever drives them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    at_fault: int | None = Field(default=None, ge=1, description="so many at-fault collisions")
-    collisions: int | None = Field(default=None, ge=1)
-    episodes: int | None = Field(default=None, ge=1)
 
 
 class Space(BaseModel):
@@ -99,7 +90,7 @@ class SweepSpec(Space):
         rank_by: a column.
     """
 
-    method: Method = Spread()
+    method: Method = SpreadMethod()
     seeds: list[Annotated[int, Field(ge=0, lt=2**63)]] = Field(default=[0], min_length=1)
     planners: list[Annotated[str, Field(min_length=1, max_length=400)]] = Field(
         default=["idm"], min_length=1
@@ -111,7 +102,7 @@ class SweepSpec(Space):
 
     @model_validator(mode="after")
     def _check_points(self) -> Self:
-        if isinstance(self.method, Spread) and self.method.count > 4096:
+        if isinstance(self.method, SpreadMethod) and self.method.count > 4096:
             return self  # Names cannot be wrong, and drawing them twice would take its time.
         points_of(self.method, drawn_parameters(self.parameters))
         return self
@@ -191,16 +182,7 @@ def _content(path: Path) -> dict[str, Any]:
     fields = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     if not isinstance(fields, dict):
         raise ValueError(f"its top level is a {type(fields).__name__}, no mapping")
-    # Kinds may be left out where they are plain.
-    given = fields.get("parameters")
-    for parameter in given.values() if isinstance(given, dict) else ():
-        if isinstance(parameter, dict) and "kind" not in parameter:
-            parameter["kind"] = "derived" if "expression" in parameter else "float"
-            if "values" in parameter:
-                parameter["kind"] = "choice"
-    if isinstance(method := fields.get("method"), str):
-        fields["method"] = {"kind": method}
-    return fields
+    return with_kinds(fields)
 
 
 def _put(fields: dict[str, Any], path: str, value: Value) -> None:

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from real2sim_proto.storyboard import (
     Choice,
     Distribution,
+    MapRoads,
     Normal,
     Storyboard,
     Uniform,
@@ -22,11 +23,18 @@ from real2sim_proto.storyboard import (
     ValueSet,
 )
 
+from .._files import atomic_file
 from ..console import CommandError
 from ..scenarios.errors import ScenarioError
 from ..scenarios.fit import fitted_to_scene
 from ..scenarios.gallery import corner_case
-from ..scenarios.openscenario import ReadOptions, ScenarioFile, read_openscenario
+from ..scenarios.openscenario import (
+    ReadOptions,
+    ScenarioFile,
+    read_openscenario,
+    read_openscenario_text,
+    write_openscenario,
+)
 from ..scene import Scene
 from ..scene.errors import BundleError
 from .parameters import Value
@@ -49,6 +57,7 @@ class ScenarioSource(BaseModel):
         ego: entity that is the ego; None: the one that is called so.
         leave_out: elements that are not supported and are left out.
         as_it_is: the scene's world is the file's, so that nothing is laid along the scene's route.
+        alone: nothing beside an OpenSCENARIO file is read: no catalogs, no road network.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -57,6 +66,7 @@ class ScenarioSource(BaseModel):
     ego: str | None = None
     leave_out: tuple[str, ...] = ()
     as_it_is: bool = False
+    alone: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +141,37 @@ def read_scenario(
         fields = json.loads(path.read_text(encoding="utf-8"))
         fields["parameters"] = {**fields.get("parameters", {}), **parameters}
         return ScenarioFile(Storyboard.model_validate(fields))
-    return read_openscenario(path, ReadOptions(parameters, frozenset(source.leave_out), source.ego))
+    options = ReadOptions(parameters, frozenset(source.leave_out), source.ego)
+    if source.alone:
+        return read_openscenario_text(path.read_bytes(), path.name, options)
+    return read_openscenario(path, options)
+
+
+def write_scenario_file(
+    folder: Path, name: str, read: ScenarioFile, source: ScenarioSource
+) -> ScenarioSource:
+    """Write a storyboard with the road network that it names; how it is read again.
+
+    Args:
+        folder: of the file.
+        name: of the file, without its suffix: ``.xosc``, or ``.json`` where OpenSCENARIO has no
+            words for it.
+        read: in the frame of its file.
+        source: that it was read from.
+    """
+    board = read.board
+    if isinstance(board.roads, MapRoads) and read.road_file is not None:
+        roads = f"{name}{read.road_file.suffix}"
+        with atomic_file(folder / roads) as file:
+            file.write(read.road_file.read_bytes())
+        board = board.model_copy(update={"roads": MapRoads(file=roads)})
+    try:
+        suffix, content = ".xosc", write_openscenario(board)
+    except ScenarioError:
+        suffix, content = ".json", board.model_dump_json(indent=2).encode()
+    with atomic_file(folder / f"{name}{suffix}") as file:
+        file.write(content)
+    return ScenarioSource(file=f"{name}{suffix}", ego=source.ego, as_it_is=source.as_it_is)
 
 
 def run_options(board: Storyboard, *, seed: int, seconds: float) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from real2sim.planners import load_planner, needs_of
+from real2sim_proto.sweeps import StopRule
 
 from ..console import CommandError
 from ..executors import Executor
@@ -21,11 +22,13 @@ from .parameters import Choice, IntRange, Value, drawn_parameters, values_at
 from .pictures import CameraFeed
 from .sampling import points_of
 from .scenes import open_scene
-from .spec import StopRule, SweepSpec
+from .spec import SweepSpec
+from .storyboard_space import write_scenario_file
 from .table import write_table
 from .worker import COLUMNS, Row, recipe_of
 
-JOURNAL, TABLE, RECORDINGS = "episodes.journal", "episodes.parquet", "recordings"
+JOURNAL, TABLE = "episodes.journal", "episodes.parquet"
+RECORDINGS, SCENARIOS = "recordings", "scenarios"
 AT_ONCE = 64
 """With a stop rule, so many episodes are handed out before it is asked again."""
 
@@ -74,13 +77,13 @@ def run_sweep(
 
     Args:
         spec: what is driven.
-        out: folder of ``episodes.parquet``, ``recordings/`` and the journal.
+        out: folder of ``episodes.parquet``, ``recordings/``, ``scenarios/`` and the journal.
         executor: who drives.
         scenes: folder of bundles; every worker finds it at the same path.
         on_progress: called with (stage, done, all).
 
     Returns:
-        Figures: episodes, those that were driven now, collisions, at-fault ones.
+        Figures: episodes, those that were driven now, collisions, at-fault ones; keys of the worst.
 
     Raises:
         CommandError: no such scene, planner, score or column.
@@ -112,9 +115,12 @@ def run_sweep(
     episodes = planned if stop is None else planned[:stop]
     rows = [e.columns() | journal.rows[e.key] for e in episodes]
     write_table(out / TABLE, rows, column_types(spec))
-    worst = _worst([e.drive for e in episodes], rows, spec)
-    for done, (key, drive) in enumerate(worst, start=1):
-        _record(scene, drive, out / RECORDINGS / f"{key}.r2e")
+    worst = _worst(episodes, rows, spec)
+    for done, episode in enumerate(worst, start=1):
+        _record(scene, episode.drive, out / RECORDINGS / f"{episode.key}.r2e")
+        if spec.storyboard is not None:
+            read = spec.storyboard.read(episode.values)
+            write_scenario_file(_made(out / SCENARIOS), episode.key, read, spec.storyboard.source)
         on_progress("recordings", done, len(worst))
     return {
         "episodes": len(rows),
@@ -122,6 +128,7 @@ def run_sweep(
         "collisions": sum(bool(r["collisions"]) for r in rows),
         "at fault": sum(bool(r["at_fault"]) for r in rows),
         "errors": sum(r["error"] is not None for r in rows),
+        "worst": [episode.key for episode in worst],
         "table": str(out / TABLE),
     }
 
@@ -207,15 +214,17 @@ def _enough(planned: list[PlannedEpisode], rows: Mapping[str, Row], stop: StopRu
     return None
 
 
-def _worst(drives: list[Drive], rows: list[Row], spec: SweepSpec) -> list[tuple[str, Drive]]:
-    """Keys and episodes of the highest in the column that ranks them."""
+def _worst(
+    episodes: list[PlannedEpisode], rows: list[Row], spec: SweepSpec
+) -> list[PlannedEpisode]:
+    """The highest in the column that ranks them."""
 
     def rank(k: int) -> tuple[float, int]:
         value = rows[k].get(spec.rank_by)
         return (math.inf if value is None or isinstance(value, str) else -float(value), k)
 
     ranked = sorted((k for k in range(len(rows)) if rows[k]["error"] is None), key=rank)
-    return [(rows[k]["episode"], drives[k]) for k in ranked[: spec.worst]]
+    return [episodes[k] for k in ranked[: spec.worst]]
 
 
 def _record(scene: Scene, drive: Drive, path: Path) -> None:
@@ -223,3 +232,8 @@ def _record(scene: Scene, drive: Drive, path: Path) -> None:
     if not path.exists():
         driven = drive_episode(scene, drive, load_planner(drive.planner), keep_entries=True)
         save_recording(recording_of(scene, driven), path)
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -18,6 +18,8 @@ from .mesh import Mesh, MeshBuilder
 
 PROFILE_SAMPLES = 96
 """Samples of the roof line that the body's surface looks up."""
+CARGO_FLOOR = 1.0
+"""Height of the box behind a cab over the ground [m]."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +246,7 @@ def _add_cargo(builder: MeshBuilder, shape: VehicleShape, black: int) -> None:
     rear, front = (x * length for x in shape.cargo)
     white = builder.mix(0.72, 0.72, 0.7)
     stripe = builder.mix(0.1, 0.22, 0.45)
-    floor = 1.0
+    floor = CARGO_FLOOR
     half = width / 2
     builder.box([rear, -half, floor], [front, half, height], PLAIN, white)
     for y in (-half - 0.001, half + 0.001):

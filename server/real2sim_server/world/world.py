@@ -61,6 +61,8 @@ from .scoring import Instant, MetricAccumulator, Score
 from .seam import Seam
 from .storyboard.begin import begin_storyboard
 from .storyboard.run import StoryboardRun
+from .storyboard.shown_signal import ShownSignal
+from .strides import Strides
 from .traffic import ObservedEgo, Surroundings, Traffic
 from .traffic.spawner import begin_spawner
 
@@ -96,6 +98,7 @@ class World:
         drawn: what the seed has drawn for the start and for objects so far, by name.
         ranging: LiDARs and radars of the episode.
         wake: the way that all has come, as far back as a sweep looks.
+        strides: of people who are not where their trajectories lead.
     """
 
     def __init__(
@@ -127,6 +130,7 @@ class World:
         self._clock = episode_clock(scene, spec)
         self.ranging = mounted_sensors(spec.lidars, spec.radars, spec.dt_us)
         self.wake = Wake.of(self.ranging.longest_us)
+        self.strides = Strides()
         self.t_us = self._clock.at(self.steps)
         # Until then the ego moves as recorded.
         self._warm_up_end_us = self._clock.start_us + spec.warmup_us
@@ -258,6 +262,9 @@ class World:
         since_us, body = self.t_us, self.T_world_body
         moved = self._advance(controller)
         self._commit_motion(moved)
+        self.strides = self.strides.after(
+            self.scene, self.agents, since_us=since_us, t_us=self.t_us
+        )
         ways = (body, self.T_world_body), (start.agents, self.agents)
         self.wake = self.wake.after(StepWay(since_us, self.t_us, *ways))
         self._step_drawn = _newly_drawn(self.traffic.drawn, drawn_before, jitter_us)
@@ -367,9 +374,12 @@ class World:
             lap=self.lap,
             drawn=self._step_drawn,
             truth=truth,
-            signals=() if self.storyboard is None else self.storyboard.signals(),
+            signals=self._signals(),
             lanes=self._lanes_around(motion),
         )
+
+    def _signals(self) -> tuple[ShownSignal, ...]:
+        return () if self.storyboard is None else self.storyboard.signals()
 
     def _lanes_around(self, motion: Motion) -> tuple[LanePiece, ...]:
         lanes = self.scene.lanes if self.spec.privileged else None
@@ -386,7 +396,8 @@ class World:
     def instances(self) -> list[Instance]:
         """What the renderer draws at this instant; nothing is copied."""
         shown_us = min(self.t_us, self.scene.end_us)
-        drawn = compose(self.scene, self.state, self.agents, shown_us)
+        strides = self.strides.made
+        drawn = compose(self.scene, self.state, self.agents, shown_us, strides=strides)
         if self.deformation is not None:
             # Background first, then the objects, then shadows.
             for k, subject in enumerate(self.agents.objects, start=1):
@@ -697,6 +708,7 @@ class World:
             secondary=contacts.secondary,
             plan=plan,
             seam=seam,
+            signals=self._signals(),
         )
 
 

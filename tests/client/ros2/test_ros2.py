@@ -272,6 +272,13 @@ def test_in_real_time_the_newest_command_holds_and_none_is_a_stop():
     assert [plan.acceleration for plan in session.plans[2:]] == [4.0, 4.0]
 
 
+def test_commands_are_heard_by_a_simulation_that_cannot_keep_up_with_real_time():
+    session, node = PlayedSession(), PlayedNode(lambda _k: ackermann(9.0), spins=10_000)
+    Ros2Bridge(session, node, real_time=1e9).run()
+
+    assert [plan.acceleration for plan in session.plans] == [4.0] * 4
+
+
 def test_a_command_that_is_none_is_reported_and_the_next_one_awaited():
     said: list[str] = []
     session, node = PlayedSession(last=1), PlayedNode(lambda _k: path("odom"), spins=3)

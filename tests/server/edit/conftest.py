@@ -72,5 +72,7 @@ def state(summary: SimpleNamespace) -> ScenarioState:
 @pytest.fixture(scope="session")
 def state_with_assets(summary: SimpleNamespace) -> ScenarioState:
     """The same, beside a library that holds a van."""
-    van = SimpleNamespace(asset_id="van", category="truck", size=(5.0, 2.1, 2.0), gaussians=7)
+    van = SimpleNamespace(
+        asset_id="van", category="truck", size=(5.0, 2.1, 2.0), gaussians=7, figure=None
+    )
     return ScenarioState.of(summary, assets={"van": van}.get)

@@ -22,6 +22,7 @@ from real2sim_proto.operations import (
     Retime,
     Rotate,
     Scale,
+    SetGait,
     SetPhysics,
     SetPose,
     SetStoryboard,
@@ -88,8 +89,8 @@ def examples(state: ScenarioState) -> list[Any]:
     ]
 
 
-NEEDS_MORE = {Restore, Insert, Spawn}
-"""A deleted object, an asset library, a driver: tested with what they need elsewhere."""
+NEEDS_MORE = {Restore, Insert, Spawn, SetGait}
+"""A deleted object, an asset library, a driver, a person: tested with what they need elsewhere."""
 
 
 @pytest.fixture

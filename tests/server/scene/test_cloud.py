@@ -164,3 +164,21 @@ def test_uncertainties_out_of_range_are_found(make_cloud, value):
     bad = replace(make_cloud(4), uncertainties=torch.tensor([0, 0, 1, value]))
     with pytest.raises(SceneError, match="1 of 4 values: uncertainties"):
         bad.check_values("x")
+
+
+def test_a_stretched_cloud_has_stretched_covariances(make_cloud):
+    cloud, factors = make_cloud(40), (1.5, 0.5, 2.0)
+    found = cloud.stretched(factors)
+    by = np.diag(factors)
+
+    def covariances(given):
+        axes = quaternion_to_matrix(given.quats.numpy()) * given.scales.numpy()[:, None, :]
+        return axes @ axes.transpose(0, 2, 1)
+
+    np.testing.assert_allclose(
+        covariances(found), by @ covariances(cloud) @ by, rtol=1e-3, atol=1e-7
+    )
+    np.testing.assert_allclose(found.means, cloud.means.numpy() * factors, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(found.quats, axis=1), 1, atol=1e-6)
+    with pytest.raises(SceneError, match="positive"):
+        cloud.stretched((1.0, 0.0, 1.0))

@@ -35,7 +35,8 @@ from real2sim._async import jobs as async_jobs
 from real2sim._async import scenarios as async_scenarios
 from real2sim._async import scenes as async_scenes
 from real2sim._async import sessions as async_sessions
-from real2sim._sync import assets, jobs, scenarios, scenes, sessions
+from real2sim._async import sweeps as async_sweeps
+from real2sim._sync import assets, jobs, scenarios, scenes, sessions, sweeps
 from real2sim_server.scene.io import save_scene, write_splats
 from real2sim_server.service.serve import RunningWorker, running_worker
 from real2sim_server.settings import Settings
@@ -54,6 +55,7 @@ SDK_CLASSES: tuple[type, ...] = (
     jobs.Jobs,
     jobs.Job,
     sessions.Sessions,
+    sweeps.Sweeps,
     real2sim.DriveSession,
     real2sim.DriveBatch,
     real2sim.AsyncClient,
@@ -65,6 +67,7 @@ SDK_CLASSES: tuple[type, ...] = (
     async_jobs.AsyncJobs,
     async_jobs.AsyncJob,
     async_sessions.AsyncSessions,
+    async_sweeps.AsyncSweeps,
     real2sim.AsyncDriveSession,
     real2sim.AsyncDriveBatch,
     real2sim.Image,

@@ -11,6 +11,9 @@ from collections.abc import Callable
 import pytest
 from fastapi.testclient import TestClient
 
+from real2sim_server.service.token_file import TokenLimits, add_token
+
+from .test_accounts import bearer
 from .test_trouble import Site, wait_until
 
 LEASE_S = 0.4
@@ -134,6 +137,29 @@ def test_a_session_that_is_over_is_over_everywhere(start):
     site = Site(start("w0"))
     assert site.client.delete(site.session, headers=site.token).status_code == 204
     assert by(start("w1"), site).step().json()["code"] == "SESSION_CLOSED"
+
+
+def test_sessions_and_jobs_of_a_token_are_limited_over_all_workers(start, tmp_path):
+    tokens = tmp_path / "tokens.json"
+    held = bearer(add_token(tokens, "alice", TokenLimits(sessions=2, jobs=1)))
+    one, other = (start(name, tokens_file=tokens) for name in ("w0", "w1"))
+    for client in (one, other):
+        made = client.post("/v1/sessions?scene=tiny", json={}, headers=held)
+        assert made.status_code == 201, made.text
+    slow = {"scene": "tiny", "camera": "front", "fps": 60, "width": 320}
+    assert one.post("/v1/exports", json=slow, headers=held).status_code == 202
+    time.sleep(1.5 * LEASE_S)
+    for client in (one, other):
+        refused = client.post("/v1/sessions?scene=tiny", json={}, headers=held)
+        assert (refused.status_code, refused.json()["code"]) == (429, "TOO_MANY_SESSIONS")
+        assert "2 sessions are open" in refused.json()["detail"]
+    refused = other.post("/v1/exports", json=slow, headers=held)
+    assert (refused.status_code, refused.json()["code"]) == (429, "TOO_MANY_JOBS")
+    url = f"/v1/sessions/{made.json()['session_id']}"
+    assert other.delete(url, headers=held).status_code == 204
+    wait_until(
+        lambda: one.post("/v1/sessions?scene=tiny", json={}, headers=held).status_code == 201
+    )
 
 
 def test_any_worker_tells_of_all(start, run_worker):

@@ -22,7 +22,7 @@ from real2sim_server.render.cast.warm_up import warm_up_casting
 from real2sim_server.scene.io import save_scene
 
 from ..worker_processes import KillableWorker
-from .haproxy import running_haproxy
+from .haproxy import free_port, running_haproxy
 from .sessions.test_resume import FAN, SENSORS, hashed, plan
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -30,6 +30,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 WORKERS = ("w0", "w1", "w2")
 SESSIONS, EPISODES, STEPS = 6, 3, 18
 KILLS = int(os.environ.get("REAL2SIM_TEST_KILLS", "3"))
+RESTARTED_EPISODES = int(os.environ.get("REAL2SIM_TEST_EPISODES", "36"))
 
 
 class Fleet:
@@ -69,9 +70,15 @@ def fleet(tmp_path_factory, tiny_scene, postgres) -> Iterator[Fleet]:
     store_url = postgres.new_database()
     warm_up_casting()
     with ExitStack() as stack:
-        workers = {}
+        workers, agents = {}, {}
         for name in WORKERS:
-            settings = {"REAL2SIM_STORE_URL": store_url, "REAL2SIM_WORKER_ID": name}
+            agents[name] = free_port()
+            settings = {
+                "REAL2SIM_STORE_URL": store_url,
+                "REAL2SIM_WORKER_ID": name,
+                "REAL2SIM_AGENT_PORT": str(agents[name]),
+                "REAL2SIM_DRAIN_SECONDS": "1.5",
+            }
             workers[name] = KillableWorker(
                 scenes=root / "scenes",
                 data=root / name,
@@ -83,7 +90,7 @@ def fleet(tmp_path_factory, tiny_scene, postgres) -> Iterator[Fleet]:
         for worker in workers.values():
             worker.wait_listening()
         ports = {name: worker.port for name, worker in workers.items()}
-        url = stack.enter_context(running_haproxy(root, ports))
+        url = stack.enter_context(running_haproxy(root, ports, agents))
         with real2sim.connect(url) as client:
             client.wait_ready(240)
         yield Fleet(url, store_url, workers)
@@ -144,3 +151,37 @@ def test_a_worker_that_was_stopped_for_ten_seconds_is_fenced_off(fleet, undistur
         assert [d.result() for d in drives] == undisturbed
         waking.join()
     assert fleet.logs_are_whole()
+
+
+@pytest.mark.timeout(3600)
+def test_a_rolling_restart_is_seen_by_no_planner(fleet, undisturbed):
+    """Workers are stopped in order and started again, one after the other, for as long as there is
+    driving; every drive is as if nothing had happened, and no error reaches its planner."""
+    over, restarted = threading.Event(), []
+
+    def restart_in_turn() -> None:
+        while not over.is_set():
+            name = WORKERS[len(restarted) % len(WORKERS)]
+            fleet.workers[name].stop(60)
+            fleet.workers[name].start()
+            fleet.workers[name].wait_ready(120)
+            restarted.append(name)
+
+    fleet.gaps.clear()
+    episodes = 0
+    with ThreadPoolExecutor(1) as operator, ThreadPoolExecutor(SESSIONS) as drivers:
+        restarting = operator.submit(restart_in_turn)
+        try:
+            while episodes < RESTARTED_EPISODES or len(restarted) < len(WORKERS):
+                drives = [drivers.submit(drive, fleet, seed) for seed in range(SESSIONS)]
+                assert [d.result() for d in drives] == undisturbed
+                episodes += SESSIONS * EPISODES
+        finally:
+            over.set()
+        restarting.result()
+    assert fleet.logs_are_whole()
+    p99 = float(np.percentile(fleet.gaps, 99))
+    print(
+        f"{len(restarted)} restarts under {episodes} episodes: longest step "
+        f"{max(fleet.gaps):.2f} s, p99 {p99:.2f} s"
+    )

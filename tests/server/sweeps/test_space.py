@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from real2sim_proto.sweeps import GridMethod, ImportanceBump, ImportanceMethod, SpreadMethod
 from real2sim_server.console import CommandError
 from real2sim_server.sweeps.expression import evaluate, names_in
 from real2sim_server.sweeps.parameters import Choice, FloatRange, IntRange, Normal, values_at
-from real2sim_server.sweeps.sampling import Bump, Grid, Importance, Spread, points_of
+from real2sim_server.sweeps.sampling import points_of
 from real2sim_server.sweeps.spec import Space, load_space, load_sweep
 
 units = st.floats(0.0, 1.0)
@@ -148,7 +149,7 @@ DRAWN = {
 
 
 def test_a_grid_has_every_combination_once():
-    points, weights = points_of(Grid(kind="grid", levels={"a": 3}), DRAWN)
+    points, weights = points_of(GridMethod(kind="grid", levels={"a": 3}), DRAWN)
     found = {tuple(values_at(DRAWN, p).values()) for p in points}
     assert found == {(a, b, c) for a in (0.0, 0.5, 1.0) for b in (1, 2, 3) for c in "xy"}
     assert len(points) == 18
@@ -157,8 +158,8 @@ def test_a_grid_has_every_combination_once():
 
 @pytest.mark.parametrize("kind", ["random", "latin_hypercube", "sobol", "halton"])
 def test_the_same_seed_gives_the_same_points(kind):
-    one, again = (points_of(Spread(kind=kind, count=10, seed=4), DRAWN)[0] for _ in range(2))
-    other, _ = points_of(Spread(kind=kind, count=10, seed=5), DRAWN)
+    one, again = (points_of(SpreadMethod(kind=kind, count=10, seed=4), DRAWN)[0] for _ in range(2))
+    other, _ = points_of(SpreadMethod(kind=kind, count=10, seed=5), DRAWN)
     np.testing.assert_array_equal(one, again)
     assert (one != other).any()
     assert one.shape == (10, 3)
@@ -166,12 +167,12 @@ def test_the_same_seed_gives_the_same_points(kind):
 
 @pytest.mark.parametrize("kind", ["sobol", "halton", "random"])
 def test_more_points_go_on_from_those_before(kind):
-    few, many = (points_of(Spread(kind=kind, count=n), DRAWN)[0] for n in (6, 20))
+    few, many = (points_of(SpreadMethod(kind=kind, count=n), DRAWN)[0] for n in (6, 20))
     np.testing.assert_array_equal(many[:6], few)
 
 
 def test_a_latin_hypercube_has_one_point_in_every_slice():
-    points, _ = points_of(Spread(kind="latin_hypercube", count=20), DRAWN)
+    points, _ = points_of(SpreadMethod(kind="latin_hypercube", count=20), DRAWN)
     for column in points.T:
         assert sorted((column * 20).astype(int)) == list(range(20))
 
@@ -179,8 +180,8 @@ def test_a_latin_hypercube_has_one_point_in_every_slice():
 def test_weights_of_importance_sampling_take_it_back():
     """The probability of a corner is found from points drawn near it."""
     drawn = {"a": FloatRange(low=0, high=1), "b": FloatRange(low=0, high=1)}
-    bumps = {"a": Bump(mean=0.98, std=0.05), "b": Bump(mean=0.98, std=0.05)}
-    method = Importance(kind="importance", count=20_000, towards=bumps)
+    bumps = {"a": ImportanceBump(mean=0.98, std=0.05), "b": ImportanceBump(mean=0.98, std=0.05)}
+    method = ImportanceMethod(kind="importance", count=20_000, towards=bumps)
     points, weights = points_of(method, drawn)
     inside = (points > 0.95).all(axis=1)
     assert inside.mean() > 0.1

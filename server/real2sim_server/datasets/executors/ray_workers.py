@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from ... import executors
+from ..._files import unpack_tar
 from ..errors import DatasetError
 from ..plan import ExportPlan, PlannedClip
 from .maker import ArchiveMaker, Recipe
@@ -69,5 +70,5 @@ def _unpack(archive: bytes, folder: Path) -> None:
     shutil.rmtree(partial_folder, ignore_errors=True)
     partial_folder.mkdir(parents=True)
     with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
-        tar.extractall(partial_folder, filter="data")
+        unpack_tar(tar, partial_folder, members=tar)
     partial_folder.rename(folder)

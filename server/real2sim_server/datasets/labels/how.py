@@ -25,6 +25,8 @@ HOW = {
     "lidar": "rendered: returns of the LiDAR through the scene's Gaussians, everything where it "
     "is at each ray's instant; the ego's motion is taken out; instance of the Gaussian that takes "
     "half of the ray's light, class by category, the ground by geometry",
+    "keypoints": "body: COCO's 17 keypoints of people who are walking bodies, in the world, exact; "
+    "in images hidden where nothing of the person is rendered within 0.2 m before them",
     "track": "box: poses of the object at the instants before and after",
     "detections": "box: boxes of the drive, moved, missed and made up as a detector might",
     "ego_future": "box: poses of the ego at the instants after, in the ego's frame",

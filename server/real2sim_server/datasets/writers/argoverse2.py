@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pyarrow import feather
 
 from ...geometry.rotation import Float, matrix_to_quaternion
@@ -21,6 +22,7 @@ from ...logs.readers.argoverse2 import AXLE_HEIGHT
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip
+from ..labels.points import points_in_boxes
 from .nuscenes import FRONT, channels_of
 from .writer import LabelledDrive
 
@@ -106,29 +108,44 @@ def _write_poses(path: Path, clip: Clip) -> None:
 
 def _write_annotations(path: Path, drive: LabelledDrive, clip: Clip) -> None:
     rows = [(frame["t_us"], subject) for frame in clip.frames for subject in frame["objects"]]
-    poses = np.array([subject["T_ego_object"] for _, subject in rows]).reshape(-1, 4, 4)
+    poses = _shift(-AXLE_HEIGHT) @ _poses_of([subject for _, subject in rows])
     tracks = {
         subject["object_id"]: str(uuid.UUID(drive.token("track", clip.name, subject["object_id"])))
         for _, subject in rows
     }
+    counts = [count for frame in clip.frames for count in _counts(clip, frame)]
     columns = {
         "timestamp_ns": [t_us * 1000 for t_us, _ in rows],
         "track_uuid": pa.array([tracks[s["object_id"]] for _, s in rows], pa.string()),
         "category": pa.array([_category(s["category"]) for _, s in rows], pa.string()),
         **{name: [float(s["size"][k]) for _, s in rows] for k, name in enumerate(SIZE)},
-        **_pose_columns(_shift(-AXLE_HEIGHT) @ poses),
-        "num_interior_pts": pa.array([s["points"] for _, s in rows], pa.int64()),
+        **_pose_columns(poses),
+        "num_interior_pts": pa.array(counts, pa.int64()),
     }
     _write(path, columns)
 
 
-def _write_sweep(path: Path, clip: Clip, frame: int) -> None:
-    rows = clip.points(frame)
-    points = rows["xyz"].astype(np.float64)
+def _counts(clip: Clip, frame: Mapping[str, Any]) -> list[int]:
+    """Points in each box of a frame as the sweep has them: rounding moves some across a face."""
+    subjects = frame["objects"]
+    poses = _shift(-AXLE_HEIGHT) @ _poses_of(subjects)
+    return points_in_boxes(_xyz(clip, frame["index"]), poses, [s["size"] for s in subjects])
+
+
+def _poses_of(subjects: Sequence[Mapping[str, Any]]) -> Float:
+    return np.array([subject["T_ego_object"] for subject in subjects]).reshape(-1, 4, 4)
+
+
+def _xyz(clip: Clip, frame: int) -> NDArray[np.float32]:
+    """Points [N, 3] of a sweep in the frame of the rear axle [m]."""
+    points = clip.points(frame)["xyz"].astype(np.float64)
     points[:, 2] -= AXLE_HEIGHT
-    columns: dict[str, Any] = {
-        name: points[:, k].astype(np.float32) for k, name in enumerate("xyz")
-    }
+    return points.astype(np.float32)
+
+
+def _write_sweep(path: Path, clip: Clip, frame: int) -> None:
+    rows, points = clip.points(frame), _xyz(clip, frame)
+    columns: dict[str, Any] = {name: points[:, k].copy() for k, name in enumerate("xyz")}
     columns["intensity"] = np.rint(rows["intensity"] * 255).astype(np.uint8)
     columns["laser_number"] = rows["beam"].copy()
     columns["offset_ns"] = rows["time_us"] * np.int32(1000)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.semantics import SEMANTIC_CLASSES, UNLABELED
 
+from ...body.model import KEYPOINTS
 from ...render import encode_image
 from ..labels.views import without_blobs
 from .writer import LabelledDrive, categories_of, objects_of, write_json
@@ -27,13 +28,27 @@ SEGMENTS_OF_A_CATEGORY = 1000
 """A panoptic id is the category's times this, plus the number of the object."""
 
 QUALITY = 95
+PERSON = {
+    "id": 1,
+    "name": "person",
+    "supercategory": "person",
+    "keypoints": list(KEYPOINTS),
+    # Pairs of keypoints, counted from 1, as COCO draws them.
+    "skeleton": [
+        [16, 14], [14, 12], [17, 15], [15, 13], [12, 13], [6, 12], [7, 13], [6, 7], [6, 8], [7, 9],
+        [8, 10], [9, 11], [2, 3], [1, 2], [1, 3], [2, 4], [3, 5], [4, 6], [5, 7],
+    ],
+}  # fmt: skip
 
 
 class CocoWriter:
     """Writes images by split, ``annotations/instances_*.json`` and ``panoptic_*``."""
 
     name = "coco"
-    holds = "instances_<split>.json (boxes, RLE masks, tracks) and panoptic_<split>.json with png"
+    holds = (
+        "instances_<split>.json (boxes, RLE masks, tracks), panoptic_<split>.json with png and, "
+        "where people are walking bodies, person_keypoints_<split>.json"
+    )
 
     def write(self, drive: LabelledDrive, folder: Path) -> None:
         """See :class:`DatasetWriter`. Raises OSError."""
@@ -74,6 +89,7 @@ class _Split:
         self.name = name
         self.images: list[dict[str, Any]] = []
         self.annotations: list[dict[str, Any]] = []
+        self.keypoints: dict[int, list[tuple[float, float, int]]] = {}
         self.panoptic: list[dict[str, Any]] = []
 
     def add_image(
@@ -104,6 +120,8 @@ class _Split:
         for view in frame["views"][camera]:
             if view["box_2d_modal"] is None:
                 continue
+            if "keypoints_2d" in view:
+                self.keypoints[len(self.annotations) + 1] = view["keypoints_2d"]
             left, top, right, bottom = view["box_2d_modal"]
             mask = without_blobs(instance == view["instance_id"])
             self.annotations.append(
@@ -170,6 +188,11 @@ class _Split:
             folder / "annotations" / f"instances_{self.name}.json",
             {**common, "annotations": self.annotations, "categories": objects},
         )
+        if self.keypoints:
+            write_json(
+                folder / "annotations" / f"person_keypoints_{self.name}.json",
+                {**common, "annotations": self._people(), "categories": [PERSON]},
+            )
         stuff = [
             {"id": STUFF_FROM + number, "name": name, "isthing": 0, "supercategory": "background"}
             for name, number in SEMANTIC_CLASSES.items()
@@ -183,6 +206,18 @@ class _Split:
                 "categories": [{**o, "isthing": 1} for o in objects] + stuff,
             },
         )
+
+    def _people(self) -> list[dict[str, Any]]:
+        """The annotations of people whose keypoints are known, with these."""
+        found = []
+        for row in self.annotations:
+            points = self.keypoints.get(row["id"])
+            if points is not None:
+                flat = [number for point in points for number in point]
+                known = sum(flag > 0 for *_, flag in points)
+                person = {"category_id": PERSON["id"], "keypoints": flat, "num_keypoints": known}
+                found.append({**row, **person})
+        return found
 
 
 def _from_corners(box: Sequence[float]) -> list[float]:

@@ -39,8 +39,14 @@ CATEGORIES = {
     "motorcyclist": "vehicle.motorcycle",
     "motorcycle": "vehicle.motorcycle",
     "bicycle": "vehicle.bicycle",
+    "animal": "animal",
+    "barrier": "movable_object.barrier",
+    "cone": "movable_object.trafficcone",
+    "debris": "movable_object.debris",
 }
-"""nuScenes' category by ours; all others are ``movable_object.<category>``."""
+"""nuScenes' category by ours."""
+OTHER = "static.other"
+"""All others: the devkit opens no data set with classes of points that it has no colour for."""
 
 LEVELS = ("v0-40", "v40-60", "v60-80", "v80-100")
 BOUNDS = (0.4, 0.6, 0.8)
@@ -320,7 +326,7 @@ def _npz(labels: NDArray[np.uint16]) -> bytes:
 
 
 def _category(category: str) -> str:
-    return CATEGORIES.get(category, f"movable_object.{category}")
+    return CATEGORIES.get(category, OTHER)
 
 
 def _key_frames(clip: Clip) -> list[int]:

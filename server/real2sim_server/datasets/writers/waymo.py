@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from real2sim_proto.semantics import SEMANTIC_CLASSES
 
@@ -58,6 +59,8 @@ POINT_CLASS = "[LiDARSegmentationLabelComponent].range_image_return"
 GLOBAL_SHUTTER = 5
 COLUMNS = 4096
 """Of range images: finer than those of any LiDAR of the catalogue, so that no cell has two."""
+LEVEL_1, LEVEL_2, FEW_POINTS = 1, 2, 5
+"""A box with this few points or fewer is hard, as in the data set's own evaluation."""
 DIVISOR = 1000
 QUALITY = 95
 POINT_CLASSES = {"car": 1, "truck": 2, "bus": 3, "trailer": 4, "train": 4, "person": 7, "rider": 6}
@@ -85,9 +88,13 @@ class WaymoWriter:
             with _Components(root, segment) as files:
                 beams = _inclinations(drive, clip)
                 _write_calibrations(files, drive, numbers, beams)
+                covered = _cameras_covered(drive.cameras)
                 for frame in clip.frames:
                     start_us = frame["t_us"] - drive.period_us // 2
-                    _write_frame(files, drive, clip, frame, start_us, numbers=numbers)
+                    _write_boxes(files, clip, frame, start_us)
+                    _write_frame(
+                        files, drive, clip, frame, start_us, numbers=numbers, covered=covered
+                    )
                     _write_sweep(files, drive, clip, frame, start_us, beams=beams)
 
 
@@ -177,10 +184,11 @@ def _write_frame(
     start_us: int,
     *,
     numbers: Mapping[str, int],
+    covered: Mapping[str, bytes],
 ) -> None:
+    velocity = _velocity(clip, frame)
     pose, seconds = _matrices(np.array(frame["T_world_ego"])[None]), [frame["t_us"] * 1e-6]
     files.add("vehicle_pose", {TIME: pa.array([start_us], pa.int64()), POSE: pose})
-    _write_boxes(files, frame, start_us)
     shutter = f"{IMAGE}.rolling_shutter_params"
     for camera in sorted(drive.cameras, key=lambda camera: numbers[camera.name]):
         rgb = clip.pixels("rgb", camera.name, frame["index"])
@@ -191,6 +199,7 @@ def _write_frame(
         image = {
             f"{IMAGE}.image": [encode_image(rgb, "rgb", "jpeg", quality=QUALITY).data],
             f"{IMAGE}.pose.transform": pose,
+            **velocity,
             f"{IMAGE}.pose_timestamp": seconds,
             f"{shutter}.shutter": [0.0],
             f"{shutter}.camera_trigger_time": seconds,
@@ -198,10 +207,58 @@ def _write_frame(
         }
         files.add("camera_image", {**key, **image})
         _write_camera_boxes(files, frame, camera.name, numbers[camera.name], start_us)
-        files.add("camera_segmentation", {**key, **_panoptic(clip, camera.name, frame)})
+        covers = {f"{PANOPTIC}.num_cameras_covered": [covered[camera.name]]}
+        files.add("camera_segmentation", {**key, **_panoptic(clip, camera.name, frame), **covers})
 
 
-def _write_boxes(files: _Components, frame: Mapping[str, Any], start_us: int) -> None:
+def _velocity(clip: Clip, frame: Mapping[str, Any]) -> dict[str, Any]:
+    """Of the vehicle along and about the world's axes, from the frames before and after."""
+    before, after, seconds = _around(clip, frame)
+    poses = np.array([before["T_world_ego"], after["T_world_ego"]])
+    moved = poses[1, :3, 3] - poses[0, :3, 3]
+    turned = Rotation.from_matrix(poses[1, :3, :3] @ poses[0, :3, :3].T).as_rotvec()
+    rows = (("linear", moved / seconds, pa.float32()), ("angular", turned / seconds, pa.float64()))
+    return {
+        f"{IMAGE}.velocity.{kind}_velocity.{axis}": pa.array([float(row[k])], type_)
+        for kind, row, type_ in rows
+        for k, axis in enumerate("xyz")
+    }
+
+
+def _around(clip: Clip, frame: Mapping[str, Any]) -> tuple[Any, Any, float]:
+    """The frames before and after one, or itself at an end of the clip, and what lies between [s];
+    where it is the only one, itself twice and 1."""
+    place = next(k for k, other in enumerate(clip.frames) if other["index"] == frame["index"])
+    before = clip.frames[max(place - 1, 0)]
+    after = clip.frames[min(place + 1, len(clip.frames) - 1)]
+    return before, after, (after["t_us"] - before["t_us"]) * 1e-6 or 1.0
+
+
+def _cameras_covered(cameras: Sequence[Camera]) -> dict[str, bytes]:
+    """By camera a png that says how many cameras see each of its pixels, far away."""
+    covered = {}
+    for camera in cameras:
+        directions = _directions(camera)
+        count = np.zeros((camera.height, camera.width), np.uint8)
+        for other in cameras:
+            seen = directions @ other.T_vehicle_camera[:3, :3]
+            x, y, w = np.moveaxis(seen @ other.K.T, -1, 0)
+            ahead = seen[..., 2] > 0
+            u, v = (np.divide(part, w, out=np.full_like(w, -1.0), where=ahead) for part in (x, y))
+            count += (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height) & ahead
+        covered[camera.name] = bytes(cv2.imencode(".png", count)[1])
+    return covered
+
+
+def _directions(camera: Camera) -> Float:
+    """[H, W, 3] of the rays through centres of pixels, frame of the vehicle."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
+    directions: Float = rays @ camera.T_vehicle_camera[:3, :3].T
+    return directions
+
+
+def _write_boxes(files: _Components, clip: Clip, frame: Mapping[str, Any], start_us: int) -> None:
     objects = frame["objects"]
     poses = np.array([subject["T_ego_object"] for subject in objects]).reshape(-1, 4, 4)
     vectors = {
@@ -209,9 +266,11 @@ def _write_boxes(files: _Components, frame: Mapping[str, Any], start_us: int) ->
         "box.size": np.array([subject["size"] for subject in objects]).reshape(-1, 3),
         # Along the world's axes, as Waymo's speeds.
         "speed": np.array([subject["velocity"] for subject in objects]).reshape(-1, 3),
+        "acceleration": _accelerations(clip, frame),
     }
     headings = quaternion_yaw(matrix_to_quaternion(poses[:, :3, :3])) if len(poses) else np.zeros(0)
-    counts = pa.array([subject["points"] for subject in objects], pa.int64())
+    counts = [subject["points"] for subject in objects]
+    level = pa.array([LEVEL_2 if n <= FEW_POINTS else LEVEL_1 for n in counts], pa.int8())
     files.add(
         "lidar_box",
         {
@@ -224,10 +283,27 @@ def _write_boxes(files: _Components, frame: Mapping[str, Any], start_us: int) ->
             },
             f"{BOX}.box.heading": pa.array(headings, pa.float64()),
             f"{BOX}.type": pa.array([box_type(s["category"]) for s in objects], pa.int8()),
-            f"{BOX}.num_lidar_points_in_box": counts,
-            f"{BOX}.num_top_lidar_points_in_box": counts,
+            f"{BOX}.num_lidar_points_in_box": pa.array(counts, pa.int64()),
+            f"{BOX}.num_top_lidar_points_in_box": pa.array(counts, pa.int64()),
+            f"{BOX}.difficulty_level.detection": level,
+            f"{BOX}.difficulty_level.tracking": level,
         },
     )
+
+
+def _accelerations(clip: Clip, frame: Mapping[str, Any]) -> Float:
+    """[K, 3] of a frame's objects along the world's axes, from the frames before and after."""
+    before, after, seconds = _around(clip, frame)
+    earlier, later = objects_of(before), objects_of(after)
+    rows = np.zeros((len(frame["objects"]), 3))
+    for k, subject in enumerate(frame["objects"]):
+        own = subject["object_id"]
+        # Who is there in one of them alone has half the time, between that one and now.
+        one, other = earlier.get(own, subject), later.get(own, subject)
+        share = 1.0 if own in earlier and own in later else 0.5
+        change = np.array(other["velocity"]) - np.array(one["velocity"])
+        rows[k] = change / (seconds * share)
+    return rows
 
 
 def box_type(category: str) -> int:
@@ -255,6 +331,9 @@ def _write_camera_boxes(
                 for k, axis in enumerate("xy")
             },
             f"{CAMERA_BOX}.type": pa.array(types, pa.int8()),
+            # Of pictures people say how hard they are.
+            f"{CAMERA_BOX}.difficulty_level.detection": pa.array([0] * len(seen), pa.int8()),
+            f"{CAMERA_BOX}.difficulty_level.tracking": pa.array([0] * len(seen), pa.int8()),
         },
     )
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform, transform_from
 from ...scene import CameraRig, SceneError, Trajectory
-from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
+from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
 from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
 from .formats.parquet_files import read_feather
@@ -96,7 +96,8 @@ class Argoverse2Reader:
             mounts["up_lidar"][:3, 3],
         )
         source.images.check_sizes()
-        ego = city.moved(invert_transform(city.transform(int(times_us[frames[0]]))))
+        T_world_city = invert_transform(city.transform(int(times_us[frames[0]])))
+        ego = city.moved(T_world_city)
         tracks, keys = _read_tracks(folder / "annotations.feather", ego)
         return DrivingLog(
             name=f"argoverse2_{folder.name}",
@@ -116,7 +117,13 @@ class Argoverse2Reader:
                 "frames_without_all_images": len(times_us) - len(frames),
             },
             image_times_us=image_times,
+            logged_map=_map_beside(folder, T_world_city),
         )
+
+
+def _map_beside(folder: Path, T_world_city: Float) -> LoggedMap | None:
+    maps = folder / "map"
+    return LoggedMap(maps, T_world_city) if any(maps.glob("log_map_archive_*.json")) else None
 
 
 def _logs(path: Path) -> dict[str, Path]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform, transform_from
 from ...scene import CameraRig, SceneError, Trajectory
-from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
+from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
 from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
 from .formats.json_tables import Tables
@@ -112,7 +112,19 @@ class NuScenesReader:
                 "frames_without_all_images": len(front) - len(times_us),
             },
             image_times_us=matched.times_us,
+            logged_map=_map_beside(path, folder, tables.row("scene", scenes[name]), ego.to_log),
         )
+
+
+def _map_beside(
+    root: Path, folder: Path, scene: Mapping[str, Any], T_world_map: Float
+) -> LoggedMap | None:
+    """The map expansion of a scene's town, where it was unpacked beside the tables."""
+    if not (folder / "log.json").is_file():
+        return None
+    log = Tables(folder, ("log",)).row("log", str(scene["log_token"]))
+    path = root / "maps" / "expansion" / f"{Path(str(log['location'])).name}.json"
+    return LoggedMap(path, T_world_map) if path.is_file() else None
 
 
 def _match(

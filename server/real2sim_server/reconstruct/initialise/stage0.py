@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...logs import DrivingLog, ObjectTrack
-from ...maps import laid_on
+from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
 from ...scene.spherical_harmonics import SH_C0
@@ -28,8 +28,9 @@ from .stereo import sweep_planes
 from .surfels import Surfels, fit_surfels, round_surfels
 from .triangulate import TriangulatedPoints, triangulate
 from .vehicle_body import VehicleBody, faced, fitted_body
-from .vehicle_light import FROM_ABOVE, LIGHT, pose_amid
+from .vehicle_light import LIGHT, pose_amid
 from .vehicle_paint import VehicleSurface, fill_vehicles
+from .vehicle_parts import PARTS
 from .views import PlacedSurfels, ProjectedView, chosen_frames, gather_views
 from .walls import continue_walls, real_walls
 
@@ -121,6 +122,7 @@ def initialise_scene(
         ReconstructError: the log has no camera or no frame, or neither a usable LiDAR point nor
             features that tell a depth.
         LogError: a file of the log cannot be read.
+        MapError: the map that the log comes with cannot be read.
     """
     options = options or InitialiseOptions()
     stages = Stages(on_progress, timing_s)
@@ -145,10 +147,12 @@ def initialise_scene(
     with stages("colour") as report_step:
         colours, known, sky_samples = _sample_colours(log, parts, options, report_step)
     with stages("fill"):
-        colours, light = _inpaint(log, parts, fitted.surface, colours, known)
+        colours, look = _inpaint(log, parts, fitted.surface, colours, known)
         sky = sky_samples.finish(_median_colour(colours[: parts.ground_count]))
-    scene = _assemble(log, parts, colours, sky, {LIGHT: light.tolist(), "options": asdict(options)})
-    lanes = None if log.lanes is None else laid_on(log.lanes, fitted.ground)
+    scene = _assemble(log, parts, colours, sky, {**look, "options": asdict(options)})
+    lanes = lanes_of_log(log, source=options.lanes)
+    if lanes is not None:
+        lanes = laid_on(lanes, fitted.ground)
     return replace(scene, stored_ground=fitted.ground, lanes=lanes)
 
 
@@ -330,8 +334,8 @@ def _inpaint(
     surface: Ground,
     colours: NDArray[np.float32],
     known: NDArray[np.bool_],
-) -> tuple[NDArray[np.float32], Float]:
-    """Colours [N, 3] of all Gaussians, and the light [3] on vehicles."""
+) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Colours [N, 3] of all Gaussians, and what vehicles share: light, colours of parts."""
     points, filled = parts.surfels.points, colours.copy()
     ground = slice(0, parts.ground_count)
     filled[ground] = fill_ground(surface, points[ground], colours[ground], known[ground])
@@ -348,12 +352,12 @@ def _inpaint(
 
 def _inpaint_objects(
     log: DrivingLog, parts: _SurfelSet, colours: NDArray[np.float32], known: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], Float]:
-    """Fill each object's body from itself, then its underside, in place; the light on vehicles."""
+) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Fill each object's body from itself, then its underside, in place; what vehicles share."""
     bodies = ~parts.is_underside
     members = [np.flatnonzero((parts.instance == i + 1) & bodies) for i in range(len(log.tracks))]
     if not members:
-        return colours, np.array(FROM_ABOVE)
+        return colours, {}
     relative = np.zeros(len(colours), dtype=np.float32)
     for track, mine in zip(log.tracks, members, strict=True):
         relative[mine] = parts.surfels.points[mine, 2] / track.size[2]
@@ -375,7 +379,7 @@ def _inpaint_objects(
             surfaces.append(
                 VehicleSurface(parts.surfels.points[mine], normals, colours[mine], seen, body)
             )
-    filled, light = fill_vehicles(surfaces)
+    filled, light, palette = fill_vehicles(surfaces)
     for k, found in zip(closed, filled, strict=True):
         colours[members[k]] = found
     for mine, body in zip(members, parts.bodies, strict=True):
@@ -389,7 +393,7 @@ def _inpaint_objects(
             points, mirrored, now_known, plain, trust_reach=BODY_COLOR_REACH
         )
     colours[parts.is_underside & ~known] = UNDERSIDE_COLOUR
-    return colours, light
+    return colours, {LIGHT: light.tolist(), PARTS: palette.tolist()}
 
 
 def _median_colour(colours: NDArray[np.float32]) -> NDArray[np.float32]:

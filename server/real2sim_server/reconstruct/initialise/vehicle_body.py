@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +18,23 @@ from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from ...logs import DrivingLog, ObjectTrack
 from ...scene import Scene
-from ...synthetic.materials import BODY, WHEEL
-from ...synthetic.vehicles import SHAPES, VehicleShape, build_vehicle, roof_heights
-from .inpainting import GREY, MIN_OBSERVED, modal_colour
+from ...synthetic.materials import BODY, PLAIN, WHEEL
+from ...synthetic.vehicles import CARGO_FLOOR, SHAPES, VehicleShape, build_vehicle
+from .inpainting import GREY, modal_colour
 from .vehicle_light import brightness
+from .vehicle_parts import Part, shell_parts, shown_paints, wheel_parts, with_paints
 
 SPACING = 0.05
 """Distance between points on a body [m]."""
+WIDE_SPACING = 0.12
+"""Distance between those that are drawn where a body is flat and of one part [m]."""
+FLAT = 0.95
+"""Cosine between normals of neighbours up to which a body is flat."""
 FEW_POINTS = 50
 """Fewer measured points do not tell one shape from another."""
 COMPARED = 1500
 LONGEST_SCALE = 1.35
 """A body that would have to be stretched or pressed more than this is another kind of vehicle."""
-GLASS = (0.2, 0.23, 0.27)
-TRIM = (0.13, 0.13, 0.14)
-TYRE = (0.1, 0.1, 0.1)
-RIM = (0.4, 0.4, 0.41)
-WHITE_LAMP, RED_LAMP = (0.65, 0.65, 0.65), (0.45, 0.1, 0.1)
-PLATE = (0.6, 0.6, 0.58)
 GRAZING = 0.35
 """Cosine to a surface's normal up to which a camera hardly sees it: 20 degrees from edge on."""
 PAINT_REACH = 0.2
@@ -48,14 +48,27 @@ class VehicleBody:
     Attributes:
         points: [N, 3] float64 [m].
         normals: [N, 3] float64, outwards.
-        colours: [N, 3] float32 of what is no paint.
-        is_paint: [N] bool.
+        parts: [N] uint8, see :class:`.vehicle_parts.Part`.
+        own_colours: [N, 3] float32, the builder's, of what is ``OTHER``.
+        drawn: [N] float32, distance to the next point where all that need not be drawn are left
+            out [m]; 0 at these.
     """
 
     points: Float
     normals: Float
-    colours: NDArray[np.float32]
-    is_paint: NDArray[np.bool_]
+    parts: NDArray[np.uint8]
+    own_colours: NDArray[np.float32]
+    drawn: NDArray[np.float32]
+
+    @property
+    def is_paint(self) -> NDArray[np.bool_]:
+        """[N] bool."""
+        return np.asarray(self.parts == Part.PAINT)
+
+    def colours(self, palette: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Colours [N, 3] by ``palette`` [10, 3], but for what is ``OTHER``."""
+        other = (self.parts == Part.OTHER)[:, None]
+        return np.where(other, self.own_colours, palette[self.parts])
 
     def unit_normals(self) -> Float:
         """[N, 3] of length 1."""
@@ -64,18 +77,34 @@ class VehicleBody:
 
     def nearest(self, points: Float) -> NDArray[np.int64]:
         """Indices [N] of the body's points nearest to ``points`` [N, 3]."""
+        return self.closest(points)[1]
+
+    def closest(self, points: Float | NDArray[np.float32]) -> tuple[Float, NDArray[np.int64]]:
+        """Distances [N] of ``points`` [N, 3] from the body [m], and its nearest points [N]."""
+        distance, index = self._tree.query(points, workers=-1)
+        return np.asarray(distance), np.asarray(index)
+
+    def parts_at(
+        self, distance: Float, index: NDArray[np.int64], *, reach: float = PAINT_REACH
+    ) -> NDArray[np.uint8]:
+        """Parts [N] at what :meth:`closest` gave; beyond ``reach`` [m] all counts as paint."""
+        return np.where(distance < reach, self.parts[index], np.uint8(Part.PAINT))
+
+    def parts_near(
+        self, points: NDArray[np.float32], *, reach: float = PAINT_REACH
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Indices [N] of the body's points nearest to ``points`` [N, 3], and parts [N] there.
+
+        What lies farther than ``reach`` [m] from it counts as paint.
+        """
+        distance, index = self.closest(points)
+        return index, self.parts_at(distance, index, reach=reach)
+
+    @cached_property
+    def _tree(self) -> Any:
         from scipy.spatial import cKDTree
 
-        return np.asarray(cKDTree(self.points).query(points, workers=-1)[1])
-
-    def part_colours(
-        self, points: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Colours [N, 3] of the parts nearest to ``points`` [N, 3], and [N] bool: no paint."""
-        from scipy.spatial import cKDTree
-
-        distance, index = cKDTree(self.points).query(points, workers=-1)
-        return self.colours[index], ~self.is_paint[index] & (distance < PAINT_REACH)
+        return cKDTree(self.points)
 
 
 def fitted_body(
@@ -118,22 +147,25 @@ def body_colours(
     colours: NDArray[np.float32],
     *,
     light: Float,
+    palette: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Colours [B, 3] of the points of a body: its parts' own, and one paint, in the given light.
+    """Colours [B, 3] of the points of a body: its paints and parts, in the given light.
 
     Args:
         points: [N, 3] of a vehicle in that box, stage 0's.
         colours: [N, 3] of these; the commonest where there is paint becomes the paint, the light
-            taken off.
+            taken off, and likewise of a truck's cargo.
         light: slopes [3] in the frame of the box, see :func:`.vehicle_light.fit_light`.
+        palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
-    _, is_part = body.part_colours(points)
+    distance, nearest = body.closest(points)
     lit = brightness(light, body.unit_normals())
-    plain = colours / lit[body.nearest(points.astype(np.float64))] if len(points) else colours
-    painted = plain[~is_part] if (~is_part).sum() >= MIN_OBSERVED else plain
-    paint = modal_colour(painted) if len(painted) else GREY
-    mixed = np.where(body.is_paint[:, None], paint, body.colours)
-    return np.clip(mixed * lit, 0, 1).astype(np.float32)
+    # Far from the body lies the plate under it, in the dark.
+    near = distance < PAINT_REACH
+    plain = colours / lit[nearest]
+    usual = modal_colour(plain) if len(plain) else GREY
+    own = with_paints(palette, shown_paints(body.parts[nearest[near]], plain[near]), usual)
+    return np.asarray(np.clip(body.colours(own) * lit, 0, 1), dtype=np.float32)
 
 
 def faced(
@@ -176,7 +208,7 @@ def _scaled(
     body: VehicleBody, shape: VehicleShape, size: tuple[float, float, float]
 ) -> VehicleBody:
     points = body.points * (0.98 * np.array(size) / shape.size)
-    return VehicleBody(points, body.normals, body.colours, body.is_paint)
+    return VehicleBody(points, body.normals, body.parts, body.own_colours, body.drawn)
 
 
 @cache
@@ -185,24 +217,83 @@ def _body(shape: VehicleShape) -> VehicleBody:
     paints: list[tuple[float, ...]] = []
     mesh = build_vehicle(shape, paints)
     triangle, weights = _spread(mesh.corners)
+    # Wheels first: the shell about them lies in the same cells, just behind their outer faces.
+    order = np.argsort(mesh.material[triangle] != WHEEL, kind="stable")
+    triangle, weights = triangle[order], weights[order]
     points = np.einsum("nk,nkd->nd", weights, mesh.corners[triangle])
     _, kept = np.unique(np.floor(points / SPACING).astype(np.int64), axis=0, return_index=True)
     triangle, weights, points = triangle[kept], weights[kept], points[kept]
-    # The builder's normals point inwards.
-    normals = -np.einsum("nk,nkd->nd", weights, mesh.normals[triangle])
+    normals = np.einsum("nk,nkd->nd", weights, mesh.normals[triangle])
     uv = np.einsum("nk,nkd->nd", weights, mesh.uv[triangle])
     material = mesh.material[triangle]
+    inwards = (normals * _outwards(shape, points, material)).sum(1) < 0
+    normals[inwards] *= -1
     table = np.array([row[:3] for row in paints])
     # The builder's colours are linear; images are not.
     colours = np.clip(table[mesh.paint[triangle]], 0, 1) ** (1 / 2.2)
-    is_wheel = material == WHEEL
-    rim = np.linalg.norm(uv, axis=1) < 0.68
-    colours[is_wheel] = np.where(rim[is_wheel, None], RIM, TYRE)
-    on_shell = material == BODY
-    shell = _shell_colours(shape, points + np.array([0, 0, shape.size[2] / 2]), normals)
-    is_paint = on_shell & np.isnan(shell[:, 0])
-    colours = np.where(on_shell[:, None], np.nan_to_num(shell), colours)
-    return VehicleBody(points, normals, colours.astype(np.float32), is_paint)
+    parts = np.full(len(points), Part.OTHER, dtype=np.uint8)
+    is_wheel, on_shell = material == WHEEL, material == BODY
+    parts[is_wheel] = wheel_parts(uv[is_wheel])
+    parts[_on_cargo(shape, points)] = Part.CARGO
+    over_ground = points + np.array([0, 0, shape.size[2] / 2])
+    parts[on_shell] = shell_parts(shape, over_ground[on_shell], normals[on_shell])
+    drawn = _drawn_spacing(points, normals, parts)
+    return VehicleBody(points, normals, parts, colours.astype(np.float32), drawn)
+
+
+def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """[N]: SPACING where parts meet and where a body bends, WIDE_SPACING or 0 elsewhere."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(points).query_pairs(0.75 * WIDE_SPACING, output_type="ndarray")
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+    cosine = (unit[near[:, 0]] * unit[near[:, 1]]).sum(1)
+    unlike = (cosine < FLAT) | (parts[near[:, 0]] != parts[near[:, 1]])
+    # The other side of something thin is no edge.
+    unlike &= cosine > -0.5
+    plain = np.ones(len(points), dtype=np.bool_)
+    plain[near[unlike].ravel()] = False
+    cells = np.floor(points[plain] / WIDE_SPACING)
+    from_centre = np.abs(points[plain] / WIDE_SPACING - cells - 0.5).max(axis=1)
+    # Of each cell the point in its middle, so that they are as far apart everywhere.
+    order = np.argsort(from_centre, kind="stable")
+    kept = order[np.unique(cells[order].astype(np.int64), axis=0, return_index=True)[1]]
+    drawn = np.full(len(points), SPACING, dtype=np.float32)
+    drawn[plain] = 0
+    drawn[np.flatnonzero(plain)[kept]] = WIDE_SPACING
+    return drawn
+
+
+def _on_cargo(shape: VehicleShape, points: Float) -> NDArray[np.bool_]:
+    """Which points [N] of a body are on the sides of the box behind its cab."""
+    length, width, height = shape.size
+    rear, front = (x * length for x in shape.cargo)
+    if rear == front:
+        return np.zeros(len(points), dtype=np.bool_)
+    x, side, z = points[:, 0], np.abs(points[:, 1]), points[:, 2] + height / 2
+    within = (x > rear - 0.01) & (x < front + 0.01) & (z > CARGO_FLOOR - 0.01)
+    inner = (x > rear + 0.01) & (x < front - 0.01) & (side < width / 2 - 0.01)
+    return np.asarray(within & ~(inner & (z < height - 0.01) & (z > CARGO_FLOOR + 0.01)))
+
+
+def _outwards(shape: VehicleShape, points: Float, material: NDArray[np.int32]) -> Float:
+    """Directions [N, 3] out of the convex piece that each point is on; windings differ by piece."""
+    length, width, height = shape.size
+    centres = np.zeros_like(points)
+    # The shell is no convex piece, but nearly: from the line through its middle all of it is seen.
+    centres[:, 0] = np.clip(points[:, 0], -0.35 * length, 0.35 * length)
+    x, y = points[:, 0], np.sign(points[:, 1])
+    axle = np.where(x > 0, shape.axles[1], shape.axles[0]) * length
+    of_wheel = np.stack([axle, y * (0.5 * width - 0.12), np.full_like(x, shape.wheel_radius)], 1)
+    of_wheel[:, 2] -= height / 2
+    wheel = material == WHEEL
+    centres[wheel] = of_wheel[wheel]
+    aside = (material == PLAIN) & (shape.cargo[0] == shape.cargo[1])
+    for side in (-1.0, 1.0):
+        mirror = aside & (y == side)
+        if mirror.any():
+            centres[mirror] = points[mirror].mean(axis=0)
+    return np.asarray(points - centres)
 
 
 def _spread(corners: Float) -> tuple[NDArray[np.int64], Float]:
@@ -217,50 +308,3 @@ def _spread(corners: Float) -> tuple[NDArray[np.int64], Float]:
         triangles.append(np.repeat(members, len(a)))
         weights.append(np.tile(np.stack([a, b, 1 - a - b], axis=1), (len(members), 1)))
     return np.concatenate(triangles), np.concatenate(weights)
-
-
-def _shell_colours(shape: VehicleShape, points: Float, normals: Float) -> Float:
-    """[N, 3] at points of the shell over the ground, nan where there is paint."""
-    length, width, height = shape.size
-    x, side, z = points[:, 0], np.abs(points[:, 1]), points[:, 2]
-    nx, ny = normals[:, 0], np.abs(normals[:, 1])
-    roof = np.interp(
-        x, np.linspace(-0.5, 0.5, len(roof_heights(shape))) * length, roof_heights(shape)
-    )
-    colours = np.full((len(points), 3), np.nan)
-    colours[z < shape.clearance + 0.1] = TRIM
-    edge = 0.1 if height < 2 else 0.28
-    rear, front = (a * length for a in shape.side_glass)
-    flank = ny > 0.4
-    colours[flank & (z > shape.belt) & (z < roof - edge + 0.03) & (x > rear) & (x < front)] = GLASS
-    for axle in shape.axles:
-        arch = np.hypot(x - axle * length, z - shape.wheel_radius) < shape.wheel_radius + 0.055
-        colours[flank & arch] = TYRE
-    half = 0.5 * width * (0.9 if height > 2 else 0.8)
-    above = ~flank & (z > shape.belt) & (z < height - 0.05) & (side < half)
-    foot, top = (a * length for a in shape.windscreen)
-    colours[above & (nx > 0.2) & (x > top) & (x < foot)] = GLASS
-    low, high = (a * length for a in shape.rear_window)
-    colours[above & (nx < -0.2) & (x > low) & (x < high)] = GLASS
-    _paint_ends(colours, shape, x, side, z, nx)
-    return colours
-
-
-def _paint_ends(  # noqa: PLR0917
-    colours: Float, shape: VehicleShape, x: Float, side: Float, z: Float, nx: Float
-) -> None:
-    """Lamps and plates at nose and tail, in place."""
-    length, width, height = shape.size
-    big = height > 2
-    lamp = 0.78 if big else 0.47 * shape.belt + 0.2
-    nose = (nx > 0.35) & (x > length / 2 - 0.6) & (z < shape.belt)
-    colours[nose & (side < 0.42) & (np.abs(z - lamp + 0.02) < 0.08)] = TRIM
-    outer = (side > width / 2 - 0.52) & (side < width / 2 - 0.1)
-    colours[nose & outer & (np.abs(z - lamp) < 0.08)] = WHITE_LAMP
-    colours[nose & (side < 0.26) & (np.abs(z - lamp + 0.21) < 0.055)] = PLATE
-    tail = (nx < -0.35) & (x < 0.4 - length / 2) & (z < max(shape.belt, 0.7 * height))
-    low, high, inner = shape.belt - 0.33, shape.belt - 0.12, width / 2 - 0.42
-    if big:
-        low, high, inner = shape.belt - 0.4, shape.belt - 0.02, width / 2 - 0.24
-    colours[tail & (side > inner) & (z > low) & (z < high)] = RED_LAMP
-    colours[tail & (side < 0.26) & (np.abs(z - low - 0.05) < 0.055)] = PLATE

@@ -40,6 +40,7 @@ WITHOUT_LOOKS = InitialiseOptions(
     max_colour_frames=8,
     samples=2,
     sky_resolution=32,
+    lanes="none",
 )
 """Shapes alone, for where no beam measured anything: beams see no colours."""
 GONE = 0.02

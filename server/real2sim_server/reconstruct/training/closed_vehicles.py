@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -22,6 +23,7 @@ from ...scene import GaussianCloud, SceneObject
 from ...scene.spherical_harmonics import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
 from ..initialise.vehicle_light import light_on
+from ..initialise.vehicle_parts import palette_of
 from .directions import ViewingDirections, constant_colours, viewing_directions
 from .gaussians import FIELDS, OBJECT_FIELDS
 from .model import SceneModel
@@ -45,8 +47,8 @@ SHADOW = 0.3
 """The ground plate on which shadows lie reaches so far beyond the box [m]."""
 INSETS = (1.0, 0.96, 0.92, 0.87, 0.82)
 """A body may be this much narrower and lower, where images show it beyond a vehicle's outline."""
-DISC = (0.6 * SPACING, 0.6 * SPACING, 0.15 * SPACING)
-"""Standard deviations of a body's Gaussians [m]."""
+DISC = (0.7, 0.7, 0.15)
+"""Standard deviations of a body's Gaussians, by the distance between them."""
 ROWS = 2000
 
 
@@ -86,14 +88,15 @@ def offer_bodies(
     """
     scene = model.scene
     reconstruction = scene.provenance.get("reconstruction")
+    palette = palette_of(reconstruction)
     objects, alternatives = dict(scene.objects), [_no_choice(len(scene.background))]
     for index, (name, item) in enumerate(scene.objects.items()):
         body, insets = bodies[index], INSETS if followed[index] else INSETS[:1]
         if body is not None:
             light = light_on(item, reconstruction)
-            cloud = body_cloud(body, item, light=light, insets=insets)
+            cloud = body_cloud(body, item, light=light, palette=palette, insets=insets)
             objects[name] = replace(item, cloud=cloud)
-            alternatives.append(torch.arange(len(body.points)).repeat(len(insets)))
+            alternatives.append(torch.arange(len(cloud) // len(insets)).repeat(len(insets)))
         else:
             alternatives.append(_no_choice(len(item.cloud)))
     # Of a body's point one inset is taken; numbers tell the points of all objects apart.
@@ -102,30 +105,40 @@ def offer_bodies(
 
 
 def body_cloud(
-    body: VehicleBody, item: SceneObject, *, light: Float, insets: Sequence[float]
+    body: VehicleBody,
+    item: SceneObject,
+    *,
+    light: Float,
+    palette: NDArray[np.float32],
+    insets: Sequence[float],
 ) -> GaussianCloud:
     """The whole of a body once for each inset, in the paint that ``item`` shows.
+
+    Where it is flat and of one part, few and larger Gaussians do.
 
     Args:
         item: of stage 0.
         light: slopes [3] in its frame, see :func:`.vehicle_light.fit_light`.
+        palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
     shown = constant_colours(item.cloud)
     points = item.cloud.means.cpu().numpy()
-    colours = body_colours(body, points, shown.cpu().numpy(), light=light)
+    colours = body_colours(body, points, shown.cpu().numpy(), light=light, palette=palette)
+    drawn = body.drawn > 0
+    colours, scales = colours[drawn], body.drawn[drawn, None] * np.array(DISC, dtype=np.float32)
     factors = np.array([(1 - 0.4 * (1 - f), f, f) for f in insets])
-    normals = body.unit_normals()
+    normals = body.unit_normals()[drawn]
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0, 1]], [[1.0, 0, 0]])
     first = np.cross(helper, normals)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     axes = np.stack([first, np.cross(normals, first), normals], axis=2)
-    count, copies = len(body.points), len(insets)
-    means = (factors[:, None] * body.points).reshape(-1, 3)
+    copies = len(insets)
+    means = (factors[:, None] * body.points[drawn]).reshape(-1, 3)
     cloud = GaussianCloud(
         means=torch.from_numpy(means).float(),
         quats=torch.from_numpy(matrix_to_quaternion(axes)).float().repeat(copies, 1),
-        scales=torch.tensor(DISC).repeat(copies * count, 1),
-        opacities=torch.full((copies * count,), 0.99),
+        scales=torch.from_numpy(scales).repeat(copies, 1),
+        opacities=torch.full((len(means),), 0.99),
         sh=torch.from_numpy((colours - 0.5) / SH_C0)[:, None].float().repeat(copies, 1, 1),
     )
     return cloud.to(item.cloud.device)

@@ -64,7 +64,7 @@ class TrainOptions:
         width: of the training images [px]; None for the logged width. Never above ``max_width``.
         max_width: largest width of training images [px].
         coarse: (fraction of iterations, divisor of the width) stages before full size.
-        scales: divisors of the width that take turns after them; (1, 2) keeps a scene sharp at
+        scales: divisors of the width that take turns after them; (1, 2, 2) keeps a scene sharp at
             full size and true at half of it.
         sh_degree: highest degree of the spherical harmonics.
         sh_every: fraction of the iterations after which the degree grows by one.
@@ -203,13 +203,13 @@ def at_width(options: TrainOptions, width: int) -> TrainOptions:
     """``options`` for images of ``width`` [px], coarse to fine where these are wider than its own.
 
     Stages before the last are then at the widths that they had, so that most steps cost what they
-    did; in the last, full size takes turns with a part of it, or what was trained would be too
-    sharp for smaller images.
+    did; in the last, one image at full size takes turns with two at a part of it, or what was
+    trained would be too sharp for smaller images.
     """
     part = -(-width // options.max_width)
     if part > 1:
         stages = tuple((until, divisor * part) for until, divisor in options.coarse)
-        options = replace(options, coarse=(*stages, (FINE_START, part)), scales=(1, part))
+        options = replace(options, coarse=(*stages, (FINE_START, part)), scales=(1, part, part))
     return replace(options, width=width, max_width=width)
 
 

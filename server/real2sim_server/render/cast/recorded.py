@@ -59,6 +59,8 @@ def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:
         if not item.trajectory.covers(t_us):
             continue
         cloud, attributes = met_by_lidar(scene, object_id)
+        if item.figure is not None:
+            cloud, attributes = item.posed_at(t_us, item.trajectory), None
         pose = item.trajectory.transform(t_us)
         instances.append(Instance(cloud, pose, instance_id=index + 1))
         moved.append(transforms_at(item.trajectory, times))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...body.gait import GaitStyle
 from ..asset import Asset
 from ..cloud import GaussianCloud
 from ..colour import TimeColour
 from ..errors import BundleError, SceneError
+from ..figure import Figure
 from ..ground import Ground, of_bundle
 from ..ground_fit import BoxTrack, fit_scene_ground
 from ..lane_graph import LaneGraph
@@ -34,6 +36,8 @@ from .document import (
     CloudPart,
     ColourPart,
     EgoPart,
+    FigurePart,
+    GaitPart,
     GroundPart,
     LanesPart,
     LidarPart,
@@ -50,6 +54,8 @@ from .tensors import (
     TensorFile,
     cloud_shapes,
     cloud_tensors,
+    figure_shapes,
+    figure_tensors,
     reflector_shapes,
     reflector_tensors,
     tensor_hashes,
@@ -86,6 +92,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
     background = _outgoing(scene.background, "background")
     objects = [_outgoing(o.cloud, f"object {k!r}") for k, o in scene.objects.items()]
     colours = [_outgoing_colour(o) for o in scene.objects.values()]
+    figures = [_outgoing_figure(o.figure, f"object {k!r}") for k, o in scene.objects.items()]
     sky = _outgoing_sky(scene.sky)
     ground = _outgoing_ground(scene.ground)
     lanes, lane_tensors = _outgoing_lanes(scene.lanes)
@@ -111,7 +118,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
         content=content,
         **_UNWRITTEN,
     )
-    whole = [a | b for a, b in zip(objects, colours, strict=True)]
+    whole = [a | b | c for a, b, c in zip(objects, colours, figures, strict=True)]
     keyed = {f"{i}.{name}": t for i, part in enumerate(whole) for name, t in part.items()}
     files = {BACKGROUND_FILE: background, OBJECTS_FILE: keyed, GROUND_FILE: ground}
     if sky:
@@ -210,15 +217,21 @@ def save_asset(asset: Asset, path: str | PathLike[str], *, overwrite: bool = Fal
     Arguments and errors are those of :func:`save_scene`.
     """
     cloud = _outgoing(asset.cloud, f"asset {asset.asset_id!r}")
+    figure = _outgoing_figure(asset.figure, f"asset {asset.asset_id!r}")
     document = AssetDocument(
         kind="asset",
         name=asset.asset_id,
         provenance=_json_values(asset.provenance),
-        content=AssetContent(category=asset.category, size=asset.size, cloud=_cloud_part(cloud)),
+        content=AssetContent(
+            category=asset.category,
+            size=asset.size,
+            cloud=_cloud_part(cloud),
+            figure=_figure_part(asset.figure),
+        ),
         **_UNWRITTEN,
     )
     written = write_container(
-        document, Path(path), tensors={ASSET_FILE: cloud}, overwrite=overwrite
+        document, Path(path), tensors={ASSET_FILE: cloud | figure}, overwrite=overwrite
     )
     return replace(asset, content_hash=written.content_hash)
 
@@ -238,6 +251,7 @@ def load_asset(
             cloud=_cloud(file, "", document.content.cloud, "asset"),
             provenance=document.provenance,
             content_hash=document.content_hash,
+            figure=_figure(file, "", document.content.figure, document.content.cloud, "asset"),
         )
     return asset.to(device)
 
@@ -254,6 +268,13 @@ def _outgoing_colour(scene_object: SceneObject) -> dict[str, Tensor]:
     if not bool(torch.isfinite(colour.coefficients).all()):
         raise SceneError(f"object {scene_object.object_id!r}: colour holds values not finite")
     return {"fourier": colour.coefficients.detach().cpu().contiguous()}
+
+
+def _outgoing_figure(figure: Figure | None, what: str) -> dict[str, Tensor]:
+    if figure is None:
+        return {}
+    figure.check_values(what)
+    return figure_tensors(figure)
 
 
 def _outgoing_sky(sky: Sky | None) -> dict[str, Tensor]:
@@ -334,6 +355,7 @@ def _object_part(
         trajectory=TrajectoryPart.of(scene_object.trajectory),
         cloud=_cloud_part(tensors),
         colour=_colour_part(scene_object.colour, colour),
+        figure=_figure_part(scene_object.figure),
     )
 
 
@@ -346,6 +368,18 @@ def _colour_part(colour: TimeColour | None, tensors: Mapping[str, Tensor]) -> Co
         start_us=colour.start_us,
         end_us=colour.end_us,
         tensors=tensor_hashes(tensors),
+    )
+
+
+def _figure_part(figure: Figure | None) -> FigurePart | None:
+    if figure is None:
+        return None
+    return FigurePart(
+        shape=list(figure.shape),
+        height=figure.height,
+        middle=figure.middle,
+        style=GaitPart(**asdict(figure.style)),
+        tensors=tensor_hashes(figure_tensors(figure)),
     )
 
 
@@ -390,6 +424,9 @@ def _objects(file: TensorFile, parts: list[ObjectPart]) -> dict[str, SceneObject
             cloud=_cloud(file, f"{index}.", part.cloud, f"object {part.object_id!r}"),
             trajectory=part.trajectory.build(),
             colour=_colour(file, f"{index}.", part),
+            figure=_figure(
+                file, f"{index}.", part.figure, part.cloud, f"object {part.object_id!r}"
+            ),
         )
     return objects
 
@@ -402,6 +439,21 @@ def _colour(file: TensorFile, prefix: str, part: ObjectPart) -> TimeColour | Non
     if file.verify and not bool(torch.isfinite(coefficients).all()):
         raise SceneError(f"object {part.object_id!r}: colour holds values that are not finite")
     return TimeColour(coefficients, part.colour.basis, part.colour.start_us, part.colour.end_us)
+
+
+def _figure(
+    file: TensorFile, prefix: str, part: FigurePart | None, cloud: CloudPart, what: str
+) -> Figure | None:
+    if part is None:
+        return None
+    shapes = figure_shapes(cloud.gaussians)
+    dtypes = {"joints": torch.uint8}
+    taken = file.take(prefix, shapes=shapes, hashes=part.tensors, dtypes=dtypes)
+    style = GaitStyle(**part.style.model_dump())
+    figure = Figure(tuple(part.shape), part.height, part.middle, **taken, style=style)
+    if file.verify:
+        figure.check_values(what)
+    return figure
 
 
 def _sky(folder: Path, document: SceneDocument, verify: bool) -> Sky | None:

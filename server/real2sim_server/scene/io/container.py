@@ -17,7 +17,7 @@ from .document import AssetDocument, SceneDocument
 from .tensors import write_tensors
 
 FORMAT = "real2sim-scene"
-VERSION = 6
+VERSION = 7
 """Newest version read here; what needs no more is written in version 1."""
 DOCUMENT_NAME = "scene.json"
 

@@ -184,11 +184,32 @@ class ColourPart(_Part):
     tensors: dict[str, Sha256]
 
 
+class GaitPart(_Part):
+    """How a person walks; see :class:`~real2sim_server.body.gait.GaitStyle`."""
+
+    stride: float
+    arms: float
+    lean: float
+    width: float
+    phase: float
+
+
+class FigurePart(_Part):
+    """How a cloud follows a body; see :class:`~real2sim_server.scene.Figure`."""
+
+    shape: list[float]
+    height: float
+    middle: float
+    style: GaitPart
+    tensors: dict[str, Sha256]
+
+
 class ObjectPart(_Part):
     """One object of a scene; its tensors are keyed by its position in the list.
 
     Attributes:
         colour: left out of the JSON where there is none, as version 1 of the format asks.
+        figure: left out of the JSON where there is none, as versions 1 to 6 of the format ask.
     """
 
     object_id: str
@@ -197,13 +218,16 @@ class ObjectPart(_Part):
     trajectory: TrajectoryPart
     cloud: CloudPart
     colour: ColourPart | None = None
+    figure: FigurePart | None = None
 
     @model_serializer(mode="wrap")
-    def _without_absent_colour(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if values.get("colour") is None:
-            values.pop("colour", None)
-        return values
+    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return _present(handler(self), "colour", "figure")
+
+
+def _present(values: dict[str, Any], *names: str) -> dict[str, Any]:
+    """``values`` without those of ``names`` that are None."""
+    return {k: v for k, v in values.items() if v is not None or k not in names}
 
 
 class ReflectorPart(_Part):
@@ -271,6 +295,8 @@ class SceneContent(_Part):
     @property
     def version(self) -> int:
         """Lowest version of the format that holds this content."""
+        if any(o.figure is not None for o in self.objects):
+            return 7
         if self.lanes is not None:
             return 6
         stored = [self.background.tensors, *(o.cloud.tensors for o in self.objects)]
@@ -289,15 +315,26 @@ class SceneContent(_Part):
 
 
 class AssetContent(_Part):
-    """Everything that makes an asset what it is; the content hash is taken over this."""
+    """Everything that makes an asset what it is; the content hash is taken over this.
+
+    Attributes:
+        figure: left out of the JSON where there is none, as versions 1 to 6 of the format ask.
+    """
 
     category: str
     size: Vector3
     cloud: CloudPart
+    figure: FigurePart | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_absent_figure(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return _present(handler(self), "figure")
 
     @property
     def version(self) -> int:
         """Lowest version of the format that holds this content."""
+        if self.figure is not None:
+            return 7
         return 5 if UNCERTAINTIES in self.cloud.tensors else 1
 
 

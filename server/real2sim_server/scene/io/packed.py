@@ -15,6 +15,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,16 +28,18 @@ from torch import Tensor
 
 from ..._files import atomic_file
 from ..._npy import read_entries, read_npy
+from ...body.gait import GaitStyle
 from ..camera import CameraRig
 from ..cloud import GaussianCloud
 from ..colour import TimeColour
 from ..errors import BundleError
+from ..figure import Figure
 from ..ground import Ground
 from ..scene import Scene, SceneObject
 from ..sky import Sky
-from .document import UNCERTAINTIES, CameraPart, TrajectoryPart
+from .document import UNCERTAINTIES, CameraPart, GaitPart, TrajectoryPart
 
-FORMAT, VERSION = "real2sim-packed", 2
+FORMAT, VERSION = "real2sim-packed", 3
 DOCUMENT = "scene.json"
 MAX_BYTES = 1 << 32
 """Of all arrays when unpacked; a small file cannot ask for more memory than this."""
@@ -70,6 +73,13 @@ class _PackedColour(_Part):
     end_us: int
 
 
+class _PackedFigure(_Part):
+    shape: list[float]
+    height: float
+    middle: float
+    style: GaitPart
+
+
 class _PackedObject(_Part):
     object_id: str
     category: str
@@ -77,6 +87,7 @@ class _PackedObject(_Part):
     trajectory: TrajectoryPart
     cloud: _PackedCloud
     colour: _PackedColour | None
+    figure: _PackedFigure | None = None
 
 
 class _PackedGround(_Part):
@@ -204,6 +215,11 @@ def _pack_object(item: SceneObject, key: str, arrays: Arrays) -> _PackedObject:
     colour = item.colour
     if colour is not None:
         arrays[f"{key}.fourier"] = colour.coefficients.detach().cpu().numpy().astype(np.float16)
+    figure = item.figure
+    if figure is not None:
+        figure.check_values(f"object {item.object_id!r}")
+        arrays[f"{key}.joints"] = figure.joints.numpy()
+        arrays[f"{key}.weights"] = figure.weights.numpy()
     return _PackedObject(
         object_id=item.object_id,
         category=item.category,
@@ -212,6 +228,13 @@ def _pack_object(item: SceneObject, key: str, arrays: Arrays) -> _PackedObject:
         cloud=_pack_cloud(item.cloud, key, arrays),
         colour=colour
         and _PackedColour(basis=colour.basis, start_us=colour.start_us, end_us=colour.end_us),
+        figure=figure
+        and _PackedFigure(
+            shape=list(figure.shape),
+            height=figure.height,
+            middle=figure.middle,
+            style=GaitPart(**asdict(figure.style)),
+        ),
     )
 
 
@@ -242,8 +265,9 @@ def _pack_cloud(cloud: GaussianCloud, key: str, arrays: Arrays) -> _PackedCloud:
         packed[UNCERTAINTIES] = _root_steps(cloud.uncertainties)
     for name, values in packed.items():
         arrays[f"{key}.{name}"] = np.ascontiguousarray(values[order])
-    if f"{key}.fourier" in arrays:
-        arrays[f"{key}.fourier"] = arrays[f"{key}.fourier"][order]
+    for name in ("fourier", "joints", "weights"):
+        if f"{key}.{name}" in arrays:
+            arrays[f"{key}.{name}"] = arrays[f"{key}.{name}"][order]
     return _PackedCloud(low=_vector(low), extent=_vector(extent), sh_range=sh_range)
 
 
@@ -273,6 +297,7 @@ def _scene(document: _PackedDocument, arrays: Arrays) -> Scene:
             cloud=_cloud(part.cloud, f"{index}", arrays),
             trajectory=part.trajectory.build(),
             colour=colour,
+            figure=_figure(part.figure, f"{index}", arrays),
         )
     return Scene(
         name=document.name,
@@ -286,6 +311,21 @@ def _scene(document: _PackedDocument, arrays: Arrays) -> Scene:
         provenance=document.provenance,
         stored_ground=_unpack_ground(document.ground, arrays) if document.ground else None,
     )
+
+
+def _figure(part: _PackedFigure | None, key: str, arrays: Arrays) -> Figure | None:
+    if part is None:
+        return None
+    figure = Figure(
+        tuple(part.shape),
+        part.height,
+        part.middle,
+        torch.from_numpy(arrays[f"{key}.joints"]),
+        torch.from_numpy(arrays[f"{key}.weights"]),
+        GaitStyle(**part.style.model_dump()),
+    )
+    figure.check_values(key)
+    return figure
 
 
 def _sky(arrays: Arrays) -> Sky | None:

@@ -21,7 +21,7 @@ from ..trajectory import Trajectory
 from .bundle import load_ground, load_lanes
 from .container import read_container
 from .document import UNCERTAINTIES, AssetDocument, Bounds, SceneDocument, Vector3
-from .tensors import check_file, cloud_shapes
+from .tensors import check_file, cloud_shapes, figure_shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +151,8 @@ def read_asset_summary(path: str | PathLike[str]) -> AssetSummary:
         check_file(folder / Path(name).name, nbytes)
     cloud = document.content.cloud
     shapes = cloud_shapes(cloud.gaussians, cloud.sh_degree, known=cloud.tensors)
+    figure = figure_shapes(cloud.gaussians) if document.content.figure else {}
+    joints, weights = (math.prod(figure.get(name, (0,))) for name in ("joints", "weights"))
     return AssetSummary(
         asset_id=document.name,
         category=document.content.category,
@@ -158,7 +160,7 @@ def read_asset_summary(path: str | PathLike[str]) -> AssetSummary:
         provenance=document.provenance,
         content_hash=document.content_hash,
         gaussians=cloud.gaussians,
-        nbytes=4 * sum(math.prod(shape) for shape in shapes.values()),
+        nbytes=4 * sum(math.prod(shape) for shape in shapes.values()) + joints + 4 * weights,
     )
 
 

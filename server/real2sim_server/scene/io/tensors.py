@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..cloud import GaussianCloud
 from ..errors import BundleError
+from ..figure import Figure
 from ..lidar_surfaces import Reflector
 from .document import UNCERTAINTIES
 
@@ -38,6 +39,16 @@ def cloud_shapes(
     if UNCERTAINTIES in known:
         shapes[UNCERTAINTIES] = (n,)
     return shapes
+
+
+def figure_tensors(figure: Figure) -> dict[str, Tensor]:
+    """Tensors of a figure by field name, contiguous."""
+    return {"joints": figure.joints.contiguous(), "weights": figure.weights.contiguous()}
+
+
+def figure_shapes(gaussians: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of :func:`figure_tensors`."""
+    return {"joints": (gaussians, 4), "weights": (gaussians, 4)}
 
 
 def reflector_tensors(reflector: Reflector) -> dict[str, Tensor]:

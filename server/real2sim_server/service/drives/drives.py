@@ -18,13 +18,14 @@ from ...edit import AssetLookup
 from ...world.recording.recording import Recording, load_recording, to_bytes
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError
+from ..jobs.command_process import CommandProcess
 from ..jobs.exports import VideoSource
 from ..jobs.jobs import JobContext, JobResult, Jobs, NewJob, require_success
 from ..library.scene_cache import SceneCache
 from ..sessions import Sessions
 from ..sessions.recording import RECORDING, episode_of
 from ..sessions.session import Session
-from .planner_process import PlannerProcess
+from .planner_process import start_planner
 from .playback import playback_of
 
 PLAYBACK, RECORDED = "playback.json", "recording.r2e"
@@ -173,12 +174,12 @@ async def _driven(
 
 
 @asynccontextmanager
-async def _planner(seat: Seat, request: DriveRequest) -> AsyncIterator[PlannerProcess | None]:
+async def _planner(seat: Seat, request: DriveRequest) -> AsyncIterator[CommandProcess | None]:
     """The planner's process while it drives; None where somebody else brings theirs."""
     if request.planner is None:
         yield None
         return
-    process = await PlannerProcess.start(request, seat.session, url=seat.url, token=seat.token)
+    process = await start_planner(request, seat.session, url=seat.url, token=seat.token)
     try:
         yield process
     finally:
@@ -186,7 +187,7 @@ async def _planner(seat: Seat, request: DriveRequest) -> AsyncIterator[PlannerPr
 
 
 async def _until_over(
-    session: Session, process: PlannerProcess | None, request: DriveRequest, context: JobContext
+    session: Session, process: CommandProcess | None, request: DriveRequest, context: JobContext
 ) -> None:
     before, was_driven = session.world, False
     while session.closed is None:

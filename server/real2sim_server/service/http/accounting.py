@@ -9,6 +9,7 @@ from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..accounts import PAYER, Account, Payer
+from .roles import check_role
 from .websocket import EXTENSION, TAKING, Part, Taker
 
 USAGE_KEY = "real2sim.usage"
@@ -47,8 +48,10 @@ def begin_paying(connection: HTTPConnection, account: Account) -> None:
     Raises:
         RevokedError: its token is no more.
         OverLimitError: it has had its requests or bytes.
+        ServiceError: FORBIDDEN: its role does not allow it.
     """
     usage_of(connection.scope).account = account
+    check_role(connection, account.role, name=account.name)
     account.admit()
     PAYER.set(Payer(account))
 

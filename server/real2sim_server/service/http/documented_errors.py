@@ -18,6 +18,7 @@ OF_EVERY_CALL = (
     C.BAD_MESSAGE,
     C.UNAUTHORIZED,
     C.FOREIGN_PAGE,
+    C.FORBIDDEN,
     C.REQUEST_TIMEOUT,
     C.PAYLOAD_TOO_LARGE,
     C.TOO_MANY_REQUESTS,
@@ -71,6 +72,7 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
         C.NOT_RESET,
         C.JOB_NOT_DONE,
         C.UNSUPPORTED,
+        C.TOO_MANY_JOBS,
         C.QUOTA_EXCEEDED,
     ),
     "health-metrics": (C.NOT_FOUND,),
@@ -81,7 +83,7 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
     "scenarios-import_": (*_OF_SCENES, *_OF_EDITS),
     "scenarios-points": (*_OF_SCENES, C.TIME_OUT_OF_RANGE),
     "scenarios-redo": (C.NOTHING_TO_REDO,),
-    "scenarios-simulate": (C.QUOTA_EXCEEDED, C.UNSUPPORTED, C.UNKNOWN_OBJECT),
+    "scenarios-simulate": (C.TOO_MANY_JOBS, C.QUOTA_EXCEEDED, C.UNSUPPORTED, C.UNKNOWN_OBJECT),
     "scenarios-undo": (C.NOTHING_TO_UNDO,),
     "scenes-import_": (
         C.QUOTA_EXCEEDED,
@@ -91,6 +93,8 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
         C.OUT_OF_MEMORY,
     ),
     "scenes-load": (C.JOB_FAILED,),
+    "scenes-sky": (C.NOT_FOUND,),
+    "scenes-splats": (C.NOT_FOUND, C.UNKNOWN_OBJECT),
     "scenes-unload": (C.SCENE_IN_USE,),
     "sessions-create": (
         *_OF_SCENES,
@@ -108,8 +112,10 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
     "sessions-step": _OF_EPISODES,
     "storyboards-apply_corner_case": _OF_EDITS,
     "storyboards-import_xosc": _OF_EDITS,
+    "storyboards-picture": (C.NOT_FOUND,),
     "storyboards-remove": _OF_EDITS,
     "storyboards-replace": _OF_EDITS,
+    "sweeps-create": (*_OF_SCENES, C.TOO_MANY_JOBS, C.QUOTA_EXCEEDED),
 }
 """What does not follow from parameters, by operation id."""
 

@@ -36,6 +36,7 @@ class Metrics:
         registry = self.registry = CollectorRegistry()
         self.build = Info("real2sim_build", "version and backend", registry=registry)
         self._exposing = threading.Lock()
+        self.engine_seconds = 0.0
         self.requests = Histogram(
             "real2sim_http_request_duration_seconds",
             "time to answer a request",
@@ -153,6 +154,7 @@ class Metrics:
 
     def observe_job(self, label: str, waited_s: float, ran_s: float) -> None:
         """Note one engine job."""
+        self.engine_seconds += ran_s
         self.queue_wait.observe(waited_s)
         self.jobs.labels(label).observe(ran_s)
 

@@ -19,12 +19,14 @@ from .documented_errors import document_errors
 METHODS = ("get", "put", "post", "delete", "patch")
 
 PARAMETERS: dict[str, Any] = {
+    "object_id": "car_3",
     "scene": "demo_street",
     "scenario": "sc_0123456789abcdef",
     "scenario_id": "sc_0123456789abcdef",
     "session_id": "w0.0123456789abcdef",
     "job_id": "job_0123456789abcdef",
     "asset_id": "red_car",
+    "case": "cut_in",
     "name": "video.webm",
     "camera": "front",
     "t_us": 2_000_000,
@@ -77,6 +79,13 @@ BODIES: dict[str, Any] = {
     },
     "SimulateRequest": {"start_us": 0, "end_us": 2_000_000, "objects": ["car_0", "van_0"]},
     "DriveRequest": {"planner": "idm"},
+    "SweepRequest": {
+        "scene": "demo_street",
+        "corner_case": "cut_in",
+        "parameters": {"gap": {"kind": "float", "low": 2.0, "high": 20.0}},
+        "method": {"kind": "sobol", "count": 8},
+        "planners": ["idm"],
+    },
     "SessionClock": {"state": "held", "steps": 5},
     "CalibrateRequest": {
         "object_id": "car_0",

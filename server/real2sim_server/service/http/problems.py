@@ -139,6 +139,7 @@ CODE_OF_LIMIT = {
     Limit.BYTES: ErrorCode.TOO_MANY_BYTES,
     Limit.ENGINE: ErrorCode.TOO_MUCH_ENGINE_TIME,
     Limit.SESSIONS: ErrorCode.TOO_MANY_SESSIONS,
+    Limit.JOBS: ErrorCode.TOO_MANY_JOBS,
 }
 
 
@@ -147,6 +148,8 @@ def _of_limit(error: OverLimitError) -> ServiceError:
     hint = f"send it again in {seconds} s"
     if error.limit is Limit.SESSIONS:
         hint = "end one of your sessions: DELETE /v1/sessions/{id}"
+    if error.limit is Limit.JOBS:
+        hint = "wait for one of your jobs, or cancel one: DELETE /v1/jobs/{id}"
     return ServiceError(
         CODE_OF_LIMIT[error.limit],
         str(error),

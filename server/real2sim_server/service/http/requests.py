@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import structlog
@@ -37,11 +37,23 @@ class RequestContext:
     Takes the request id from ``X-Request-Id`` or makes one, sends it back, binds it and the client
     for logs, measures the request, answers HEAD as GET without its body, and INTERNAL for uncaught
     errors.
+
+    Args:
+        app: the application.
+        metrics: of the worker.
+        on_end: told of each request: scope, method, status, request id.
     """
 
-    def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        metrics: Metrics,
+        on_end: Callable[[Scope, str, int, str], None] | None = None,
+    ) -> None:
         self._app = app
         self._metrics = metrics
+        self._on_end = on_end
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection."""
@@ -88,6 +100,8 @@ class RequestContext:
             await response(scope, receive, send_with_id)
         finally:
             self._note(scope, method, status, time.perf_counter() - started)
+            if self._on_end is not None:
+                self._on_end(scope, method, status, request_id)
 
     def _note(self, scope: Scope, method: str, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", None) or "unmatched"
@@ -100,6 +114,7 @@ class RequestContext:
             path=scope["path"],
             status=status,
             **({"account": account.name} if account is not None else {}),
+            **_session(scope),
             ms=round(seconds * 1e3, 2),
         )
 
@@ -152,6 +167,12 @@ def _too_large(size: int, limit: int) -> ServiceError:
 def _request_id(headers: Headers) -> str:
     given = headers.get(REQUEST_ID_HEADER, "")
     return given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+
+
+def _session(scope: Scope) -> dict[str, str]:
+    """The session that a request is about, for logs."""
+    found = (scope.get("path_params") or {}).get("session_id")
+    return {"session_id": str(found)} if found else {}
 
 
 def _client(scope: Scope, headers: Headers) -> dict[str, str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
-import tarfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,6 +27,7 @@ from ..engine import Engine, QueueFullError
 from ..http.problems import ServiceError
 from ..lanes import Lane
 from ..library.quotas import Quota
+from .archive import pack
 from .jobs import JobContext, JobResult
 
 T = TypeVar("T")
@@ -249,7 +249,7 @@ def _packed(folder: Path, context: JobContext) -> JobResult:
         shutil.copyfile(sheet, context.folder / name)
         files[name] = "image/jpeg"
     context.progress(0.97, "packing")
-    _pack(folder, context.folder / ARCHIVE, context)
+    pack(folder, context.folder / ARCHIVE, context)
     values = {
         "frames": manifest["statistics"]["frames"],
         "formats": list(manifest["plan"]["formats"]),
@@ -258,16 +258,3 @@ def _packed(folder: Path, context: JobContext) -> JobResult:
         "statistics": manifest["statistics"],
     }
     return JobResult(values, files)
-
-
-def _pack(folder: Path, archive: Path, context: JobContext) -> None:
-    """The same bytes for the same files: without the day, the user or the rights. A file that is
-    packed goes, so that the disk holds each once."""
-    with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as tar:
-        for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-            context.check()
-            member = tarfile.TarInfo(str(path.relative_to(folder)))
-            member.size, member.mtime, member.mode = path.stat().st_size, 0, 0o644
-            with path.open("rb") as file:
-                tar.addfile(member, file)
-            path.unlink()

@@ -8,8 +8,8 @@ import contextvars
 import secrets
 import shutil
 import threading
-from collections import OrderedDict, deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from collections import Counter, OrderedDict, deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,7 +53,7 @@ MAX_DEATHS = 3
 MAX_FINISHED_JOBS = 64
 """Ended jobs in memory; others are read from the store."""
 
-JOBS_AT_A_TIME = {"physics": 1, "exports": 2, "drives": 8}
+JOBS_AT_A_TIME = {"physics": 1, "exports": 2, "drives": 8, "sweeps": 1}
 """Lanes. Physics takes all cores; a video, a data set or a planner waits for none of it."""
 
 LANE_OF: Mapping[str, str] = {
@@ -62,6 +62,7 @@ LANE_OF: Mapping[str, str] = {
     "calibrate": "physics",
     "export": "exports",
     "drive": "drives",
+    "sweep": "sweeps",
 }
 
 log = structlog.get_logger(__name__)
@@ -175,6 +176,9 @@ class Jobs:
         self._turns = {lane: asyncio.Semaphore(many) for lane, many in JOBS_AT_A_TIME.items()}
         self._closing = False
         self.work_again: WorkAgain | None = None
+        self.fetch: Callable[[str], Awaitable[bool]] | None = None
+        self.listen: Callable[[], Callable[[float], Awaitable[None]]] = lambda: asyncio.sleep
+        self.on_forget: Callable[[str], Awaitable[None]] | None = None
 
     @property
     def quota(self) -> Quota:
@@ -185,7 +189,7 @@ class Jobs:
     async def running(self) -> AsyncIterator[Jobs]:
         """Goes on with what an earlier run or a worker that is gone left unfinished, or marks it;
         leaves what is unfinished at the end to other workers, or marks that."""
-        await self._take_over(await self._log.left_behind(own=True), own=True)
+        await self._take_over_own()
         looking = asyncio.create_task(self._look_after(), name="jobs")
         try:
             yield self
@@ -194,12 +198,21 @@ class Jobs:
             looking.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await looking
-            tasks = [job.task for job in self._jobs.values() if job.task and not job.task.done()]
-            for job in self._jobs.values():
-                job.context.cancel()
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await self.leave()
+
+    async def leave(self) -> None:
+        """Begin no jobs any more, and leave what is unfinished to other workers, or mark it."""
+        self._closing = True
+        tasks = [job.task for job in self._jobs.values() if job.task and not job.task.done()]
+        for job in self._jobs.values():
+            job.context.cancel()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def unfinished(self) -> Counter[str]:
+        """How many jobs are not over, by the name of their owner's token."""
+        return Counter(job.info.owner for job in self._jobs.values() if not job.info.over)
 
     # --- life -------------------------------------------------------------------------------
 
@@ -225,6 +238,9 @@ class Jobs:
                 f"{waiting} jobs wait already",
                 hint="send it again after Retry-After seconds, or cancel one: DELETE /v1/jobs/{id}",
             )
+        payer = PAYER.get()
+        if payer is not None:
+            payer.account.check_jobs(self.unfinished()[payer.account.name])
         if not new.light:
             stored = await self._log.count()
             await asyncio.to_thread(self._quota.check, entries=stored)
@@ -267,6 +283,8 @@ class Jobs:
         if job is None or info.over:
             self._jobs.pop(job_id, None)
             await self._log.remove(job_id)
+            if self.on_forget is not None:
+                await self.on_forget(job_id)
             await asyncio.to_thread(shutil.rmtree, self._folder / job_id, ignore_errors=True)
             return None
         self._cancel(job)
@@ -295,6 +313,7 @@ class Jobs:
         """A file that a job left. Raises ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, NOT_FOUND."""
         info = await self.get(job_id)
         require_success(info)
+        await self.bring_files(info)
         for file in info.files:
             if file.name == name and (path := self._folder / job_id / name).is_file():
                 return path, file
@@ -309,14 +328,21 @@ class Jobs:
             ErrorCode.NOT_FOUND, f"job {job_id!r} left no {name!r}; it left: {names}"
         )
 
+    async def bring_files(self, info: JobInfo) -> None:
+        """Have the files of a job of another worker here, where workers share them."""
+        here = (self._folder / info.job_id).is_dir()
+        if not here and info.files and self.fetch is not None:
+            await self.fetch(info.job_id)
+
     async def wait(self, job_id: str, seconds: float) -> JobInfo:
         """The job when it is over, or after ``seconds``. Raises ServiceError: UNKNOWN_JOB."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 if (job := self._jobs.get(job_id)) is not None:
                     await self._wait_until_over(job)
+                pause = self.listen()
                 while not (await self.get(job_id)).over:
-                    await asyncio.sleep(FOLLOW_S)
+                    await pause(FOLLOW_S)
         return await self.get(job_id)
 
     async def events(self, job_id: str, *, after: int) -> AsyncIterator[JobInfo]:
@@ -325,12 +351,13 @@ class Jobs:
         Raises:
             ServiceError: UNKNOWN_JOB.
         """
+        pause = self.listen()
         while True:
             if (job := self._jobs.get(job_id)) is None:
                 # It is over, or with another worker.
                 events = [await self.get(job_id)]
                 over = events[0].over
-                await asyncio.sleep(0 if over else FOLLOW_S)
+                await pause(0 if over else FOLLOW_S)
             else:
                 await _next_event(job, after)
                 events, over = list(job.events), job.info.over
@@ -352,14 +379,17 @@ class Jobs:
     # --- inside -----------------------------------------------------------------------------
 
     async def _look_after(self) -> None:
-        while True:
-            await asyncio.sleep(LOOK_S)
+        pause = self.listen()
+        while not self._closing:
+            await pause(LOOK_S)
             try:
                 await self._hear_of_own()
-                await self._take_over(await self._log.left_behind(own=False))
-                if kinds := [kind for kind, lane in LANE_OF.items() if self._has_room(lane)]:
-                    # One at a time: those who have room as well get the others.
-                    await self._take_over((await self._log.overdue(kinds))[:1])
+                while (claimed := await self._log.claim_left_behind()) is not None:
+                    await self._go_on_fenced(claimed)
+                kinds = [kind for kind, lane in LANE_OF.items() if self._has_room(lane)]
+                # One at a time: those who have room as well get the others.
+                if kinds and (claimed := await self._log.claim_overdue(kinds)) is not None:
+                    await self._go_on_fenced(claimed)
             except StoreError:
                 continue  # it tells of its trouble itself
             except Exception:
@@ -383,11 +413,14 @@ class Jobs:
                 await self._log.update_progress(info, epoch=job.epoch)
                 job.stored_event = info.event
 
-    async def _take_over(self, job_ids: Iterable[str], *, own: bool = False) -> None:
-        for job_id in job_ids:
-            if (claimed := await self._log.claim(job_id, own=own)) is not None:
-                with contextlib.suppress(FencedError):
-                    await self._go_on(claimed)
+    async def _take_over_own(self) -> None:
+        for job_id in await self._log.left_behind(own=True):
+            if (claimed := await self._log.claim(job_id, own=True)) is not None:
+                await self._go_on_fenced(claimed)
+
+    async def _go_on_fenced(self, claimed: ClaimedJob) -> None:
+        with contextlib.suppress(FencedError):
+            await self._go_on(claimed)
 
     async def _go_on(self, claimed: ClaimedJob) -> None:
         """Begin a job anew that was another worker's, or say why not."""

@@ -287,7 +287,12 @@ def with_assets(scene: Scene, state: ScenarioState) -> tuple[Scene, PlacedObject
         resolved_id = f"asset.{subject.asset.asset_id}"
         cloud = subject.asset.cloud_in(scene)
         objects[resolved_id] = SceneObject(
-            resolved_id, subject.category, subject.size, cloud, subject.trajectory
+            resolved_id,
+            subject.category,
+            subject.size,
+            cloud,
+            subject.trajectory,
+            figure=subject.asset.figure,
         )
         visible.append(replace(subject, source_id=resolved_id))
     return replace(scene, objects=objects), ResolvedObjects(tuple(visible))

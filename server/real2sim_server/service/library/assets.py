@@ -20,7 +20,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.assets import AssetInfo, AssetUpload
 
 from ...edit.lighting import Colour, ambient_colour, relighting_gain, relit
-from ...scene import Asset, BundleError, GaussianCloud, Scene
+from ...scene import Asset, BundleError, Figure, GaussianCloud, Scene
 from ...scene.io import (
     AssetSummary,
     StagingLimits,
@@ -86,6 +86,11 @@ class LibraryAsset:
     def gaussians(self) -> int:
         """Number of Gaussians."""
         return len(self.asset.cloud)
+
+    @property
+    def figure(self) -> Figure | None:
+        """Of a person who walks; None for what is rigid."""
+        return self.asset.figure
 
     @property
     def content_hash(self) -> str:
@@ -352,8 +357,9 @@ def extract_object(scene: Scene, object_id: str, *, asset_id: str, category: str
         "object_id": object_id,
         "ambient": list(ambient_colour(scene)),
     }
-    cloud = found.cloud_at(middle).to("cpu")
-    return Asset(asset_id, category or found.category, found.size, cloud, provenance)
+    cloud = (found.cloud if found.figure is not None else found.cloud_at(middle)).to("cpu")
+    named = category or found.category
+    return Asset(asset_id, named, found.size, cloud, provenance, figure=found.figure)
 
 
 def import_asset(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -23,6 +23,7 @@ from ...scene.io import SceneSummary, load_scene
 from ..engine import Engine
 from ..http.problems import ServiceError
 from ..lanes import Lane
+from ..objects.shared_bundles import mark_used
 from .memory import IdleItem, MemoryBudget
 from .scene_catalog import Listing, SceneCatalog
 
@@ -52,6 +53,9 @@ class SceneCache:
         budget: of memory, shared with others that load things.
         device: where their tensors live.
         on_load: called with the seconds each load took.
+
+    Attributes:
+        fetch: brings a scene that is not in the folder from elsewhere; whether there was one.
     """
 
     def __init__(
@@ -68,6 +72,7 @@ class SceneCache:
         self.device = device
         self._engine = engine
         self._on_load = on_load
+        self.fetch: Callable[[str], Awaitable[bool]] | None = None
         self._listings: dict[str, Listing] = {}
         self._resident: dict[str, _Resident] = {}
         self._loading: dict[str, asyncio.Task[Scene]] = {}
@@ -102,6 +107,8 @@ class SceneCache:
             ServiceError: UNKNOWN_SCENE, with the names there are.
         """
         known = self._listings.get(name) or (await self.refresh()).get(name)
+        if known is None and self.fetch is not None and await self.fetch(name):
+            known = (await self.refresh()).get(name)
         if known is None:
             names = ", ".join(list(self._listings)[:20]) or "none"
             raise ServiceError(
@@ -249,6 +256,7 @@ class SceneCache:
     async def _load(self, name: str, summary: SceneSummary) -> Scene:
         started = time.monotonic()
         try:
+            await self.on_disk_thread(partial(mark_used, summary.path))
             scene = await self.on_disk_thread(lambda: load_scene(summary.path))
             scene = await self._engine.call(scene.to, self.device, label="load", lane=Lane.BULK)
         except BundleError as error:

@@ -9,7 +9,7 @@ from ...edit.shadow import contact_shadow
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
-from ...scene import Asset, Ground
+from ...scene import Asset, GaussianCloud, Ground, Trajectory
 
 BACKDROP = (0.90, 0.91, 0.93)
 FOCAL = 1.6
@@ -29,7 +29,7 @@ def draw_thumbnail(asset: Asset, *, width: int, backend: Backend) -> NDArray[np.
     floor = Ground.level(-asset.size[2] / 2)
     shadow = contact_shadow(np.eye(4), asset.size, floor, device=asset.cloud.device)
     output = rasterize(
-        [Instance(asset.cloud), *([shadow] if shadow else [])],
+        [Instance(_standing(asset)), *([shadow] if shadow else [])],
         invert_transform(_looking_at_origin(eye))[None],
         K[None],
         width,
@@ -40,6 +40,14 @@ def draw_thumbnail(asset: Asset, *, width: int, backend: Backend) -> NDArray[np.
     rgb = output.rgb[0].clamp(0.0, 1.0).mul(255.0).round()
     pixels: NDArray[np.uint8] = rgb.to("cpu").numpy().astype(np.uint8)
     return pixels
+
+
+def _standing(asset: Asset) -> GaussianCloud:
+    if asset.figure is None:
+        return asset.cloud
+    place = np.array([[0.0, 0.0, asset.figure.middle]])
+    here = Trajectory(np.zeros(1, np.int64), place, np.array([[1.0, 0.0, 0.0, 0.0]]))
+    return asset.figure.posed(asset.cloud, here, 0)
 
 
 def _looking_at_origin(eye: Float) -> Float:

@@ -85,6 +85,7 @@ def edited_objects(
             asset_id=o.asset.asset_id if o.asset else None,
             physics=o.physics,
             velocity=o.velocity,
+            gait=o.gait,
         )
         for o in objects
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -14,10 +15,11 @@ from pydantic import BaseModel, ValidationError
 from starlette.datastructures import FormData, UploadFile
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetUpload
+from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetPerson, AssetUpload
 from real2sim_proto.base import Identifier
 
 from ...render import encode_image
+from ...scene.person import person_asset
 from ..http.auth import TokenRoute
 from ..http.idempotency import IdempotencyKey, form_digest
 from ..http.problems import ServiceError
@@ -37,7 +39,9 @@ _BODY: dict[str, Any] = {
         "required": True,
         "content": {
             "application/json": {
-                "schema": AssetCut.model_json_schema(),
+                "schema": {
+                    "anyOf": [AssetCut.model_json_schema(), AssetPerson.model_json_schema()]
+                },
                 "example": {"scene": "demo_street", "object_id": "car_3", "asset_id": "red_car"},
             },
             "multipart/form-data": {
@@ -67,7 +71,8 @@ router = APIRouter(prefix="/v1/assets", tags=["assets"], route_class=TokenRoute)
 async def add(
     worker: WorkerOf, request: Request, idempotency_key: IdempotencyKey = None
 ) -> Response:
-    """Add an asset: an object cut out of a scene (JSON), or an uploaded splat file (form).
+    """Add an asset: an object cut out of a scene or a person who walks (JSON), or an uploaded
+    splat file (form).
 
     Assets stand upright with x forward, at a real size, and never change: an id that is taken
     stays taken.
@@ -75,7 +80,9 @@ async def add(
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
     with worker.imports.place():
         if kind != "multipart/form-data":
-            add_asset = partial(_extract, worker, await request.body())
+            body = await request.body()
+            make = _person if _names_a_build(body) else _extract
+            add_asset = partial(make, worker, body)
             return await _added(worker, request, idempotency_key, add_asset)
         async with request.form(max_files=1, max_fields=len(AssetUpload.model_fields)) as form:
             content = await form_digest(form) if idempotency_key is not None else None
@@ -131,6 +138,8 @@ async def delete(
     with worker.assets.removing(asset_id):
         # Once more: an edit that was under way may have found it before.
         await _check_unused(worker, asset_id)
+        if worker.sharing is not None:
+            await worker.sharing.forget("asset", asset_id)
         await worker.scene_cache.on_disk_thread(lambda: worker.assets.remove(asset_id))
     return Response(status_code=204)
 
@@ -182,6 +191,34 @@ async def _extract(worker: Worker, body: bytes, claim: str | None) -> AssetInfo:
             return made
         asset = extract_object(scene, cut.object_id, asset_id=asset_id, category=cut.category)
         worker.assets.check_free(asset_id)
+        worker.assets_quota.check(added_bytes=asset.nbytes)
+        return worker.assets.add(asset, claim=claim)
+
+    return await worker.imports.run(work)
+
+
+def _names_a_build(body: bytes) -> bool:
+    try:
+        given = json.loads(body)
+    except ValueError:
+        return False
+    return isinstance(given, dict) and "build" in given
+
+
+async def _person(worker: Worker, body: bytes, claim: str | None) -> AssetInfo:
+    asked = _parsed(AssetPerson, body)
+
+    def work() -> AssetInfo:
+        if (made := worker.assets.made_by(claim, asked.asset_id)) is not None:
+            return made
+        worker.assets.check_free(asked.asset_id)
+        asset = person_asset(
+            asked.asset_id,
+            asked.build,
+            height=asked.height,
+            clothes={str(name): (r, g, b) for name, (r, g, b) in asked.clothes.items()},
+            worn=asked.worn,
+        )
         worker.assets_quota.check(added_bytes=asset.nbytes)
         return worker.assets.add(asset, claim=claim)
 

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
-from fastapi.responses import FileResponse, StreamingResponse
+from fastapi.responses import FileResponse, RedirectResponse, StreamingResponse
 
 from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo, JobList
@@ -30,6 +30,8 @@ FILE_TYPES = (
     RECORDING,
     "application/x-tar",
     "image/jpeg",
+    "application/xml",
+    "application/vnd.apache.parquet",
 )
 """Of what jobs leave."""
 
@@ -134,11 +136,26 @@ async def preview(
                 media_type: {"schema": {"type": "string", "format": "binary"}}
                 for media_type in FILE_TYPES
             },
-        }
+        },
+        206: {"description": "the part of it that `Range` asked for"},
+        307: {"description": "where it may be fetched for a while, with `signed`"},
     },
 )
-async def file(worker: WorkerOf, job_id: Identifier, name: Identifier) -> Response:
-    """A file that a finished job left."""
+async def file(
+    worker: WorkerOf,
+    job_id: Identifier,
+    name: Identifier,
+    signed: Annotated[
+        bool,
+        Query(description="answer 307 with an address at the object store, where there is one"),
+    ] = False,
+) -> Response:
+    """A file that a finished job left; `Range` asks for a part of it."""
+    if signed and worker.sharing is not None:
+        seconds = worker.settings.objects_url_seconds
+        url = await worker.sharing.signed_url("job", job_id, name, seconds=seconds)
+        if url is not None:
+            return RedirectResponse(url, headers={"Cache-Control": "no-store"})
     path, left = await worker.jobs.file(job_id, name)
     return FileResponse(path, media_type=left.media_type, filename=f"{job_id}.{name}")
 

@@ -23,6 +23,7 @@ from real2sim_proto.storyboard import Storyboard
 from ...scenarios.errors import ScenarioError
 from ...scenarios.fit import fitted_to_scene
 from ...scenarios.gallery import GALLERY, corner_case
+from ...scenarios.gallery.pictures import shipped
 from ...scenarios.openscenario import ReadOptions, read_openscenario_text, write_openscenario
 from ..http.auth import TokenRoute
 from ..http.idempotency import IdempotentRequest
@@ -34,7 +35,7 @@ from .scenarios import Change, ChangeOf
 
 router = APIRouter(prefix="/v1", tags=["storyboards"], route_class=TokenRoute)
 
-XOSC = "application/xml"
+XOSC, SVG = "application/xml", "image/svg+xml"
 T = TypeVar("T")
 
 
@@ -48,10 +49,35 @@ async def gallery() -> Gallery:
                 title=case.title,
                 family=case.family,
                 parameters=dict(case.parameters),
+                picture=f"/v1/gallery/{case.name}/picture",
             )
             for case in GALLERY.values()
         ]
     )
+
+
+@router.get(
+    "/gallery/{case}/picture",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "an SVG document, three times as wide as it is high",
+            "content": {SVG: {"schema": {"type": "string"}}},
+        }
+    },
+)
+async def picture(case: Identifier) -> Response:
+    """A corner case from above: who comes from where, and where an ego that goes straight on at
+    10 m/s (blue) meets them."""
+    if case not in GALLERY:
+        raise ServiceError(
+            ErrorCode.NOT_FOUND,
+            f"the gallery has no {case!r}",
+            hint=f"GET /v1/gallery lists them: {', '.join(GALLERY)}",
+        )
+    content = await asyncio.to_thread(shipped, case)
+    headers = {"Cache-Control": "private, max-age=3600"}
+    return Response(content, media_type=SVG, headers=headers)
 
 
 @router.post("/scenarios/{scenario_id}/corner-case", response_model=OperationResult)

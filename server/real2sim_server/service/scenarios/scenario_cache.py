@@ -15,7 +15,8 @@ from ...scene.io import SceneSummary
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..storage.store import ScenarioRow, Store
-from .replies import stored_entry
+from .recorded import check_made, recorded_hash, recorded_row
+from .replies import replayed, stored_entry
 from .snapshots import Snapshots
 
 MAX_CACHED_SCENARIOS = 256
@@ -67,7 +68,12 @@ class ScenarioCache:
 
     @asynccontextmanager
     async def locked(self, scenario_id: str) -> AsyncIterator[CachedScenario]:
-        """The scenario while nobody else changes it. Raises as :meth:`get`."""
+        """The scenario while nobody else changes it.
+
+        Raises:
+            ServiceError: as :meth:`get`, or INVALID_OPERATION for what was recorded.
+        """
+        check_made(scenario_id)
         while True:
             cached = await self.get(scenario_id)
             async with cached.lock:
@@ -77,11 +83,14 @@ class ScenarioCache:
                     return
 
     async def get(self, scenario_id: str) -> CachedScenario:
-        """The scenario with all that is in its log, by whichever worker.
+        """The scenario with all that is in its log, by whichever worker; a scene as it was
+        recorded has none.
 
         Raises:
             ServiceError: UNKNOWN_SCENARIO, or SCENE_BROKEN where its scene has changed.
         """
+        if (wanted := recorded_hash(scenario_id)) is not None:
+            return await self._recorded(scenario_id, wanted)
         while (cached := self._cached.get(scenario_id)) is not None:
             if await self._is_current(scenario_id, cached):
                 return cached
@@ -94,6 +103,25 @@ class ScenarioCache:
             if not lock.locked():
                 self._opening.pop(scenario_id, None)
         return cached
+
+    async def _recorded(self, scenario_id: str, wanted: str) -> CachedScenario:
+        """A scene as it was recorded; only memory has it."""
+        cached = self._cached.get(scenario_id)
+        if cached is not None:
+            there = await self._scene_cache.summary(cached.row.scene)
+            if there.content_hash == wanted:
+                self._cached.move_to_end(scenario_id)
+                return cached
+            self.evict(scenario_id)
+        for scene, listing in (await self._scene_cache.refresh()).items():
+            summary = listing.summary
+            if summary is not None and summary.content_hash == wanted:
+                row = recorded_row(scene, summary)
+                scenario = await asyncio.to_thread(replayed, row, summary, [], self._assets)
+                cached = CachedScenario(row, scenario, summary)
+                self.put(cached)
+                return cached
+        raise _unknown(scenario_id)
 
     async def _is_current(self, scenario_id: str, cached: CachedScenario) -> bool:
         """Whether a scenario in memory is, by now, what the log says; evicts it where it is not.

@@ -29,6 +29,7 @@ from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..library.scene_catalog import BUNDLE_SUFFIX
 from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply, now_us
+from .recorded import check_made
 from .replies import (
     ScenarioView,
     asset_hashes,
@@ -138,7 +139,9 @@ class Scenarios:
         )
 
     async def rename(self, scenario_id: str, name: str) -> ScenarioView:
-        """Give a scenario another name. Raises ServiceError: UNKNOWN_SCENARIO."""
+        """Give a scenario another name. Raises ServiceError: UNKNOWN_SCENARIO, or
+        INVALID_OPERATION for what was recorded."""
+        check_made(scenario_id)
         await self._store.rename_scenario(scenario_id, name)
         return await self.view(scenario_id)
 

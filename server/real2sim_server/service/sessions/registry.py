@@ -105,7 +105,7 @@ class Sessions:
         self.segments = segments
         self.stepper = Stepper(pipeline, kernels, store, on_fenced=self.let_go)
         self.metrics = metrics
-        self.draining = False
+        self.draining = self._handed_over = False
         self.resume_key = secrets.token_bytes()
         self._limits = limits
         self._store = store
@@ -370,15 +370,21 @@ class Sessions:
         log.info("session closed", session_id=session.session_id, reason=reason)
 
     def let_go(self, session: Session) -> None:
-        """Leave a session that another worker has taken over; its connections are told to come
-        back to that one. A second time changes nothing."""
+        """Leave a session that another worker has taken over, or may; its connections are told to
+        come back to that one. A second time changes nothing."""
         if self._open.get(session.session_id) is not session:
             return
         del self._open[session.session_id]
         session.closed = elsewhere(session.session_id)
         self._scene_cache.unpin(session.row.scene)
         self._tell(session, session.closed)
-        log.warning("session taken over by another worker", session_id=session.session_id)
+        log.warning("session left to another worker", session_id=session.session_id)
+
+    def hand_over(self) -> None:
+        """Leave all sessions to other workers, and take none back; what is on record is whole."""
+        self.draining = self._handed_over = True
+        for session in list(self):
+            self.let_go(session)
 
     async def let_go_of_lost(self) -> None:
         """Leave all sessions that were taken over: this worker was thought dead."""
@@ -449,6 +455,8 @@ class Sessions:
         return await asyncio.shield(task)
 
     async def _rebuild(self, row: SessionRow) -> Session:
+        if self._handed_over:
+            raise elsewhere(row.session_id)
         with self._reserved_slot(row.owner):
             taken = await self._leases.take_over(row.session_id)
             if taken is None:

@@ -21,6 +21,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 
+from ..._files import unpack_tar
 from . import tables as t
 from .errors import StoreError
 from .migrations import check_version
@@ -175,7 +176,7 @@ def _unpacked(file: Path, beside: Path) -> Iterator[Path]:
         try:
             with tarfile.open(file, "r:") as tar:
                 members = [member for member in tar if _belongs(member)]
-                tar.extractall(folder, members=members, filter="data")
+                unpack_tar(tar, folder, members=members)
             told = json.loads((folder / MANIFEST).read_text("utf-8"))
             info = BackupInfo(**told)
         except (tarfile.TarError, OSError, ValueError, TypeError) as error:

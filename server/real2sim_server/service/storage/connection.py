@@ -103,6 +103,36 @@ def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:
     return engine
 
 
+def native_connection(url: sa.URL, timeout_s: float) -> tuple[Any, socket.socket]:
+    """A connection of pg8000's own kind, outside of all pools, and its socket; each statement is
+    committed by itself.
+
+    Raises:
+        pg8000.exceptions.Error: there is no server, or it refuses.
+    """
+    from pg8000 import native
+
+    engine_dialect = url.get_dialect()()
+    _, parameters = engine_dialect.create_connect_args(url)
+    address = parameters.get("host", "localhost"), parameters.get("port", 5432)
+    try:
+        connected = socket.create_connection(address, timeout_s)
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    except OSError as error:
+        raise native.InterfaceError(
+            f"no connection to {address[0]}:{address[1]}: {error}"
+        ) from error
+    try:
+        connection = native.Connection(**parameters, timeout=timeout_s, sock=connected)
+        for name in ("statement_timeout", "lock_timeout"):
+            connection.run(f"SET {name} = {round(timeout_s * SERVER_SHARE * 1000)}")
+    except BaseException:
+        connected.close()
+        raise
+    return connection, connected
+
+
 def _connect_by_own_socket(
     dialect: Any, _record: object, arguments: list[Any], parameters: dict[str, Any]
 ) -> Any:

@@ -31,8 +31,9 @@ from .errors import (
     StoreUnavailableError,
     sorted_error,
 )
-from .migrations import prepare_schema
+from .migrations import Policy, prepare_schema
 from .ownership import StateFolderError, owned_name
+from .prepared import Prepared, PreparedStatements
 from .server_name import NameOnServer
 
 T = TypeVar("T")
@@ -64,6 +65,8 @@ class Write:
     Attributes:
         statement: as text it goes to the driver as it is, with tuples as rows.
         rows: that it is made with, once for each.
+        prepared: the same for a connection that prepares it, where it may be alone in its
+            transaction.
         fenced: how many rows it must change; fewer mean that their sessions were taken over, and
             nothing of the transaction is kept. None where it may be any number.
     """
@@ -71,6 +74,7 @@ class Write:
     statement: sa.Executable | str
     rows: list[dict[str, Any]] | list[tuple[Any, ...]] | None = None
     fenced: int | None = None
+    prepared: Prepared | None = None
 
     def made_by(self, connection: sa.Connection) -> sa.CursorResult[Any]:
         """What comes of it."""
@@ -101,6 +105,7 @@ class Database:
         worker_id: name to hold as long as the database is open; None for a guest.
         timeout_s: of a statement, a lock, an answer [s].
         durability: what reaches the disk before it is acknowledged.
+        migration: whether a store of an older schema is brought up to date.
         on_call: told of each read and write, on the thread that did it.
     """
 
@@ -111,6 +116,7 @@ class Database:
         worker_id: str | None = None,
         timeout_s: float = TIMEOUT_S,
         durability: Durability = "edits",
+        migration: Policy = "auto",
         on_call: OnCall | None = None,
     ) -> None:
         self.url = url
@@ -118,6 +124,7 @@ class Database:
         self._worker_id = worker_id
         self._timeout_s = timeout_s
         self._durability = durability
+        self._migration: Policy = migration
         self._trouble: StoreTroubleError | None = None
         self._trouble_since = 0.0
         self._file: Path | None = None
@@ -128,6 +135,7 @@ class Database:
         self._write_lock = threading.Lock()
         self._engine: sa.Engine | None = None
         self._writer: sa.Connection | None = None
+        self._prepared: PreparedStatements | None = None
 
     async def open(self, first: Write) -> None:
         """Connect, create what is missing, and execute the first statement.
@@ -195,6 +203,24 @@ class Database:
         """
         self._refuse_while_down()
         return await self.on_thread(partial(self.execute, changes))
+
+    async def write_returning(self, statement: sa.UpdateBase) -> list[dict[str, Any]]:
+        """Rows that a statement returns which writes, in a transaction of its own."""
+
+        def write() -> list[dict[str, Any]]:
+            self._refuse_while_down()
+            try:
+                with (
+                    self._timed("write"),
+                    self._write_lock,
+                    self._transaction(durable=True) as connection,
+                ):
+                    return [dict(row) for row in connection.execute(statement).mappings()]
+            except Exception as error:
+                self._reraise(error)
+
+        self._refuse_while_down()
+        return await self.on_thread(write)
 
     def execute(self, changes: Sequence[Write], *, promised: bool = True) -> list[int]:
         """Like :meth:`write`, on the calling thread; never on the event loop.
@@ -295,6 +321,8 @@ class Database:
         """Rows changed by each statement, in one transaction; the caller holds the write lock."""
         if self._file is not None and len(changes) == 1 and isinstance(changes[0].statement, str):
             return [self._executed_by_driver(changes[0], durable=durable)]
+        if self._prepared is not None and len(changes) == 1 and changes[0].prepared is not None:
+            return [changes[0].checked(self._prepared.execute(changes[0].prepared))]
         with self._transaction(durable=durable) as connection:
             return [c.checked(c.made_by(connection).rowcount) for c in changes]
 
@@ -433,6 +461,9 @@ class Database:
             self._engine = connect(self.url, timeout_s=self._timeout_s)
             self._prepare()
             self._own_name()
+            url = self._engine.url
+            if url.get_backend_name() == "postgresql" and url.get_driver_name() == "pg8000":
+                self._prepared = PreparedStatements(url, timeout_s=self._timeout_s)
             with self._engine.begin() as connection:
                 first.made_by(connection)
         except (StateFolderError, StoreError):
@@ -449,11 +480,11 @@ class Database:
         with engine.connect():
             pass  # Whether anybody is there is found out in the usual time.
         if self._file is None and engine.dialect.name == "sqlite":
-            prepare_schema(engine)
+            prepare_schema(engine, policy=self._migration)
             return
         long_running = connect(self.url, timeout_s=SCHEMA_TIMEOUT_S)
         try:
-            prepare_schema(long_running)
+            prepare_schema(long_running, policy=self._migration)
         finally:
             long_running.dispose()
 
@@ -470,6 +501,8 @@ class Database:
     def _close(self) -> None:
         self._drop_writer()
         self._owned.close()
+        if self._prepared is not None:
+            self._prepared.close()
         if self._engine is not None:
             self._engine.dispose()
             self._engine = None

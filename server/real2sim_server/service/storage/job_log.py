@@ -12,6 +12,7 @@ from real2sim_proto.jobs import JobInfo, JobState
 
 from . import tables as t
 from .leases import clock_of, is_alive
+from .notices import notice
 from .store import Store, StoredReply, Write, now_us
 
 UNFINISHED = (JobState.QUEUED.value, JobState.RUNNING.value)
@@ -67,25 +68,25 @@ class JobLog:
         """
         row = _row(job) | {"worker_id": self._worker_id, "created_us": now_us()}
         row["portable"] = int(portable)
-        await self._store.write(Write(sa.insert(t.jobs), [row]), reply=reply)
+        await self._store.write(Write(sa.insert(t.jobs), [row]), *self._notice(), reply=reply)
 
     async def update(self, job: JobInfo, *, epoch: int) -> None:
         """Keep what the job is now. Raises FencedError: another worker has it, or it is gone."""
         mine = (t.jobs.c.job_id == job.job_id) & (t.jobs.c.epoch == epoch)
         change = sa.update(t.jobs).where(mine).values(_row(job))
-        await self._store.write(Write(change, fenced=1))
+        await self._store.write(Write(change, fenced=1), *self._notice())
 
     async def update_progress(self, job: JobInfo, *, epoch: int) -> None:
         """Keep how far a job is, unless it has ended meanwhile."""
         mine = (t.jobs.c.job_id == job.job_id) & (t.jobs.c.epoch == epoch)
         running = t.jobs.c.state == JobState.RUNNING.value
         change = sa.update(t.jobs).where(mine & running).values(_row(job))
-        await self._store.write(Write(change))
+        await self._store.write(Write(change), *self._notice())
 
     async def ask_to_cancel(self, job_id: str) -> None:
         """Leave word for whichever worker has the job."""
         change = sa.update(t.jobs).where(t.jobs.c.job_id == job_id).values(cancelled=1)
-        await self._store.write(Write(change))
+        await self._store.write(Write(change), *self._notice())
 
     async def asked_to_cancel(self, epochs: Mapping[str, int]) -> tuple[set[str], set[str]]:
         """Which jobs somebody has cancelled, and which this worker has no more.
@@ -105,27 +106,44 @@ class JobLog:
         worker."""
         return await self._ids(self._is_left_behind(own=own))
 
-    async def overdue(self, kinds: Collection[str]) -> list[str]:
-        """Jobs of some kinds that wait with another worker though any could begin them."""
-        return await self._ids(self._is_overdue() & t.jobs.c.kind.in_(kinds))
-
     async def claim(self, job_id: str, *, own: bool = False) -> ClaimedJob | None:
         """Take over a job that is left behind or overdue, in one statement: of several workers that
         try, one gets it; None for the others."""
-        j = t.jobs.c
         free = self._is_left_behind(own=own) | self._is_overdue()
+        return await self._claim((t.jobs.c.job_id == job_id) & free)
+
+    async def claim_left_behind(self) -> ClaimedJob | None:
+        """Take over the oldest job whose worker is dead; None where there is none."""
+        return await self._claim(self._is_first_of(self._is_left_behind(own=False)))
+
+    async def claim_overdue(self, kinds: Collection[str]) -> ClaimedJob | None:
+        """Take over the oldest job of some kinds that waits with another worker though any could
+        begin it; None where there is none."""
+        return await self._claim(self._is_first_of(self._is_overdue() & t.jobs.c.kind.in_(kinds)))
+
+    def _is_first_of(self, free: sa.ColumnElement[bool]) -> sa.ColumnElement[bool]:
+        """Workers that look at the same time get different jobs, and none waits for another's
+        transaction: on a server rows that somebody is just taking are passed over."""
+        j = t.jobs.c
+        first = sa.select(j.job_id).where(free).order_by(j.created_us, j.job_id).limit(1)
+        first = first.with_for_update(skip_locked=True).correlate(None)
+        return j.job_id == first.scalar_subquery()
+
+    async def _claim(self, condition: sa.ColumnElement[bool]) -> ClaimedJob | None:
+        j = t.jobs.c
         died = sa.case((j.state == JobState.RUNNING.value, 1), else_=0)
         values = {"worker_id": self._worker_id, "epoch": j.epoch + 1, "deaths": j.deaths + died}
-        claimed = sa.update(t.jobs).where((j.job_id == job_id) & free).values(values)
-        (count,) = await self._store.write(Write(claimed))
-        query = sa.select(t.jobs).where((j.job_id == job_id) & (j.worker_id == self._worker_id))
-        rows = await self._store.read(query) if count else []
+        claimed = sa.update(t.jobs).where(condition).values(values).returning(t.jobs)
+        rows = await self._store.database.write_returning(claimed)
         if not rows:
             return None
         (row,) = rows
         info = JobInfo.model_validate_json(row["document"])
         whether = bool(row["portable"]), bool(row["cancelled"])
         return ClaimedJob(info, row["epoch"], row["deaths"], *whether)
+
+    def _notice(self) -> list[Write]:
+        return notice("jobs", on_server=self._store.database.is_server)
 
     def _is_left_behind(self, *, own: bool) -> sa.ColumnElement[bool]:
         j = t.jobs.c

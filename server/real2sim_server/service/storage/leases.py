@@ -41,11 +41,14 @@ class Leases:
         store: open while this is used.
         worker_id: whose promises these are.
         seconds: for which each holds.
+
+    Attributes:
+        worker_id: whose promises these are.
     """
 
     def __init__(self, store: Store, worker_id: str, *, seconds: float) -> None:
         self._store = store
-        self._worker_id = worker_id
+        self.worker_id = worker_id
         self._seconds = seconds
 
     async def renew(self, document: Mapping[str, Any]) -> None:
@@ -64,17 +67,17 @@ class Leases:
         """Claim an open session that is this worker's, or whose worker has not kept its promise;
         None where there is none, or another one has it."""
         s = t.sessions.c
-        is_free = (s.worker_id == self._worker_id) | ~is_alive(s.worker_id, self._store)
+        is_free = (s.worker_id == self.worker_id) | ~is_alive(s.worker_id, self._store)
         claimed = sa.update(t.sessions).where((s.session_id == session_id) & s.closed_us.is_(None))
-        claimed = claimed.where(is_free).values(worker_id=self._worker_id, epoch=s.epoch + 1)
+        claimed = claimed.where(is_free).values(worker_id=self.worker_id, epoch=s.epoch + 1)
         (count,) = await self._store.write(Write(claimed))
         row = await self._store.session(session_id)
-        return row if count and row is not None and row.worker_id == self._worker_id else None
+        return row if count and row is not None and row.worker_id == self.worker_id else None
 
     async def epochs(self, session_ids: Collection[str]) -> dict[str, int]:
         """Epochs of those of the sessions that this worker has, by their ids."""
         s = t.sessions.c
-        mine = (s.worker_id == self._worker_id) & s.session_id.in_(session_ids)
+        mine = (s.worker_id == self.worker_id) & s.session_id.in_(session_ids)
         rows = await self._store.read(sa.select(s.session_id, s.epoch).where(mine))
         return {row["session_id"]: row["epoch"] for row in rows}
 
@@ -91,10 +94,10 @@ class Leases:
     async def _promise(self, seconds: float, document: Mapping[str, Any]) -> None:
         text = json.dumps(document, allow_nan=False)
         until = clock_of(self._store) + round(seconds * 1e6)
-        mine = t.workers.c.worker_id == self._worker_id
+        mine = t.workers.c.worker_id == self.worker_id
         values = {"lease_until_us": until, "document": text}
         renewed = Write(sa.update(t.workers).where(mine).values(values))
-        first = Write(sa.insert(t.workers).values(worker_id=self._worker_id, **values))
+        first = Write(sa.insert(t.workers).values(worker_id=self.worker_id, **values))
 
         def promise() -> None:
             # It is no use after the machine has gone down: nothing has to reach the disk.

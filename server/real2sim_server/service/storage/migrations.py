@@ -1,15 +1,21 @@
-"""The schema of a store, and the numbered steps from older ones to the present one.
+"""The schema of a store: numbered revisions, by Alembic, from older ones to the present one.
 
-A new store gets the present schema at once. A change of `tables` is a new entry of
-:data:`MIGRATIONS` besides, which makes of a store of the version before what a new one would be;
-entries are never changed once released.
+A new store gets the present schema at once. A change of `tables` is a new file in
+``revisions/versions`` besides, numbered on, which makes of a store of the version before what a new
+one would be; files are never changed once released. Versions before 5 are older than Alembic here
+and have steps of their own (:mod:`.older`).
+
+The number stands in ``schema_version``, which every program that ever read a store looks at, and as
+a revision in Alembic's own table.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import sqlalchemy as sa
 import structlog
@@ -17,89 +23,77 @@ from sqlalchemy.engine import Connection
 
 from . import tables as t
 from .errors import StoreError
-from .tokens import token_hash
+from .older import LAST, OLDER_STEPS
+
+if TYPE_CHECKING:
+    from alembic.config import Config
 
 SCHEMA_LOCK = 0x5232_5301
 """Of PostgreSQL, for the time in which the schema is made or changed."""
+
+REVISIONS = Path(__file__).parent / "revisions"
+OLDEST = OLDER_STEPS[0].version - 1
+"""Oldest schema that this program can bring up to date."""
+
+Policy = Literal["auto", "refuse"]
+"""What happens to a store of an older schema: it is brought up to date, or refused."""
 
 log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True)
-class Migration:
-    """A step to a schema from the one before.
+class SchemaStatus:
+    """What a store's schema is, and what this program would make of it.
 
     Attributes:
-        version: that it leads to.
-        what: it does, for the log.
-        apply: does it, within a transaction.
+        found: its version; None for an empty database.
+        wanted: by this program.
+        steps: what would be done, one line a version.
     """
 
-    version: int
-    what: str
-    apply: Callable[[Connection], None]
+    found: int | None
+    wanted: int
+    steps: tuple[str, ...]
 
 
-def _hash_tokens(connection: Connection) -> None:
-    """Session tokens become hashes; answers that hold one are forgotten."""
-    if connection.dialect.name == "sqlite":
-        connection.exec_driver_sql("PRAGMA secure_delete=ON")
-    connection.exec_driver_sql("ALTER TABLE sessions RENAME COLUMN token TO token_hash")
-    rows = connection.exec_driver_sql("SELECT session_id, token_hash FROM sessions").all()
-    hashed = [{"id": session_id, "hash": token_hash(token)} for session_id, token in rows]
-    if hashed:
-        change = sa.text("UPDATE sessions SET token_hash = :hash WHERE session_id = :id")
-        connection.execute(change, hashed)
-    answers = connection.exec_driver_sql("SELECT key, body FROM idempotent_replies").all()
-    telling = [{"key": key} for key, body in answers if b'"token"' in bytes(body)]
-    if telling:
-        connection.execute(sa.text("DELETE FROM idempotent_replies WHERE key = :key"), telling)
-
-
-def _add_owners(connection: Connection) -> None:
-    """Sessions of before belong to the single token that there was."""
-    connection.exec_driver_sql(
-        "ALTER TABLE sessions ADD COLUMN owner VARCHAR(80) DEFAULT 'default' NOT NULL"
-    )
-
-
-def _add_leases(connection: Connection) -> None:
-    """Workers say that they live, and sessions may go from one to another."""
-    connection.exec_driver_sql("ALTER TABLE sessions ADD COLUMN epoch INTEGER DEFAULT 0 NOT NULL")
-    connection.exec_driver_sql(
-        "CREATE TABLE workers (worker_id VARCHAR(16) NOT NULL PRIMARY KEY, "
-        "lease_until_us BIGINT NOT NULL, document TEXT NOT NULL)"
-    )
-
-
-def _add_leases_of_jobs(connection: Connection) -> None:
-    """Jobs may go from one worker to another; those of before end with theirs."""
-    for column in ("epoch", "deaths", "portable", "cancelled"):
-        connection.exec_driver_sql(
-            f"ALTER TABLE jobs ADD COLUMN {column} INTEGER DEFAULT 0 NOT NULL"
-        )
-
-
-MIGRATIONS: tuple[Migration, ...] = (
-    Migration(2, "tokens of sessions are kept as hashes", _hash_tokens),
-    Migration(3, "sessions keep the name of the token they were made with", _add_owners),
-    Migration(4, "sessions may go from one worker to another", _add_leases),
-    Migration(5, "jobs may go from one worker to another", _add_leases_of_jobs),
-)
-
-OLDEST = MIGRATIONS[0].version - 1
-"""Oldest schema that this program can bring up to date."""
-
-
-def prepare_schema(engine: sa.Engine) -> None:
-    """Make the schema, or bring an older one up to date; several may try at once.
+def schema_status(engine: sa.Engine) -> SchemaStatus:
+    """Look at a store's schema; nothing is changed.
 
     Raises:
-        StoreError: the schema is newer than this program, or too old for it.
+        StoreError: this program can neither use it nor bring it up to date.
     """
     with engine.connect() as connection:
-        if _version(connection) == t.SCHEMA_VERSION:
-            return
+        found = _version(connection)
+    if found is None:
+        return SchemaStatus(None, t.SCHEMA_VERSION, (f"{t.SCHEMA_VERSION}: all tables",))
+    check_version(found)
+    steps = [f"{step.version}: {step.what}" for step in OLDER_STEPS if step.version > found]
+    if max(found, LAST) < t.SCHEMA_VERSION:
+        steps += [f"{number}: {what}" for number, what in _revisions() if number > max(found, LAST)]
+    return SchemaStatus(found, t.SCHEMA_VERSION, tuple(steps))
+
+
+def prepare_schema(engine: sa.Engine, *, policy: Policy = "auto") -> None:
+    """Make the schema, or bring an older one up to date; several may try at once.
+
+    Args:
+        engine: of the store.
+        policy: whether an older one is brought up to date.
+
+    Raises:
+        StoreError: the schema is newer than this program, or too old for it, or older where that
+            is refused; with the command to run.
+    """
+    with engine.connect() as connection:
+        found = _version(connection)
+    if found == t.SCHEMA_VERSION:
+        return
+    if found is not None and OLDEST <= found < t.SCHEMA_VERSION and policy == "refuse":
+        raise StoreError(
+            f"the store has schema version {found}, this worker wants {t.SCHEMA_VERSION}; make a "
+            "backup and run `real2sim store migrate`, or let workers do it by themselves with "
+            "REAL2SIM_STORE_MIGRATION=auto"
+        )
     with _alone(engine) as connection:
         # Another worker may have been faster.
         found = _version(connection)
@@ -108,13 +102,10 @@ def prepare_schema(engine: sa.Engine) -> None:
         if found is None:
             t.metadata.create_all(connection)
             _note(connection, t.SCHEMA_VERSION)
+            _stamp(connection)
             return
         check_version(found)
-        for migration in MIGRATIONS:
-            if migration.version > found:
-                migration.apply(connection)
-                _note(connection, migration.version)
-                log.warning("store migrated", version=migration.version, what=migration.what)
+        _migrate(connection, found)
     _rewrite(engine)
 
 
@@ -123,13 +114,65 @@ def check_version(found: int) -> None:
     if OLDEST <= found <= t.SCHEMA_VERSION:
         return
     if found > t.SCHEMA_VERSION:
-        remedy = "start a worker of that version, or restore a backup made before the upgrade"
+        remedy = (
+            "start a worker of that version, or restore a backup made before the upgrade: "
+            "`real2sim restore FILE --overwrite`"
+        )
     else:
-        remedy = "start a worker of a version in between first"
+        remedy = "run `real2sim store migrate` of a version in between first"
     raise StoreError(
-        f"the store has schema version {found}, this worker reads {OLDEST} to "
+        f"the store has schema version {found}, this program reads {OLDEST} to "
         f"{t.SCHEMA_VERSION}; {remedy}, or give another REAL2SIM_STORE_URL"
     )
+
+
+# --- steps ------------------------------------------------------------------------------
+
+
+def _migrate(connection: Connection, found: int) -> None:
+    for step in OLDER_STEPS:
+        if step.version > found:
+            step.apply(connection)
+            _note(connection, step.version)
+            log.warning("store migrated", version=step.version, what=step.what)
+    _upgrade(connection, from_version=max(found, LAST))
+
+
+def _upgrade(connection: Connection, *, from_version: int) -> None:
+    """Alembic's revisions behind ``from_version``, in the transaction of the connection."""
+    from alembic import command
+
+    def on_step(*, step: Any, **_others: object) -> None:
+        number, what = int(step.up_revision_id), step.up_revision.doc
+        _note(connection, number)
+        log.warning("store migrated", version=number, what=what)
+
+    if not sa.inspect(connection).has_table("alembic_version"):
+        command.stamp(_config(connection), f"{from_version:04}")
+    command.upgrade(_config(connection, on_step=on_step), "head")
+
+
+def _stamp(connection: Connection) -> None:
+    """Note in a new store that nothing is left for Alembic to do."""
+    from alembic import command
+
+    command.stamp(_config(connection), f"{t.SCHEMA_VERSION:04}")
+
+
+def _config(connection: Connection | None = None, *, on_step: Any = None) -> Config:
+    from alembic.config import Config
+
+    config = Config(attributes={"connection": connection, "on_step": on_step})
+    config.set_main_option("script_location", str(REVISIONS).replace("%", "%%"))
+    return config
+
+
+def _revisions() -> list[tuple[int, str]]:
+    """Versions and what leads to them, oldest first."""
+    from alembic.script import ScriptDirectory
+
+    found = ScriptDirectory.from_config(_config()).walk_revisions()
+    return sorted((int(one.revision), one.doc.rstrip(".")) for one in found)
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ import sqlalchemy as sa
 
 from . import tables as t
 from .database import Write
+from .prepared import Prepared
 from .rows import Claim, SessionEntry
 
 ClaimedEntries = tuple[Claim, Sequence[SessionEntry]]
@@ -76,7 +77,11 @@ def _append(rows: int) -> str:
 
 def _appended_on_server(values: Sequence[tuple[object, ...]]) -> Write:
     given = {f"v{k}": value for k, value in enumerate(chain.from_iterable(values))}
-    return Write(_append_on_server(len(values)).bindparams(**given), fenced=len(values))
+    text = _append_on_server(len(values))
+    # Of one session all rows are written or none: the statement needs no transaction around it.
+    alone = len({row[0] for row in values}) == 1
+    prepared = Prepared(f"{text.text} RETURNING 1", given) if alone else None
+    return Write(text.bindparams(**given), fenced=len(values), prepared=prepared)
 
 
 @cache

@@ -14,6 +14,7 @@ from . import tables as t
 from .clock import now_us
 from .database import TIMEOUT_S, Database, Durability, OnCall, Write
 from .errors import ConflictError, FencedError, StoreError, StoreTroubleError
+from .migrations import Policy
 from .rows import Claim, ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
 from .session_log import ClaimedEntries, appended, withdrawn
 
@@ -50,6 +51,7 @@ class Store:
         worker_id: name to hold as long as the store is open; None for a guest.
         timeout_s: of a statement, a lock, an answer [s].
         durability: what reaches the disk before it is acknowledged.
+        migration: whether a store of an older schema is brought up to date.
         on_call: told of each read and write, on the thread that did it.
     """
 
@@ -60,6 +62,7 @@ class Store:
         worker_id: str | None = None,
         timeout_s: float = TIMEOUT_S,
         durability: Durability = "edits",
+        migration: Policy = "auto",
         on_call: OnCall | None = None,
     ) -> None:
         self.url = url
@@ -68,6 +71,7 @@ class Store:
             worker_id=worker_id,
             timeout_s=timeout_s,
             durability=durability,
+            migration=migration,
             on_call=on_call,
         )
 

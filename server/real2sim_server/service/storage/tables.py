@@ -15,8 +15,8 @@ from sqlalchemy import (
     Text,
 )
 
-SCHEMA_VERSION = 5
-"""Raised with every change of a table, together with an entry in `migrations`."""
+SCHEMA_VERSION = 7
+"""Raised with every change of a table, together with a new file in ``revisions/versions``."""
 
 metadata = MetaData()
 
@@ -141,3 +141,36 @@ idempotent_replies = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 Index("ix_idempotent_replies_created", idempotent_replies.c.created_us)
+
+# Scenes, assets and files of jobs that lie in a store of objects: of which ones they are made.
+shared_bundles = Table(
+    "shared_bundles",
+    metadata,
+    Column("kind", String(8), primary_key=True),
+    Column("name", String(80), primary_key=True),
+    Column("content", String(64), nullable=False),
+    Column("document", Text, nullable=False),
+    Column("bytes", BigInteger, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+
+# Requests that changed something, and those that were refused for their token or role.
+audit = Table(
+    "audit",
+    metadata,
+    Column(
+        "entry",
+        BigInteger().with_variant(Integer, "sqlite"),
+        primary_key=True,
+        autoincrement=True,
+    ),
+    Column("at_us", BigInteger, nullable=False),
+    Column("account", String(80), nullable=False),
+    Column("client", String(80), nullable=False),
+    Column("worker_id", String(16), nullable=False),
+    Column("method", String(16), nullable=False),
+    Column("path", Text, nullable=False),
+    Column("status", Integer, nullable=False),
+    Column("request_id", String(80), nullable=False),
+)
+Index("ix_audit_at", audit.c.at_us)

@@ -29,6 +29,7 @@ export function startView() {
     onError: (text) => notify(text, "bad"),
     onGone: (gone) => ($("gone").hidden = !gone),
   });
+  on("begun", () => socket.turnTo(model.scenario.scenario_id));
   on("time draft camera", () => requestFrame(true));
   on("scenario run", () => requestFrame(false));
   on("selection draft scenario sweep layout", outline);
@@ -52,12 +53,14 @@ function viewRequest(width) {
   };
 }
 
+const drawnHere = () => model.space && !model.remote;
+
 // Small pictures while something moves, a full one as soon as it rests.
 function requestFrame(moving) {
-  if (model.mosaic || model.live) {
+  clearTimeout(still);
+  if (model.mosaic || model.live || drawnHere()) {
     return;
   }
-  clearTimeout(still);
   if (moving) {
     socket.requestFrame(viewRequest(Math.min(MOVING_WIDTH, fullWidth())));
   }
@@ -75,7 +78,7 @@ function fullWidth() {
 }
 
 function show(head, blob) {
-  if (model.live) {
+  if (model.live || drawnHere()) {
     return;
   }
   header = head;
@@ -111,6 +114,13 @@ export function showLive(blob, goesOn) {
   $("rate").textContent = "live";
   outline();
 }
+
+// The page has drawn a picture of its own; head: its size [css px], K and T_world_camera.
+export function showSpace(head) {
+  header = head;
+  outline();
+}
+export const requestPicture = () => requestFrame(false);
 
 // Place of the picture inside the stage: it is fitted with its own proportions.
 function frameBox() {
@@ -155,13 +165,16 @@ function outline() {
   if (!subject || !present(subject, model.t)) {
     return;
   }
+  pen.strokeStyle = ink().selected;
+  pen.lineWidth = 1.6;
+  strokeBox(pen, subject, toStage);
+}
+export function strokeBox(pen, subject, placeOf) {
   const { position, quaternion } = poseOf(subject);
   const corners = [...Array(8).keys()].map((i) => {
     const offset = subject.size.map((s, axis) => ((i >> axis) & 1 ? s : -s) / 2);
-    return toStage(rotate(quaternion, offset).map((v, k) => v + position[k]));
+    return placeOf(rotate(quaternion, offset).map((v, k) => v + position[k]));
   });
-  pen.strokeStyle = ink().selected;
-  pen.lineWidth = 1.6;
   for (let a = 0; a < 8; a++) {
     for (const bit of [1, 2, 4]) {
       const b = a | bit;
@@ -186,6 +199,9 @@ export function toggleUncertainty() {
 }
 
 export function toggleFree() {
+  if (model.space) {
+    return;
+  }
   model.free = model.free ? null : (header?.T_world_camera?.slice() ?? null);
   pressed("free", !!model.free);
   $("stage").classList.toggle("free", !!model.free);

@@ -1,5 +1,5 @@
 // Data sets of the scenario: made as jobs; labels over pictures, and what is in them by class.
-import { model } from "./model.js";
+import { model, own } from "./model.js";
 import { call, events, get, picture, post, sentence } from "./api.js";
 import { el, number, row } from "./dom.js";
 import { attempt, notify } from "./messages.js";
@@ -104,7 +104,7 @@ async function make(dryRun) {
   told = "";
   running = await post("/v1/exports", {
     kind: "dataset",
-    scenario: model.scenario.scenario_id,
+    scenario: await own(),
     formats: [...asked.formats],
     period_us: Math.round(asked.seconds * 1e6),
     dry_run: dryRun,

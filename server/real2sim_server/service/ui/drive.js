@@ -8,6 +8,7 @@ import { addLayer, follow } from "./map.js";
 import { show } from "./physics.js";
 import { drivesOf, isMine } from "./drive_session.js";
 import { seat, start, startDriving, take, takeTheWheel, hold, end, press } from "./driving.js";
+import { cornerCases, lookUp } from "./corner_cases.js";
 import { button, eventList, figures, said } from "./drive_figures.js";
 import { instant, isReplay, planInPicture, replay, replayed } from "./drive_replay.js";
 
@@ -46,6 +47,7 @@ export function startDrive() {
     draw();
   });
   on("run scenario", draw);
+  on("scenario", () => !page().hidden && listDrives());
   on("drive-step", live);
   on("drive-step", () => model.live && follow(model.live.ego.position));
   on("time", () => isReplay() && follow(egoPoseAt(model.t).position));
@@ -54,7 +56,7 @@ export function startDrive() {
 }
 // What was driven; one that goes on in this tab is watched again after a reload.
 export const listDrives = attempt(async () => {
-  drives = await drivesOf(model.scenario.scenario_id);
+  [drives] = await Promise.all([drivesOf(model.scenario.scenario_id), lookUp()]);
   const going = drives.find((job) => job.state === "running" && isMine(job.request.session_id));
   if (going && !seat) {
     attempt(take)(going, going.request.planner ?? "other");
@@ -83,6 +85,7 @@ function choice() {
     el("p", {
       textContent: "Somebody drives the recording vehicle through the scenario as it is now.",
     }),
+    ...cornerCases(draw),
     row("who", [pick("who", WHO)]),
     row("pace", [pick("pace", PACES)]),
     row("a crash", [

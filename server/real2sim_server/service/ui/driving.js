@@ -1,5 +1,5 @@
 // Who drives now: a planner on the worker, or whoever holds the arrow keys; and what is seen of it.
-import { model, on, emit, setTime, stopRun } from "./model.js";
+import { model, own, on, emit, setTime, stopRun } from "./model.js";
 import { events, get } from "./api.js";
 import { notify } from "./messages.js";
 import { showLive } from "./camera_view.js";
@@ -17,7 +17,7 @@ export let seat = null;
 // Who: the name of a planner; "hand" for the keyboard; "other" for a planner from elsewhere.
 export async function start({ who, pace, onCollision }) {
   stopRun();
-  const session = await sessions.begin(model.scenario.scenario_id, { on_collision: onCollision });
+  const session = await sessions.begin(await own(), { on_collision: onCollision });
   if (pace) {
     await sessions.setClock(session, { state: "running", pace });
   }

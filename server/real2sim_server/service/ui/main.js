@@ -4,6 +4,9 @@ import { call } from "./api.js";
 import {
   model,
   open,
+  look,
+  own,
+  isRecorded,
   refresh,
   on,
   undo,
@@ -17,6 +20,7 @@ import { el } from "./dom.js";
 import { attempt, notify } from "./messages.js";
 import { startPage } from "./start.js";
 import { startView, toggleFree, toggleUncertainty } from "./camera_view.js";
+import { startSpace, toggleSpace } from "./space.js";
 import { startMosaic } from "./mosaic.js";
 import { startMap, fit, centre } from "./map.js";
 import { startPanels, turnTo } from "./panels.js";
@@ -30,10 +34,10 @@ const $ = (id) => document.getElementById(id);
 
 async function main() {
   const address = addressParameters();
-  if (!address.scenario) {
+  if (!address.scenario && !address.scene) {
     return startPage();
   }
-  await open(address.scenario);
+  await (address.scenario ? open(address.scenario) : look(address.scene));
   const names = model.scene.cameras.map((c) => c.name);
   const { start_us: firstUs, end_us: lastUs } = model.scenario;
   model.camera = names.includes(address.camera) ? address.camera : forward();
@@ -50,6 +54,7 @@ async function main() {
     startTimeline,
     startMosaic,
     startView,
+    startSpace,
     startShortcuts,
   ].forEach((start) => start());
   bar();
@@ -66,6 +71,9 @@ async function main() {
   if (address.lidar) {
     chooseLidar(address.lidar);
   }
+  if (address.space) {
+    await attempt(toggleSpace)();
+  }
   startAddress();
   document.body.dataset.ready = "yes";
   return null;
@@ -78,9 +86,11 @@ function forward() {
 function bar() {
   const draw = () => {
     const s = model.scenario;
-    $("name").textContent = document.title = s.name || s.scenario_id;
-    $("subtitle").textContent = `on ${s.scene} · ${s.objects.length} objects`;
-    $("saved").textContent = `kept · r${s.revision}`;
+    const name = s.name || (isRecorded() ? s.scene : s.scenario_id);
+    $("name").textContent = document.title = name;
+    const where = isRecorded() ? "as recorded" : `on ${s.scene}`;
+    $("subtitle").textContent = `${where} · ${s.objects.length} objects`;
+    $("saved").textContent = isRecorded() ? "Nothing changed yet" : `kept · r${s.revision}`;
     $("undo").disabled = !s.can_undo;
     $("redo").disabled = !s.can_redo;
   };
@@ -93,7 +103,9 @@ function bar() {
   $("fit").onclick = fit;
   $("centre").onclick = centre;
   $("rename").onclick = attempt(rename);
-  $("fork").onclick = attempt(() => copyAs(`${model.scenario.name} (fork)`));
+  $("fork").onclick = attempt(() =>
+    copyAs(`${model.scenario.name || model.scenario.scene} (fork)`),
+  );
   $("save").onclick = attempt(async () => {
     const name = prompt("Name", model.scenario.name);
     if (name) {
@@ -105,7 +117,7 @@ function bar() {
 async function rename() {
   const name = prompt("Name", model.scenario.name)?.trim();
   if (name) {
-    await call("PATCH", `/v1/scenarios/${model.scenario.scenario_id}`, { body: { name } });
+    await call("PATCH", `/v1/scenarios/${await own()}`, { body: { name } });
     await refresh();
   }
 }

@@ -18,6 +18,8 @@ export const model = {
   free: null,
   shows: "rgb",
   mosaic: false,
+  space: false,
+  remote: false, // in space, where the worker draws because this page is too slow
   when: "always",
   box: null,
   lidar: null,
@@ -36,6 +38,39 @@ export async function open(id) {
     ? await get(`/v1/scenes/${model.scenario.scene}/lanes?roads=false`)
     : null;
   model.history = await get(path("/operations"));
+}
+
+// Looking needs no scenario: the scene as it was recorded is one that nobody made.
+const RECORDED = "recorded.";
+export const isRecorded = () => model.scenario.scenario_id.startsWith(RECORDED);
+export async function look(scene) {
+  const { content_hash: hash } = await get(`/v1/scenes/${encodeURIComponent(scene)}`);
+  await open(`${RECORDED}${hash}`);
+}
+// What is changed or worked on is a scenario of one's own; its id.
+let making = null;
+export async function own() {
+  if (isRecorded()) {
+    making ??= begin().finally(() => (making = null));
+    await making;
+  }
+  return model.scenario.scenario_id;
+}
+async function begin() {
+  const { scene } = model.scenario;
+  const { scenario_id: id } = await post("/v1/scenarios", { scene, name: `${scene} edit` });
+  await turnTo(id);
+}
+async function turnTo(id) {
+  model.scenario = await get(`/v1/scenarios/${id}`);
+  emit("begun");
+  await refresh();
+}
+// Of a change that was refused, nothing stays.
+async function unmake(recorded) {
+  const made = path();
+  await turnTo(recorded);
+  await call("DELETE", made);
 }
 
 export async function refresh() {
@@ -129,8 +164,13 @@ export async function edit(operations) {
     return list.length ? change("/operations", { operations: list }) : null;
   });
 }
-export const undo = () => inTurn(() => change("/undo"));
-export const redo = () => inTurn(() => change("/redo"));
+// A corner case of the gallery, with other values for some parameters, is what happens from now on.
+export const letHappen = (name, parameters) => {
+  stopRun();
+  return inTurn(() => change("/corner-case", { name, parameters }));
+};
+export const undo = () => inTurn(() => !isRecorded() && change("/undo"));
+export const redo = () => inTurn(() => !isRecorded() && change("/redo"));
 
 // Changes of this page follow one another, so that each knows the revision that the last has made.
 let turn = Promise.resolve();
@@ -140,7 +180,9 @@ function inTurn(make) {
 }
 
 async function change(rest, body) {
+  const recorded = isRecorded() && model.scenario.scenario_id;
   try {
+    await own();
     const result = await post(path(rest), body, {
       "If-Match": model.scenario.etag,
       "Idempotency-Key": crypto.randomUUID?.() ?? `${Date.now()}-${Math.random()}`,
@@ -159,7 +201,7 @@ async function change(rest, body) {
         : error.message,
       "bad",
     );
-    await refresh();
+    await (recorded && !isRecorded() ? unmake(recorded) : refresh());
     return null;
   } finally {
     model.draft = null;
@@ -195,4 +237,7 @@ export const fork = (name) => post(path("/fork"), { name });
 export async function exportFile() {
   return (await call("GET", path("/export"))).blob();
 }
-export const startSimulation = (body) => post(path("/simulate"), body);
+export async function startSimulation(body) {
+  await own();
+  return post(path("/simulate"), body);
+}

@@ -2,6 +2,7 @@
 import { model, undo, redo, edit, select } from "./model.js";
 import { toggle, step } from "./timeline.js";
 import { toggleFree, toggleUncertainty } from "./camera_view.js";
+import { toggleSpace } from "./space.js";
 import { shift } from "./flight.js";
 import { swap } from "./layout.js";
 import { fit, centre } from "./map.js";
@@ -45,6 +46,7 @@ const KEYS = [
   [null, "", "]", selected((id) => edit([{ op: "rotate", object_id: id, angle: -0.0872665 }]))],
   ["Arrows", "while you drive: faster, brake, left, right", "", null],
   ["F", "free camera; drag looks, right drag moves, the wheel goes", "f", toggleFree],
+  ["3", "three dimensions, drawn by this page", "3", toggleSpace],
   ["U", "uncertainty of what is shown, where the scene knows it", "u", toggleUncertainty],
   ["W A S D", "fly", "w", flying(0, 0, 0.5)],
   [null, "", "s", flying(0, 0, -0.5)],

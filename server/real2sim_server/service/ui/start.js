@@ -1,5 +1,5 @@
 // The first page: scenarios that exist, and scenes to begin one on.
-import { call, get, post, picture } from "./api.js";
+import { call, get, picture } from "./api.js";
 import { isInBin, putInBin } from "./bin.js";
 import { el } from "./dom.js";
 import { attempt } from "./messages.js";
@@ -21,7 +21,7 @@ async function listScenarios() {
       .reverse()
       .filter((s) => !isInBin(pathOf(s)))
       .map(scenarioCard),
-    "No scenario yet. Begin one on a scene.",
+    "No scenario yet. The first edit of a scene begins one.",
   );
 }
 function fill(id, cards, otherwise) {
@@ -29,7 +29,6 @@ function fill(id, cards, otherwise) {
     .getElementById(id)
     .replaceChildren(...(cards.length ? cards : [el("p", { textContent: otherwise })]));
 }
-const go = (id) => location.assign(`?scenario=${encodeURIComponent(id)}`);
 const pathOf = (s) => `/v1/scenarios/${s.scenario_id}`;
 const nameOf = (s) => s.name || s.scenario_id;
 const scenarioCard = (s) =>
@@ -68,9 +67,7 @@ async function rename(s) {
   }
 }
 function sceneCard(s) {
-  const begin = attempt(async () =>
-    go((await post("/v1/scenarios", { scene: s.scene, name: `${s.scene} edit` })).scenario_id),
-  );
+  const look = () => location.assign(`?scene=${encodeURIComponent(s.scene)}`);
   const image = el("img", { alt: "" });
   if (s.cameras.length && s.state !== "broken") {
     picture(`/v1/scenes/${s.scene}/render?camera=${s.cameras[0].name}&width=420`).then(
@@ -80,7 +77,7 @@ function sceneCard(s) {
   }
   return el(
     "button",
-    { class: "card", onclick: begin, disabled: !s.cameras.length, "data-scene": s.scene },
+    { class: "card", onclick: look, disabled: !s.cameras.length, "data-scene": s.scene },
     image,
     el("strong", { textContent: s.scene }),
     el("small", {

@@ -35,6 +35,15 @@ export class ViewSocket {
       }
     };
   }
+  // Of another scenario from now on.
+  turnTo(id) {
+    this.socket.onclose = this.socket.onmessage = null;
+    this.socket.close();
+    this.id = id;
+    this.busy = false;
+    this.next ??= this.last;
+    this.connect();
+  }
   requestFrame(request) {
     this.next = this.last = request;
     this.flush();

@@ -1,6 +1,6 @@
 // Work: jobs of this scenario or of all, with what is left of them; runs, drives and videos are
 // opened from here, also after a reload.
-import { model } from "./model.js";
+import { model, own } from "./model.js";
 import { call, events, get, post, sentence } from "./api.js";
 import { el } from "./dom.js";
 import { attempt, notify } from "./messages.js";
@@ -168,7 +168,7 @@ async function download(job, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 async function film() {
-  const of = model.job ? { simulation: model.job } : { scenario: model.scenario.scenario_id };
+  const of = model.job ? { simulation: model.job } : { scenario: await own() };
   const job = await post("/v1/exports", { ...of, camera: model.camera });
   await listWork();
   for await (const now of events(`/v1/jobs/${job.job_id}/events`)) {

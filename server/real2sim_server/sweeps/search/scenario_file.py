@@ -13,13 +13,9 @@ import numpy as np
 
 from real2sim.planners import load_planner
 from real2sim_proto.episode import ResetSpec
-from real2sim_proto.storyboard import MapRoads
 
-from ..._files import atomic_file
-from ...scenarios.errors import ScenarioError
-from ...scenarios.openscenario import ScenarioFile, write_openscenario
 from ..episode import Drive, Driven, drive_episode
-from ..storyboard_space import ScenarioSource, read_scenario, run_options
+from ..storyboard_space import read_scenario, run_options, write_scenario_file
 from .evaluation import Evaluation, Evaluator, impact_of
 
 NAMING = ("name", "author", "date")
@@ -63,7 +59,7 @@ def write_scenario(
         return None
     folder = path.parent
     folder.mkdir(parents=True, exist_ok=True)
-    source = _written(folder, path.name, space.read(found.values), space.source)
+    source = write_scenario_file(folder, path.name, space.read(found.values), space.source)
     seconds = ResetSpec.model_validate(found.drive.reset).horizon or 0
     seed = int(found.drive.reset.get("seed", 0))
     board = space.laid_out(read_scenario(source, folder, {}).board)
@@ -79,23 +75,6 @@ def write_scenario(
     command += ["--ego", space.source.ego] if space.source.ego else []
     command += ["--as-it-is"] if space.source.as_it_is else []
     return WrittenScenario(file, shlex.join(command), _same(again, driven))
-
-
-def _written(folder: Path, name: str, read: ScenarioFile, source: ScenarioSource) -> ScenarioSource:
-    """Write a storyboard; how it is read again."""
-    board = read.board
-    if isinstance(board.roads, MapRoads) and read.road_file is not None:
-        roads = f"{name}{read.road_file.suffix}"
-        with atomic_file(folder / roads) as file:
-            file.write(read.road_file.read_bytes())
-        board = board.model_copy(update={"roads": MapRoads(file=roads)})
-    try:
-        suffix, content = ".xosc", write_openscenario(board)
-    except ScenarioError:
-        suffix, content = ".json", board.model_dump_json(indent=2).encode()
-    with atomic_file(folder / f"{name}{suffix}") as file:
-        file.write(content)
-    return ScenarioSource(file=f"{name}{suffix}", ego=source.ego, as_it_is=source.as_it_is)
 
 
 def _same_options(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> bool:

@@ -17,6 +17,7 @@ from ..ego.reference import PlannedTrajectory
 from ..scoring import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
 from ..scoring.instant import Side
 from ..seam import Seam
+from ..storyboard.shown_signal import ShownSignal
 
 MAX_WAY_M = 1e6
 """Length of a route or lane [m]: they are cut into pieces of less than a metre."""
@@ -46,6 +47,8 @@ def instant_row(instant: Instant, digest: str) -> dict[str, Any]:
         row["plan"] = [instant.plan.times_us.tolist(), instant.plan.poses.tolist()]
     if instant.seam is not None:
         row["seam"] = list(instant.seam)
+    if instant.signals:
+        row["signals"] = [[s.signal_id, s.state, s.stop_line] for s in instant.signals]
     return row
 
 
@@ -76,6 +79,7 @@ def read_instant(row: Mapping[str, Any]) -> tuple[Instant, str]:
         secondary=_integer(row["secondary"]),
         plan=_plan(row["plan"]) if "plan" in row else None,
         seam=Seam(*_numbers(row["seam"], (3,), "seam").tolist()) if "seam" in row else None,
+        signals=tuple(_signal(s) for s in _list(row.get("signals", []))),
     )
     return instant, _text(row["digest"])
 
@@ -129,6 +133,14 @@ def _contact(fields: Mapping[str, Any]) -> ContactRecord:
         raise ValueError(f"a contact on side {fields['side']!r}")
     _text(fields["category"])
     return ContactRecord(**dict(fields) | {"impulse": (x, y)})
+
+
+def _signal(value: Any) -> ShownSignal:
+    name, state, line = _list(value)
+    if line is None:
+        return ShownSignal(_text(name), _text(state), None)
+    x, y, heading = _numbers(line, (3,), "stop line").tolist()
+    return ShownSignal(_text(name), _text(state), (x, y, heading))
 
 
 def _plan(value: Any) -> PlannedTrajectory:

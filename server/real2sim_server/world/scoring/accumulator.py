@@ -14,6 +14,7 @@ from .comfort import ComfortAccumulator
 from .feasibility import Feasibility
 from .hazard import NEVER
 from .instant import EgoSample
+from .traffic_lights import NO_LIGHTS, TrafficLights
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,7 @@ class MetricAccumulator:
         delta_v: greatest change of the ego's velocity by one impact [m/s].
         secondary: contacts begun after the first, of the ego or between objects.
         hit: objects in contact so far.
+        lights: what traffic lights showed, and which were run.
         ego: at the newest instant.
         states: what single metrics accumulate themselves, by name; see :class:`.metric.Metric`.
     """
@@ -92,6 +94,7 @@ class MetricAccumulator:
     delta_v: float = 0.0
     secondary: int = 0
     hit: frozenset[str] = frozenset()
+    lights: TrafficLights = NO_LIGHTS
     ego: EgoSample | None = None
     states: Mapping[str, Any] = field(default_factory=dict)
 

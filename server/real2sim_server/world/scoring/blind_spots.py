@@ -10,7 +10,15 @@ from .instant import ScoringContext
 from .progress import LEAST_ROUTE, expert_progress
 
 Aspect = Literal[
-    "progress", "comfort", "near_misses", "road", "lane", "direction", "speed_limit", "fault"
+    "progress",
+    "comfort",
+    "near_misses",
+    "road",
+    "lane",
+    "direction",
+    "speed_limit",
+    "fault",
+    "lights",
 ]
 """What a score may look at, beside contact and whether a car can move so."""
 
@@ -43,7 +51,8 @@ def cannot_see(
     seconds, most = accumulator.steps * context.dt, context.horizon * context.dt
     if not accumulator.contacts and seconds + context.warmup_steps * context.dt < most - 1e-9:
         blind.append(f"what comes after {seconds:g} s (the episode may last {most:g} s)")
-    blind.append("traffic lights, signs and right of way (no map)")
+    seen = "lights" in sees and bool(accumulator.lights.placed)
+    blind.append(f"{'signs' if seen else 'traffic lights, signs'} and right of way (no map)")
     if not context.background:
         blind.append("walls and poles (contact.background is off)")
     if not context.reactive:
@@ -99,6 +108,8 @@ def _uncounted(
         found.append(f"{accumulator.cut:.0f} m of the route left out by a short cut")
     if "lane" not in sees and accumulator.outside >= NOT_NOTICED:
         found.append(f"{accumulator.outside:.0f} m beside all lanes that were driven")
+    if "lights" not in sees and (ran := len(accumulator.lights.ran)):
+        found.append(f"stop lines crossed on red ({ran})")
     without_fault = accumulator.collisions - sum(accumulator.at_fault.values())
     if "fault" in sees and without_fault > 0:
         found.append(f"contacts without fault of the ego, or again ({without_fault})")

@@ -15,6 +15,7 @@ from ..._records import made_quickly
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
 from ..seam import Seam
+from ..storyboard.shown_signal import ShownSignal
 from .road_kernels import DENSITY, in_lane, off_road
 from .road_map import RoadMap
 
@@ -105,6 +106,7 @@ class Instant:
         plan: that the step was made with; None where there was no new trajectory.
         seam: over which the ego was put back before it moved; places of the instant before are
             where it takes them. None where it was not.
+        signals: traffic signals of the storyboard, and what they show.
     """
 
     step: int
@@ -115,6 +117,7 @@ class Instant:
     secondary: int = 0
     plan: PlannedTrajectory | None = None
     seam: Seam | None = None
+    signals: tuple[ShownSignal, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,12 +43,21 @@ def driven_lanes(context: ScoringContext) -> tuple[str, ...]:
     return roads(context)
 
 
-def lights(context: ScoringContext) -> str:
-    """What is assumed of traffic lights: a map tells where they stand, not what they show."""
+def lights(accumulator: MetricAccumulator, context: ScoringContext) -> str:
+    """What is assumed of traffic lights: a map tells where they stand, a storyboard what they
+    show."""
+    seen = accumulator.lights
     signals = () if context.road_map is None else context.road_map.graph.signals.values()
-    if any(signal.kind == "traffic_light" for signal in signals):
-        return "TLC: the map's traffic lights show no phases"
-    return "TLC: no traffic lights"
+    mapped = {signal.signal_id for signal in signals if signal.kind == "traffic_light"}
+    if not seen.seen:
+        phases = "the map's traffic lights show no phases" if mapped else "no traffic lights"
+        return f"TLC: {phases}"
+    told = f"TLC: stop lines of {len(seen.placed)} signals of the storyboard"
+    if seen.unplaced:
+        told += f"; where to stop for {len(seen.unplaced)} others is not known"
+    if mapped - seen.placed - seen.unplaced:
+        told += "; others of the map show no phases"
+    return told
 
 
 # --- terms ------------------------------------------------------------------------------------
@@ -70,6 +79,12 @@ def nuplan_no_collision(accumulator: MetricAccumulator) -> float:
     return math.prod(
         max(0.0, 1 - accumulator.at_fault.get(kind, 0) / (m + 1)) for kind, m in allowed.items()
     )
+
+
+def light_compliance(accumulator: MetricAccumulator) -> float:
+    """TLC of NAVSIM v2: 0 once the ego's front has crossed a stop line while its signal was red,
+    else 1; 1 where there are no signals with phases."""
+    return float(not accumulator.lights.ran)
 
 
 def direction(accumulator: MetricAccumulator) -> float:
@@ -168,7 +183,7 @@ def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue
     )
 
 
-@metric("epdms", version="5", sees={*NAVSIM_SEES, "lane", "direction"})
+@metric("epdms", version="5", sees={*NAVSIM_SEES, "lane", "direction", "lights"})
 def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC DDC TLC (5 EP + 5 TTC + 2 LK + 2 HC + 2 EC) / 16 (Cao et al. 2025, NAVSIM v2),
     without the penalty filter by the human drive."""
@@ -179,7 +194,7 @@ def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
         "NC": no_collision(accumulator),
         "DAC": float(not accumulator.off_road),
         "DDC": direction(accumulator),
-        "TLC": 1.0,
+        "TLC": light_compliance(accumulator),
         "EP": navsim_progress(accumulator, context),
         "TTC": ttc_within_bound(accumulator),
         "LK": float(not accumulator.left_lane),
@@ -188,7 +203,11 @@ def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
     }
     weighted = 5 * (terms["EP"] + terms["TTC"]) + 2 * (terms["LK"] + terms["HC"] + terms["EC"])
     multipliers = (terms[name] for name in ("feasible", "NC", "DAC", "DDC", "TLC"))
-    assumed = (lights(context), *roads(context), *assumed_progress(accumulator, context))
+    assumed = (
+        lights(accumulator, context),
+        *roads(context),
+        *assumed_progress(accumulator, context),
+    )
     return MetricValue(math.prod(multipliers) * weighted / 16, terms, assumed=assumed)
 
 

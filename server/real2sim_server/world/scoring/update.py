@@ -20,6 +20,7 @@ from .hazard import time_to_collision
 from .instant import ContactRecord, EgoSample, Instant, ScoringContext
 from .metric import METRICS
 from .put_back import put_back
+from .traffic_lights import NO_LIGHTS
 from .window import Window
 
 NUPLAN_DRIVABLE_TOLERANCE = 0.3
@@ -68,6 +69,7 @@ def _begun(
         comfort=comfort,
         comfort_with_history=with_history,
         feasibility=Feasibility(Window((ego, 0.0))),
+        lights=NO_LIGHTS.updated(None, instant, context),
     )
 
 
@@ -127,6 +129,7 @@ def update_accumulator(
         overspeed=accumulator.overspeed + (max(ego.speed - limit, 0.0) * dt if limit else 0.0),
         hugsim=accumulator.hugsim + _hugsim_step(instant, quarters / 4, ttc, comfort),
         feasibility=accumulator.feasibility.updated(instant, distance, context),
+        lights=accumulator.lights.updated(before, instant, context),
         ego=ego,
         states=_updated_states(accumulator, instant, context),
     )

@@ -36,9 +36,12 @@ def met_things(world: World) -> MetThings:
     """What there is for rays to meet: with surfaces for LiDARs where the scene has them, objects
     deformed by impacts as images show them, and no shadows."""
     scene, agents = world.scene, world.agents
+    shown_us = min(world.t_us, scene.end_us)
     found = [met_background(scene, world.state)]
+    strides = world.strides.made
     for subject, transform in zip(agents.objects, agents.transforms, strict=True):
-        found.append(met_object(scene, subject, transform))
+        stride = strides.get(subject.object_id)
+        found.append(met_object(scene, subject, transform, shown_us, stride=stride))
     ids = [subject.object_id for subject in agents.objects]
     if world.deformation is not None:
         _deform(world, found, ids)
@@ -56,7 +59,8 @@ def _deform(
     assert shapes is not None
     if not shapes.has_impacts:
         return
-    drawn = compose(world.scene, world.state, world.agents, min(world.t_us, world.scene.end_us))
+    shown_us, strides = min(world.t_us, world.scene.end_us), world.strides.made
+    drawn = compose(world.scene, world.state, world.agents, shown_us, strides=strides)
     for k, object_id in enumerate(ids, start=1):
         deformed = shapes.deformed_instance(object_id, drawn[k], world.t_us)
         if deformed is not drawn[k]:

@@ -57,7 +57,7 @@ def begin_storyboard(
         )
     return StoryboardRun.begin(
         board,
-        subjects_of(resolved(board).entities, state),
+        subjects_of(resolved(board).entities, state, scene),
         surroundings,
         ego_size=scene.ego_size,
         network=_network(board, scene),

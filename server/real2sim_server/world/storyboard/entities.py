@@ -12,7 +12,8 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.storyboard import Entity
 
 from ...edit import ObjectState, ScenarioState
-from ...scene import Trajectory
+from ...edit.compose import figure_of
+from ...scene import Scene, Trajectory
 from ...scene.scene import MAX_OBJECTS
 from ..ego.box import REAR_OVERHANG
 from ..errors import WorldError
@@ -57,8 +58,10 @@ def box_of(entity: Entity, subject: ObjectState | None, ego_size: Vector) -> tup
     return size, (ahead, 0.0, size[2] / 2)
 
 
-def subjects_of(entities: Iterable[Entity], state: ScenarioState) -> dict[str, ObjectState]:
-    """The object of each entity but the ego, by name.
+def subjects_of(
+    entities: Iterable[Entity], state: ScenarioState, scene: Scene
+) -> dict[str, ObjectState]:
+    """The object of each entity but the ego, by name; new ones look like objects of ``scene``.
 
     Raises:
         WorldError: UNKNOWN_OBJECT for an object or look that the world lacks, UNKNOWN_ASSET,
@@ -71,7 +74,7 @@ def subjects_of(entities: Iterable[Entity], state: ScenarioState) -> dict[str, O
         if entity.kind == "object":
             found[entity.name] = _known(state, str(entity.object_id), f"entity {entity.name!r}")
             continue
-        found[entity.name] = _new(entity, state, number)
+        found[entity.name] = _new(entity, state, scene, number)
         number -= 1
     ids = [subject.object_id for subject in found.values()]
     if twice := sorted({i for i in ids if ids.count(i) > 1}):
@@ -100,7 +103,7 @@ def _known(state: ScenarioState, object_id: str, who: str) -> ObjectState:
     return known[object_id]
 
 
-def _new(entity: Entity, state: ScenarioState, instance_id: int) -> ObjectState:
+def _new(entity: Entity, state: ScenarioState, scene: Scene, instance_id: int) -> ObjectState:
     size, _ = box_of(entity, None, (1.0, 1.0, 1.0))
     object_id, else_id = object_ids_of(entity.name)
     if state.has_id(object_id):
@@ -123,16 +126,11 @@ def _new(entity: Entity, state: ScenarioState, instance_id: int) -> ObjectState:
                 "library",
                 hint="GET /v1/assets lists them; POST /v1/assets adds one",
             )
-        scale = _fitting(size, asset.size)
-        return ObjectState(
-            source_id="",
-            size=asset.size,
-            scale=scale,
-            asset=asset,
-            **common,  # type: ignore[arg-type]
-        )
+        fitted = _fitted(size, asset.size, walks=asset.figure is not None)
+        return ObjectState(source_id="", asset=asset, **fitted, **common)  # type: ignore[arg-type]
     look = _look(entity, state, size)
-    return replace(look, scale=_fitting(size, look.size), **common)  # type: ignore[arg-type]
+    fitted = _fitted(size, look.size, walks=figure_of(scene, look) is not None)
+    return replace(look, **fitted, **common)  # type: ignore[arg-type]
 
 
 def _look(entity: Entity, state: ScenarioState, size: Vector) -> ObjectState:
@@ -157,5 +155,11 @@ def _look(entity: Entity, state: ScenarioState, size: Vector) -> ObjectState:
     return min(candidates, key=unlike)
 
 
-def _fitting(size: Vector, of: Vector) -> Vector:
-    return (size[0] / of[0], size[1] / of[1], size[2] / of[2])
+def _fitted(size: Vector, of: Vector, *, walks: bool) -> dict[str, Vector]:
+    """Size before its scale, and scale, of whoever has the box ``size`` and looks like something of
+    size ``of``: stretched to it, or as a person only made taller."""
+    if not walks:
+        return {"size": of, "scale": (size[0] / of[0], size[1] / of[1], size[2] / of[2])}
+    scale = size[2] / of[2]
+    length, width, height = (edge / scale for edge in size)
+    return {"size": (length, width, height), "scale": (scale, scale, scale)}

@@ -1,25 +1,22 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from scipy.spatial import cKDTree
 
 from real2sim_server.reconstruct.initialise.points import PointSet
-from real2sim_server.reconstruct.initialise.vehicle_body import (
-    GLASS,
-    RED_LAMP,
-    TYRE,
-    faced,
-    fitted_body,
-)
+from real2sim_server.reconstruct.initialise.vehicle_body import body_colours, faced, fitted_body
+from real2sim_server.reconstruct.initialise.vehicle_parts import Part, usual_palette, wheel_parts
+from real2sim_server.synthetic.vehicles import SHAPES
 
 from ..conftest import painted_log
 
 SALOON, ESTATE = (4.7, 1.82, 1.46), (4.65, 1.84, 1.68)
 
 
-def near(body, place) -> np.ndarray:
-    """Colour of the part nearest to a place; nan for paint."""
-    colour, is_part = body.part_colours(np.array([place], np.float32))
-    return colour[0] if is_part[0] else np.full(3, np.nan)
+def near(body, place) -> Part:
+    """The part nearest to a place."""
+    return Part(body.parts_near(np.array([place], np.float32))[1][0])
 
 
 def test_measured_points_choose_the_shape_of_a_car():
@@ -36,10 +33,87 @@ def test_measured_points_choose_the_shape_of_a_car():
 
 def test_glass_tyres_and_lamps_are_no_paint():
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
-    np.testing.assert_allclose(near(body, (0.3, 0.75, 0.35)), GLASS, atol=1e-6)
-    np.testing.assert_allclose(near(body, (0.3 * 4.7, 0.9, -0.45 + 0.02)), TYRE, atol=0.5)
-    np.testing.assert_allclose(near(body, (-2.3, 0.75, 0.0)), RED_LAMP, atol=1e-6)
-    assert np.isnan(near(body, (0.0, 0.9, -0.1))).all()
+    assert near(body, (0.3, 0.75, 0.35)) is Part.GLASS
+    assert near(body, (0.3 * 4.7, 0.9, -0.73 + 0.03)) is Part.TYRE
+    assert near(body, (-2.3, 0.75, 0.0)) is Part.RED_LAMP
+    assert near(body, (0.0, 0.9, -0.1)) is Part.PAINT
+
+
+def test_side_windows_are_parted_by_dark_pillars_and_framed():
+    body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+    window = (body.points[:, 1] > 0.6) & (np.abs(body.points[:, 2] - 0.36) < 0.1)
+    along = np.round(body.points[window, 0] / 0.1) * 0.1
+    dark = [(body.parts[window][along == x] == Part.TRIM).mean() for x in np.unique(along)]
+    inner = np.unique(along)
+    pillars = [x for x, share in zip(inner, dark, strict=True) if share > 0.3 and -1.2 < x < 0.6]
+    # Two of them: at a third and at two thirds of the glass.
+    glass = np.array([-0.31, 0.19]) * SALOON[0]
+    for k in (1, 2):
+        assert np.abs(np.array(pillars) - (glass[0] + k * np.diff(glass)[0] / 3)).min() < 0.1
+
+
+def test_the_rim_has_dark_gaps_between_its_spokes():
+    angle = np.linspace(0, 2 * np.pi, 200)
+    ring = wheel_parts(0.45 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    changes = (ring != np.roll(ring, 1)).sum()
+    assert changes == 10
+    assert set(wheel_parts(np.array([[0.9, 0.0], [0.0, 0.1]]))) == {Part.TYRE, Part.RIM}
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
+def test_normals_point_outwards(shape):
+    body = fitted_body(np.zeros((0, 3), np.float32), shape.size, shape.category)
+    outer = body.points / (np.array(shape.size) / 2)
+    # What lies on the outside of the box, away from its edges, faces away from its middle.
+    on_side = (np.abs(outer[:, 1]) > 0.93) & (np.abs(outer[:, 2]) < 0.5)
+    wheel = (body.parts == Part.TYRE) | (body.parts == Part.RIM)
+    hub = wheel & (np.abs(outer[:, 1]) > 0.95)
+    assert on_side.sum() > 100
+    assert (np.sign(body.normals[on_side, 1]) == np.sign(outer[on_side, 1])).mean() > 0.9
+    assert (np.sign(body.normals[hub, 1]) == np.sign(outer[hub, 1])).mean() > 0.9
+
+
+def test_few_wide_discs_leave_no_gap_in_what_is_flat():
+    body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+    drawn = body.drawn > 0
+    assert drawn.mean() < 0.65
+    np.testing.assert_allclose(np.unique(body.drawn[drawn]), [0.05, 0.12])
+    distance = cKDTree(body.points[drawn]).query(body.points)[0]
+    assert distance.max() < 0.15
+    # Where parts meet all points are drawn, or their edges would blur.
+    lamp = body.parts == Part.RED_LAMP
+    assert (body.drawn[lamp] == np.float32(0.05)).mean() > 0.7
+
+
+def test_a_trucks_cargo_has_a_paint_of_its_own():
+    truck = next(s for s in SHAPES if s.category == "truck")
+    body = fitted_body(np.zeros((0, 3), np.float32), truck.size, "truck")
+    behind, ahead = (-0.15 * truck.size[0], 1.19, 0.5), (0.31 * truck.size[0], 1.1, -0.5)
+    assert near(body, behind) is Part.CARGO
+    assert near(body, ahead) is Part.PAINT
+    points = body.points.astype(np.float32)
+    shown = np.where((body.parts == Part.CARGO)[:, None], (0.6, 0.1, 0.1), (0.1, 0.1, 0.6))
+    colours = body_colours(
+        body, points, shown.astype(np.float32), light=np.zeros(3), palette=usual_palette()
+    )
+    for part, paint in ((Part.CARGO, (0.6, 0.1, 0.1)), (Part.PAINT, (0.1, 0.1, 0.6))):
+        mine = colours[body.parts == part]
+        np.testing.assert_allclose(mine, np.tile(paint, (len(mine), 1)), atol=0.02)
+
+
+def test_the_dark_plate_under_a_vehicle_is_not_its_paint():
+    body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
+    few = body.points[body.is_paint][::40].astype(np.float32)
+    plate = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * (2.2, 0.8, 0) - (0, 0, 1.2)
+    colours = np.concatenate([np.full((len(few), 3), 0.6), np.full((len(plate), 3), 0.05)])
+    found = body_colours(
+        body,
+        np.concatenate([few, plate.astype(np.float32)]),
+        colours.astype(np.float32),
+        light=np.zeros(3),
+        palette=usual_palette(),
+    )
+    np.testing.assert_allclose(found[body.is_paint], 0.6, atol=0.02)
 
 
 def test_other_categories_and_odd_boxes_have_no_body():

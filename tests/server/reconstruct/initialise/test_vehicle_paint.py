@@ -15,6 +15,12 @@ from real2sim_server.reconstruct.initialise.vehicle_light import (
 )
 from real2sim_server.reconstruct.initialise.vehicle_light import LIGHT as LIGHT_KEY
 from real2sim_server.reconstruct.initialise.vehicle_paint import VehicleSurface, fill_vehicles
+from real2sim_server.reconstruct.initialise.vehicle_parts import (
+    PARTS,
+    Part,
+    palette_of,
+    usual_palette,
+)
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
 
 SALOON = (4.7, 1.82, 1.46)
@@ -67,7 +73,7 @@ def test_without_vehicles_light_comes_from_above():
 
 def test_a_flank_that_no_camera_saw_is_even_and_in_the_colour_of_the_tail(body):
     dark = np.zeros(3)
-    [filled], _ = fill_vehicles([surface(body, GREEN, light=dark)])
+    [filled], _, _ = fill_vehicles([surface(body, GREEN, light=dark)])
     flank = filled[doors(body)]
     assert np.ptp(flank, axis=0).max() < 0.05
     np.testing.assert_allclose(flank.mean(0) / flank.mean(), GREEN / GREEN.mean(), atol=0.1)
@@ -77,14 +83,14 @@ def test_the_mirrored_flank_has_the_light_of_its_own_side(body):
     towards = np.array([0.0, 0.8, 0.0])
     left = surface(body, GREEN, light=towards, seen_from=(0, 1, 0))
     cars = [left, *(surface(body, GREEN, light=towards, seen_from=(0, s, 0)) for s in (-1, 1) * 4)]
-    filled, light = fill_vehicles(cars)
+    filled, light, _ = fill_vehicles(cars)
     assert light[1] > 0.5
     near, far = (doors(body) & (side * body.points[:, 1] > 0) for side in (1, -1))
     bright = filled[0][far].mean() / filled[0][near].mean()
     assert bright < np.exp(-2 * 0.8 * 0.5)
 
 
-def test_a_vehicle_that_was_never_seen_has_the_paint_of_the_others(body):
+def test_a_vehicle_that_was_never_seen_is_grey_and_as_bright_as_the_others(body):
     dark = np.zeros(3)
     hidden = surface(body, GREEN, light=dark)
     hidden = VehicleSurface(
@@ -94,10 +100,36 @@ def test_a_vehicle_that_was_never_seen_has_the_paint_of_the_others(body):
         np.zeros_like(hidden.seen),
         body,
     )
-    filled, light = fill_vehicles([surface(body, GREEN, light=dark), hidden])
+    filled, light, _ = fill_vehicles([surface(body, GREEN, light=dark), hidden])
     flank = doors(body)
-    np.testing.assert_allclose(filled[1][flank], filled[0][flank], atol=0.04)
+    np.testing.assert_allclose(filled[1][flank].mean(1), filled[0][flank].mean(1), atol=0.04)
+    assert np.ptp(filled[1][flank], axis=1).max() < 1e-6
     assert np.isfinite(light).all()
+
+
+def test_glass_is_as_dark_as_the_logs_own(body):
+    dark, black = np.zeros(3), np.full(3, 0.04, np.float32)
+
+    def glazed(seen: bool) -> VehicleSurface:
+        car = surface(body, GREEN, light=dark)
+        colours = np.where((body.parts == Part.GLASS)[:, None], black, car.colours)
+        return VehicleSurface(
+            car.points, car.normals, colours, car.seen if seen else car.seen & False, body
+        )
+
+    filled, _, palette = fill_vehicles([glazed(True)] * 8 + [glazed(False)])
+    usual = usual_palette()
+    assert palette[Part.GLASS].max() < 0.1 < usual[Part.GLASS].min()
+    # A vehicle whose glass nobody saw has the others'; lamps, lit or not, are never learnt.
+    glass = filled[-1][body.parts == Part.GLASS]
+    np.testing.assert_allclose(glass.mean(0), palette[Part.GLASS], rtol=0.3)
+    np.testing.assert_array_equal(palette[Part.RED_LAMP], usual[Part.RED_LAMP])
+
+
+def test_a_scene_without_colours_of_parts_has_the_usual_ones():
+    np.testing.assert_array_equal(palette_of(None), usual_palette())
+    kept = usual_palette() * 0.5
+    np.testing.assert_allclose(palette_of({PARTS: kept.tolist()}), kept)
 
 
 def test_light_turns_with_the_vehicle_and_comes_from_above_where_none_is_known():

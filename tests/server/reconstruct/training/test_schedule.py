@@ -8,17 +8,19 @@ from real2sim_server.reconstruct.training.schedule import at_width, from_values,
 
 
 def widths(options: TrainOptions, width: int, *fractions: float) -> list[set[int]]:
-    """Of the images of a pair of steps after each of these fractions of the iterations."""
+    """Of the images of three steps after each of these fractions of the iterations."""
     found = []
     for fraction in fractions:
         first = round(fraction * options.iterations)
-        found.append({width // options.divisor(i) for i in (first, first + 1)})
+        found.append({width // options.divisor(i) for i in range(first, first + 3)})
     return found
 
 
 def test_images_wider_than_a_presets_own_come_last_and_take_turns_with_smaller_ones():
     options = at_width(preset("cpu-small"), 1242)
     assert widths(options, 1242, 0, 0.3, 0.8) == [{310}, {621}, {621, 1242}]
+    last = [options.divisor(i) for i in range(3600, 4000)]
+    assert 0.3 < last.count(1) / len(last) < 0.36
 
 
 def test_up_to_a_presets_own_width_its_stages_stay():

@@ -26,8 +26,8 @@ def test_a_folder_without_json_is_no_bundle(tmp_path):
 
 @pytest.mark.parametrize("read", [load_scene, read_scene_summary])
 def test_a_newer_version_is_refused_with_both_versions_and_what_to_do(bundle, read):
-    edit_json(bundle, version=7, content={"unheard": "of"})
-    with pytest.raises(BundleError, match=r"version 7 .* up to version 6; update real2sim"):
+    edit_json(bundle, version=8, content={"unheard": "of"})
+    with pytest.raises(BundleError, match=r"version 8 .* up to version 7; update real2sim"):
         read(bundle)
 
 

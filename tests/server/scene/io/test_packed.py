@@ -91,7 +91,7 @@ def test_what_is_missing_or_cut_short_is_refused_by_name(packed, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 3}, "version 3"),
+        ({"version": 4}, "version 4"),
         ({"format": "other"}, "no packed scene"),
         ({"ego_size": [1.0, 2.0]}, "damaged"),
     ],

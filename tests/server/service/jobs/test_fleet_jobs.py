@@ -34,7 +34,7 @@ def url(request, tmp_path) -> str:
 def quick(monkeypatch):
     monkeypatch.setattr(module, "LOOK_S", 0.05)
     monkeypatch.setattr(module, "FOLLOW_S", 0.02)
-    monkeypatch.setattr(job_log, "OVERDUE_US", 50_000)
+    monkeypatch.setattr(job_log, "OVERDUE_US", 500_000)
 
 
 @pytest.fixture
@@ -89,10 +89,15 @@ async def for_ever(context) -> JobResult:
 async def die(jobs: Jobs) -> None:
     """What a killed worker leaves: nothing of it moves any more, and its lease runs out."""
     jobs._closing = True
+    jobs._log.claim_overdue = jobs._log.claim_left_behind = none
     for job in jobs._jobs.values():
         job.lost = True
         job.task.cancel()
     await Leases(jobs._log._store, jobs._log.worker_id, seconds=0).renew({})
+
+
+async def none(*_given) -> None:
+    """A dead worker takes nothing."""
 
 
 async def running(jobs: Jobs, job: JobInfo) -> None:

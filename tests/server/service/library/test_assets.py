@@ -178,3 +178,58 @@ def test_an_asset_whose_id_is_part_of_a_used_one_can_be_deleted(client):
     edit(client, create(client), {"op": "insert", "asset_id": "redx2", "pose": THERE})
     assert client.delete("/v1/assets/red").status_code == 204
     assert client.delete("/v1/assets/red_2").status_code == 204
+
+
+PERSON = {"asset_id": "anna", "build": "woman", "height": 1.7, "clothes": {"top": [0.9, 0.1, 0.1]}}
+
+
+def track(speed: float, height: float = 0.8) -> dict:
+    """Across the street ahead of the ego, to the left."""
+    times = [0, 500_000, 1_000_000]
+    half = 2**-0.5
+    return {
+        "times_us": times,
+        "positions": [[7.0, -1.5 + speed * t * 1e-6, height] for t in times],
+        "quaternions": [[half, 0.0, 0.0, half]] * 3,
+    }
+
+
+def picture(client, scenario, t_us: int) -> np.ndarray:
+    query, headers = {"t_us": t_us, "camera": "front"}, {"Accept": "image/png"}
+    answer = client.get(f"/v1/scenarios/{scenario}/preview", params=query, headers=headers)
+    assert answer.status_code == 200, answer.text
+    return cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_a_person_is_made_and_walks_where_a_trajectory_leads(client):
+    answer = client.post("/v1/assets", json=PERSON)
+    info = AssetInfo.model_validate(answer.json())
+    assert answer.status_code == 201, answer.text
+    assert (info.category, info.asset_id) == ("pedestrian", "anna")
+    assert info.size[2] == pytest.approx(1.7, abs=0.05)
+    scenario = create(client)
+    before = picture(client, scenario, 500_000)
+    inserted = edit(
+        client, scenario, {"op": "insert", "asset_id": "anna", "trajectory": track(1.4)}
+    )
+    assert inserted.status_code == 200, inserted.text
+    shown = picture(client, scenario, 500_000)
+    seen = np.abs(shown.astype(int) - before).max(axis=2) > 20
+    assert seen.sum() > 30
+    # At another speed through the same place the legs are elsewhere.
+    (name,) = inserted.json()["created"]
+    there = track(1.4)
+    slower = there | {"positions": [[7.0, -1.15 + 0.7 * t * 1e-6, 0.8] for t in there["times_us"]]}
+    changed = edit(
+        client, scenario, {"op": "set_trajectory", "object_id": name, "trajectory": slower}
+    )
+    assert changed.status_code == 200, changed.text
+    assert (picture(client, scenario, 500_000) != shown).any()
+
+
+@pytest.mark.parametrize(
+    "change", [{"build": "giraffe"}, {"height": 3.0}, {"clothes": {"hat": [0, 0, 0]}}]
+)
+def test_a_wrong_person_is_refused(client, change):
+    answer = client.post("/v1/assets", json=PERSON | change)
+    assert answer.json()["code"] == ErrorCode.INVALID_REQUEST

@@ -91,5 +91,13 @@ def test_the_gallery_is_listed(client):
     assert [case["name"] for case in cases] == list(GALLERY)
     assert cases[0] == {
         "name": "ccrs", "title": GALLERY["ccrs"].title, "family": "ahead",
-        "parameters": {"gap": 40.0, "offset": 0.0},
+        "parameters": {"gap": 40.0, "offset": 0.0}, "picture": "/v1/gallery/ccrs/picture",
     }  # fmt: skip
+
+
+def test_each_case_of_the_gallery_has_a_picture(client):
+    cases = client.get("/v1/gallery").json()["cases"]
+    pictures = [client.get(case["picture"]) for case in cases]
+    assert {answer.headers["Content-Type"] for answer in pictures} == {"image/svg+xml"}
+    assert len({answer.content for answer in pictures}) == len(GALLERY)
+    assert client.get("/v1/gallery/cut_on/picture").json()["code"] == "NOT_FOUND"

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 import threading
 
 import pytest
 import sqlalchemy as sa
 
-from real2sim_server.service.storage import migrations, tables
+from real2sim_server.service.storage import migrations, older, tables
 from real2sim_server.service.storage.connection import connect, keep_write_ahead_journal
+from real2sim_server.service.storage.errors import StoreError
 from real2sim_server.service.storage.tokens import token_hash
 
 from ..postgres import Postgres
@@ -143,12 +145,12 @@ def test_a_migration_that_fails_leaves_the_store_as_it_was(url, monkeypatch):
     before = schema_of(url)
 
     def fail(connection) -> None:
-        migrations._hash_tokens(connection)
+        older._hash_tokens(connection)
         raise OSError("the plug was pulled")
 
-    broken = migrations.Migration(2, "fails", fail)
+    broken = older.Migration(2, "fails", fail)
     with monkeypatch.context() as patch:
-        patch.setattr(migrations, "MIGRATIONS", (broken,))
+        patch.setattr(migrations, "OLDER_STEPS", (broken,))
         with pytest.raises(Exception, match="the plug was pulled"):
             run(url, nothing)
     assert schema_of(url) == before
@@ -157,8 +159,80 @@ def test_a_migration_that_fails_leaves_the_store_as_it_was(url, monkeypatch):
 
 
 def test_every_migration_leads_one_version_on():
-    versions = [m.version for m in migrations.MIGRATIONS]
-    assert versions == list(range(versions[0], tables.SCHEMA_VERSION + 1))
+    versions = [m.version for m in older.OLDER_STEPS]
+    versions += [number for number, _ in migrations._revisions() if number > older.LAST]
+    assert versions == list(range(2, tables.SCHEMA_VERSION + 1))
+
+
+REVISION = '''"""scenarios have a colour."""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "{new:04}"
+down_revision = "{last:04}"
+
+
+def upgrade() -> None:
+    op.add_column("scenarios", sa.Column("colour", sa.String(20)))
+    {then}
+'''
+
+
+@pytest.fixture
+def next_version(tmp_path, monkeypatch):
+    """Makes this program one that has a revision more; what it does besides is given."""
+
+    def make(then: str = "pass") -> int:
+        last = tables.SCHEMA_VERSION
+        folder = tmp_path / "revisions"
+        shutil.copytree(migrations.REVISIONS, folder, dirs_exist_ok=True)
+        text = REVISION.format(new=last + 1, last=last, then=then)
+        (folder / "versions" / "next.py").write_text(text)
+        monkeypatch.setattr(migrations, "REVISIONS", folder)
+        monkeypatch.setattr(tables, "SCHEMA_VERSION", last + 1)
+        return last + 1
+
+    return make
+
+
+@pytest.mark.parametrize("old", [False, True], ids=["present", "older-than-alembic"])
+def test_a_store_follows_the_revisions_of_alembic(url, old, next_version):
+    if old:
+        write_version_1(url)
+    else:
+        run(url, nothing)
+    new = next_version()
+    engine = connect(url, timeout_s=30)
+    assert migrations.schema_status(engine).steps[-1] == f"{new}: scenarios have a colour"
+    migrations.prepare_schema(engine)
+    assert migrations.schema_status(engine) == migrations.SchemaStatus(new, new, ())
+    engine.dispose()
+    assert "colour" in str(schema_of(url)["scenarios"])
+
+
+def test_a_revision_that_fails_leaves_the_store_as_it_was(url, next_version):
+    run(url, nothing)
+    before = schema_of(url)
+    next_version("raise OSError('the plug was pulled')")
+    with pytest.raises(Exception, match="the plug was pulled"):
+        run(url, nothing)
+    assert schema_of(url) == before
+
+
+def test_an_older_store_is_refused_with_the_command_to_run_where_that_is_asked_for(url):
+    write_version_1(url)
+    before = schema_of(url)
+    with pytest.raises(StoreError, match="real2sim store migrate"):
+        run(url, nothing, migration="refuse")
+    assert schema_of(url) == before
+    run(url, nothing)
+    run(url, nothing, migration="refuse")
+
+
+def test_a_new_store_is_made_also_where_older_ones_are_refused(url):
+    run(url, nothing, migration="refuse")
+    assert "alembic_version" in schema_of(url)
 
 
 @pytest.mark.parametrize("old", [False, True], ids=["empty", "older"])

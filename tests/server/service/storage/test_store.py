@@ -14,7 +14,9 @@ from real2sim_server.service.storage.errors import StoreFullError
 from real2sim_server.service.storage.job_log import JobLog
 from real2sim_server.service.storage.session_log import ClaimedEntries
 from real2sim_server.service.storage.store import (
+    Claim,
     ConflictError,
+    FencedError,
     ScenarioRow,
     SessionEntry,
     SessionRow,
@@ -244,7 +246,7 @@ def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
     connection.execute("UPDATE schema_version SET version = 99")
     connection.commit()
     connection.close()
-    with pytest.raises(StoreError, match="schema version 99, this worker reads 1 to 5"):
+    with pytest.raises(StoreError, match=r"schema version 99, this program reads 1 to \d+;"):
         run(sqlite_url, nothing)
 
 
@@ -350,3 +352,41 @@ def test_a_write_without_space_leaves_the_connection_for_readers_and_later_write
 
     before, after = run(sqlite_url, fill)
     assert (len(before), len(after)) == (0, 1)
+
+
+def action(seq: int) -> SessionEntry:
+    return SessionEntry(seq, "action", seq, b"\x80", 1)
+
+
+def test_an_append_on_a_server_is_prepared_and_fenced(postgres):
+    url = postgres.new_database()
+
+    async def work(store):
+        await store.create_session(SESSION)
+        claim = SESSION.claim
+        store.record(claim, [action(0), action(1)])
+        with pytest.raises(ConflictError):
+            store.record(claim, [action(1)])
+        with pytest.raises(FencedError):
+            store.record(Claim(SESSION.session_id, 7), [action(2)])
+        store.record(claim, [action(2)])
+        prepared = store.database._prepared
+        assert len(prepared._known) == 2
+        return [entry.seq for entry in await store.session_entries(SESSION.session_id)]
+
+    assert run(url, work) == [0, 1, 2]
+
+
+def test_a_prepared_append_goes_on_when_the_server_was_restarted(postgres):
+    url = postgres.new_database()
+
+    async def work(store):
+        await store.create_session(SESSION)
+        claim = SESSION.claim
+        store.record(claim, [action(0)])
+        await asyncio.to_thread(postgres.stop)
+        await asyncio.to_thread(postgres.start)
+        store.record(claim, [action(1)])
+        return len(await store.session_entries(SESSION.session_id))
+
+    assert run(url, work) == 2

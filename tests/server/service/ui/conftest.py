@@ -11,7 +11,7 @@ import pytest
 
 from real2sim_server.service.serve import RunningWorker, running_worker
 
-from .hands import STEP_MS
+from .hands import STEP_MS, kept
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
@@ -19,13 +19,19 @@ BROWSER = next(
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
+def browser_args() -> list[str]:
+    """Of the browser's command line."""
+    return ["--no-sandbox"]
+
+
+@pytest.fixture(scope="module")
+def chromium(browser_args: list[str]) -> Iterator[Any]:
     """A headless browser; skips where there is none."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if not BROWSER:
         pytest.skip("no chromium on the PATH")
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=BROWSER, args=browser_args)
         yield browser
         browser.close()
 
@@ -66,8 +72,16 @@ def page(visit, running) -> Any:
 
 
 @pytest.fixture
-def studio(page) -> Any:
-    """The studio with a new scenario on the tiny scene."""
+def looking(page) -> Any:
+    """The studio with the tiny scene as it was recorded."""
     page.click("[data-scene=tiny]")
     page.wait_for_selector("body[data-ready]")
     return page
+
+
+@pytest.fixture
+def studio(looking) -> Any:
+    """The studio with a new scenario on the tiny scene."""
+    looking.evaluate("async () => (await import('/ui/model.js')).own()")
+    kept(looking, 0)
+    return looking

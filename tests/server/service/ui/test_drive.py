@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from .hands import shown
+from .hands import enter, kept, shown
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
@@ -80,3 +80,28 @@ def test_work_shows_what_is_left_and_is_found_again_after_a_reload(studio):
     studio.click(".work.cancelled button:text-is('Delete')")
     studio.wait_for_selector(".work.cancelled", state="detached")
     assert studio.locator(".work").count() == 1
+
+
+def test_a_corner_case_is_chosen_by_its_picture_taken_over_undone_and_dropped(studio):
+    studio.click("[data-tab=drive]")
+    studio.select_option("#corner-case", "cut_in")
+    studio.wait_for_selector("#drive:has-text('a car moves in from the left')")
+    size = studio.evaluate(
+        "async () => { const i = document.getElementById('corner-case-picture');"
+        " await i.decode(); return i.naturalWidth / i.naturalHeight; }"
+    )
+    assert size == pytest.approx(3.0, abs=0.1)
+    enter(studio, "case-gap", 8.0)
+    studio.click("#take-case")
+    studio.wait_for_selector("#corner-case-now:has-text('Cut-in')")
+    kept(studio, 1)
+    board = studio.evaluate(
+        "async () => { const { model } = await import('/ui/model.js');"
+        " return (await fetch(`/v1/scenarios/${model.scenario.scenario_id}/storyboard`)).json(); }"
+    )
+    assert board["parameters"]["gap"] == 8.0
+    studio.click("#drop-case")
+    studio.wait_for_selector("#corner-case-now", state="detached")
+    kept(studio, 2)
+    studio.keyboard.press("Control+z")
+    studio.wait_for_selector("#corner-case-now:has-text('Cut-in')")

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
 import re
+from hashlib import sha256
+from pathlib import Path
 
 import pytest
 
 from real2sim_server.service.routes.ui import FOLDER, STUDIO
 
-MODULES = sorted(name for name in STUDIO if name.endswith(".js"))
+OWN = sorted(name for name in STUDIO if not name.startswith("vendor/"))
+"""What is vendored is as its authors have published it."""
+MODULES = [name for name in OWN if name.endswith(".js")]
 IMPORT = re.compile(r'^import (?:\{([^}]*)\} )?from "\./([\w.]+)";', re.MULTILINE)
 EXPORT = re.compile(r"^export (?:async )?(?:function\*?|const|let|class) (\w+)", re.MULTILINE)
 
@@ -53,7 +57,21 @@ def test_a_module_is_served_as_javascript_and_short(client, name):
     assert len(answer.text.splitlines()) < 300
 
 
-@pytest.mark.parametrize("name", sorted(STUDIO))
+def test_what_is_vendored_is_what_the_notices_say():
+    notices = Path(__file__).parents[4].joinpath("THIRD_PARTY.md").read_text()
+    stated = dict(re.findall(r"(?m)^\| (\S+) \| `([0-9a-f]{64})` \|$", notices))
+    there = {
+        path.relative_to(FOLDER / "vendor").as_posix(): sha256(path.read_bytes()).hexdigest()
+        for path in (FOLDER / "vendor").rglob("*")
+        if path.is_file()
+    }
+    assert there == stated
+    assert {name.split("/")[0] for name in there if name.endswith("/LICENSE")} == {
+        name.split("/")[0] for name in there
+    }
+
+
+@pytest.mark.parametrize("name", OWN)
 def test_no_file_names_another_host(name):
     addresses = re.findall(r"https?://[\w.]+", text(name))
     assert [a for a in addresses if a != "http://www.w3.org"] == []
@@ -61,7 +79,18 @@ def test_no_file_names_another_host(name):
 
 def test_every_element_that_a_module_asks_for_exists():
     made = re.findall(r'\bid: "([\w-]+)"', "".join(map(text, MODULES)))
-    there = set(re.findall(r'\bid="([\w-]+)"', text("index.html"))) | set(made)
+    pages = text("index.html") + text("fleet.html")
+    there = set(re.findall(r'\bid="([\w-]+)"', pages)) | set(made)
     asked = re.findall(r'(?:\$|getElementById)\("([\w-]+)"\)', "".join(map(text, MODULES)))
     # Fields of the pose are made one for each axis.
     assert {a for a in asked if not a.startswith("pose-")} <= there
+
+
+def test_the_page_of_the_fleet_shows_what_workers_tell(client):
+    page = client.get("/ui/fleet.html")
+    assert page.status_code == 200
+    assert 'src="fleet.js"' in page.text
+    (worker,) = client.get("/v1/fleet").json()["workers"]
+    shown = set(re.findall(r"worker\.(\w+)", text("fleet.js")))
+    assert shown <= set(worker)
+    assert {"sessions", "load", "queue", "scenes", "scene_sessions"} <= shown

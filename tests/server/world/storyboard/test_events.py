@@ -261,3 +261,20 @@ def test_signals_go_through_their_phases(run):
     assert [s["state"] for s in shown[::10]] == ["green", "green", "red"] * 2 + ["green"]
     assert shown[0]["stop_line"] == (50.0, 0.0, 0.0)
     assert times_of(worlds, "seen") == pytest.approx([2.0], abs=SOON)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "ran"), [("red", "green", {"s"}), ("green", "red", set())]
+)
+def test_scores_hold_the_ego_to_what_signals_show_when_it_crosses(run, first, second, ran):
+    # The ego's front is at the line after some 4.6 s, in the second turn of the first phase.
+    phases = [
+        {"name": "one", "duration": 2.0, "states": {"s": first}},
+        {"name": "two", "duration": 1.0, "states": {"s": second}},
+    ]
+    worlds = run(
+        signals=[{"signal_id": "s", "stop_line": {"kind": "world", "x": 50, "y": 0}}],
+        controllers=[{"name": "c", "phases": phases}],
+    )
+    assert worlds[40].accumulator.lights.ran == set()
+    assert worlds[60].accumulator.lights.ran == ran

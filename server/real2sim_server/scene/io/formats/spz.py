@@ -14,7 +14,15 @@ from ...._files import atomic_file
 from ....geometry.rotation import Float
 from ...cloud import GaussianCloud
 from ...errors import BundleError, SceneError
-from .spz_container import MAX_REST, Header, Streams, is_spz, read_streams, write_streams
+from .spz_container import (
+    GZIP_LEVEL,
+    MAX_REST,
+    Header,
+    Streams,
+    is_spz,
+    read_streams,
+    write_streams,
+)
 from .types import UpAxis, build_cloud, host_array
 
 COLOUR_SCALE = 0.15
@@ -44,6 +52,7 @@ class Spz:
 
     Args:
         version: of the files to write: 3 (gzip, what most viewers read) or 4 (zstd, smaller).
+        gzip_level: 1 (fast) to 9 (small), of version 3.
     """
 
     name = "spz"
@@ -51,10 +60,13 @@ class Spz:
     has_signature = True
     up_axis: UpAxis = "y"
 
-    def __init__(self, *, version: int = 3) -> None:
+    def __init__(self, *, version: int = 3, gzip_level: int = GZIP_LEVEL) -> None:
         if version not in (3, 4):
             raise SceneError(f"spz version to write must be 3 or 4, not {version!r}")
+        if not 1 <= gzip_level <= 9:
+            raise SceneError(f"gzip_level of an spz file must be 1 to 9, not {gzip_level!r}")
         self.version = version
+        self.gzip_level = gzip_level
 
     def recognises(self, head: bytes) -> bool:
         """Whether ``head`` is that of a plain or gzipped spz file."""
@@ -79,6 +91,12 @@ class Spz:
             SceneError: for positions beyond what 24 bits of whole units hold (8 million).
             OSError: the file cannot be written.
         """
+        content = self.encode(cloud)
+        with atomic_file(path) as file:
+            file.write(content)
+
+    def encode(self, cloud: GaussianCloud) -> bytes:
+        """The bytes of a file with ``cloud`` in its order. Raises SceneError as :meth:`write`."""
         means = host_array(cloud.means)
         bits = _fractional_bits(means)
         header = Header(self.version, len(cloud), cloud.sh_degree, bits, 0)
@@ -90,8 +108,7 @@ class Spz:
             rotations=_packed_rotations(host_array(cloud.quats)),
             sh=_packed_harmonics(host_array(cloud.sh[:, 1:])),
         )
-        with atomic_file(path) as file:
-            file.write(write_streams(header, streams))
+        return write_streams(header, streams, gzip_level=self.gzip_level)
 
 
 def _positions(path: Path, header: Header, streams: Streams) -> NDArray[np.float32]:

@@ -32,7 +32,7 @@ MAX_SPLATS = 20_000_000
 """More are refused; the largest street scenes have a few million."""
 
 ZSTD_LEVEL = 12
-GZIP_LEVEL = 9
+GZIP_LEVEL = 6
 _CHUNK = 1 << 20
 
 Bytes = NDArray[np.uint8]
@@ -120,13 +120,14 @@ def read_streams(path: Path, *, max_bytes: int | None = None) -> tuple[Header, S
     return header, _cut(path, header, data) if header.version < 4 else _unpack(path, header, data)
 
 
-def write_streams(header: Header, streams: Streams) -> bytes:
-    """A whole file of version 3 (gzip) or 4 (zstd); the same streams give the same bytes."""
+def write_streams(header: Header, streams: Streams, *, gzip_level: int = GZIP_LEVEL) -> bytes:
+    """A whole file of version 3 (gzip, ``gzip_level`` 1 to 9) or 4 (zstd); the same streams give
+    the same bytes."""
     parts = [getattr(streams, name).tobytes() for name in header.stream_sizes]
     values = (header.version, header.count, header.sh_degree, header.fractional_bits, header.flags)
     if header.version < 4:
         plain = b"".join([HEADER.pack(MAGIC, *values, 0), *parts])
-        return gzip.compress(plain, GZIP_LEVEL, mtime=0)
+        return gzip.compress(plain, gzip_level, mtime=0)
     filled = [part for part in parts if part]
     packed = [zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(part) for part in filled]
     start = HEADER_4.pack(MAGIC, *values, len(packed), HEADER_4.size)

@@ -1,0 +1,112 @@
+"""``real2sim store``: the schema of a worker's database, and bringing it up to date."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..console import CommandError, console
+from .command import command
+
+if TYPE_CHECKING:
+    import sqlalchemy as sa
+
+app = typer.Typer(no_args_is_help=True, help="Look at a worker's database, and migrate it.")
+
+Data = Annotated[
+    Path | None, typer.Option(help="State folder; default as `real2sim serve` has it.")
+]
+Url = Annotated[str | None, typer.Option(help="Default $REAL2SIM_STORE_URL, or SQLite in DATA.")]
+
+
+@command("status", group=app)
+def status(*, data: Data = None, url: Url = None) -> None:
+    """Say which schema a store has, and what migrating it would do; nothing is changed."""
+    from ..service.storage.migrations import schema_status
+
+    with _engine(data, url, must_exist=True) as engine:
+        found = schema_status(engine)
+    console.print(f"schema {found.found or 'none'}; this program's is {found.wanted}")
+    for step in found.steps:
+        console.print(f"  to do: {step}", highlight=False)
+    if found.steps:
+        console.print("run `real2sim store migrate` for that; make a backup first")
+
+
+@command("migrate", group=app)
+def migrate(*, data: Data = None, url: Url = None) -> None:
+    """Bring a store up to date, in one transaction; a new database gets its tables."""
+    from ..service.storage.migrations import prepare_schema, schema_status
+
+    with _engine(data, url, must_exist=False) as engine:
+        before = schema_status(engine)
+        prepare_schema(engine)
+    if not before.steps:
+        console.print(f"nothing to do: the schema is {before.wanted}")
+    for step in before.steps:
+        console.print(f"done: {step}", highlight=False)
+
+
+@command("audit", group=app)
+def audit(
+    *,
+    data: Data = None,
+    url: Url = None,
+    who: Annotated[str | None, typer.Option(help="Name of a token; default: all.")] = None,
+    last: Annotated[int, typer.Option(min=1, max=1_000_000, help="Entries.")] = 100,
+) -> None:
+    """Say who changed what, newest first, a line of JSON each; also who was refused."""
+    import asyncio
+    import json
+    from dataclasses import asdict
+
+    from ..service.storage.audit_log import AuditEntry, AuditLog
+    from ..service.storage.store import Store
+    from ..settings import Settings
+
+    settings = Settings() if data is None else Settings(data_dir=data)
+
+    async def read() -> list[AuditEntry]:
+        store = Store(url or settings.database_url, migration="refuse")
+        await store.open()
+        try:
+            return await AuditLog(store).newest(account=who, limit=last)
+        finally:
+            await store.close()
+
+    for entry in asyncio.run(read()):
+        print(json.dumps(asdict(entry)))
+
+
+@contextmanager
+def _engine(data: Path | None, url: str | None, *, must_exist: bool) -> Iterator[sa.Engine]:
+    """The store's database, with time enough for a migration.
+
+    Raises:
+        CommandError: there is none, or it cannot be reached.
+    """
+    from sqlalchemy import exc
+
+    from ..service.storage.connection import connect, file_of, shown_url
+    from ..service.storage.database import SCHEMA_TIMEOUT_S, TIMEOUT_S
+    from ..settings import Settings
+
+    settings = Settings() if data is None else Settings(data_dir=data)
+    url = url or settings.database_url
+    file = file_of(url)
+    if must_exist and file is not None and not file.is_file():
+        raise CommandError(
+            f"there is no store at {str(file)!r}; name its folder with --data, or give its --url"
+        )
+    engine = connect(url, timeout_s=TIMEOUT_S if must_exist else SCHEMA_TIMEOUT_S)
+    try:
+        yield engine
+    except exc.SQLAlchemyError as error:
+        reason = getattr(error, "orig", None) or error
+        raise CommandError(f"cannot use the store {shown_url(url)!r}: {reason}") from error
+    finally:
+        engine.dispose()

@@ -1,0 +1,192 @@
+"""Parts of the bodies that the synthetic street builds: glass, tyres, lamps, and their colours.
+
+Colours of glass, trim and tyres are those that the log's own vehicles show: a camera in hard
+sun has darker ones than a camera under clouds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...geometry.rotation import Float
+from ...synthetic.vehicles import VehicleShape, roof_heights
+from .inpainting import MIN_OBSERVED, modal_colour
+
+DOUBT = 2.0
+"""Weight of the usual colour of a part, in vehicles that show theirs."""
+PARTS = "vehicle_parts"
+"""Where a scene's reconstruction keeps the colours of parts."""
+FRAME = 0.035
+"""Width of the dark frame about side windows [m]."""
+PILLAR = 0.05
+"""Half the width of a pillar between side windows [m]."""
+Colours = NDArray[np.float32]
+
+
+class Part(IntEnum):
+    """What a place of a body is.
+
+    Paint and cargo (the box of a truck) are each vehicle's own; ``OTHER`` has the builder's colour.
+    """
+
+    PAINT = 0
+    GLASS = 1
+    TRIM = 2
+    TYRE = 3
+    RIM = 4
+    WHITE_LAMP = 5
+    RED_LAMP = 6
+    PLATE = 7
+    CARGO = 8
+    OTHER = 9
+
+
+USUAL: dict[Part, tuple[float, float, float]] = {
+    Part.GLASS: (0.2, 0.23, 0.27),
+    Part.TRIM: (0.13, 0.13, 0.14),
+    Part.TYRE: (0.1, 0.1, 0.1),
+    Part.RIM: (0.5, 0.5, 0.51),
+    Part.WHITE_LAMP: (0.65, 0.65, 0.65),
+    Part.RED_LAMP: (0.45, 0.1, 0.1),
+    Part.PLATE: (0.6, 0.6, 0.58),
+}
+"""sRGB of parts in the light of a surface that faces the horizon, before a log is looked at."""
+FITTED = (Part.GLASS, Part.TRIM, Part.TYRE)
+"""Parts that are alike on all vehicles and large enough to be seen; lamps are lit or not, and rims
+are seen together with the dark between their spokes."""
+PAINTED = (Part.PAINT, Part.CARGO)
+"""Parts in a vehicle's own paints."""
+
+
+def usual_palette() -> Colours:
+    """Colours [10, 3] by part before a log is looked at; 0 for what has none."""
+    palette = np.zeros((len(Part), 3), dtype=np.float32)
+    for part, colour in USUAL.items():
+        palette[part] = colour
+    return palette
+
+
+def fit_palette(
+    parts: Sequence[NDArray[np.uint8]], colours: Sequence[NDArray[np.float32]]
+) -> Colours:
+    """Colours [10, 3] by part, those of FITTED as vehicles of a log show them.
+
+    Args:
+        parts: by vehicle, [N] what its points are, of points that images show.
+        colours: by vehicle, [N, 3] there, the light taken off.
+    """
+    palette = usual_palette()
+    for part in FITTED:
+        members = [c[p == part] for p, c in zip(parts, colours, strict=True)]
+        shown = [modal_colour(c) for c in members if len(c) >= MIN_OBSERVED]
+        if shown:
+            total = DOUBT * palette[part] + np.sum(shown, axis=0)
+            palette[part] = total / (DOUBT + len(shown))
+    return palette
+
+
+def shown_paints(
+    parts: NDArray[np.uint8], colours: NDArray[np.float32]
+) -> dict[Part, NDArray[np.float32]]:
+    """The commonest colour [3] of each of PAINTED that enough points show.
+
+    Args:
+        parts: [N] what points are.
+        colours: [N, 3] there, the light taken off.
+    """
+    members = {part: colours[parts == part] for part in PAINTED}
+    return {part: modal_colour(c) for part, c in members.items() if len(c) >= MIN_OBSERVED}
+
+
+def with_paints(
+    palette: Colours, paints: dict[Part, NDArray[np.float32]], usual: NDArray[np.float32]
+) -> Colours:
+    """The palette [10, 3] of one vehicle: a paint that it does not show is the other, or usual."""
+    known = [paints[part] for part in PAINTED if part in paints]
+    own = palette.copy()
+    for part in PAINTED:
+        own[part] = paints.get(part, known[0] if known else usual)
+    return own
+
+
+def palette_of(reconstruction: object) -> Colours:
+    """The palette [10, 3] that a scene's provenance keeps; the usual one where it keeps none."""
+    known = reconstruction.get(PARTS) if isinstance(reconstruction, dict) else None
+    palette = usual_palette()
+    if known is not None:
+        palette[: len(known)] = np.asarray(known, dtype=np.float32)
+    return palette
+
+
+def wheel_parts(uv: Float) -> NDArray[np.uint8]:
+    """Tyre, rim, or the dark between a rim's spokes, at places [N, 2] relative to the radius."""
+    radius, angle = np.hypot(uv[:, 0], uv[:, 1]), np.arctan2(uv[:, 1], uv[:, 0])
+    between = (radius > 0.22) & (radius < 0.6) & (np.cos(5 * angle) < -0.1)
+    return np.where((radius < 0.68) & ~between, Part.RIM, Part.TYRE).astype(np.uint8)
+
+
+def shell_parts(shape: VehicleShape, points: Float, normals: Float) -> NDArray[np.uint8]:
+    """Parts [N] at points [N, 3] of the shell, z over the ground, with normals [N, 3] outwards."""
+    width, height = shape.size[1:]
+    x, side, z = points[:, 0], np.abs(points[:, 1]), points[:, 2]
+    nx, flank = normals[:, 0], np.abs(normals[:, 1]) > 0.4
+    parts = np.full(len(points), Part.PAINT, dtype=np.uint8)
+    parts[z < shape.clearance + 0.1] = Part.TRIM
+    _set_side_windows(parts, shape, x, z, flank)
+    for axle in shape.axles:
+        arch = np.hypot(x - axle * shape.size[0], z - shape.wheel_radius)
+        parts[flank & (arch < shape.wheel_radius + 0.055)] = Part.TYRE
+    half = 0.5 * width * (0.9 if height > 2 else 0.8)
+    above = ~flank & (z > shape.belt) & (z < height - 0.05) & (side < half)
+    foot, top = (a * shape.size[0] for a in shape.windscreen)
+    parts[above & (nx > 0.2) & (x > top) & (x < foot)] = Part.GLASS
+    low, high = (a * shape.size[0] for a in shape.rear_window)
+    parts[above & (nx < -0.2) & (x > low) & (x < high)] = Part.GLASS
+    _set_ends(parts, shape, x, side, z, nx)
+    return parts
+
+
+def _set_side_windows(
+    parts: NDArray[np.uint8], shape: VehicleShape, x: Float, z: Float, flank: NDArray[np.bool_]
+) -> None:
+    """Windows between dark frames and pillars, in place."""
+    length, _, height = shape.size
+    heights = roof_heights(shape)
+    roof = np.interp(x, np.linspace(-0.5, 0.5, len(heights)) * length, heights)
+    edge = 0.1 if height < 2 else 0.28
+    rear, front = (a * length for a in shape.side_glass)
+
+    def within(margin: float) -> NDArray[np.bool_]:
+        tall = (z > shape.belt + 0.03 - margin) & (z < roof - edge + margin)
+        return np.asarray(flank & tall & (x > rear - margin) & (x < front + margin))
+
+    parts[within(FRAME)] = Part.TRIM
+    glass = within(0.0)
+    step = (front - rear) / (shape.pillars + 1)
+    for k in range(1, shape.pillars + 1):
+        glass &= np.abs(x - rear - k * step) > PILLAR
+    parts[glass] = Part.GLASS
+
+
+def _set_ends(  # noqa: PLR0917
+    parts: NDArray[np.uint8], shape: VehicleShape, x: Float, side: Float, z: Float, nx: Float
+) -> None:
+    """Lamps and plates at nose and tail, in place."""
+    length, width, height = shape.size
+    big = height > 2
+    lamp = 0.78 if big else 0.47 * shape.belt + 0.2
+    nose = (nx > 0.35) & (x > length / 2 - 0.6) & (z < shape.belt)
+    parts[nose & (side < 0.42) & (np.abs(z - lamp + 0.02) < 0.08)] = Part.TRIM
+    outer = (side > width / 2 - 0.52) & (side < width / 2 - 0.1)
+    parts[nose & outer & (np.abs(z - lamp) < 0.08)] = Part.WHITE_LAMP
+    parts[nose & (side < 0.26) & (np.abs(z - lamp + 0.21) < 0.055)] = Part.PLATE
+    tail = (nx < -0.35) & (x < 0.4 - length / 2) & (z < max(shape.belt, 0.7 * height))
+    low, high, inner = shape.belt - 0.33, shape.belt - 0.12, width / 2 - 0.42
+    if big:
+        low, high, inner = shape.belt - 0.4, shape.belt - 0.02, width / 2 - 0.24
+    parts[tail & (side > inner) & (z > low) & (z < high)] = Part.RED_LAMP
+    parts[tail & (side < 0.26) & (np.abs(z - low - 0.05) < 0.055)] = Part.PLATE

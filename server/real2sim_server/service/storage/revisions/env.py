@@ -1,0 +1,35 @@
+"""What Alembic runs for every upgrade: the revisions of this folder, on the connection it is given.
+
+A worker and ``real2sim store migrate`` hand it the connection that holds the lock of the schema,
+see :mod:`..migrations`; whoever writes a revision may run ``alembic revision`` with the URL of a
+store in ``REAL2SIM_STORE_URL``.
+"""
+
+import os
+
+import sqlalchemy as sa
+from alembic import context
+
+from real2sim_server.service.storage import tables
+
+
+def run(connection: sa.Connection) -> None:
+    """All revisions up to the one asked for, within the connection's transaction."""
+    on_step = context.config.attributes.get("on_step")
+    context.configure(
+        connection=connection,
+        target_metadata=tables.metadata,
+        on_version_apply=on_step,
+        # SQLite changes a column by copying its table.
+        render_as_batch=connection.dialect.name == "sqlite",
+    )
+    with context.begin_transaction():
+        context.run_migrations()
+
+
+given = context.config.attributes.get("connection")
+if given is not None:
+    run(given)
+else:
+    with sa.create_engine(os.environ["REAL2SIM_STORE_URL"]).begin() as own:
+        run(own)

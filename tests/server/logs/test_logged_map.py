@@ -1,0 +1,124 @@
+"""Lanes that a log comes with: of its own document, of a data set's map beside it, of the drive."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.logs import LoggedMap, open_log
+from real2sim_server.maps import MapError, lanes_of_log
+from real2sim_server.scene import Lane, LaneGraph
+from real2sim_server.scene.io.lane_document import lane_document
+
+
+def straight(name: str, start: tuple[float, float], heading: float = 0.0, **more) -> Lane:
+    s = np.linspace(0, 60, 31)
+    x, y = start[0] + s * np.cos(heading), start[1] + s * np.sin(heading)
+    centre = np.column_stack([x, y, np.zeros_like(s)])
+    return Lane(name, "driving", centre, np.full(len(s), 3.4), **more)
+
+
+def placed(yaw: float, x: float, y: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T[:2, 3] = x, y
+    return T
+
+
+@pytest.fixture
+def bare(tiny_log):
+    """The drive without lanes of its own."""
+    return replace(tiny_log, lanes=None, logged_map=None)
+
+
+def with_map(log, folder: Path, graph: LaneGraph, T_world_map: np.ndarray):
+    """The drive beside a map whose lanes are ``graph`` in the world."""
+    back = invert_transform(T_world_map)
+    moved = graph.moved(float(np.arctan2(back[1, 0], back[0, 0])), back[:3, 3])
+    path = folder / "lanes.json"
+    path.write_text(lane_document(moved).model_dump_json())
+    return replace(log, logged_map=LoggedMap(path, T_world_map))
+
+
+def test_a_map_beside_the_log_is_brought_into_its_world(bare, tmp_path):
+    graph = LaneGraph.of([straight("a", (-10, 1.5)), straight("b", (0, -2))])
+    log = with_map(bare, tmp_path, graph, placed(0.7, 30, -400))
+    found = lanes_of_log(log)
+    assert set(found.lanes) == {"a", "b"}
+    for name, lane in graph.lanes.items():
+        np.testing.assert_allclose(found.lane(name).centre, lane.centre, atol=1e-3)
+
+
+def test_of_a_whole_town_only_what_is_near_the_drive_is_kept(bare, tmp_path):
+    near = straight("near", (0, 0), successors=("next",))
+    graph = LaneGraph.of([near, straight("next", (60, 0)), straight("far", (4000, 0))])
+    found = lanes_of_log(with_map(bare, tmp_path, graph, np.eye(4)))
+    assert set(found.lanes) == {"near", "next"}
+    assert found.lane("near").successors == ("next",)
+
+
+def test_a_map_of_another_place_is_refused_by_name(bare, tmp_path):
+    log = with_map(bare, tmp_path, LaneGraph.of([straight("a", (9000, 0))]), np.eye(4))
+    with pytest.raises(MapError, match=r"lanes\.json: no lane of this map is within 250 m"):
+        lanes_of_log(log)
+    assert lanes_of_log(log, source="none") is None
+
+
+def test_lanes_of_the_log_itself_come_first(tiny_log, tmp_path):
+    own = LaneGraph.of([straight("own", (0, 0))])
+    log = replace(tiny_log, lanes=own, logged_map=LoggedMap(tmp_path / "missing", np.eye(4)))
+    assert lanes_of_log(log) is own
+
+
+def test_without_a_map_the_drive_is_asked_only_on_request(bare):
+    assert lanes_of_log(bare) is None
+    gathered = lanes_of_log(bare, source="log")
+    assert gathered is None or gathered.accuracy is not None
+
+
+def test_argoverse_2_brings_its_map(written_argoverse2, tmp_path):
+    folder = Path(shutil.copytree(written_argoverse2, tmp_path / "log"))
+    assert open_log(folder).logged_map is None
+    (folder / "map").mkdir()
+    (folder / "map" / "log_map_archive_x____PIT_city_1.json").write_text("{}")
+    log = open_log(folder)
+    assert log.logged_map.path == folder / "map"
+    # The world's origin is the first pose, whatever that is in the city.
+    city = log.logged_map.T_world_map
+    np.testing.assert_allclose(city[:3, :3] @ city[:3, :3].T, np.eye(3), atol=1e-9)
+
+
+def test_nuscenes_brings_the_expansion_of_its_town(written_nuscenes, tmp_path):
+    root = Path(shutil.copytree(written_nuscenes, tmp_path / "set"))
+    assert open_log(root).logged_map is None
+    tables = next(root.glob("v1.0-*"))
+    scenes = json.loads((tables / "scene.json").read_text())
+    for scene in scenes:
+        scene["log_token"] = "l"
+    (tables / "scene.json").write_text(json.dumps(scenes))
+    (tables / "log.json").write_text(json.dumps([{"token": "l", "location": "boston-seaport"}]))
+    assert open_log(root).logged_map is None
+    expansion = root / "maps" / "expansion" / "boston-seaport.json"
+    expansion.parent.mkdir(parents=True)
+    expansion.write_text("{}")
+    log = open_log(root)
+    assert log.logged_map.path == expansion
+    np.testing.assert_allclose(log.logged_map.T_world_map, log.provenance["T_world_dataset"])
+
+
+def test_a_real_argoverse_2_drive_runs_on_its_lanes(test_data):
+    path = test_data / "argoverse2"
+    if not path.is_dir():
+        pytest.skip(f"no sample drive at {path}")
+    log = open_log(path)
+    graph = lanes_of_log(log)
+    assert len(graph.lanes) > 50
+    start = log.ego.positions[0]
+    assert graph.nearest(float(start[0]), float(start[1])) is not None
+    assert graph.is_drivable(log.ego.positions[:, :2]).all()

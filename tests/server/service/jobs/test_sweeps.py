@@ -1,0 +1,158 @@
+"""Sweeps and searches as jobs of a worker."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+
+import pyarrow.parquet as pq
+import pytest
+
+from real2sim_proto.sweeps import SweepRequest
+from real2sim_server.executors import InProcess
+from real2sim_server.scenarios.gallery import corner_case
+from real2sim_server.scenarios.openscenario import read_openscenario_text, write_openscenario
+from real2sim_server.service.sweeps.files import write_spec
+from real2sim_server.sweeps import load_sweep, run_sweep
+from real2sim_server.world.recording.recording import recording_of_bytes
+
+GAP = {"kind": "float", "low": 6.0, "high": 14.0}
+CUT_IN = {
+    "scene": "tiny",
+    "corner_case": "cut_in",
+    "reset": {"horizon": 8},
+    "parameters": {"gap": GAP},
+    "method": {"kind": "grid", "levels": 3},
+    "planners": ["idm", "follow_route"],
+    "worst": 2,
+}
+
+
+def over(client, job: dict, seconds: float = 120.0) -> dict:
+    give_up = time.monotonic() + seconds
+    while job["state"] in {"queued", "running"}:
+        if time.monotonic() > give_up:
+            raise TimeoutError(job)
+        time.sleep(0.1)
+        job = client.get(f"/v1/jobs/{job['job_id']}").json()
+    return job
+
+
+def begun(client, **changes) -> dict:
+    answer = client.post("/v1/sweeps", json=CUT_IN | changes)
+    assert answer.status_code == 202, answer.text
+    return answer.json()
+
+
+def left(client, job: dict, name: str) -> bytes:
+    answer = client.get(f"/v1/jobs/{job['job_id']}/files/{name}")
+    assert answer.status_code == 200, answer.text
+    return answer.content
+
+
+def test_a_sweep_leaves_the_table_that_the_command_makes(client, scenes_dir, tmp_path):
+    job = over(client, begun(client))
+    assert job["state"] == "succeeded", job["error"]
+    table = left(client, job, "episodes.parquet")
+    spec = {
+        "case": {"name": "c", "scene": str(scenes_dir / "tiny.r2s"), "reset": CUT_IN["reset"]},
+        "storyboard": "gallery:cut_in",
+        **{k: CUT_IN[k] for k in ("parameters", "method", "planners", "worst")},
+    }
+    (tmp_path / "sweep.json").write_text(json.dumps(spec))
+    run_sweep(load_sweep(tmp_path / "sweep.json"), tmp_path / "out", InProcess())
+    assert table == (tmp_path / "out" / "episodes.parquet").read_bytes()
+    assert job["result"]["episodes"] == pq.read_table(io.BytesIO(table)).num_rows == 6
+
+
+def test_the_worst_leave_recordings_and_scenario_files(client):
+    job = over(client, begun(client))
+    assert len(job["result"]["worst"]) == 2
+    for key in job["result"]["worst"]:
+        recording_of_bytes(left(client, job, f"{key}.r2e"), key)
+        board = read_openscenario_text(left(client, job, f"{key}.xosc"), key).board
+        assert 6.0 <= float(board.parameters["gap"]) <= 14.0
+    names = {file["name"] for file in job["files"]}
+    assert len(names) == 5
+
+
+def test_a_scenario_file_of_the_caller_is_swept_by_its_own_parameters(client):
+    text = write_openscenario(corner_case("cut_in").storyboard()).decode()
+    job = over(client, begun(client, corner_case=None, openscenario=text, planners=["idm"]))
+    assert job["state"] == "succeeded", job["error"]
+    table = pq.read_table(io.BytesIO(left(client, job, "episodes.parquet")))
+    assert sorted(set(table["gap"].to_pylist())) == [6.0, 10.0, 14.0]
+
+
+def test_what_lies_beside_an_uploaded_file_is_not_read(tmp_path, scenes_dir):
+    secret = tmp_path / "secret.xodr"
+    secret.write_text("<OpenDRIVE/>")
+    text = write_openscenario(corner_case("cut_in").storyboard()).decode()
+    network = f'<RoadNetwork><LogicFile filepath="{secret}"/></RoadNetwork>'
+    text = text.replace("<RoadNetwork/>", network).replace("<RoadNetwork />", network)
+    asked = SweepRequest(scene="tiny", openscenario=text, parameters={"gap": GAP})
+    write_spec(asked, tmp_path / "job", scenes_dir / "tiny.r2s")
+    storyboard = load_sweep(tmp_path / "job" / "sweep.json").storyboard
+    read = storyboard.read({"gap": 8.0})
+    assert (read.board.roads.kind, read.road_file) == ("map", None)
+
+
+def test_a_search_leaves_its_failures_and_all_of_it_packed(client, tmp_path):
+    pytest.importorskip("cmaes")
+    ask = {"kind": "search", "episodes": 20, "shrink": 0}
+    changes = {"method": ask, "planners": ["follow_route"]}
+    body = {name: value for name, value in CUT_IN.items() if name != "worst"} | changes
+    job = over(client, client.post("/v1/sweeps", json=body).json(), 240.0)
+    assert job["state"] == "succeeded", job["error"]
+    found = json.loads(left(client, job, "failures.json"))
+    assert found["episodes"] == job["result"]["episodes"] == 20
+    assert len(found["failures"]) == len(job["result"]["failures"])
+    assert str(tmp_path).encode() not in left(client, job, "failures.tar")
+
+
+def test_a_sweep_can_be_cancelled(client):
+    job = begun(client, method={"kind": "sobol", "count": 4000})
+    time.sleep(1.0)
+    client.delete(f"/v1/jobs/{job['job_id']}")
+    assert over(client, job)["state"] == "cancelled"
+
+
+def test_a_stopped_worker_goes_on_where_its_sweep_was(start_worker, run_worker, tmp_path):
+    with run_worker() as client:
+        job = begun(client, method={"kind": "sobol", "count": 300})
+        give_up = time.monotonic() + 120
+        while "left" not in client.get(f"/v1/jobs/{job['job_id']}").json()["stage"]:
+            assert time.monotonic() < give_up
+            time.sleep(0.1)
+    with run_worker() as client:
+        done = over(client, client.get(f"/v1/jobs/{job['job_id']}").json())
+        assert (done["state"], done["result"]["episodes"]) == ("succeeded", 600)
+        assert 0 < done["result"]["driven_now"] < 600
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"corner_case": "cut_off"}, "cut_off"),
+        ({"scene": "nowhere"}, "no scene 'nowhere'"),
+        ({"planners": ["learned=/etc/passwd"]}, "planners"),
+        ({"method": {"kind": "sobol", "count": 10_000}}, "20000 episodes"),
+        ({"reset": {"seed": 3}}, "reset names 'seed'"),
+        ({"parameters": {}}, "nothing would vary"),
+        ({"method": {"kind": "search"}}, "a search is of one"),
+        ({"corner_case": None, "openscenario": "<a/>"}, "a"),
+        ({"openscenario": "<a/>"}, "give one of"),
+    ],
+)
+def test_what_cannot_be_swept_is_refused_before_it_begins(client, changes, words):
+    answer = client.post("/v1/sweeps", json=CUT_IN | changes)
+    assert answer.status_code in {404, 422}
+    assert words in answer.text
+
+
+def test_a_parameter_that_the_scenario_has_not_fails_the_job_with_a_sentence(client, tmp_path):
+    job = over(client, begun(client, parameters={"gapp": GAP}))
+    assert job["state"] == "failed"
+    assert "no parameter 'gapp'" in job["error"]["detail"]
+    assert str(tmp_path) not in job["error"]["detail"]

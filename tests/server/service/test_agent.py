@@ -1,0 +1,127 @@
+"""What a worker tells its proxy, and how it leaves a fleet in order."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from real2sim_server.service import prewarming, serve
+from real2sim_server.service.agent import Agent, Willingness
+from real2sim_server.service.prewarming import loads_of
+from real2sim_server.service.storage.leases import WorkerRow
+
+from .haproxy import free_port
+from .test_fleet import by, start, store_url  # noqa: F401, fixtures
+from .test_trouble import Site, wait_until
+
+
+@pytest.mark.parametrize(
+    ("ready", "full", "handed_over", "word"),
+    [
+        (True, False, False, "up ready 70%"),
+        (False, False, False, "up drain"),
+        (True, True, False, "up drain"),
+        (False, True, True, "down"),
+    ],
+)
+def test_the_word_for_the_proxy(ready, full, handed_over, word):
+    found = Willingness(ready=ready, full=full, handed_over=handed_over)
+    assert Agent(lambda: found, weight=70).word() == word
+
+
+def ask(port: int) -> str:
+    with socket.create_connection(("127.0.0.1", port), 5) as asked, asked.makefile() as lines:
+        return lines.readline()
+
+
+@pytest.mark.network
+def test_a_worker_tells_its_proxy_whether_it_takes_sessions(start):  # noqa: F811
+    port = free_port()
+    client = start("w0", agent_port=port, max_sessions=1)
+    wait_until(lambda: ask(port) == "up ready 100%\n")
+    Site(client)
+    assert ask(port) == "up drain\n"
+
+
+def ready(client):
+    """The same, once others know that it takes work."""
+    wait_until(lambda: client.get("/v1/fleet").json()["workers"][-1]["ready"])
+    return client
+
+
+def test_sessions_are_handed_over_without_waiting_for_a_lease(start):  # noqa: F811
+    first = start("w0", lease_seconds=300)
+    site = Site(first)
+    assert site.step().status_code == 200
+    second = ready(start("w1", lease_seconds=300))
+    other = by(second, site)
+    assert other.step().json()["code"] == "SESSION_ELSEWHERE"
+
+    worker = first.app.state.worker
+    assert first.portal.call(worker.hand_over)
+    assert worker._willingness().handed_over
+    assert other.step().json()["step"] == 2
+    # Who still comes here is sent away, and nothing is taken back.
+    assert site.step().json()["code"] == "SESSION_ELSEWHERE"
+
+
+def test_jobs_are_handed_over_too_and_nobody_has_died(start):  # noqa: F811
+    first, second = start("w0", lease_seconds=300), ready(start("w1", lease_seconds=300))
+    body = {"scene": "tiny", "camera": "front", "width": 640, "fps": 60}
+    job = first.post("/v1/exports", json=body).headers["Location"]
+    first.portal.call(first.app.state.worker.hand_over)
+    wait_until(lambda: second.get(job).json()["state"] == "succeeded", 120)
+    done = second.get(job).json()
+    assert (done["worker"], done["attempt"]) == ("w1", 1)
+
+
+def test_a_worker_without_others_keeps_its_sessions(start):  # noqa: F811
+    client = start("w0")
+    site = Site(client)
+    assert not client.portal.call(client.app.state.worker.hand_over)
+    assert site.step().status_code == 200
+
+
+def test_a_server_that_is_told_to_stop_hands_over_before_it_ends(start, monkeypatch):  # noqa: F811
+    first, second = start("w0"), ready(start("w1"))
+    site = Site(first)
+    server = serve.DrainingServer(
+        serve.server_config(first.app, first.app.state.worker.settings), first.app.state.worker
+    )
+    monkeypatch.setattr(serve, "LINGER_S", 0.0)
+    server._stops_at = 0.0
+    first.portal.call(server.on_tick, 1)
+    assert not server.should_exit
+    assert by(second, site).step().json()["step"] == 1
+    first.portal.call(server.on_tick, 1)
+    assert server.should_exit
+
+
+def member(name: str, alive: bool = True, **about) -> WorkerRow:
+    return WorkerRow(name, alive, {"ready": True} | about)
+
+
+def test_a_hot_scene_is_loaded_by_one_more_worker():
+    hot = member("w0", scenes=["a", "b"], scene_sessions={"a": 4, "b": 3})
+    rest = [
+        member("w1"),
+        member("w2", scenes=["b"]),
+        member("w3", draining=True),
+        member("w4", alive=False),
+    ]
+    loads = {name: loads_of(name, [hot, *rest], hot=4) for name in ("w0", "w1", "w2", "w3", "w4")}
+    assert sorted(loads.values()) == [[], [], [], [], ["a"]]
+    assert loads["w1"] or loads["w2"]
+    # Two have it then, and nobody else loads it.
+    again = [hot, member("w1", scenes=["a"]), member("w2", scenes=["a", "b"])]
+    assert [loads_of(name, again, hot=4) for name in ("w0", "w1", "w2")] == [[], [], []]
+
+
+def test_a_worker_loads_a_hot_scene_ahead(start, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(prewarming, "LOOK_S", 0.05)
+    first, second = start("w0", hot_scene_sessions=1), start("w1", hot_scene_sessions=1)
+    Site(first)
+    worker = second.app.state.worker
+    wait_until(lambda: "tiny" in second.get("/v1/fleet").json()["workers"][0]["scenes"])
+    wait_until(lambda: worker.scene_cache.resident_names == ["tiny"], 30)

@@ -1,0 +1,140 @@
+"""Where the proxy's configuration sends what, with small servers in the workers' places."""
+
+from __future__ import annotations
+
+import http.client
+import subprocess
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from socketserver import StreamRequestHandler, ThreadingTCPServer
+
+import pytest
+
+from .haproxy import SHIPPED, program, running_haproxy
+
+pytestmark = pytest.mark.network
+
+NAMES = ("w0", "w1", "w2")
+READY = "up ready 100%"
+
+
+class Stand:
+    """In the place of a worker: says its name to whoever asks, and to its proxy what it is told."""
+
+    def __init__(self, name: str) -> None:
+        stand = self
+        self.word = READY
+
+        class Web(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def do_GET(self) -> None:
+                body = name.encode()
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+
+            do_POST = do_GET
+
+            def log_message(self, *_given) -> None:
+                """Nobody reads it."""
+
+        class Word(StreamRequestHandler):
+            def handle(self) -> None:
+                self.wfile.write(f"{stand.word}\n".encode())
+
+        ThreadingTCPServer.daemon_threads = ThreadingHTTPServer.daemon_threads = True
+        self.web = ThreadingHTTPServer(("127.0.0.1", 0), Web)
+        self.agent = ThreadingTCPServer(("127.0.0.1", 0), Word)
+        for server in (self.web, self.agent):
+            threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+
+    def stop(self) -> None:
+        for server in (self.web, self.agent):
+            server.shutdown()
+            server.server_close()
+
+
+class Site:
+    def __init__(self, stands: dict[str, Stand], url: str) -> None:
+        self.stands = stands
+        self._address = url.removeprefix("http://")
+
+    def ask(self, path: str, method: str = "GET") -> str:
+        connection = http.client.HTTPConnection(self._address, timeout=10)
+        try:
+            connection.request(method, path)
+            return connection.getresponse().read().decode()
+        finally:
+            connection.close()
+
+    def new(self, scene: str) -> str:
+        return self.ask(f"/v1/sessions?scene={scene}", "POST")
+
+    def wait(self, condition) -> None:
+        deadline = time.monotonic() + 20
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    program()
+    stands = {name: Stand(name) for name in NAMES}
+    webs = {name: stand.web.server_address[1] for name, stand in stands.items()}
+    agents = {name: stand.agent.server_address[1] for name, stand in stands.items()}
+    with running_haproxy(tmp_path, webs, agents) as url:
+        site = Site(stands, url)
+        site.wait(lambda: all(site.ask(f"/v1/sessions/{name}.7f/step") == name for name in NAMES))
+        yield site
+    for stand in stands.values():
+        stand.stop()
+
+
+def test_the_configuration_that_is_shipped_is_valid(tmp_path):
+    text = SHIPPED.read_text()
+    done = subprocess.run(
+        [program(), "-c", "-f", str(SHIPPED)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "use-server" in text
+
+
+def test_new_sessions_go_where_their_scene_is_and_scenes_to_all_workers(site):
+    scenes = [f"scene_{k}" for k in range(60)]
+    asked = [{scene: site.new(scene) for scene in scenes} for _ in range(5)]
+    usual = {scene: Counter(a[scene] for a in asked).most_common(1)[0] for scene in scenes}
+    # Not all: a connection that is just being closed counts as load.
+    assert sum(many for _, many in usual.values()) >= 0.95 * 5 * len(scenes)
+    shares = Counter(name for name, _ in usual.values())
+    assert set(shares) == set(NAMES)
+    # Of 60 scenes a hash gives no worker more than twice its part.
+    assert max(shares.values()) <= 40
+
+
+def test_a_worker_that_drains_keeps_its_sessions_and_gets_no_new_ones(site):
+    scene = next(s for s in (f"scene_{k}" for k in range(200)) if site.new(s) == "w1")
+    site.stands["w1"].word = "up drain"
+    site.wait(lambda: site.new(scene) != "w1")
+    assert [site.ask("/v1/sessions/w1.7f/step") for _ in range(5)] == ["w1"] * 5
+    site.stands["w1"].word = READY
+    site.wait(lambda: site.new(scene) == "w1")
+
+
+def test_sessions_of_a_worker_that_is_down_or_unknown_go_to_one_that_is_there(site):
+    site.stands["w2"].word = "down"
+    site.wait(lambda: site.ask("/v1/sessions/w2.7f/step") != "w2")
+    assert site.ask("/v1/sessions/w9.7f/step") in ("w0", "w1")
+
+
+def test_a_worker_that_has_gone_costs_no_request(site):
+    site.stands["w0"].stop()
+    answers = [site.ask("/v1/sessions/w0.7f/step") for _ in range(10)]
+    assert set(answers) <= {"w1", "w2"}
+    site.stands["w0"] = Stand("w0")

@@ -1,0 +1,69 @@
+"""Looking at a scene makes nothing; the first edit makes a scenario."""
+
+from __future__ import annotations
+
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import httpx2
+import pytest
+
+from .hands import enter, field, kept, shown, until
+
+pytestmark = [pytest.mark.browser, pytest.mark.network]
+
+
+def scenarios(running: Any) -> list[dict[str, Any]]:
+    listed: list[dict[str, Any]] = httpx2.get(f"{running.url}/v1/scenarios").json()["scenarios"]
+    return listed
+
+
+def address(page: Any) -> dict[str, str]:
+    return {k: v[0] for k, v in parse_qs(urlsplit(page.evaluate("location.href")).query).items()}
+
+
+def test_whoever_looks_leaves_nothing_and_can_share_what_is_seen(looking, visit, running):
+    looking.wait_for_selector("#picture[data-seq]")
+    assert looking.inner_text("#name") == "tiny"
+    assert looking.inner_text("#saved") == "Nothing changed yet"
+    looking.evaluate("async () => (await import('/ui/model.js')).select('car_red')")
+    looking.click("#next")
+    looking.keyboard.press("Control+z")
+    until(lambda: address(looking).get("selected") == "car_red")
+    assert "scenario" not in address(looking)
+    other = visit(looking.evaluate("location.href"))
+    other.wait_for_selector("body[data-ready]")
+    assert shown(other, "model.selected") == "car_red"
+    assert shown(other, "model.t") == shown(looking, "model.t")
+    assert scenarios(running) == []
+
+
+def test_the_first_edit_makes_the_scenario_and_the_picture_follows(looking, running):
+    looking.wait_for_selector("#picture[data-seq]")
+    looking.evaluate("async () => (await import('/ui/model.js')).select('car_red')")
+    before = field(looking, "pose-x")
+    enter(looking, "pose-x", before + 1)
+    kept(looking, 1)
+    (made,) = scenarios(running)
+    assert (made["name"], made["revision"]) == ("tiny edit", 1)
+    until(lambda: address(looking).get("scenario") == made["scenario_id"])
+    assert looking.inner_text("#name") == "tiny edit"
+    seq = looking.get_attribute("#picture", "data-seq")
+    looking.click("#next")
+    until(lambda: looking.get_attribute("#picture", "data-seq") != seq)
+    enter(looking, "pose-x", before + 2)
+    kept(looking, 2)
+    assert len(scenarios(running)) == 1
+    assert not looking.is_visible("#gone")
+
+
+def test_an_edit_that_is_refused_makes_nothing(looking, running):
+    looking.evaluate(
+        "async () => (await import('/ui/model.js')).edit([{ op: 'delete', object_id: 'nobody' }])"
+    )
+    looking.wait_for_selector("#messages:has-text('nobody')")
+    until(lambda: scenarios(running) == [])
+    assert looking.inner_text("#saved") == "Nothing changed yet"
+    looking.wait_for_timeout(400)
+    assert "scenario" not in address(looking)
+    assert not looking.is_visible("#gone")

@@ -1,0 +1,295 @@
+"""The three-dimensional view, drawn by the page itself (software WebGL)."""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import Any
+
+import httpx2
+import numpy as np
+import pytest
+from PIL import Image
+
+import real2sim
+from real2sim_server.geometry.rotation import matrix_to_quaternion
+
+from .hands import drag, kept, shown, until
+
+pytestmark = [pytest.mark.browser, pytest.mark.network]
+LEAST_PSNR = 38.0
+"""[dB]; 45 were seen."""
+
+
+@pytest.fixture(scope="module")
+def browser_args() -> list[str]:
+    """WebGL is drawn by software."""
+    return ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+def opened(studio: Any, width: int = 700) -> Any:
+    """The view with the whole scene in it, small: software draws it."""
+    studio.set_viewport_size({"width": width, "height": 560})
+    studio.click("#space-mode")
+    studio.wait_for_selector("#space[data-whole][data-detail=whole]")
+    studio.wait_for_timeout(1500)
+    return studio
+
+
+def image_of(encoded: str) -> np.ndarray:
+    """[H, W, 3] of a picture in base64."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB"))
+
+
+def drawn(page: Any) -> np.ndarray:
+    """The canvas as it is now, without what is drawn over it [H, W, 3]."""
+    url = page.evaluate("() => document.getElementById('space').toDataURL()")
+    return image_of(url.partition(",")[2])
+
+
+def of_worker(page: Any, running: Any) -> np.ndarray:
+    """The worker's exact picture from the same camera, as large as the canvas."""
+    view = page.evaluate("async () => (await import('/ui/space.js')).view()")
+    T = np.reshape(view["T"], (4, 4))
+    camera = {
+        "name": "same",
+        "width": view["width"],
+        "height": view["height"],
+        "K": np.reshape(view["K"], (3, 3)).tolist(),
+        "pose": {
+            "position": T[:3, 3].tolist(),
+            "quaternion": matrix_to_quaternion(T[:3, :3]).tolist(),
+        },
+    }
+    body = {"t_us": shown(page, "model.t"), "cameras": [camera]}
+    answer = httpx2.post(
+        f"{running.url}/v1/scenes/tiny/render", json=body, headers={"Accept": "image/png"}
+    )
+    return image_of(base64.b64encode(answer.raise_for_status().content).decode())
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    error = np.mean((a.astype(float) - b.astype(float)) ** 2)
+    return float(10 * np.log10(255**2 / error))
+
+
+def test_the_page_draws_what_the_worker_draws(studio, running):
+    page = opened(studio)
+    ours, exact = drawn(page), of_worker(page, running)
+    assert ours.shape == exact.shape
+    assert exact.std() > 10
+    assert psnr(ours, exact) > LEAST_PSNR
+
+
+def middle_of(page: Any, name: str) -> tuple[float, float]:
+    inside = page.evaluate(
+        "async (id) => (await import('/ui/camera_view.js')).stagePlace(id)", name
+    )
+    box = page.locator("#stage").bounding_box()
+    return box["x"] + inside[0], box["y"] + inside[1]
+
+
+def test_a_dragged_object_moves_at_once_and_makes_one_edit(studio):
+    page = opened(studio)
+    place = "model.scenario.objects.find((o) => o.object_id === 'car_red').trajectory.positions[0]"
+    before, pixels = shown(page, place), drawn(page)
+    x, y = middle_of(page, "car_red")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 25, y + 6, steps=4)
+    assert shown(page, "model.selected") == "car_red"
+    assert shown(page, "model.scenario.revision") == 0
+    page.wait_for_timeout(600)
+    assert np.abs(drawn(page).astype(int) - pixels).max() > 60
+    page.mouse.up()
+    kept(page, 1)
+    after = shown(page, place)
+    assert np.hypot(after[0] - before[0], after[1] - before[1]) > 0.3
+    assert shown(page, "model.history.entries.length") == 1
+
+
+def test_what_is_dragged_beside_objects_goes_round_and_edits_nothing(studio):
+    page = opened(studio)
+    before = shown(page, "model.free")
+    box = page.locator("#stage").bounding_box()
+    drag(page, (box["x"] + 40, box["y"] + 20), (60, 0))
+    after = shown(page, "model.free")
+    assert np.abs(np.subtract(after, before)).max() > 0.1
+    assert shown(page, "model.scenario.revision") == 0
+    R = np.reshape(after, (4, 4))[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+
+
+def test_the_ring_of_an_object_turns_it(studio):
+    page = opened(studio)
+    yaw = "model.scenario.objects.find((o) => o.object_id === 'car_red').trajectory.quaternions[0]"
+    before = shown(page, yaw)
+    page.evaluate("async () => (await import('/ui/model.js')).select('car_red')")
+    ring = page.evaluate(
+        """async () => {
+            const { model, object } = await import('/ui/model.js');
+            const { ringOf } = await import('/ui/space_hands.js');
+            const { project } = await import('/ui/poses.js');
+            const { view } = await import('/ui/space.js');
+            const { T, K } = view();
+            return ringOf(object(model.selected)).map((point) => project(point, T, K));
+        }"""
+    )
+    box = page.locator("#stage").bounding_box()
+    # The nearest point of the ring is the lowest in the picture: beside the car, on the road.
+    x, y = max((p for p in ring if p), key=lambda p: p[1])
+    drag(page, (box["x"] + x, box["y"] + y), (40, 0))
+    kept(page, 1)
+    after = shown(page, yaw)
+    turned = 2 * np.arccos(min(1.0, abs(float(np.dot(before, after)))))
+    assert 0.05 < turned < 2.0
+    assert shown(page, "model.history.entries[0].operations[0].op") in {"rotate", "set_pose"}
+
+
+def test_a_device_that_is_too_slow_shows_the_workers_picture_of_the_same_camera(studio):
+    """As it is where a processor draws: said by a part that is one of many, and slow."""
+
+    def one_of_many(route: Any) -> None:
+        answer = route.fetch()
+        headers = {**answer.headers, "x-real2sim-total": "1000000"}
+        route.fulfill(response=answer, headers=headers)
+
+    studio.route("**/splats?*", one_of_many)
+    studio.evaluate(
+        "async () => { const { Pace } = await import('/ui/pace.js');"
+        " Pace.prototype.fastest = async () => 400; }"
+    )
+    studio.set_viewport_size({"width": 700, "height": 560})
+    studio.click("#space-mode")
+    studio.wait_for_selector("#space.remote")
+    studio.wait_for_selector("#messages:has-text('graphics card')")
+    before = studio.get_attribute("#picture", "data-seq")
+    x, y = middle_of(studio, "car_red")
+    place = "model.scenario.objects.find((o) => o.object_id === 'car_red').trajectory.positions[0]"
+    drag(studio, (x, y), (25, 6))
+    kept(studio, 1)
+    assert shown(studio, place)[1] != pytest.approx(0.0, abs=1e-3)
+    studio.wait_for_timeout(500)
+    assert int(studio.get_attribute("#picture", "data-seq")) > int(before or 0)
+
+
+def test_without_webgl_the_workers_picture_stays(studio):
+    studio.evaluate(
+        "() => { const real = HTMLCanvasElement.prototype.getContext;"
+        " HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
+        " return kind === 'webgl2' ? null : real.call(this, kind, ...more); }; }"
+    )
+    studio.wait_for_selector("#picture[data-seq]")
+    studio.click("#space-mode")
+    studio.wait_for_selector("#messages:has-text('WebGL2')")
+    assert not studio.is_visible("#space")
+    assert studio.get_attribute("#space-mode", "aria-pressed") == "false"
+    assert studio.is_visible("#picture")
+
+
+CONVERGES = """async ([each, total]) => {
+    const { Detail } = await import('/ui/detail.js');
+    const detail = new Detail();
+    let chosen;
+    for (let k = 0; k < 40; k++) {
+        chosen = detail.moving(total);
+        detail.took(5 + detail.shown * each, { resting: false });
+    }
+    const moving = { ...chosen, shown: detail.shown };
+    const steps = [];
+    while (!detail.whole(total)) {
+        detail.resting(total);
+        steps.push(detail.shown);
+        detail.took(5 + detail.shown * each, { resting: true });
+    }
+    return { moving, steps, after: detail.moving(total).share };
+}"""
+
+
+@pytest.mark.parametrize("each", [4e-3, 4e-4])
+def test_what_moves_shows_as_much_as_comes_in_time_and_all_of_it_at_rest(page, each):
+    total = 360_000
+    told = page.evaluate(CONVERGES, [each, total])
+    assert told["moving"]["share"] < 0.5
+    assert told["moving"]["scale"] < 1
+    assert told["moving"]["shown"] * each < 70 or told["moving"]["shown"] <= 16384
+    assert told["steps"] == sorted(told["steps"])
+    assert told["steps"][-1] == total
+    assert told["after"] == pytest.approx(told["moving"]["share"])
+
+
+def test_where_all_of_it_comes_in_time_all_of_it_moves(page):
+    told = page.evaluate(CONVERGES, [1e-5, 360_000])
+    assert told["moving"] == {"share": 1, "scale": 1, "shown": 360_000}
+    assert told["steps"] == []
+
+
+def test_a_share_of_the_scene_is_what_covers_most_of_it(studio):
+    active = studio.evaluate(
+        """async () => {
+            const { SplatWorld } = await import('/ui/splat_world.js');
+            const { view } = await import('/ui/space.js');
+            const { model, emit } = await import('/ui/model.js');
+            const canvas = document.createElement('canvas');
+            const world = new SplatWorld(canvas, model.scene, { draw: () => {}, again: () => {} });
+            await world.load();
+            world.pace.stop();
+            const counts = [];
+            for (const share of [1, 0.5, 0.1]) {
+                world.show({ share, scale: 1 });
+                await world.pace.prepare();
+                counts.push(world.spark.activeSplats);
+            }
+            const later = await world.cloudAt(world.url('splats', { object_id: 'car_red' }));
+            const { count } = world.splats.get(later.splats);
+            const joins = [count, later.splats.numSplats];
+            return { counts, total: world.total(), joins };
+        }"""
+    )
+    total = active["total"]
+    assert total > 200
+    assert active["counts"] == [total, -(-total // 2), -(-total // 10)]
+    # Who comes later comes with the same share: nothing has to be ordered anew for that.
+    whole, share = active["joins"]
+    assert whole > 10
+    assert share == -(-whole // 10)
+
+
+def test_people_assets_and_what_was_stretched_are_drawn_as_the_scenario_has_them(studio, running):
+    page = opened(studio)
+    total = int(page.get_attribute("#space", "data-total"))
+    before = drawn(page)
+    with real2sim.connect(running.url) as sim:
+        sim.assets.person(
+            asset_id="anna", build="woman", height=1.7, clothes={"top": (0.9, 0.1, 0.1)}
+        )
+        scenario = sim.scenarios.get(shown(page, "model.scenario.scenario_id"))
+        scenario.insert("anna", position=(6.0, -2.5, 0.9), object_id="visitor")
+        scenario.objects["car_red"].scale(x=1.5)
+        scenario.objects["post"].scale(x=1.2, y=1.2, z=1.2)
+    with page.expect_request("**/splats?object_id=visitor**"):
+        page.evaluate("async () => (await import('/ui/model.js')).refresh()")
+    until(lambda: page.get_attribute("#space", "data-boxes") == "")
+    until(lambda: int(page.get_attribute("#space", "data-total")) > total + 1000)
+    page.wait_for_timeout(1500)
+    x, y = page.evaluate("async () => (await import('/ui/camera_view.js')).stagePlace('visitor')")
+    around = (slice(int(y) - 8, int(y) + 8), slice(int(x) - 4, int(x) + 4))
+    assert np.abs(drawn(page).astype(int) - before)[around].max() > 60
+    # Who walks is asked for at every instant, others are not.
+    asked = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.click("#next")
+    t_us = shown(page, "model.t")
+    until(lambda: any(f"object_id=visitor&t_us={t_us}" in url for url in list_of(page, asked)))
+    assert not [url for url in asked if "splats" in url and "visitor" not in url]
+    # Their coming holds no picture up.
+    pictures = int(page.get_attribute("#space", "data-drawn"))
+    page.click("#play")
+    page.wait_for_timeout(1200)
+    assert int(page.get_attribute("#space", "data-drawn")) > pictures + 3
+
+
+def list_of(page: Any, asked: list[str]) -> list[str]:
+    """What was asked for, once the browser has told."""
+    page.wait_for_timeout(50)
+    return list(asked)
