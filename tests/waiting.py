@@ -1,0 +1,54 @@
+"""The one way in which tests wait for something that another thread or process does."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+T = TypeVar("T")
+
+LIMIT_S = 120.0
+"""Far more than anything takes on a busy machine: only something that never comes reaches it."""
+
+POLL_S = 0.01
+
+
+def wait_until(
+    holds: Callable[[], T], what: str | Callable[[], str], *, seconds: float = LIMIT_S
+) -> T:
+    """Wait until ``holds()`` is true, and return what it returned.
+
+    Args:
+        holds: asked every 10 ms.
+        what: the test waits for, for the error; a function is called only then.
+        seconds: to wait [s]. Leave it out: a limit that can be reached makes a test flaky.
+
+    Raises:
+        AssertionError: the time is up.
+    """
+    for _ in _polls(what, seconds):
+        if result := holds():
+            return result
+        time.sleep(POLL_S)
+    raise AssertionError
+
+
+async def wait_until_async(
+    holds: Callable[[], T], what: str | Callable[[], str], *, seconds: float = LIMIT_S
+) -> T:
+    """:func:`wait_until` on an event loop, which runs meanwhile."""
+    for _ in _polls(what, seconds):
+        if result := holds():
+            return result
+        await asyncio.sleep(POLL_S)
+    raise AssertionError
+
+
+def _polls(what: str | Callable[[], str], seconds: float) -> Iterator[None]:
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        yield
+    told = what if isinstance(what, str) else what()
+    raise AssertionError(f"waited {seconds:g} s for {told}")
