@@ -2,6 +2,7 @@
 
 Its parts, lowest first; each imports only those before it, and no file is part of a circle:
 
+- ``clock``: time as the worker reads it.
 - ``storage``: a ``Database`` that executes, a ``Store`` of what is asked of it: scenarios,
   sessions, jobs, stored answers; who owns them.
 - ``objects``: a store of what workers share, by content.

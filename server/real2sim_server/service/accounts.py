@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import structlog
 
+from . import clock
 from .storage.tokens import token_hash
 from .token_file import DEFAULT_NAME, Role, TokenFileError, TokenLimits, read_token_file
 
@@ -78,11 +79,11 @@ class Meter:
         self._per_s = allowed / period_s
         self._level = 0.0
         self._seen = 0.0
-        self._at = time.monotonic()
+        self._at = clock.monotonic()
 
     def wait_s(self, total: float, more: float = 0.0) -> float:
         """Seconds until ``more`` may be added to what is ``total`` up to now; 0 for at once."""
-        now = time.monotonic()
+        now = clock.monotonic()
         leaked = (now - self._at) * self._per_s
         self._level = max(0.0, self._level - leaked) + (total - self._seen)
         self._at, self._seen = now, total
@@ -238,7 +239,8 @@ class Payer:
             except OverLimitError as error:
                 if not self.waits:
                     raise
-                await asyncio.sleep(min(error.retry_after_s, PATIENCE_S))
+                wait_s = min(error.retry_after_s, PATIENCE_S)
+                await clock.sleep_until(clock.monotonic() + wait_s)
 
 
 PAYER: ContextVar[Payer | None] = ContextVar("payer", default=None)

@@ -18,6 +18,7 @@ from real2sim_proto.jobs import JobInfo
 
 from ..settings import Settings
 from .accounts import PAYER, Payer
+from .clock import now_us
 from .http.accounting import Accounting, usage_of
 from .http.auth import require_token
 from .http.hosts import LoopbackOnly
@@ -49,7 +50,6 @@ from .routes import (
     view,
 )
 from .storage.audit_log import AuditEntry
-from .storage.store import now_us
 from .tracing import Tracing, engine_spans, traces_to
 from .worker import Worker
 

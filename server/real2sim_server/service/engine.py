@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import structlog
 
+from . import clock
 from .accounts import PAYER, Account, computing_account
 from .lanes import Lane, Lanes
 
@@ -127,7 +128,7 @@ class _EngineJob:
     future: Future[Any] | _LoopFuture
     account: Account | None
     companions: Companions | None = None
-    queued_at: float = field(default_factory=time.perf_counter)
+    queued_at: float = field(default_factory=lambda: clock.monotonic())  # noqa: PLW0108
     on_end: Callable[[str, float, float], None] | None = None
 
 
@@ -169,7 +170,7 @@ class Engine:
         self._changed = threading.Condition()
         self._accepting = False
         self._running: str | None = None
-        self._last_tick = time.monotonic()
+        self._last_tick = clock.monotonic()
         self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name="engine", daemon=True)
 
@@ -179,7 +180,7 @@ class Engine:
         """Start the thread and set the thread counts of torch and numba once and for all."""
         sys.setswitchinterval(min(SWITCH_INTERVAL_S, sys.getswitchinterval()))
         self._accepting = True
-        self._last_tick = time.monotonic()
+        self._last_tick = clock.monotonic()
         self._thread.start()
         self.call_sync(set_thread_counts, self._threads, label="threads")
 
@@ -302,7 +303,7 @@ class Engine:
         while (job := self._next_more_urgent()) is not None:
             self._start(job)
             del job
-        self._began = time.perf_counter()
+        self._began = clock.monotonic()
 
     def note_error(self, error: BaseException) -> None:
         """Something that began here has failed on another thread: the device may be lost."""
@@ -324,7 +325,7 @@ class Engine:
     @property
     def seconds_since_tick(self) -> float:
         """Time since the thread last looked for a job; grows while one runs [s]."""
-        return time.monotonic() - self._last_tick
+        return clock.monotonic() - self._last_tick
 
     @property
     def queue_depth(self) -> int:
@@ -399,7 +400,7 @@ class Engine:
     def _next(self) -> _EngineJob | None:
         with self._changed:
             while True:
-                self._last_tick = time.monotonic()
+                self._last_tick = clock.monotonic()
                 if (job := self._jobs.begin_next()) is not None:
                     return job
                 if not self._accepting:
@@ -408,12 +409,12 @@ class Engine:
 
     def _next_more_urgent(self) -> _EngineJob | None:
         with self._changed:
-            self._last_tick = time.monotonic()
+            self._last_tick = clock.monotonic()
             return self._jobs.begin_more_urgent()
 
     def _start(self, job: _EngineJob) -> None:
         """Run a job that is wanted still, with those that join it, and count its time."""
-        self._began = time.perf_counter()
+        self._began = clock.monotonic()
         interrupted = self._payers
         try:
             jobs = [j for j in self._joined(job) if j.future.set_running_or_notify_cancel()]
@@ -445,7 +446,7 @@ class Engine:
             return [first, *self._jobs.begin_with(joins)]
 
     def _charge(self) -> None:
-        now = time.perf_counter()
+        now = clock.monotonic()
         spent, self._began = now - self._began, now
         with self._changed:
             self._jobs.charge(spent)
@@ -454,7 +455,7 @@ class Engine:
                 account.engine_seconds += spent / len(self._payers)
 
     def _run(self, jobs: Sequence[_EngineJob]) -> None:
-        started = time.perf_counter()
+        started = clock.monotonic()
         interrupted, self._running = self._running, jobs[0].label
         try:
             results = _results(jobs)
@@ -476,7 +477,7 @@ class Engine:
         for job in jobs:
             for told in (self._on_job, job.on_end):
                 if told is not None:
-                    told(job.label, started - job.queued_at, time.perf_counter() - started)
+                    told(job.label, started - job.queued_at, clock.monotonic() - started)
 
     def _hand_over(self, job: _EngineJob, result: Any) -> None:
         if job.companions is None or not isinstance(result, Exception):

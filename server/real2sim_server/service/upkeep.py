@@ -9,13 +9,14 @@ import structlog
 
 from .._files import sweep_leftovers
 from ..settings import Settings
+from .clock import now_us
 from .jobs.jobs import Jobs
 from .sessions import Sessions
 from .sessions.segment import sweep_segments
 from .storage.backup import RESTORING
 from .storage.errors import StoreError
 from .storage.retention import DAY_US, Retention, RetentionLimits
-from .storage.store import Store, now_us
+from .storage.store import Store
 
 PERIOD_S = 3600.0
 UPLOADS = ".upload-"

@@ -19,7 +19,10 @@ from fastapi.testclient import TestClient
 from real2sim_server.service.app import create_app
 from real2sim_server.settings import Settings
 
+from .manual_clock import manual_clock
 from .postgres import Postgres, running_postgres
+
+__all__ = ["manual_clock"]
 
 PROCESSORS = [
     structlog.contextvars.merge_contextvars,

@@ -7,11 +7,12 @@ import contextlib
 import json
 import os
 import re
-import time
+import threading
 from pathlib import Path
 
 import pytest
 from starlette.websockets import WebSocketDisconnect
+from tests.waiting import wait_until, wait_until_async
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_server.service import accounts as accounts_module
@@ -27,6 +28,7 @@ from real2sim_server.service.accounts import (
     RevokedError,
 )
 from real2sim_server.service.engine import Engine
+from real2sim_server.service.jobs import exports
 from real2sim_server.service.sessions.transition import Transition
 from real2sim_server.service.token_file import (
     TokenFileError,
@@ -39,40 +41,32 @@ from real2sim_server.service.token_file import (
 SINGLE = "a long enough secret"
 
 
-@pytest.fixture
-def clock(monkeypatch) -> list[float]:
-    """Time of the accounts, which stands still until a test moves it."""
-    now = [1000.0]
-    monkeypatch.setattr(accounts_module.time, "monotonic", lambda: now[0])
-    return now
-
-
 # --- limits -----------------------------------------------------------------------------------
 
 
-def test_a_meter_lets_a_period_at_once_and_then_as_much_as_leaks(clock):
+def test_a_meter_lets_a_period_at_once_and_then_as_much_as_leaks(manual_clock):
     meter, taken = Meter(10.0, 1.0), 0
     for _ in range(10):
         assert meter.wait_s(taken, 1.0) == 0
         taken += 1
     assert meter.wait_s(taken, 1.0) == pytest.approx(0.1)
-    clock[0] += 0.1
+    manual_clock.advance(0.11)
     assert meter.wait_s(taken, 1.0) == 0
 
 
-def test_a_meter_below_one_lets_one_at_a_time(clock):
+def test_a_meter_below_one_lets_one_at_a_time(manual_clock):
     meter = Meter(0.5, 1.0)
     assert meter.wait_s(0, 1.0) == 0
     assert meter.wait_s(1, 1.0) == pytest.approx(2.0)
-    clock[0] += 2.0
+    manual_clock.advance(2.0)
     assert meter.wait_s(1, 1.0) == 0
 
 
-def test_what_was_taken_at_once_is_waited_for(clock):
+def test_what_was_taken_at_once_is_waited_for(manual_clock):
     meter = Meter(60.0, 60.0)
     assert meter.wait_s(0.0) == 0
     assert meter.wait_s(90.0) == pytest.approx(30.0, abs=0.01)
-    clock[0] += 31
+    manual_clock.advance(31)
     assert meter.wait_s(90.0) == 0
 
 
@@ -83,7 +77,7 @@ def test_what_was_taken_at_once_is_waited_for(clock):
         (TokenLimits(bytes_per_day=100), {"received_bytes": 60, "sent_bytes": 41}, Limit.BYTES),
     ],
 )
-def test_who_has_had_enough_is_told_of_what(clock, limits, taken, limit):
+def test_who_has_had_enough_is_told_of_what(manual_clock, limits, taken, limit):
     account = Account("alice", limits)
     account.admit()
     account.admit()
@@ -96,7 +90,7 @@ def test_who_has_had_enough_is_told_of_what(clock, limits, taken, limit):
     assert (account.requests, account.refusals[limit]) == (2, 1)
 
 
-def test_other_limits_do_not_count_what_was_taken_before(clock):
+def test_other_limits_do_not_count_what_was_taken_before(manual_clock):
     account = Account("alice")
     account.sent_bytes = 10**9
     account.limit(TokenLimits(bytes_per_day=1000))
@@ -114,25 +108,28 @@ def engine():
     engine.stop()
 
 
-def test_time_on_the_engine_goes_to_whoever_asked(engine):
+def test_time_on_the_engine_goes_to_whoever_asked(engine, manual_clock):
     alice, bob = Account("alice"), Account("bob")
 
     async def ask(account: Account, seconds: float) -> None:
         PAYER.set(Payer(account))
-        await engine.call(time.sleep, seconds)
+        await engine.call(manual_clock.advance, seconds)
 
     async def both() -> None:
-        await asyncio.gather(ask(alice, 0.05), ask(bob, 0.15))
+        await asyncio.gather(ask(alice, 0.25), ask(bob, 0.5))
 
     asyncio.run(both())
-    assert 0.05 <= alice.engine_seconds < bob.engine_seconds >= 0.15
+    assert (alice.engine_seconds, bob.engine_seconds) == pytest.approx((0.25, 0.5))
 
 
-def test_what_runs_within_a_long_job_is_not_counted_to_it(engine):
+def test_what_runs_within_a_long_job_is_not_counted_to_it(engine, manual_clock):
     alice, bob = Account("alice"), Account("bob")
+    begun = threading.Event()
 
     def long() -> None:
-        time.sleep(0.05)
+        begun.set()
+        manual_clock.advance(0.25)
+        wait_until(lambda: engine.queue_depth == 1, "the urgent job to be queued")
         engine.give_way()
 
     async def ask(account: Account, fn, lane) -> None:
@@ -143,15 +140,17 @@ def test_what_runs_within_a_long_job_is_not_counted_to_it(engine):
         from real2sim_server.service.lanes import Lane
 
         first = asyncio.create_task(ask(alice, long, Lane.BULK))
-        await asyncio.sleep(0.02)
-        await asyncio.gather(first, ask(bob, lambda: time.sleep(0.3), Lane.DRIVE))
+        await asyncio.to_thread(begun.wait)
+        await asyncio.gather(first, ask(bob, lambda: manual_clock.advance(0.5), Lane.DRIVE))
 
     asyncio.run(both())
-    assert alice.engine_seconds < 0.3 <= bob.engine_seconds
+    assert (alice.engine_seconds, bob.engine_seconds) == pytest.approx((0.25, 0.5))
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_time_on_the_engine_is_counted_before_anybody_is_woken(engine, monkeypatch, fails):
+def test_time_on_the_engine_is_counted_before_anybody_is_woken(
+    engine, monkeypatch, manual_clock, fails
+):
     alice, seen = Account("alice"), []
     wake = engine_module._LoopFuture._on_loop
 
@@ -162,7 +161,7 @@ def test_time_on_the_engine_is_counted_before_anybody_is_woken(engine, monkeypat
     monkeypatch.setattr(engine_module._LoopFuture, "_on_loop", observed)
 
     def work() -> None:
-        time.sleep(0.01)
+        manual_clock.advance(0.25)
         if fails:
             raise KeyError("on purpose")
 
@@ -172,11 +171,10 @@ def test_time_on_the_engine_is_counted_before_anybody_is_woken(engine, monkeypat
             await engine.call(work)
 
     asyncio.run(ask())
-    assert [seconds >= 0.01 for seconds in seen] == [True]
+    assert seen == pytest.approx([0.25])
 
 
-def test_who_has_had_their_time_on_the_engine_is_refused_and_a_job_waits(engine, monkeypatch):
-    monkeypatch.setattr(accounts_module, "PATIENCE_S", 0.01)
+def test_who_has_had_their_time_on_the_engine_is_refused_and_a_job_waits(engine, manual_clock):
     account = Account("alice", TokenLimits(engine_seconds_per_minute=60))
     account.engine_seconds = 60.2
 
@@ -187,7 +185,14 @@ def test_who_has_had_their_time_on_the_engine_is_refused_and_a_job_waits(engine,
     with pytest.raises(OverLimitError) as error:
         asyncio.run(ask(waits=False))
     assert error.value.limit is Limit.ENGINE
-    assert asyncio.run(ask(waits=True)) == 7
+
+    async def wait() -> int:
+        waiting = asyncio.create_task(ask(waits=True))
+        await wait_until_async(lambda: manual_clock.anything_due, "the job to wait")
+        manual_clock.advance(0.5)
+        return await waiting
+
+    assert asyncio.run(wait()) == 7
 
 
 # --- the file ---------------------------------------------------------------------------------
@@ -349,20 +354,27 @@ def test_sessions_of_a_token_are_limited_forks_among_them(start_worker, tokens_f
 
 
 def test_jobs_keep_their_owner_and_wait_for_their_time_on_the_engine(
-    start_worker, tokens_file, monkeypatch
+    start_worker, tokens_file, manual_clock, monkeypatch
 ):
-    monkeypatch.setattr(accounts_module, "PATIENCE_S", 0.01)
-    alice = add_token(tokens_file, "alice", TokenLimits(engine_seconds_per_minute=0.6))
+    alice = add_token(tokens_file, "alice", TokenLimits(engine_seconds_per_minute=60))
     client = start_worker(tokens_file=tokens_file)
+    over_limit, prepare = threading.Event(), exports._render_request
+    monkeypatch.setattr(
+        exports, "_render_request", lambda *given: over_limit.wait() and prepare(*given)
+    )
     body = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
     job = client.post("/v1/exports", json=body, headers=bearer(alice)).json()
     assert job["owner"] == "alice"
-    client.app.state.worker.accounts.of_owner("alice").engine_seconds += 0.62
-    deadline = time.monotonic() + 30
-    while not job["finished_at"] if "finished_at" in job else True:
-        assert time.monotonic() < deadline
-        job = client.get(f"/v1/jobs/{job['job_id']}", headers=bearer(alice)).json()
-    assert job["state"] == "succeeded"
+    client.app.state.worker.accounts.of_owner("alice").engine_seconds += 60.5
+    over_limit.set()
+
+    def seen() -> dict:
+        return client.get(f"/v1/jobs/{job['job_id']}", headers=bearer(alice)).json()
+
+    wait_until(lambda: manual_clock.anything_due, "the job to wait")
+    assert seen()["state"] == "running"
+    manual_clock.advance(0.6)
+    assert wait_until(lambda: (now := seen())["finished_at"] and now, seen)["state"] == "succeeded"
 
 
 def test_keys_of_one_token_are_not_those_of_another(start_worker, tokens_file):
@@ -414,7 +426,7 @@ def driving(client, made, **fields):
 
 
 def test_messages_of_the_drive_socket_count_and_are_refused_over_the_limit(
-    start_worker, tokens_file
+    start_worker, tokens_file, manual_clock
 ):
     # The session, the hello and the reset are let in.
     alice = add_token(tokens_file, "alice", TokenLimits(requests_per_second=3))
@@ -430,13 +442,15 @@ def test_messages_of_the_drive_socket_count_and_are_refused_over_the_limit(
         assert {said["code"] for said in refused} == {"TOO_MANY_REQUESTS"}
         assert all(said["retryable"] and not said["fatal"] for said in refused)
         assert all(said["retry_after_s"] == 1 for said in refused)
-        time.sleep(0.5)
+        manual_clock.advance(0.5)
         drive.send_bytes(encode({"v": 1, "type": "reset", "id": 9, "spec": {}}))
         assert answer(drive)["type"] == "obs"
     assert figure(client, "sent_bytes_total", "alice") > 500
 
 
-def test_a_step_over_the_engine_limit_is_refused_and_may_be_sent_again(start_worker, tokens_file):
+def test_a_step_over_the_engine_limit_is_refused_and_may_be_sent_again(
+    start_worker, tokens_file, manual_clock
+):
     alice = add_token(tokens_file, "alice", TokenLimits(engine_seconds_per_minute=600))
     client = start_worker(tokens_file=tokens_file)
     made = client.post("/v1/sessions?scene=tiny", headers=bearer(alice)).json()
@@ -450,7 +464,7 @@ def test_a_step_over_the_engine_limit_is_refused_and_may_be_sent_again(start_wor
         account.engine_seconds += 602
         drive.send_bytes(encode(step))
         assert answer(drive)["code"] == "TOO_MUCH_ENGINE_TIME"
-        time.sleep(0.5)
+        manual_clock.advance(0.5)
         drive.send_bytes(encode(step))
         assert answer(drive)["step"] == 1
 

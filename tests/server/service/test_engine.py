@@ -8,6 +8,7 @@ import time
 
 import pytest
 import torch
+from tests.waiting import LIMIT_S, wait_until, wait_until_async
 
 from real2sim_server.service.engine import (
     DeviceLostError,
@@ -30,7 +31,7 @@ def make_engine():
 
     yield make
     for engine in engines:
-        engine.stop(drain=False, timeout_s=10)
+        engine.stop(drain=False, timeout_s=LIMIT_S)
 
 
 class Gate:
@@ -42,7 +43,7 @@ class Gate:
 
     def job(self) -> str:
         self.entered.set()
-        assert self._opened.wait(10)
+        assert self._opened.wait(LIMIT_S)
         return "through"
 
     def open(self) -> None:
@@ -50,7 +51,7 @@ class Gate:
 
 
 async def until_entered(gate: Gate) -> None:
-    assert await asyncio.to_thread(gate.entered.wait, 10)
+    assert await asyncio.to_thread(gate.entered.wait, LIMIT_S)
 
 
 def test_a_call_returns_what_the_function_returns(make_engine):
@@ -234,11 +235,11 @@ def test_stop_says_which_job_does_not_end(make_engine):
     engine, gate = make_engine(), Gate()
     caller = threading.Thread(target=engine.call_sync, args=(gate.job,), kwargs={"label": "slow"})
     caller.start()
-    gate.entered.wait(10)
+    assert gate.entered.wait(LIMIT_S)
     with pytest.raises(TimeoutError, match="'slow' still runs"):
         engine.stop(timeout_s=0.05)
     gate.open()
-    caller.join(10)
+    caller.join(LIMIT_S)
 
 
 def test_a_job_may_call_the_engine_without_waiting_for_itself(make_engine):
@@ -253,16 +254,16 @@ def test_call_sync_gives_up_after_its_timeout(make_engine):
     gate.open()
 
 
-def test_the_heartbeat_ages_only_while_a_job_runs(make_engine):
+def test_the_heartbeat_ages_only_while_a_job_runs(make_engine, manual_clock):
     engine, gate = make_engine(), Gate()
-    time.sleep(0.6)
-    assert engine.seconds_since_tick < 0.5
+    manual_clock.advance(10.0)
+    wait_until(lambda: engine.seconds_since_tick == 0.0, "the next tick of an idle engine")
 
     async def ask() -> None:
         task = asyncio.create_task(engine.call(gate.job, label="long"))
         await until_entered(gate)
-        await asyncio.sleep(0.6)
-        assert engine.seconds_since_tick > 0.5
+        manual_clock.advance(10.0)
+        assert engine.seconds_since_tick == pytest.approx(10.0)
         assert engine.running == "long"
         gate.open()
         await task
@@ -326,7 +327,7 @@ def test_a_long_job_gives_way_to_a_step_between_its_pieces(make_engine):
     def film() -> None:
         order.append("film begins")
         piece.set()
-        assert asked.wait(10)
+        assert asked.wait(LIMIT_S)
         engine.give_way()
         order.append("film ends")
 
@@ -350,7 +351,7 @@ def test_a_step_that_fails_leaves_the_job_that_gave_way(make_engine):
 
     def film() -> str:
         piece.set()
-        assert asked.wait(10)
+        assert asked.wait(LIMIT_S)
         engine.give_way()
         return "filmed"
 
@@ -414,7 +415,7 @@ def test_a_process_of_low_priority_starts_its_engine_at_that_priority():
         "print(engine.call_sync(int, '7')); engine.stop()"
     )
     ran = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT_S, check=False
     )
     assert ran.stdout == "7\n", ran.stderr
 
@@ -428,7 +429,7 @@ def test_an_engine_whose_thread_ends_tells_those_who_wait(monkeypatch):
     engine.on_failure = ended.set
     with pytest.raises(DeviceLostError, match="niceness"):
         engine.start()
-    assert ended.wait(5)
+    assert ended.wait(LIMIT_S)
     assert not engine.alive
 
 
@@ -441,7 +442,7 @@ def test_an_engine_starts_at_a_niceness_that_it_may_not_lower():
         "from real2sim_server.service.engine import Engine\n"
         "engine = Engine()\n"
         "engine.start()\n"
-        "print(engine.call_sync(lambda: 'works', timeout_s=30))\n"
+        "print(engine.call_sync(lambda: 'works', timeout_s=120))\n"
         "engine.stop()\n"
     )
     # While everything can still be read.
@@ -451,7 +452,7 @@ def test_an_engine_starts_at_a_niceness_that_it_may_not_lower():
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=LIMIT_S,
     )
     assert done.stdout == "works\n", done.stderr[-2000:]
 
@@ -474,8 +475,10 @@ def waiting_together(engine, gate, calls):
         busy = asyncio.create_task(engine.call(gate.job))
         await until_entered(gate)
         tasks = [asyncio.ensure_future(call) for call in calls]
-        while engine.queue_depth < len(calls) and not any(task.done() for task in tasks):
-            await asyncio.sleep(0.001)
+        await wait_until_async(
+            lambda: engine.queue_depth == len(calls) or any(task.done() for task in tasks),
+            "all calls to be queued",
+        )
         gate.open()
         await busy
         return await asyncio.gather(*tasks, return_exceptions=True)

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 import threading
-import time
 
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
+from tests.waiting import LIMIT_S, wait_until
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.scenes import Readiness
@@ -16,10 +16,7 @@ HERE = {"Host": "127.0.0.1"}
 
 
 def wait_until_ready(client) -> None:
-    deadline = time.monotonic() + 60
-    while client.get("/readyz").status_code != 200:
-        assert time.monotonic() < deadline, client.get("/readyz").text
-        time.sleep(0.02)
+    wait_until(lambda: client.get("/readyz").status_code == 200, lambda: client.get("/readyz").text)
 
 
 def samples(client) -> dict[str, float]:
@@ -40,7 +37,7 @@ def test_a_started_worker_lives_and_becomes_ready(client):
 def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypatch):
     warm = threading.Event()
     monkeypatch.setattr(
-        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(30)
+        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(LIMIT_S)
     )
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
         assert client.get("/livez").status_code == 200
@@ -61,20 +58,19 @@ def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):
 
     monkeypatch.setattr("real2sim_server.service.rendering.renderer.warm_up", fail)
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
-        deadline = time.monotonic() + 10
-        while "no compiler" not in client.get("/readyz").text:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_until(lambda: "no compiler" in client.get("/readyz").text, "the reason")
         assert client.get("/livez").status_code == 200
 
 
-def test_a_job_that_does_not_end_stalls_the_worker(start_worker):
-    client = start_worker(stall_seconds=0.2)
+def test_a_job_that_does_not_end_stalls_the_worker(start_worker, manual_clock):
+    client = start_worker(stall_seconds=60)
     wait_until_ready(client)
     engine, go_on = client.app.state.worker.engine, threading.Event()
     stuck = threading.Thread(target=engine.call_sync, args=(go_on.wait,), kwargs={"label": "stuck"})
     stuck.start()
-    time.sleep(0.4)
+    wait_until(lambda: engine.running == "stuck", "the job to run")
+    assert client.get("/livez").status_code == 200
+    manual_clock.advance(61.0)
     response = client.get("/livez")
     go_on.set()
     stuck.join()

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from real2sim_server.service.storage import clock as clock_module
+from real2sim_server.service import clock as clock_module
 
 from .postgres import Postgres, running_postgres
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from real2sim_proto import ErrorCode, Problem
 from real2sim_proto.jobs import JobInfo, JobState
 
+from ..clock import now_us
 from ..http.problems import ServiceError, problem_of
 from ..scenarios.replies import iso_time
-from ..storage.store import now_us
 
 
 def ended(info: JobInfo, state: JobState, *, error: Problem | None = None) -> JobInfo:

@@ -21,12 +21,13 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import JobFile, JobInfo, JobKind, JobState
 
 from ..accounts import PAYER, Payer, owner_name
+from ..clock import now_us
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, problem_of, service_error
 from ..library.quotas import Quota
 from ..scenarios.replies import iso_time
 from ..storage.job_log import ClaimedJob, JobLog
-from ..storage.store import FencedError, StoreError, StoreTroubleError, now_us
+from ..storage.store import FencedError, StoreError, StoreTroubleError
 from .endings import ended, given_up, interruption
 
 MAX_QUEUED_JOBS = 32

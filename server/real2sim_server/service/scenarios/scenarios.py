@@ -22,13 +22,14 @@ from real2sim_proto.scenarios import (
 
 from ...edit import AssetLookup, EditError, LogEntry, PlannedEntry, Scenario, ScenarioState
 from ...scene.io import SceneSummary
+from ..clock import now_us
 from ..http.disconnects import uncancellable
 from ..http.idempotency import IdempotentRequest
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..library.scene_catalog import BUNDLE_SUFFIX
-from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply, now_us
+from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply
 from .recorded import check_made
 from .replies import (
     ScenarioView,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import time
+
+from .. import clock
 
 
 class ClockHold:
@@ -33,7 +34,7 @@ class ClockHold:
         """How long the next action has to wait from now [s]."""
         if self.held:
             return math.inf
-        return 0.0 if self._pace is None else max(0.0, self._next_s - time.monotonic())
+        return 0.0 if self._pace is None else max(0.0, self._next_s - clock.monotonic())
 
     def release(self, *, pace: float | None = None) -> None:
         """All actions pass; with a pace, so many simulated seconds take a second."""
@@ -50,7 +51,7 @@ class ClockHold:
         if self._steps:
             self._steps -= 1
         if self._pace is not None:
-            now = time.monotonic()
+            now = clock.monotonic()
             self._next_s = max(self._next_s, now) + dt_us * 1e-6 / self._pace
 
     async def wait(self, seconds: float) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Awaitable, Callable
 
 import structlog
 from prometheus_client import Counter
 
+from .. import clock
 from .session import Session
 from .step import Stepper
 from .wire import EncodedMessage
@@ -39,11 +39,11 @@ class DeadlineTimer:
         self._send = send
         self._missed = missed
         self._waiting: asyncio.Task[None] | None = None
-        self._sent_at = time.monotonic()
+        self._sent_at = clock.monotonic()
 
     def start(self) -> None:
         """An observation has been sent."""
-        self._sent_at = time.monotonic()
+        self._sent_at = clock.monotonic()
         self.cancel()
         session = self._session
         if session.world is None or session.world.over:
@@ -66,12 +66,12 @@ class DeadlineTimer:
     @property
     def waited_us(self) -> int:
         """Time since the newest observation was sent [us]."""
-        return int((time.monotonic() - self._sent_at) * 1e6)
+        return int((clock.monotonic() - self._sent_at) * 1e6)
 
     async def _wait(self, step: int) -> None:
         try:
             while (until := self._next(step)) is not None:
-                await asyncio.sleep(max(until - time.monotonic(), 0.0))
+                await clock.sleep_until(until)
                 # The fallback itself must not be broken off half way by an action that arrives.
                 await asyncio.shield(asyncio.ensure_future(self._expire(step)))
                 step = self._session.lockstep.step or 0
@@ -106,7 +106,7 @@ class DeadlineTimer:
                 message = await self._stepper.stop(session, "deadline")
             else:
                 message = await self._stepper.step_without_action(session)
-            self._sent_at = time.monotonic()
+            self._sent_at = clock.monotonic()
         with contextlib.suppress(Exception):
             await self._send(message)
-        self._sent_at = time.monotonic()
+        self._sent_at = clock.monotonic()

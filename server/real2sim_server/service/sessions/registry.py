@@ -7,7 +7,6 @@ import contextlib
 import hmac
 import re
 import secrets
-import time
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -25,6 +24,7 @@ from ...scene import Scene
 from ...world import Score, World
 from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
 from ...world.scoring import scores_of
+from .. import clock
 from ..accounts import Accounts, owner_name
 from ..http.idempotency import IdempotentRequest
 from ..http.metrics import Metrics
@@ -32,7 +32,7 @@ from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache
 from ..scenarios.scenarios import Scenarios
 from ..storage.leases import Leases
-from ..storage.store import SessionEntry, SessionRow, Store, now_us
+from ..storage.store import SessionEntry, SessionRow, Store
 from ..storage.tokens import token_hash
 from ..warm_up import KernelWarmUp
 from .describe import session_info
@@ -259,7 +259,7 @@ class Sessions:
                 session.row,
                 session_id=f"{self._limits.worker_id}.{secrets.token_hex(8)}",
                 token_hash=token_hash(token),
-                created_us=now_us(),
+                created_us=clock.now_us(),
                 owner=owner_name(),
             )
             await self._scene_cache.pin(row.scene)
@@ -511,7 +511,7 @@ class Sessions:
             scenario_id=scenario,
             scenario_revision=view.revision if view is not None else None,
             token_hash=token_hash(token),
-            created_us=now_us(),
+            created_us=clock.now_us(),
             owner=owner_name(),
         )
         return row, EpisodeStart(pinned, summary, state)
@@ -527,9 +527,9 @@ class Sessions:
     async def _evict_idle(self) -> None:
         idle = self._limits.idle_seconds
         while True:
-            await asyncio.sleep(min(IDLE_CHECK_S, idle / 2))
+            await clock.sleep_until(clock.monotonic() + min(IDLE_CHECK_S, idle / 2))
             for session in self:
-                unused = time.monotonic() - session.used_at
+                unused = clock.monotonic() - session.used_at
                 if unused > idle and not session.connected and not session.lock.locked():
                     self.evict(session)
 

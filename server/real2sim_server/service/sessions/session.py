@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -15,6 +14,7 @@ from ...edit import ScenarioState
 from ...scene import Camera, Scene
 from ...scene.io import SceneSummary
 from ...world import Event, Motion, Plan, World
+from .. import clock
 from ..http.auth import secrets_equal
 from ..http.problems import ServiceError
 from ..storage.store import SessionRow
@@ -112,7 +112,7 @@ class Session:
     observers: set[ObserverQueue] = field(default_factory=set)
     close_callbacks: set[CloseWithError] = field(default_factory=set)
     closed: ServiceError | None = None
-    used_at: float = field(default_factory=time.monotonic)
+    used_at: float = field(default_factory=lambda: clock.monotonic())  # noqa: PLW0108
 
     @property
     def session_id(self) -> str:
@@ -126,7 +126,7 @@ class Session:
 
     def touch(self) -> None:
         """Somebody uses the session."""
-        self.used_at = time.monotonic()
+        self.used_at = clock.monotonic()
 
     def running_world(self) -> World:
         """The committed instant. Raises ServiceError: NOT_RESET before the first reset."""
@@ -145,12 +145,12 @@ class Session:
         self.lockstep.reset()
         self.events, self.newest, self.late, self.newest_plan = [], None, False, None
         cap = world.spec.wall_clock_s
-        self.expires_at = None if cap is None else time.monotonic() + cap
+        self.expires_at = None if cap is None else clock.monotonic() + cap
 
     @property
     def expired(self) -> bool:
         """Whether the episode has used up its wall-clock time."""
-        return self.expires_at is not None and time.monotonic() >= self.expires_at
+        return self.expires_at is not None and clock.monotonic() >= self.expires_at
 
     def take_events(self) -> list[Event]:
         """Events since this was called last."""

@@ -30,9 +30,10 @@ from ...world.recording.replay import (
     stop_payload,
 )
 from ..accounts import Account
+from ..clock import now_us
 from ..http.problems import ServiceError
 from ..storage.errors import FencedError, StoreTroubleError, StoreUnavailableError
-from ..storage.store import SessionEntry, Store, StoredReply, now_us
+from ..storage.store import SessionEntry, Store, StoredReply
 from ..warm_up import KernelWarmUp
 from .log_write import LogWrite
 from .observation import EncodedObservation, Seen, message_of

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 
 import sqlalchemy as sa
 
+from ..clock import now_us
 from . import tables as t
-from .clock import now_us
 from .store import Store, Write
 
 RETENTION_US = 365 * 24 * 3600 * 1_000_000

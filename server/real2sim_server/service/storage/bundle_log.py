@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import sqlalchemy as sa
 
+from ..clock import now_us
 from . import tables as t
 from .notices import notice
-from .store import ConflictError, Store, Write, now_us
+from .store import ConflictError, Store, Write
 
 
 @dataclass(frozen=True)

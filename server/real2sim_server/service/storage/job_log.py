@@ -10,10 +10,11 @@ import sqlalchemy as sa
 
 from real2sim_proto.jobs import JobInfo, JobState
 
+from ..clock import now_us
 from . import tables as t
 from .leases import clock_of, is_alive
 from .notices import notice
-from .store import Store, StoredReply, Write, now_us
+from .store import Store, StoredReply, Write
 
 UNFINISHED = (JobState.QUEUED.value, JobState.RUNNING.value)
 

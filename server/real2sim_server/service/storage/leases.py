@@ -13,8 +13,8 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from ..clock import now_us
 from . import tables as t
-from .clock import now_us
 from .rows import SessionRow
 from .store import Store, Write
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 import structlog
 
+from ..clock import now_us
 from . import tables as t
-from .store import Claim, Store, Write, now_us
+from .store import Claim, Store, Write
 
 DAY_US = 86_400 * 1_000_000
 PIECE_ROWS = 1000

@@ -10,8 +10,8 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from ..clock import now_us
 from . import tables as t
-from .clock import now_us
 from .database import TIMEOUT_S, Database, Durability, OnCall, Write
 from .errors import ConflictError, FencedError, StoreError, StoreTroubleError
 from .migrations import Policy

@@ -53,7 +53,7 @@ class Planner:
     def receive(self) -> dict[str, Any]:
         """The next message that is not about progress."""
         while True:
-            message = decode(self.socket.recv(timeout=30, decode=False))
+            message = decode(self.socket.recv(timeout=120, decode=False))
             if message["type"] != "progress":
                 return message
 
@@ -77,7 +77,7 @@ class Planner:
         """Close code, once the worker has closed; what it sent before is thrown away."""
         with contextlib.suppress(ConnectionClosed):
             while True:
-                self.socket.recv(timeout=10)
+                self.socket.recv(timeout=120)
         return self.socket.close_code
 
 
@@ -167,3 +167,12 @@ def join() -> Iterator[Callable[..., Planner]]:
 def planner(site: Site, join) -> Planner:
     """The controller of a new session on ``tiny``."""
     return join(site.create())
+
+
+@pytest.fixture
+def bystander(site: Site, join) -> Iterator[Planner]:
+    """Another session; after the test it must still drive."""
+    planner = join(site.create())
+    planner.reset(sensors=[{"camera": "front"}])
+    yield planner
+    assert planner.act(0)["step"] == 1

@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.waiting import LIMIT_S
 
 import real2sim
 from real2sim.planners import run_episode
@@ -53,7 +54,7 @@ def serve(tmp_path):
     yield start
     for process in started:
         process.terminate()
-        process.communicate(timeout=20)
+        process.communicate(timeout=LIMIT_S)
 
 
 def drive(site, target: str, *, steps: int) -> tuple[real2sim.planners.EpisodeSummary, int]:

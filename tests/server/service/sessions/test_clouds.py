@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 import zlib
 
 import numpy as np
 import pytest
+from tests.waiting import wait_until
 
 import real2sim
 from real2sim_proto import decode
@@ -29,13 +29,6 @@ EPISODE = {"dt_us": 50_000, "lidars": [TOP], "radars": [{"radar": "corner"}]}
 def casting_kernels():
     """On disk, so that no reset waits for them."""
     warm_up_casting()
-
-
-def wait_until(holds):
-    until = time.monotonic() + 20
-    while not holds():
-        assert time.monotonic() < until
-        time.sleep(0.01)
 
 
 def columns(cloud):
@@ -181,7 +174,7 @@ def test_a_session_that_is_rebuilt_goes_on_with_the_same_sweep(site, join):
         first.act(step)
     first.stack.close()
     session = site.session(info)
-    wait_until(lambda: not session.connected)
+    wait_until(lambda: not session.connected, "the worker to notice")
     site.worker.sessions.evict(session)
     again = join(info)
     assert [c["data"] for c in again.act(3)["clouds"]] == [c["data"] for c in expected]

@@ -1,140 +1,135 @@
-"""Planners that misbehave: each case ends as the rules say, and nobody else waits for it."""
+"""Planners that misbehave: each case ends as the rules say, and nobody else waits for it.
+
+Time stands still but where a test moves it, so no planner here is late by accident.
+"""
 
 from __future__ import annotations
 
-import threading
-import time
+import contextlib
+from collections.abc import Iterator
 
 import pytest
+from tests.waiting import wait_until
 
 import real2sim
 
 pytestmark = pytest.mark.network
 
 PLAN = {"kind": "control", "acceleration": 0.5, "steering": 0.0}
-SOON = {"deadline_ms": 80}
+LATE = {"deadline_ms": 80}
 
 
 @pytest.fixture
-def client(site):
-    with real2sim.connect(site.url) as client:
-        yield client
+def episode(site):
+    """Begins an episode by the SDK; keywords are its reset's. Gives the SDK's and the worker's
+    session."""
 
+    @contextlib.contextmanager
+    def begin(**spec) -> Iterator[tuple]:
+        with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
+            session.reset(action="control", **spec)
+            (inside,) = (s for s in site.worker.sessions if s.session_id == session.session_id)
+            yield session, inside
 
-@pytest.fixture
-def bystander(client):
-    """Another session, driven meanwhile; the longest step it had to wait for [s]."""
-    waits: list[float] = []
-    stop = threading.Event()
-
-    def drive() -> None:
-        with client.session(scene="tiny") as session:
-            while not stop.is_set():
-                obs = session.reset(action="control")
-                while not obs.over and not stop.is_set():
-                    began = time.monotonic()
-                    obs = session.step(PLAN)
-                    waits.append(time.monotonic() - began)
-
-    thread = threading.Thread(target=drive)
-    thread.start()
-    yield waits
-    until = time.monotonic() + 10
-    while len(waits) <= 5 and time.monotonic() < until:
-        time.sleep(0.01)
-    stop.set()
-    thread.join(30)
-    assert len(waits) > 5
-    assert max(waits) < 2.0
+    return begin
 
 
 def kinds(obs: real2sim.Observation) -> list[str]:
     return [event.type for event in obs.events]
 
 
-def test_a_planner_that_hangs_is_driven_on_by_its_last_plan(client, bystander):
-    with client.session(scene="tiny") as session:
-        session.reset(action="control", **SOON)
+def test_a_planner_that_hangs_is_driven_on_by_its_last_plan(episode, manual_clock, bystander):
+    with episode(**LATE) as (session, inside):
         first = session.step(PLAN)
-        time.sleep(0.5)
+        for step in (2, 3, 4):
+            manual_clock.expire_next()
+            wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
+        # Its observation is sent before the next deadline begins.
+        manual_clock.wait_for_sleeper()
         late = session.step(PLAN)
-    assert late.step >= 4
+    assert late.step == 4
     assert "deadline_missed" in kinds(late)
     assert late.ego.speed > first.ego.speed
 
 
-def test_a_planner_that_hangs_for_good_comes_to_the_end_of_its_episode(client):
-    with client.session(scene="tiny") as session:
-        session.reset(action="control", horizon=4, deadline_ms=30)
-        time.sleep(0.6)
+def test_a_planner_that_hangs_for_good_comes_to_the_end_of_its_episode(episode, manual_clock):
+    with episode(horizon=4, **LATE) as (session, inside):
+        for step in range(1, 5):
+            manual_clock.expire_next()
+            wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
+        wait_until(lambda: inside.world.over, "the end of the episode")
         last = session.step(PLAN)
     assert (last.step, last.over, last.reason) == (4, True, "horizon")
 
 
-def test_a_late_planner_can_be_braked_for(client):
-    with client.session(scene="tiny") as session:
-        begun = session.reset(action="control", on_timeout="brake", **SOON)
-        time.sleep(0.3)
+def test_a_late_planner_can_be_braked_for(episode, manual_clock):
+    with episode(on_timeout="brake", **LATE) as (session, inside):
+        for step in (1, 2, 3):
+            manual_clock.expire_next()
+            wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
+        manual_clock.wait_for_sleeper()
         late = session.step(PLAN)
     # On the way to -6 m/s^2 behind the lag of the brakes.
     assert -6.0 <= late.ego.acceleration < -1.0
-    assert late.ego.speed < begun.ego.speed
+    assert late.ego.speed < 5.0  # as at the start
 
 
-def test_a_late_planner_can_be_waited_for(client):
-    with client.session(scene="tiny") as session:
-        session.reset(action="control", on_timeout="pause", **SOON)
-        time.sleep(0.3)
+def test_a_late_planner_can_be_waited_for(episode, manual_clock):
+    with episode(on_timeout="pause", **LATE) as (session, inside):
+        manual_clock.expire_next()
+        wait_until(lambda: inside.late, "the deadline to be missed")
         late = session.step(PLAN)
         assert (late.step, kinds(late)) == (1, ["deadline_missed"])
         assert kinds(session.step(PLAN)) == []
 
 
-def test_a_late_planner_can_fail_its_episode(client):
-    with client.session(scene="tiny") as session:
-        session.reset(action="control", on_timeout="fail", **SOON)
-        time.sleep(0.3)
+def test_a_late_planner_can_fail_its_episode(episode, manual_clock):
+    with episode(on_timeout="fail", **LATE) as (session, inside):
+        manual_clock.expire_next()
+        wait_until(lambda: inside.world.over, "the end of the episode")
         failed = session.step(PLAN)
         assert (failed.step, failed.truncated, failed.reason) == (0, True, "deadline")
         assert session.reset(action="control").step == 0
 
 
-def test_an_episode_ends_with_its_wall_clock_time(client):
-    with client.session(scene="tiny") as session:
-        session.reset(action="control", wall_clock_s=0.2)
-        time.sleep(0.4)
+def test_an_episode_ends_with_its_wall_clock_time(episode, manual_clock):
+    with episode(wall_clock_s=0.2) as (session, inside):
+        manual_clock.expire_next()
+        wait_until(lambda: inside.world.over, "the end of the episode")
         ended = session.step(PLAN)
         assert (ended.truncated, ended.reason) == (True, "wall_clock")
 
 
-def test_a_late_action_is_stale_and_never_applied(site, join):
+def test_a_late_action_is_stale_and_never_applied(site, join, manual_clock):
     planner = join(site.create())
-    planner.reset(deadline_ms=60)
+    planner.reset(**LATE)
+    manual_clock.expire_next()
     unasked = planner.receive()
     assert (unasked["id"], unasked["step"]) == (0, 1)
-    answer = planner.act(0)
-    while answer["type"] == "obs":
-        answer = planner.receive()
-    assert answer["code"] == "STALE_STEP"
+    assert planner.act(0)["code"] == "STALE_STEP"
 
 
-def test_the_clock_stands_while_nobody_is_connected(site, join):
+def test_the_clock_stands_while_nobody_is_connected(site, join, manual_clock):
     info = site.create()
     first = join(info, None)
     token = first.hello()["resume_token"]
-    first.reset(deadline_ms=150)
+    first.reset(**LATE)
+    manual_clock.wait_for_sleeper()
     first.stack.close()
-    time.sleep(0.6)
+    wait_until(lambda: not manual_clock.anything_due, "the worker to stop the deadline")
+    manual_clock.advance(1.0)
     assert site.session(info).world.steps == 0
     second = join(info, None)
     second.hello(resume={"token": token, "last_step": 0})
     assert second.act(0)["step"] == 1
 
 
-def test_measured_latency_is_on_record_and_delays_the_plan(site, join):
+def test_measured_latency_is_on_record_and_delays_the_plan(site, join, manual_clock):
     planner = join(site.create())
-    planner.reset(latency={"model": "measured"})
-    time.sleep(0.25)
+    # The deadline shows when the observation counts as sent.
+    planner.reset(latency={"model": "measured"}, deadline_ms=900)
+    manual_clock.wait_for_sleeper()
+    manual_clock.advance(0.25)
     # A quarter of a second is more than a step: meanwhile the recorded drive goes on.
     late, prompt = (planner.act(step, acceleration=-8.0)["ego"]["speed"] for step in (0, 1))
     assert late == pytest.approx(5.0, abs=0.05)
@@ -185,7 +180,4 @@ def test_a_connection_that_drops_in_a_step_disturbs_nobody(site, join, bystander
     planner.reset(sensors=[{"camera": "front"}])
     planner.send("action", step=0, plan=PLAN)
     planner.socket.socket.close()
-    until = time.monotonic() + 10
-    while site.session(info).world.steps < 1 and time.monotonic() < until:
-        time.sleep(0.02)
-    assert site.session(info).world.steps == 1
+    wait_until(lambda: site.session(info).world.steps == 1, "the step")

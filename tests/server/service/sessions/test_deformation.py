@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 
 import pytest
+from tests.waiting import LIMIT_S
 
 from real2sim_server.service import warm_up
 from real2sim_server.service.warm_up import DeformationKernels
@@ -20,7 +21,7 @@ def compiler(site, monkeypatch):
     """Kernels of deformation come when this is set; until then a compiler is at work."""
     done = threading.Event()
     monkeypatch.setattr(warm_up, "deformation_on_disk", lambda: True)
-    monkeypatch.setattr(warm_up, "warm_up_deformation", lambda: done.wait(30))
+    monkeypatch.setattr(warm_up, "warm_up_deformation", lambda: done.wait(LIMIT_S))
     monkeypatch.setattr(site.worker.sessions.pipeline._phases, "deformation", DeformationKernels())
     yield done
     done.set()

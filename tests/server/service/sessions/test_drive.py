@@ -8,11 +8,13 @@ from weakref import WeakSet
 
 import numpy as np
 import pytest
+from tests.waiting import LIMIT_S
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode
 from real2sim_proto.drive import SERVER_MESSAGE
 from real2sim_server.service.engine import QueueFullError
 from real2sim_server.service.http.websocket import try_send_parts
+from real2sim_server.service.sessions import handshake
 
 pytestmark = pytest.mark.network
 
@@ -148,14 +150,18 @@ def test_progress_is_told_while_the_scene_warms_up(site, join, monkeypatch):
     info = site.create()
     planner = join(info, None)
 
-    async def slowly(_session: object) -> None:
-        await asyncio.sleep(1.3)
+    warm = threading.Event()
 
+    async def slowly(_session: object) -> None:
+        await asyncio.to_thread(warm.wait, LIMIT_S)
+
+    monkeypatch.setattr(handshake, "PROGRESS_S", 0.05)
     monkeypatch.setattr(site.worker.sessions, "warm_up", slowly)
     hello = planner.send("hello", protocols=[DRIVE_SUBPROTOCOL], token=info["token"])
-    progress = decode(planner.socket.recv(timeout=10))
+    progress = decode(planner.socket.recv(timeout=LIMIT_S))
     assert (progress["type"], progress["id"]) == ("progress", hello)
     SERVER_MESSAGE.validate_python(progress)
+    warm.set()
     assert planner.receive()["type"] == "welcome"
 
 

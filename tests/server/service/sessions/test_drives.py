@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
+from tests.waiting import wait_until
 from typer.testing import CliRunner
 
 import real2sim
@@ -40,13 +39,11 @@ def steps_to(site, info, step: int) -> dict:
 
 
 def ended(site, job: dict) -> dict:
-    give_up = time.monotonic() + 30
-    while job["state"] in {"queued", "running"}:
-        if time.monotonic() > give_up:
-            raise TimeoutError(job)
-        time.sleep(0.05)
-        job = site.http.get(f"/v1/jobs/{job['job_id']}").json()
-    return job
+    def now() -> dict | None:
+        seen = site.http.get(f"/v1/jobs/{job['job_id']}").json()
+        return None if seen["state"] in {"queued", "running"} else seen
+
+    return wait_until(now, f"the end of job {job['job_id']}")
 
 
 def test_who_drives_by_requests_leaves_a_recording_with_everything_of_every_instant(site, drive):

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
+from tests.waiting import LIMIT_S
 
 from real2sim_server.service.sessions.gathered_calls import MOST_TOGETHER, GatheredCalls, attempt
 
@@ -18,11 +19,12 @@ class Work:
 
     def __init__(self) -> None:
         self.groups: list[list[int]] = []
-        self.let = threading.Event()
+        self.begun, self.let = threading.Event(), threading.Event()
         self.shown: list[tuple[int, int]] = []
 
     def __call__(self, numbers: Sequence[int]) -> list[int | Exception]:
-        assert self.let.wait(10)
+        self.begun.set()
+        assert self.let.wait(LIMIT_S)
         self.groups.append(list(numbers))
         return [attempt(self._double, number) for number in numbers]
 
@@ -41,7 +43,7 @@ def run(work: Work, numbers: Sequence[int], *, cancel: Sequence[int] = ()) -> li
                 work, executor, on_result=lambda n, result: work.shown.append((n, result))
             )
             tasks = [asyncio.create_task(calls.call(numbers[0]))]
-            await asyncio.sleep(0.05)
+            assert await asyncio.to_thread(work.begun.wait, LIMIT_S)
             tasks += [asyncio.create_task(calls.call(number)) for number in numbers[1:]]
             await asyncio.sleep(0)
             for k in cancel:

@@ -24,6 +24,7 @@ import httpx2
 import numpy as np
 import pytest
 import torch
+from tests.waiting import LIMIT_S
 
 import real2sim
 from real2sim.planners.peer import PeerError
@@ -261,5 +262,5 @@ def test_the_command_says_where_it_listens_and_ends_by_interrupt(site, command, 
         assert re.search(r"interface at 127\.0\.0\.1:\d+, pictures from http://127", said)
     finally:
         process.send_signal(signal.SIGINT)
-        rest, _ = process.communicate(timeout=20)
+        rest, _ = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, rest) == (0, "")

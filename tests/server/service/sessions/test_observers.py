@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -58,9 +56,7 @@ def test_an_observer_that_does_not_read_never_holds_up_the_controller(site, join
     # A client stops reading from its socket while its queue is full.
     join(info, "observer", max_queue=1)
     controller.reset(sensors=[CAMERA | {"width": 1024, "modalities": ["rgb", "depth"]}], dt_us=1000)
-    started = time.perf_counter()
     for step in range(20):
         controller.act(step)
-    assert time.perf_counter() - started < 20
     (queue,) = site.session(info).observers
     assert queue.dropped > 0

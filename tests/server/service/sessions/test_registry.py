@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
-import time
 import tracemalloc
 
 import pytest
+from tests.waiting import wait_until
 
 from real2sim_proto import decode, encode
 from real2sim_server.render import RenderError
@@ -40,17 +40,19 @@ def test_a_worker_whose_sessions_are_all_taken_stays_ready_and_metrics_tell(own_
     assert "real2sim_session_limit 1.0" in metrics
 
 
-def test_sessions_that_nobody_uses_leave_the_memory_and_come_back_as_they_were(own_site, join):
-    site = own_site(session_idle_seconds=0.3)
+def test_sessions_that_nobody_uses_leave_the_memory_and_come_back_as_they_were(
+    own_site, join, manual_clock
+):
+    site = own_site(session_idle_seconds=1.0)
     left, held = site.create(), site.create()
     with join(left) as planner:
         planner.reset(seed=3)
         ego = planner.act(0)["ego"]
     stays = join(held)
-    until = time.monotonic() + 10
-    while len(site.worker.sessions) > 1 and time.monotonic() < until:
-        time.sleep(0.05)
-    assert len(site.worker.sessions) == 1
+    wait_until(lambda: not site.session(left).connected, "the planner to be gone")
+    for _ in range(3):
+        manual_clock.expire_next()
+    wait_until(lambda: len(site.worker.sessions) == 1, "the idle session to be evicted")
     state = site.call("GET", left, "/state").json()
     assert (state["step"], state["ego"]["speed"]) == (1, ego["speed"])
     assert stays.reset()["step"] == 0
@@ -189,9 +191,7 @@ def test_a_step_on_its_way_is_recorded_and_not_yet_among_the_entries(site, join,
     render_together = renderer.render_together
 
     def check_log(*given: object, **options: object) -> object:
-        give_up = time.monotonic() + 30
-        while len(entries(site, info)) < 2 and time.monotonic() < give_up:
-            time.sleep(0.001)
+        wait_until(lambda: len(entries(site, info)) == 2, "the action on record")
         seen.append([e.kind for e in entries(site, info)])
         seen.append([e.kind for e in asyncio.run(site.worker.sessions.entries(session))])
         return render_together(*given, **options)

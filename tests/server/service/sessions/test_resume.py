@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from tests.waiting import LIMIT_S
 
 import real2sim
 from real2sim_server.render.cast.warm_up import warm_up_casting
@@ -90,7 +91,7 @@ def test_an_observer_hears_what_the_controller_sees(site):
             driver.step(PLAN)
             driver.step(PLAN)
             view = observer.render(["front"])
-            assert [observer.receive(timeout=10).step for _ in range(2)] == [1, 2]
+            assert [observer.receive(timeout=LIMIT_S).step for _ in range(2)] == [1, 2]
             assert view.image("front").shape == (64, 96, 3)
             with pytest.raises(real2sim.ReplyTimeoutError):
                 observer.receive(timeout=0.1)

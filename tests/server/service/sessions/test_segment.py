@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.waiting import wait_until
 
 import real2sim
 from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
@@ -23,8 +24,6 @@ from real2sim_server.service.sessions.image_limits import MAX_IMAGE_BYTES
 from real2sim_server.service.sessions.segment import SLOTS, Segment, Segments, sweep_segments
 from real2sim_server.service.sessions.wire import PhaseTimer, pack_members, pack_with_frames
 from real2sim_server.settings import Settings
-
-from ..test_trouble import wait_until
 
 pytestmark = [
     pytest.mark.network,
