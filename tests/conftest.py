@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from scripts.compile_kernels import compile_drawing, compile_physics
 
 import real2sim_server  # noqa: F401 - says how threads wait, before any library starts some
 
@@ -37,3 +40,34 @@ def test_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real test data at {folder} (set REAL2SIM_TEST_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def compile_alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[], None]], None]:
+    """Runs a function that compiles kernels; one at a time in all processes of this run.
+
+    Others find on disk what the first leaves, where each would compile the same kernels slowly.
+    Time limits are of tests and not of their fixtures, so nobody fails because it waits.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # That of all processes.
+
+    def locked(kernels: Callable[[], None]) -> None:
+        with (folder / "compiling.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            kernels()
+
+    return locked
+
+
+@pytest.fixture(scope="session")
+def worker_kernels(compile_alone: Callable[[Callable[[], None]], None]) -> None:
+    """Kernels that a worker needs before it is ready, on disk."""
+    compile_alone(compile_drawing)
+
+
+@pytest.fixture(scope="session")
+def solver_kernels(compile_alone: Callable[[Callable[[], None]], None]) -> None:
+    """Kernels of the physics on the CPU, in both precisions, on disk."""
+    compile_alone(compile_physics)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 from pathlib import Path
 
 import numpy as np
@@ -98,33 +97,6 @@ def scenes_dir(tmp_path: Path, tiny_scene: Scene) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def worker_kernels() -> None:
-    """Kernels that a worker needs before it is ready, on disk.
-
-    Where none are there yet one of the processes that run tests compiles them and the others wait;
-    compiling the same in each would take longer than workers are waited for.
-    """
-    from real2sim_server.render.backends import select_backend
-    from real2sim_server.world import warm_up, warm_up_planning
-
-    with (Path(__file__).parent / ".compiling").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        select_backend("cpu").warm_up()
-        warm_up()
-        warm_up_planning()
-
-
-@pytest.fixture(scope="session")
-def solver_kernels():
-    """Kernels of the physics on the CPU, compiled in both precisions."""
-    from real2sim_server.physics.materials import FixedCorotated
-    from real2sim_server.physics.validation.check import block, solve
-
-    for precision in ("single", "double"):
-        solve([block(FixedCorotated(young=2e5))], precision=precision).step(1e-4)
-
-
 @pytest.fixture
 def one_torch_thread():
     """Small tensors gain nothing from threads and lose much when others compute."""
@@ -132,11 +104,3 @@ def one_torch_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-def pytest_collection_modifyitems(items):
-    """Time limits are for tests: compiling kernels takes minutes where others compute as well."""
-    for item in items:
-        compiles = "solver_kernels" in getattr(item, "fixturenames", ())
-        if compiles and not item.get_closest_marker("timeout"):
-            item.add_marker(pytest.mark.timeout(300, func_only=True))
