@@ -8,13 +8,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from scripts.compile_kernels import compile_drawing, compile_physics
 
 import real2sim_server  # noqa: F401 - says how threads wait, before any library starts some
 
 # Machines under load are slow now and then, and a failure must come back on the next run.
-settings.register_profile("repeatable", deadline=None, derandomize=True)
+settings.register_profile(
+    "repeatable",
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 settings.load_profile("repeatable")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -44,10 +49,10 @@ def test_data() -> Path:
 
 @pytest.fixture(scope="session")
 def compile_alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[], None]], None]:
-    """Runs a function that compiles kernels; one at a time in all processes of this run.
+    """Runs a function that compiles kernels, once in all processes of this run.
 
-    Others find on disk what the first leaves, where each would compile the same kernels slowly.
-    Time limits are of tests and not of their fixtures, so nobody fails because it waits.
+    The others wait and load from disk what is left there. Time limits are of tests and not of their
+    fixtures, so no test fails because it waits.
     """
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -56,7 +61,10 @@ def compile_alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callabl
     def locked(kernels: Callable[[], None]) -> None:
         with (folder / "compiling.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            kernels()
+            done = folder / f"{kernels.__name__}.done"
+            if not done.exists():
+                kernels()
+                done.touch()
 
     return locked
 

@@ -22,6 +22,11 @@ from real2sim_server.scene.io import save_scene
 
 END_US = 2_000_000
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
+DRAW = ("datasets", "demo", "learning", "policies", "reconstruct", "render", "scenarios", "sweeps",
+        "synthetic")  # fmt: skip
+KERNELS_OF_PACKAGES = dict.fromkeys(DRAW, ("worker_kernels",))
+KERNELS_OF_PACKAGES |= dict.fromkeys(("device", "world"), ("worker_kernels", "solver_kernels"))
+KERNELS_OF_PACKAGES |= dict.fromkeys(("physics", "simulation"), ("solver_kernels",))
 
 
 def box_cloud(count: int, size: tuple[float, float, float], rgb, *, seed: int) -> GaussianCloud:
@@ -95,6 +100,14 @@ def scenes_dir(tmp_path: Path, tiny_scene: Scene) -> Path:
     folder = tmp_path / "scenes"
     save_scene(tiny_scene, folder / "tiny.r2s")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def kernels_of_package(request: pytest.FixtureRequest) -> None:
+    """Compiled kernels for the packages whose tests would otherwise compile many of them."""
+    package = request.path.relative_to(Path(__file__).parent).parts[0]
+    for name in KERNELS_OF_PACKAGES.get(package, ()):
+        request.getfixturevalue(name)
 
 
 @pytest.fixture

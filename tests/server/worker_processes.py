@@ -98,8 +98,8 @@ def run_real2sim(
 ) -> Finished:
     """Run the command ``real2sim`` to its end; arguments as of :func:`start_real2sim`."""
     process = start_real2sim(arguments, log_file=log_file, environment=environment, before=before)
-    process.join(LIMIT_S)
-    assert process.exitcode is not None, log_file.read_text()
+    process.join()
+    assert process.exitcode is not None
     return Finished(process.exitcode, log_file.read_text())
 
 
