@@ -10,7 +10,7 @@ PARALLEL := -n $(shell $(PYTHON) -c "import os; print(min(4, os.cpu_count() + 1)
 
 # What a change breaks first: the contract, the SDK, the layers, and the packages whose tests
 # compile little. The others belong to `make test`.
-FAST := tests/test_architecture.py tests/test_vocabulary.py tests/test_docs.py tests/proto \
+FAST := tests/test_architecture.py tests/test_docs.py tests/proto \
 	tests/client tests/server/geometry tests/server/scene tests/server/edit tests/server/cli
 
 WITH_TORCH := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cublas \

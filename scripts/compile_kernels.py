@@ -1,8 +1,8 @@
 """Compile the kernels of the CPU, which are then loaded from disk.
 
 ``python scripts/compile_kernels.py drawing`` compiles those of images and worlds, ``physics`` those
-of the Material Point Method in both precisions. Tests that run side by side would each compile
-what they find missing, and the others would wait for it.
+of the Material Point Method in both precisions. Tests call the same functions where they need
+compiled kernels.
 """
 
 from __future__ import annotations

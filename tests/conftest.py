@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
+from scripts.compile_kernels import compile_drawing, compile_physics
 
 import real2sim_server  # noqa: F401 - says how threads wait, before any library starts some
 
 # Machines under load are slow now and then, and a failure must come back on the next run.
-settings.register_profile("repeatable", deadline=None, derandomize=True)
+settings.register_profile(
+    "repeatable",
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 settings.load_profile("repeatable")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -37,3 +45,37 @@ def test_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real test data at {folder} (set REAL2SIM_TEST_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def compile_alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[], None]], None]:
+    """Runs a function that compiles kernels, once in all processes of this run.
+
+    The others wait and load from disk what is left there. Time limits are of tests and not of their
+    fixtures, so no test fails because it waits.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # That of all processes.
+
+    def locked(kernels: Callable[[], None]) -> None:
+        with (folder / "compiling.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            done = folder / f"{kernels.__name__}.done"
+            if not done.exists():
+                kernels()
+                done.touch()
+
+    return locked
+
+
+@pytest.fixture(scope="session")
+def worker_kernels(compile_alone: Callable[[Callable[[], None]], None]) -> None:
+    """Kernels that a worker needs before it is ready, on disk."""
+    compile_alone(compile_drawing)
+
+
+@pytest.fixture(scope="session")
+def solver_kernels(compile_alone: Callable[[Callable[[], None]], None]) -> None:
+    """Kernels of the physics on the CPU, in both precisions, on disk."""
+    compile_alone(compile_physics)

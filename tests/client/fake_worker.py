@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,6 +19,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from tests.waiting import wait_until, wait_until_async
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.drive import CLIENT_MESSAGE, Action, Edit, Hello, Render, Reset, ResetSpec
@@ -37,11 +37,17 @@ OBJECT = {
     "start_us": 0,
     "end_us": 10_000_000,
 }
+SHORT_S = 0.05
+"""A time that tests let run out: nothing that must come is waited for so shortly."""
 SCENE = {"scene": "street", "state": "resident", "cameras": [CAMERA], "objects": [OBJECT]}
 
 
 class FakeWorker:
-    """State of the worker. Set ``mischief`` to make it misbehave."""
+    """State of the worker. Set ``mischief`` to make it misbehave.
+
+    Attributes:
+        goes_on: set by a test: what is late is answered from now on.
+    """
 
     def __init__(self) -> None:
         self.url = ""
@@ -65,6 +71,7 @@ class FakeWorker:
     def forget(self) -> None:
         """Begin anew."""
         self.mischief = ""
+        self.goes_on = False
         self.requests: list[tuple[str, str, dict[str, str]]] = []
         self.messages: list[dict[str, Any]] = []
         self.deleted: list[str] = []
@@ -86,14 +93,13 @@ class FakeWorker:
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
         thread.start()
-        while not server.started:
-            assert thread.is_alive()
-            time.sleep(0.005)
+        wait_until(lambda: server.started or not thread.is_alive(), "the worker to start")
+        assert server.started
         try:
             yield self
         finally:
             server.should_exit = True
-            thread.join(10)
+            thread.join()
             listener.close()
 
     # --- REST -----------------------------------------------------------------------------
@@ -268,7 +274,7 @@ class FakeWorker:
             answer = {"type": "edited", "revision": episode.revision, "created": ["car_3_copy1"]}
         elif isinstance(message, Render):
             if self.mischief == "late images":
-                await asyncio.sleep(0.6)
+                await asyncio.sleep(5 * SHORT_S)  # Longer than most answers are waited for.
             answer = {
                 "type": "view",
                 "t_us": episode.t_us,
@@ -316,7 +322,7 @@ class FakeWorker:
                 return True
             case "late":
                 # Two answers then: this one when nobody waits for it any more.
-                await asyncio.sleep(0.6)
+                await wait_until_async(lambda: self.goes_on, "the test to go on")
                 return False
             case "restart":
                 await socket.close(1012, "restarting")

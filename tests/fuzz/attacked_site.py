@@ -10,13 +10,13 @@ import shutil
 import socket
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import readers
 import structlog
+from tests.waiting import LIMIT_S, wait_until
 from websockets.sync.client import connect
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
@@ -25,11 +25,9 @@ from real2sim_server.service.serve import RunningWorker, running_worker
 from real2sim_server.settings import Settings
 
 TOKEN = "a long enough secret"
-DEAD_S = 20.0
+DEAD_S = LIMIT_S
 """After which a worker that says nothing hangs, however busy the machine is."""
 PATIENT_S = 600
-ATTEMPTS = 50
-"""For what the site asks itself: a request of the attack may be under way."""
 EPISODE_STEPS = 15
 SENSOR = {"camera": "front", "width": 16, "codec": "raw"}
 
@@ -127,11 +125,13 @@ class Site:
             known |= {"session_id": made["session_id"], "token": made["token"]}
         asset = {"scene": "tiny", "object_id": "post"}
         # An asset whose removal is under way can be neither seen nor made.
-        for _ in range(ATTEMPTS):
-            if self._has("assets", "asset_id"):
-                break
-            if self.ask("POST", "/v1/assets", asset, may_conflict=True) is None:
-                time.sleep(0.1)
+        wait_until(
+            lambda: (
+                self._has("assets", "asset_id")
+                or self.ask("POST", "/v1/assets", asset, may_conflict=True) is not None
+            ),
+            "the asset to be made",
+        )
         if not self._has("jobs", "job_id"):
             body = {"scene": "tiny", "camera": "front", "fps": 1, "width": 32}
             known["job_id"] = self.ask("POST", "/v1/exports", body)["job_id"]

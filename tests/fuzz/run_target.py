@@ -28,8 +28,10 @@ import mutation
 import readers
 
 MEMORY_BYTES = 2 << 30
-HANG_S = 2.0
-DEAD_S = 20.0
+HANG_S = 20.0
+"""Of processor time, for what takes milliseconds: a loop that damage makes endless, or long."""
+DEAD_S = 120.0
+"""After which a reader that is still at it hangs, however busy the machine is."""
 MAX_KEPT = 500
 MAX_PART_BYTES = 1 << 20
 GROWTH_BYTES = 256 << 20

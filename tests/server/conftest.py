@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +22,11 @@ from real2sim_server.scene.io import save_scene
 
 END_US = 2_000_000
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
+DRAW = ("datasets", "demo", "learning", "policies", "reconstruct", "render", "scenarios", "sweeps",
+        "synthetic")  # fmt: skip
+KERNELS_OF_PACKAGES = dict.fromkeys(DRAW, ("worker_kernels",))
+KERNELS_OF_PACKAGES |= dict.fromkeys(("device", "world"), ("worker_kernels", "solver_kernels"))
+KERNELS_OF_PACKAGES |= dict.fromkeys(("physics", "simulation"), ("solver_kernels",))
 
 
 def box_cloud(count: int, size: tuple[float, float, float], rgb, *, seed: int) -> GaussianCloud:
@@ -98,31 +102,12 @@ def scenes_dir(tmp_path: Path, tiny_scene: Scene) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def worker_kernels() -> None:
-    """Kernels that a worker needs before it is ready, on disk.
-
-    Where none are there yet one of the processes that run tests compiles them and the others wait;
-    compiling the same in each would take longer than workers are waited for.
-    """
-    from real2sim_server.render.backends import select_backend
-    from real2sim_server.world import warm_up, warm_up_planning
-
-    with (Path(__file__).parent / ".compiling").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        select_backend("cpu").warm_up()
-        warm_up()
-        warm_up_planning()
-
-
-@pytest.fixture(scope="session")
-def solver_kernels():
-    """Kernels of the physics on the CPU, compiled in both precisions."""
-    from real2sim_server.physics.materials import FixedCorotated
-    from real2sim_server.physics.validation.check import block, solve
-
-    for precision in ("single", "double"):
-        solve([block(FixedCorotated(young=2e5))], precision=precision).step(1e-4)
+@pytest.fixture(autouse=True)
+def kernels_of_package(request: pytest.FixtureRequest) -> None:
+    """Compiled kernels for the packages whose tests would otherwise compile many of them."""
+    package = request.path.relative_to(Path(__file__).parent).parts[0]
+    for name in KERNELS_OF_PACKAGES.get(package, ()):
+        request.getfixturevalue(name)
 
 
 @pytest.fixture
@@ -132,11 +117,3 @@ def one_torch_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-def pytest_collection_modifyitems(items):
-    """Time limits are for tests: compiling kernels takes minutes where others compute as well."""
-    for item in items:
-        compiles = "solver_kernels" in getattr(item, "fixturenames", ())
-        if compiles and not item.get_closest_marker("timeout"):
-            item.add_marker(pytest.mark.timeout(300, func_only=True))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import subprocess
 import sys
-import threading
-import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from tests.waiting import LIMIT_S, wait_until
 
 from real2sim_server._confined import ConfinedError, Limits, run_confined
 from real2sim_server._confined import run as starter
@@ -31,6 +30,10 @@ def leave(): os._exit(3)
 def sleep(): time.sleep(60)
 def burn():
     while True: pass
+def wait(folder):
+    with open(os.path.join(folder, "begun"), "wb"): pass
+    while not os.path.exists(os.path.join(folder, "go_on")): time.sleep(0.01)
+    return "done"
 def fill(): return len(bytearray(1 << 30))
 def write(path, size):
     with open(path, "wb") as file: file.write(bytes(size))
@@ -138,19 +141,17 @@ def test_it_reaches_no_network_where_namespaces_are_allowed(call):
         call("connect")
 
 
-def test_calls_of_several_threads_do_not_wait_for_each_other(call):
-    call("double", x=1)
-
-    def sleep() -> None:
-        with contextlib.suppress(ConfinedError):
-            call("sleep", limits=Limits(seconds=2))
-
-    slow = threading.Thread(target=sleep)
-    slow.start()
-    time.sleep(0.2)
-    assert call("double", x=2) == 4
-    assert slow.is_alive()
-    slow.join()
+def test_calls_of_several_threads_do_not_wait_for_each_other(call, tmp_path):
+    limits = Limits(seconds=2 * LIMIT_S, written_bytes=1)
+    with ThreadPoolExecutor() as threads:
+        slow = threads.submit(call, "wait", folder=str(tmp_path), limits=limits)
+        wait_until(lambda: (tmp_path / "begun").exists() or slow.done(), "the slow call to begin")
+        try:
+            assert call("double", x=2) == 4
+            assert not slow.done()
+        finally:
+            (tmp_path / "go_on").touch()
+        assert slow.result() == "done"
 
 
 def test_a_starter_that_was_ended_is_begun_again(call):
@@ -171,13 +172,10 @@ def test_the_starter_ends_with_the_program(tmp_path):
         "os._exit(0)\n"
     )
     found = subprocess.run(
-        [sys.executable, tmp_path / "program.py"], check=True, capture_output=True, timeout=60
+        [sys.executable, tmp_path / "program.py"], check=True, capture_output=True
     )
     pid = int(found.stdout)
-    deadline = time.monotonic() + 10
-    while _runs(pid) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not _runs(pid)
+    wait_until(lambda: not _runs(pid), "the starter to end")
 
 
 def _runs(pid: int) -> bool:

@@ -13,10 +13,13 @@ import re
 import socket
 import time
 import urllib.request
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+
+from tests.waiting import LIMIT_S, wait_until
 
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["real2sim.cli", "real2sim_server.service.serve"])
@@ -65,14 +68,17 @@ def start_real2sim(
     return process
 
 
-def printed_url(process: BaseProcess, log_file: Path, seconds: float = 60) -> str:
+def printed_url(process: BaseProcess, log_file: Path) -> str:
     """The address that a starting worker prints."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline and process.is_alive():
-        if log_file.exists() and (url := LOOPBACK_URL.search(log_file.read_text())):
-            return url.group()
-        time.sleep(0.05)
-    raise AssertionError(f"no address was printed: {log_file.read_text()}")
+
+    def found() -> re.Match[str] | None:
+        alive = process.is_alive()  # Asked first: what it printed before it ended counts.
+        printed = log_file.read_text() if log_file.exists() else ""
+        url = LOOPBACK_URL.search(printed)
+        assert url or alive, f"it ended without printing an address: {printed}"
+        return url
+
+    return wait_until(found, lambda: f"an address in {log_file.read_text()!r}").group()
 
 
 @dataclass(frozen=True)
@@ -92,8 +98,8 @@ def run_real2sim(
 ) -> Finished:
     """Run the command ``real2sim`` to its end; arguments as of :func:`start_real2sim`."""
     process = start_real2sim(arguments, log_file=log_file, environment=environment, before=before)
-    process.join(120)
-    assert process.exitcode is not None, log_file.read_text()
+    process.join()
+    assert process.exitcode is not None
     return Finished(process.exitcode, log_file.read_text())
 
 
@@ -114,9 +120,7 @@ class KillableWorker:
         log_file: Path,
         settings: Mapping[str, str] | None = None,
     ) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port: int = probe.getsockname()[1]
+        self.port = _reserved_port(self)
         self.scenes = scenes
         self._folders = ["--scenes", str(scenes), "--data", str(data)]
         self._log_file = log_file
@@ -133,26 +137,27 @@ class KillableWorker:
             environment={"REAL2SIM_LOG_LEVEL": "error", "REAL2SIM_BACKEND": "cpu"} | self._settings,
         )
 
-    def wait_listening(self, seconds: float = 60) -> None:
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
+    def wait_listening(self, seconds: float = LIMIT_S) -> None:
+        def listens() -> bool:
             assert self.process is not None
             assert self.process.is_alive(), self._log_file.read_text()
             with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self.port)):
-                return
-            time.sleep(0.05)
-        raise AssertionError(f"not listening: {self._log_file.read_text()}")
+                return True
+            return False
 
-    def wait_ready(self, seconds: float = 60) -> None:
+        wait_until(listens, lambda: f"a listener: {self._log_file.read_text()}", seconds=seconds)
+
+    def wait_ready(self, seconds: float = LIMIT_S) -> None:
         """Return once it takes work."""
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
-            with contextlib.suppress(OSError), urllib.request.urlopen(f"{self.url}/readyz"):
-                return
-            time.sleep(0.1)
-        raise AssertionError(f"not ready: {self._log_file.read_text()}")
 
-    def stop(self, seconds: float) -> None:
+        def is_ready() -> bool:
+            with contextlib.suppress(OSError), urllib.request.urlopen(f"{self.url}/readyz"):
+                return True
+            return False
+
+        wait_until(is_ready, lambda: f"readiness: {self._log_file.read_text()}", seconds=seconds)
+
+    def stop(self, seconds: float = LIMIT_S) -> None:
         """Ask it to end, by SIGTERM, and wait until it has."""
         assert self.process is not None
         self.process.terminate()
@@ -164,7 +169,7 @@ class KillableWorker:
         """End it as it is, by SIGKILL."""
         if self.process is not None:
             self.process.kill()
-            self.process.join(30)
+            self.process.join(LIMIT_S)
             self.process = None
 
     def kill_and_start(self, delay: float = 0.0) -> None:
@@ -172,6 +177,20 @@ class KillableWorker:
         time.sleep(delay)
         self.kill()
         self.start()
+
+
+def _reserved_port(owner: object) -> int:
+    """A port of this machine that nobody else is given as long as ``owner`` exists.
+
+    A socket that is bound and does not listen keeps it; a worker can bind it beside that, since
+    both set SO_REUSEADDR.
+    """
+    holder = socket.socket()
+    holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    holder.bind(("127.0.0.1", 0))
+    port: int = holder.getsockname()[1]
+    weakref.finalize(owner, os.close, holder.detach())
+    return port
 
 
 @contextlib.contextmanager

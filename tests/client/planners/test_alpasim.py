@@ -11,6 +11,7 @@ import cv2
 import grpc
 import numpy as np
 import pytest
+from tests.waiting import LIMIT_S
 
 from real2sim._alpasim_messages import DRIVER, DRIVER_METHODS, messages
 from real2sim._poses import quaternion_of
@@ -98,7 +99,7 @@ def driver():
 
 @pytest.fixture
 def planner(driver):
-    planner = AlpasimDriver(driver.target, seed=7, timeout=20)
+    planner = AlpasimDriver(driver.target, seed=7, timeout=LIMIT_S)
     planner.reset(rig.seen())
     yield planner
     planner.close()
@@ -115,7 +116,7 @@ def sessions(driver):
 
 
 def reached(driver, suffix="", **options):
-    return AlpasimDriver(driver.target + suffix, timeout=20, **options)
+    return AlpasimDriver(driver.target + suffix, timeout=LIMIT_S, **options)
 
 
 def test_it_is_found_by_name_and_wants_all_cameras(driver):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import grpc
 import pytest
+from tests.waiting import LIMIT_S
 
 from real2sim._alpasim_messages import DRIVER, DRIVER_METHODS
 from real2sim.planners.alpasim import AlpasimDriver
@@ -63,7 +64,7 @@ def observations(count: int):
 
 
 def drive(target: str):
-    planner = AlpasimDriver(target, timeout=20)
+    planner = AlpasimDriver(target, timeout=LIMIT_S)
     first, *_ = seen = list(observations(6))
     planner.reset(first)
     plans = [planner.plan(obs) for obs in seen]

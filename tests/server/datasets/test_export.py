@@ -7,7 +7,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -180,7 +179,8 @@ def test_an_episode_is_exported_as_it_went(tiny_scene, plan, tmp_path):
 
 
 PROGRAM = """
-import sys
+import os, signal, sys
+from pathlib import Path
 from real2sim_server.datasets.drive import ScenarioDrive
 from real2sim_server.datasets.export import export_dataset
 from real2sim_server.datasets.plan import ExportPlan
@@ -188,7 +188,12 @@ from real2sim_server.edit import ScenarioState
 from real2sim_server.scene.io import load_scene
 scene = load_scene(sys.argv[1])
 plan = ExportPlan(formats=("kitti", "coco"), period_us=50_000, clip_s=0.4)
-export_dataset(ScenarioDrive(scene, ScenarioState.of(scene)), plan, sys.argv[2])
+folder, clips = Path(sys.argv[3]), int(sys.argv[4])
+def die(*_):
+    if len(list(folder.glob("[0-9]*"))) == clips:
+        os.kill(os.getpid(), signal.SIGKILL)
+drive = ScenarioDrive(scene, ScenarioState.of(scene))
+export_dataset(drive, plan, sys.argv[2], on_progress=die)
 """
 
 
@@ -197,16 +202,14 @@ export_dataset(ScenarioDrive(scene, ScenarioState.of(scene)), plan, sys.argv[2])
 def test_a_killed_process_goes_on_to_the_same_bytes(tiny_scene, tmp_path, clips):
     save_scene(tiny_scene, tmp_path / "tiny.r2s")
 
-    def command_for(name: str) -> list[str]:
-        return [sys.executable, "-c", PROGRAM, str(tmp_path / "tiny.r2s"), str(tmp_path / name)]
+    clips_folder = work_folder(tmp_path / "killed") / "clips"
 
-    subprocess.run(command_for("whole"), check=True, timeout=120)
-    with subprocess.Popen(command_for("killed")) as process:
-        folder = work_folder(tmp_path / "killed") / "clips"
-        deadline = time.monotonic() + 120
-        while len(list(folder.glob("[0-9]*"))) < clips and time.monotonic() < deadline:
-            time.sleep(0.005)
-        process.send_signal(signal.SIGKILL)
+    def exported_to(name: str, kill_after: int = -1) -> int:
+        words = [tmp_path / "tiny.r2s", tmp_path / name, clips_folder, kill_after]
+        return subprocess.call([sys.executable, "-c", PROGRAM, *map(str, words)])
+
+    assert exported_to("whole") == 0
+    assert exported_to("killed", kill_after=clips) == -signal.SIGKILL
     assert not (tmp_path / "killed").exists()
-    subprocess.run(command_for("killed"), check=True, timeout=120)
+    assert exported_to("killed") == 0
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")

@@ -89,7 +89,8 @@ def test_nuscenes_has_a_class_and_a_panoptic_label_for_every_point(exported):
     for frame, (one, two) in enumerate(zip(tables["lidarseg"], tables["panoptic"], strict=True)):
         rows = points(exported, frame)
         classes = np.fromfile(exported / "nuscenes" / one["filename"], np.uint8)
-        panoptic = np.load(exported / "nuscenes" / two["filename"])["data"]
+        with np.load(exported / "nuscenes" / two["filename"]) as file:
+            panoptic = file["data"]
         scan = exported / "nuscenes" / data[one["sample_data_token"]]["filename"]
         assert len(classes) == len(rows) == scan.stat().st_size // 20
         assert (panoptic // 1000 == classes).all()

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, TypeVar, cast
 
 import pytest
+from tests.waiting import LIMIT_S, wait_until_async
 
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
@@ -73,14 +74,16 @@ class Service:
 
         def gate() -> None:
             entered.set()
-            assert opened.wait(10)
+            assert opened.wait(LIMIT_S)
 
         async def all_of_them() -> list[T | BaseException]:
             busy = asyncio.create_task(self.engine.call(gate))
-            assert await asyncio.to_thread(entered.wait, 10)
+            assert await asyncio.to_thread(entered.wait, LIMIT_S)
             tasks = [asyncio.ensure_future(step) for step in steps]
-            while self.engine.queue_depth < len(steps) and not any(t.done() for t in tasks):
-                await asyncio.sleep(0.001)
+            await wait_until_async(
+                lambda: self.engine.queue_depth >= len(steps) or any(t.done() for t in tasks),
+                "all steps to wait for the engine",
+            )
             pretended.counts.__init__()  # type: ignore[misc]
             opened.set()
             await busy

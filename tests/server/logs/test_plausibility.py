@@ -49,7 +49,8 @@ def change_sweeps(folder: Path, how: Callable[[np.ndarray, dict[str, np.ndarray]
     """``how`` gets ``T_world_vehicle`` of each frame and the arrays of its sweep."""
     ego = json.loads((folder / "log.json").read_text())["ego"]
     for frame, path in enumerate(sorted((folder / "lidar").iterdir())):
-        arrays = dict(np.load(path))
+        with np.load(path) as file:
+            arrays = dict(file)
         how(transform_from(ego["positions"][frame], ego["quaternions"][frame]), arrays)
         np.savez(path, **arrays)
 

@@ -47,7 +47,6 @@ def marked(cases, quick):
 
 
 @pytest.mark.parametrize("case", marked(CASES, set(CASES) - SLOW_ON_CPU))
-@pytest.mark.timeout(600)
 def test_cpu(case):
     assert not failures(case, "cpu")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -135,7 +136,7 @@ def test_instance_kernel_finds_what_the_reference_finds() -> None:
         capture_output=True,
         text=True,
         check=False,
-        env={"NUMBA_ENABLE_CUDASIM": "1", "PATH": ""},
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
     )
     assert result.returncode == 0, result.stderr
     assert result.stdout.strip() == "0"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -81,7 +82,7 @@ def test_bits_are_the_same_in_a_new_process_with_one_thread() -> None:
         capture_output=True,
         text=True,
         check=True,
-        env={"NUMBA_NUM_THREADS": "1", "PATH": ""},
+        env={**os.environ, "NUMBA_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
     )
     assert result.stdout.strip() == digest(draw(scene()))
 

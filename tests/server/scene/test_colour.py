@@ -50,7 +50,8 @@ def test_a_span_of_no_time_is_refused():
 
 
 def test_bundles_keep_colours(scene, tmp_path):
-    colour = TimeColour(torch.rand(20, 4, 3), "real_dft", 7, 400_007)
+    coefficients = torch.rand(20, 4, 3, generator=torch.Generator().manual_seed(0))
+    colour = TimeColour(coefficients, "real_dft", 7, 400_007)
     objects = dict(scene.objects) | {"car_7": replace(scene.object("car_7"), colour=colour)}
     save_scene(replace(scene, objects=objects), tmp_path / "a.r2s")
     loaded = load_scene(tmp_path / "a.r2s").object("car_7").colour

@@ -1,4 +1,4 @@
-"""Every test of simulations has compiled kernels, and one thread of torch."""
+"""Every test of simulations has one thread of torch."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ import pytest
 
 
 @pytest.fixture(autouse=True)
-def solver_ready(solver_kernels, one_torch_thread):
-    """See the fixtures of ``tests/server``."""
+def few_threads(one_torch_thread):
+    """See ``tests/server/conftest.py``."""

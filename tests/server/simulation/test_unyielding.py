@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from real2sim_server.physics import Box, FixedCorotated, Foam, Plane, box_partic
 from real2sim_server.physics.materials import Structure
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
-from real2sim_server.simulation.presets import preset_of
 from real2sim_server.simulation.simulator import STEP, HybridSimulator
 from real2sim_server.simulation.structure import vehicle_structure
 from real2sim_server.simulation.tyres import Tyres
@@ -200,26 +197,6 @@ def test_a_floor_that_strikes_the_road_deforms():
 
 
 @pytest.mark.slow
-def test_two_cars_cost_seconds():
-    """Two seconds of a crash: eight of two cores."""
-    turned = at(2.5, 0.5, 0.75)
-    turned[:2, :2] *= -1
-    preset, size = preset_of("vehicle"), (4.5, 1.8, 1.5)
-    options = {"spacing": preset.vehicle_spacing}
-    cars = (
-        vehicle("car", size, 1500.0, at(-2.5, 0, 0.75), name="a", velocity=(15.0, 0, 0), **options),
-        vehicle("car", size, 1500.0, turned, name="b", **options),
-    )
-    world = simulator(*cars, colliders=GROUND, gravity=GRAVITY, cfl=preset.cfl)
-    begin = time.process_time()
-    run(world, 2.0)
-    assert time.process_time() - begin < 16.0
-
-
-@pytest.mark.slow
-def test_a_truck_and_a_cone_cost_seconds():
-    """Twice what is aimed at, as others may share the caches."""
+def test_a_cone_costs_a_truck_no_particles():
     world = simulator(*truck_and_cone(), colliders=GROUND, gravity=GRAVITY)
-    begin = time.process_time()
-    run(world, 1.0)
-    assert time.process_time() - begin < 2 * 3.0
+    assert run(world, 1.0) == {"cone"}

@@ -30,4 +30,4 @@ def test_it_tells_how_far_it_is_and_ends_with_its_standard_input(following):
     told = [json.loads(following.stdout.readline()) for _ in range(2)]
     assert told == [{"stage": "episodes", "done": done, "total": 1_000} for done in (1, 2)]
     following.stdin.close()
-    assert following.wait(timeout=10) == 1
+    assert following.wait() == 1

@@ -292,7 +292,6 @@ def test_compiled_they_drive_as_they_do_in_plain_python():
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
         text=True,
-        timeout=120,
         check=True,
     )
 

@@ -357,7 +357,6 @@ def test_a_slow_impact_lasts_longer_than_a_fast_one():
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", SQUARE | OFFSET)
 def test_the_closed_loop_does_what_the_matter_does(name):
     pair = (SQUARE | OFFSET)[name]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import os
 import shutil
 import subprocess
 import tempfile
@@ -54,7 +55,7 @@ def compiled_twin(
     flags = (*FLAGS, *WARNINGS, *flags)
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files))
     digest.update(repr((sorted(made.items()), flags)).encode())
-    folder = Path(tempfile.gettempdir()) / "real2sim-kernel-twin"
+    folder = Path(tempfile.gettempdir()) / f"real2sim-kernel-twin-{os.getuid()}"
     library = folder / f"{name}-{digest.hexdigest()[:16]}.so"
     if not library.is_file():
         folder.mkdir(exist_ok=True)

@@ -16,7 +16,9 @@ from .splat_properties import covariances, largest_turn, recipes, rotation_angle
 SUFFIXES = [known.suffix for known in FORMATS]
 
 repeated = settings(
-    max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+    max_examples=40,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    deadline=None,
 )
 
 
