@@ -51,7 +51,7 @@ def test_a_worker_on_a_taken_folder_is_refused_before_anything_is_loaded(make_se
         check_start(make_settings())
 
 
-def test_a_worker_on_a_taken_folder_marks_no_jobs(run_worker):
+def test_a_worker_on_a_taken_folder_marks_no_jobs(run_worker, held_videos):
     with run_worker() as client:
         body = {"scene": "tiny", "camera": "front", "fps": 1}
         job = client.post("/v1/exports", json=body).headers["Location"]
