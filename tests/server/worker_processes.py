@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+from .ports import free_port
+
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["real2sim.cli", "real2sim_server.service.serve"])
 
@@ -113,14 +115,14 @@ class KillableWorker:
         data: Path,
         log_file: Path,
         settings: Mapping[str, str] | None = None,
+        before: str = "",
     ) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port: int = probe.getsockname()[1]
+        self.port = free_port()
         self.scenes = scenes
         self._folders = ["--scenes", str(scenes), "--data", str(data)]
         self._log_file = log_file
         self._settings = dict(settings or {})
+        self._before = before
         self.url = f"http://127.0.0.1:{self.port}"
         self.process: BaseProcess | None = None
 
@@ -131,6 +133,7 @@ class KillableWorker:
             ["serve", "--port", str(self.port), *self._folders],
             log_file=self._log_file,
             environment={"REAL2SIM_LOG_LEVEL": "error", "REAL2SIM_BACKEND": "cpu"} | self._settings,
+            before=self._before,
         )
 
     def wait_listening(self, seconds: float = 60) -> None:

@@ -12,7 +12,7 @@ from real2sim_server.service.prewarming import loads_of
 from real2sim_server.service.storage.leases import WorkerRow
 
 from ...waiting import LIMIT_S, wait_until
-from .haproxy import free_port
+from ..ports import free_port
 from .test_fleet import by, start, store_url, tell  # noqa: F401, fixtures
 from .test_trouble import Site
 from .waiting import succeeded

@@ -21,8 +21,9 @@ import real2sim
 from real2sim_server.render.cast.warm_up import warm_up_casting
 from real2sim_server.scene.io import save_scene
 
+from ..ports import free_port
 from ..worker_processes import KillableWorker
-from .haproxy import free_port, running_haproxy
+from .haproxy import running_haproxy
 from .sessions.test_resume import FAN, SENSORS, hashed, plan
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
