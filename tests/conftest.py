@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
-from scripts.compile_kernels import compile_drawing, compile_physics
 
 import real2sim_server  # noqa: F401 - says how threads wait, before any library starts some
+from scripts.compile_kernels import compile_drawing, compile_physics
 
 # Machines under load are slow now and then, and a failure must come back on the next run.
 settings.register_profile(

@@ -19,12 +19,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
-from tests.waiting import wait_until, wait_until_async
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.drive import CLIENT_MESSAGE, Action, Edit, Hello, Render, Reset, ResetSpec
 from real2sim_proto.operations import Delete, Duplicate
 from real2sim_proto.scenarios import OperationBatch
+from tests.waiting import wait_until, wait_until_async
 
 from .fake_episode import CAMERA, IMAGE, Episode, frame
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.waiting import LIMIT_S
 
 import real2sim
 from real2sim.errors import CapacityError
+from tests.waiting import LIMIT_S
 
 from .fake_episode import IMAGE
 from .fake_worker import SHORT_S, FakeWorker

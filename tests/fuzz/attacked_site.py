@@ -16,13 +16,13 @@ from typing import Any
 
 import readers
 import structlog
-from tests.waiting import LIMIT_S, wait_until
 from websockets.sync.client import connect
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_server.scene.io import save_scene, write_splats
 from real2sim_server.service.serve import RunningWorker, running_worker
 from real2sim_server.settings import Settings
+from tests.waiting import LIMIT_S, wait_until
 
 TOKEN = "a long enough secret"
 DEAD_S = LIMIT_S

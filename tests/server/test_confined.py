@@ -9,10 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from tests.waiting import LIMIT_S, wait_until
 
 from real2sim_server._confined import ConfinedError, Limits, run_confined
 from real2sim_server._confined import run as starter
+from tests.waiting import LIMIT_S, wait_until
 
 MIB = 1024**2
 PROGRAM = '''

@@ -13,13 +13,14 @@ import re
 import socket
 import time
 import urllib.request
-import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from tests.waiting import LIMIT_S, wait_until
+
+from .ports import reserved_port
 
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["real2sim.cli", "real2sim_server.service.serve"])
@@ -119,12 +120,14 @@ class KillableWorker:
         data: Path,
         log_file: Path,
         settings: Mapping[str, str] | None = None,
+        before: str = "",
     ) -> None:
-        self.port = _reserved_port(self)
+        self.port = reserved_port()
         self.scenes = scenes
         self._folders = ["--scenes", str(scenes), "--data", str(data)]
         self._log_file = log_file
         self._settings = dict(settings or {})
+        self._before = before
         self.url = f"http://127.0.0.1:{self.port}"
         self.process: BaseProcess | None = None
 
@@ -135,6 +138,7 @@ class KillableWorker:
             ["serve", "--port", str(self.port), *self._folders],
             log_file=self._log_file,
             environment={"REAL2SIM_LOG_LEVEL": "error", "REAL2SIM_BACKEND": "cpu"} | self._settings,
+            before=self._before,
         )
 
     def wait_listening(self, seconds: float = LIMIT_S) -> None:
@@ -177,20 +181,6 @@ class KillableWorker:
         time.sleep(delay)
         self.kill()
         self.start()
-
-
-def _reserved_port(owner: object) -> int:
-    """A port of this machine that nobody else is given as long as ``owner`` exists.
-
-    A socket that is bound and does not listen keeps it; a worker can bind it beside that, since
-    both set SO_REUSEADDR.
-    """
-    holder = socket.socket()
-    holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    holder.bind(("127.0.0.1", 0))
-    port: int = holder.getsockname()[1]
-    weakref.finalize(owner, os.close, holder.detach())
-    return port
 
 
 @contextlib.contextmanager

@@ -6,19 +6,22 @@ render; so frames are encoded on a thread of their own, in the order they came.
 
 from __future__ import annotations
 
+import errno
+import os
 import secrets
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 FOURCC_BY_SUFFIX = {".webm": "VP80", ".mp4": "mp4v"}
 MATROSKA_DOCTYPE = b"\x42\x82\x88matroska"
+MATROSKA_SEGMENT = b"\x18\x53\x80\x67"
 WEBM_DOCTYPE = b"\x42\x82\x88webm\0\0\0\0"
 """An EBML string may be padded by zeros (RFC 8794, 7.4)."""
 
@@ -61,7 +64,8 @@ class VideoFile:
         The frame may be changed afterwards; it is encoded later.
 
         Raises:
-            VideoError: the file cannot be written, or OpenCV lacks the encoder.
+            VideoError: OpenCV cannot write the video.
+            OSError: the system refuses the file.
         """
         height, width = (side // 2 * 2 for side in frame.shape[:2])
         if self._writer is None:
@@ -72,18 +76,23 @@ class VideoFile:
             self._waiting.popleft().result()
 
     def close(self) -> None:
-        """Finish the file; without a frame there is none. Raises what encoding a frame raised."""
+        """Finish the file; without a frame there is none. Raises what encoding a frame raised.
+
+        Raises:
+            OSError: the system refused to write some of it.
+        """
         try:
             while self._waiting:
                 self._waiting.popleft().result()
+            if not self._finish():
+                return
+            _check_whole(self._temporary)
+            if self._path.suffix == ".webm":
+                _name_webm(self._temporary)
+            self._temporary.replace(self._path)
         except BaseException:
             self.discard()
             raise
-        if not self._finish():
-            return
-        if self._path.suffix == ".webm":
-            _name_webm(self._temporary)
-        self._temporary.replace(self._path)
 
     def discard(self) -> None:
         """Leave no file."""
@@ -99,7 +108,8 @@ class VideoFile:
         fourcc = cv2.VideoWriter.fourcc(*FOURCC_BY_SUFFIX[self._path.suffix])
         writer = cv2.VideoWriter(str(self._temporary), fourcc, self._rate, (width, height))
         if not writer.isOpened():
-            raise VideoError(f"{self._path}: cannot be written, or OpenCV lacks its encoder")
+            _ask_system(self._temporary)
+            raise VideoError(f"{self._path}: OpenCV cannot write it; it may lack the encoder")
         return writer
 
     def _finish(self) -> bool:
@@ -116,7 +126,8 @@ def video_file(path: Path, *, frames_per_second: float) -> Iterator[VideoFile]:
     """A video that is there, whole, when the block ends, and is not where it fails.
 
     Raises:
-        VideoError: the file cannot be written.
+        VideoError: OpenCV cannot write the video.
+        OSError: the system refuses the file.
     """
     video = VideoFile(path, frames_per_second)
     try:
@@ -125,6 +136,56 @@ def video_file(path: Path, *, frames_per_second: float) -> Iterator[VideoFile]:
         video.discard()
         raise
     video.close()
+
+
+def _check_whole(file: Path) -> None:
+    """Raise what the system says about a file that OpenCV has not written to its end.
+
+    OpenCV tells nobody of writes that failed. FFmpeg, which writes for it, leaves out all that
+    comes after the first of them; the last is the length of what the file holds.
+
+    Raises:
+        OSError: with the system's reason, or EIO where it takes writes again.
+    """
+    with file.open("rb") as opened:
+        size = os.fstat(opened.fileno()).st_size
+        ends = _end_of_matroska if file.suffix == ".mkv" else _end_of_mp4
+        if ends(opened) == size:
+            return
+    _ask_system(file)
+    raise OSError(errno.EIO, "some of the video was not written", str(file))
+
+
+def _ask_system(file: Path) -> None:
+    """Raise the system's reason why OpenCV could not write to a file, where it has one: OpenCV
+    gives none."""
+    with file.open("ab", buffering=0) as opened:
+        opened.write(b"\0")
+        os.fsync(opened.fileno())
+
+
+def _end_of_matroska(opened: BinaryIO) -> int | None:
+    """Where the segment ends that holds all of the video (RFC 9559, 5.1)."""
+    header = opened.read(256)
+    at = header.find(MATROSKA_SEGMENT)
+    start = at + len(MATROSKA_SEGMENT) + 8
+    # FFmpeg writes the length in eight bytes, the first of which says that; it is unknown first.
+    if at < 0 or len(header) < start or header[start - 8] != 1:
+        return None
+    return start + int.from_bytes(header[start - 7 : start], "big")
+
+
+def _end_of_mp4(opened: BinaryIO) -> int | None:
+    """Where the last box ends, if it is the index of the video (ISO/IEC 14496-12, 4.2)."""
+    at, kind = 0, b""
+    while len(header := opened.read(16)) >= 8:
+        size, kind = int.from_bytes(header[:4], "big"), header[4:8]
+        if size == 1:
+            size = int.from_bytes(header[8:], "big")
+        if size < 8:
+            return None
+        at = opened.seek(at + size)
+    return at if kind == b"moov" else None
 
 
 def _name_webm(file: Path) -> None:

@@ -11,7 +11,6 @@ import cv2
 import grpc
 import numpy as np
 import pytest
-from tests.waiting import LIMIT_S
 
 from real2sim._alpasim_messages import DRIVER, DRIVER_METHODS, messages
 from real2sim._poses import quaternion_of
@@ -21,6 +20,7 @@ from real2sim.planners.alpasim import AlpasimDriver
 from real2sim.planners.peer import PeerError
 from real2sim_proto.scenes import CameraInfo
 from real2sim_server.geometry.rotation import quaternion_to_matrix
+from tests.waiting import LIMIT_S
 
 from . import rig
 

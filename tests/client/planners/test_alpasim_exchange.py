@@ -14,10 +14,10 @@ from pathlib import Path
 
 import grpc
 import pytest
-from tests.waiting import LIMIT_S
 
 from real2sim._alpasim_messages import DRIVER, DRIVER_METHODS
 from real2sim.planners.alpasim import AlpasimDriver
+from tests.waiting import LIMIT_S
 
 from . import rig
 

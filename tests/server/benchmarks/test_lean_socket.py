@@ -9,12 +9,12 @@ import threading
 from collections.abc import Callable, Iterator
 
 import pytest
-from tests.waiting import LIMIT_S, wait_until
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.server import ServerConnection, serve
 
 from real2sim_server.benchmarks import lean_socket
 from real2sim_server.benchmarks.lean_socket import LeanSocket
+from tests.waiting import LIMIT_S, wait_until
 
 SUBPROTOCOL = "bench.v1"
 

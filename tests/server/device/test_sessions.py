@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any, TypeVar, cast
 
 import pytest
-from tests.waiting import LIMIT_S, wait_until_async
 
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
@@ -27,6 +26,7 @@ from real2sim_server.service.sessions.observation import EncodedObservation
 from real2sim_server.service.sessions.pipeline import StepPipeline
 from real2sim_server.service.sessions.transition import Transition
 from real2sim_server.world import World
+from tests.waiting import LIMIT_S, wait_until_async
 
 from ..render.kernel_twin import COMPILER, NEEDS_COMPILER
 from . import pretended

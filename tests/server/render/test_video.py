@@ -1,9 +1,14 @@
 from __future__ import annotations
 
+import contextlib
+import errno
+import resource
+
 import cv2
 import numpy as np
 import pytest
 
+from real2sim_server.render import video as video_module
 from real2sim_server.render.video import VideoError, video_file
 
 FRAMES = [np.full((48, 64, 3), (40 * k, 0, 200), np.uint8) for k in range(5)]
@@ -78,4 +83,49 @@ def test_a_frame_that_cannot_be_encoded_is_an_error_and_leaves_no_file(tmp_path)
     frames = [FRAMES[0], np.zeros((48, 64, 3), np.complex128)]
     with pytest.raises(cv2.error):
         write(tmp_path / "film.webm", frames)
+    assert list(tmp_path.iterdir()) == []
+
+
+@contextlib.contextmanager
+def files_of_at_most(size):
+    """This process writes nothing behind that many bytes of a file, for the length of the block."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def refused(number):
+    """The block ends with this error of the system."""
+    return pytest.raises(OSError, match=rf"\[Errno {number}\]")
+
+
+@pytest.mark.parametrize("suffix", ["webm", "mp4"])
+def test_a_video_that_the_system_does_not_take_whole_is_an_error_and_leaves_no_file(
+    tmp_path, suffix
+):
+    noise = np.random.default_rng(0).integers(0, 255, (30, 96, 160, 3), np.uint8)
+    path = tmp_path / f"film.{suffix}"
+    write(path, noise)
+    size = path.stat().st_size
+    path.unlink()
+    for share in (0.0, 0.01, 0.3, 0.99):
+        with files_of_at_most(int(share * size)), refused(errno.EFBIG):
+            write(path, noise)
+        assert list(tmp_path.iterdir()) == []
+    with files_of_at_most(size):
+        write(path, noise)
+
+
+def test_a_file_that_cannot_be_opened_is_refused_with_the_reason_of_the_system(tmp_path):
+    with refused(errno.ENAMETOOLONG):
+        write(tmp_path / f"{'x' * 300}.webm")
+
+
+def test_a_format_that_opencv_cannot_write_is_refused_as_such(tmp_path, monkeypatch):
+    monkeypatch.setitem(video_module.FOURCC_BY_SUFFIX, ".webm", "????")
+    with pytest.raises(VideoError, match="encoder"):
+        write(tmp_path / "film.webm")
     assert list(tmp_path.iterdir()) == []

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import shutil
 import subprocess
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ import structlog
 from fastapi.testclient import TestClient
 
 from real2sim_server.service.app import create_app
+from real2sim_server.service.jobs import exports
 from real2sim_server.settings import Settings
 
 from .manual_clock import manual_clock
@@ -72,6 +76,35 @@ def start_worker(run_worker) -> Iterator[Callable[..., TestClient]]:
 @pytest.fixture
 def client(start_worker) -> TestClient:
     return start_worker()
+
+
+@dataclass(frozen=True)
+class HeldVideos:
+    """Videos of workers in this process, which are not drawn before the test lets them.
+
+    Attributes:
+        begun: one of them waits for its first frame.
+        released: set it to let them be drawn; they can be cancelled before.
+    """
+
+    begun: threading.Event = field(default_factory=threading.Event)
+    released: threading.Event = field(default_factory=threading.Event)
+
+
+@pytest.fixture
+def held_videos(monkeypatch) -> Iterator[HeldVideos]:
+    held, render_frame = HeldVideos(), exports._render_frame
+
+    async def render_when_released(renderer, render_request, context):
+        held.begun.set()
+        while not held.released.is_set():
+            context.check()
+            await asyncio.sleep(0.01)
+        return await render_frame(renderer, render_request, context)
+
+    monkeypatch.setattr(exports, "_render_frame", render_when_released)
+    yield held
+    held.released.set()
 
 
 @pytest.fixture

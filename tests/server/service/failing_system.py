@@ -2,7 +2,7 @@
 processes of their own, without root.
 
 A small library stands before the system's: writes below the folder fail with the error number in a
-file, and the wall clock is moved by the seconds in another one.
+file, which may name only some paths; the wall clock is moved by the seconds in another file.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ SOURCE = r"""
 #include <dlfcn.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <fnmatch.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -32,25 +33,32 @@ SOURCE = r"""
 #include <time.h>
 #include <unistd.h>
 
+#define LENGTH 4096
 #define NEXT(type, name, ...) \
     static type (*next)(__VA_ARGS__); if (!next) next = dlsym(RTLD_NEXT, #name)
 
-static int number_in(const char *variable) {
+/* The number that a file begins with; what stands behind it, to the end of the line, is `rest`. */
+static int number_in(const char *variable, char *rest) {
     const char *file = getenv(variable);
+    *rest = 0;
     if (!file) return 0;
     int fd = (int)(long)((long (*)(int, const char *, int, int))dlsym(RTLD_NEXT, "openat"))(
         AT_FDCWD, file, O_RDONLY | O_CLOEXEC, 0);
     if (fd < 0) return 0;
-    char text[16] = {0};
+    char text[LENGTH] = {0};
     ssize_t n = read(fd, text, sizeof text - 1);
     close(fd);
-    return n > 0 ? atoi(text) : 0;
+    int number = 0;
+    if (n > 0) sscanf(text, "%d %[^\n]", &number, rest);
+    return number;
 }
 
 static int fails_at(const char *path) {
     const char *folder = getenv("FAILING_FOLDER");
     if (!folder || !path || strncmp(path, folder, strlen(folder))) return 0;
-    int number = number_in("FAILING_ERRNO_FILE");
+    char pattern[LENGTH];
+    int number = number_in("FAILING_ERRNO_FILE", pattern);
+    if (*pattern && fnmatch(pattern, path, 0)) return 0;
     if (number) errno = number;
     return number;
 }
@@ -130,7 +138,8 @@ STATVFS(statvfs64)
 int clock_gettime(clockid_t which, struct timespec *now) {
     NEXT(int, clock_gettime, clockid_t, struct timespec *);
     int done = next(which, now);
-    if (!done && which == CLOCK_REALTIME) now->tv_sec += number_in("CLOCK_OFFSET_FILE");
+    char rest[LENGTH];
+    if (!done && which == CLOCK_REALTIME) now->tv_sec += number_in("CLOCK_OFFSET_FILE", rest);
     return done;
 }
 """
@@ -149,10 +158,19 @@ class FailingSystem:
     environment: dict[str, str]
 
     @contextlib.contextmanager
-    def refusing_writes(self, number: int) -> Iterator[None]:
-        """Writes below the folder fail by this error number, for the length of the block."""
+    def refusing_writes(self, number: int, *, to: str = "") -> Iterator[None]:
+        """Writes below the folder fail by this error number, for the length of the block.
+
+        Args:
+            number: of the error.
+            to: pattern of the paths below the folder that refuse, if not all; ``*`` matches
+                slashes too.
+        """
         switch = Path(self.environment["FAILING_ERRNO_FILE"])
-        switch.write_text(str(number))
+        # Put there whole: the worker reads it at any time.
+        written = switch.with_suffix(".new")
+        written.write_text(f"{number} {self.folder / to if to else ''}\n")
+        written.replace(switch)
         try:
             yield
         finally:
@@ -160,7 +178,10 @@ class FailingSystem:
 
     def set_clock(self, seconds: int) -> None:
         """Move the wall clock of the worker."""
-        Path(self.environment["CLOCK_OFFSET_FILE"]).write_text(str(seconds))
+        offset = Path(self.environment["CLOCK_OFFSET_FILE"])
+        written = offset.with_suffix(".new")
+        written.write_text(str(seconds))
+        written.replace(offset)
 
 
 READ_ONLY, NO_SPACE, BROKEN = errno.EROFS, errno.ENOSPC, errno.EIO

@@ -6,21 +6,17 @@ import re
 import shutil
 import socket
 import subprocess
-import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from tests.waiting import LIMIT_S, wait_until
+
+from ..ports import reserved_port
+
 SHIPPED = Path(__file__).parents[3] / "docker" / "haproxy.cfg"
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def configuration(port: int, workers: Mapping[str, int], agents: Mapping[str, int]) -> str:
@@ -49,19 +45,20 @@ def running_haproxy(
     folder: Path, workers: Mapping[str, int], agents: Mapping[str, int]
 ) -> Iterator[str]:
     """A proxy before workers, by their names, ports and their agents' ports; its address."""
-    haproxy, port = program(), free_port()
+    haproxy, port = program(), reserved_port()
     file = folder / "haproxy.cfg"
     file.write_text(configuration(port, workers, agents))
     with (folder / "haproxy.log").open("w") as log:
         process = subprocess.Popen([haproxy, "-db", "-f", str(file)], stderr=log)
-    try:
-        deadline = time.monotonic() + 10
-        while process.poll() is None and time.monotonic() < deadline:
-            with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
-                break
-            time.sleep(0.05)
+
+    def listens() -> bool:
         assert process.poll() is None, (folder / "haproxy.log").read_text()
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    try:
+        wait_until(listens, "haproxy to listen")
         yield f"http://127.0.0.1:{port}"
     finally:
         process.terminate()
-        process.wait(10)
+        process.wait(LIMIT_S)

@@ -7,9 +7,9 @@ import threading
 from collections.abc import Iterator
 
 import pytest
-from tests.waiting import wait_until
 
 from real2sim_server.service import clock
+from tests.waiting import wait_until
 
 SOON_S = 1.0
 """What is due within this time is what a test waits for; a worker's own rounds come later."""

@@ -6,7 +6,6 @@ import getpass
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import uuid
 from collections.abc import Callable, Iterator
@@ -17,6 +16,8 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+
+from ..ports import reserved_port
 
 USER = "real2sim"
 
@@ -80,16 +81,19 @@ def running_postgres(folder: Path) -> Iterator[Postgres]:
         unprivileged = ["runuser", "-u", "nobody", "--"]
 
     def call(*command: str | Path) -> None:
+        # Not in the folder of the tests, which other users may not be allowed to enter.
         done = subprocess.run(
-            [*unprivileged, *map(str, command)], capture_output=True, text=True, check=False
+            [*unprivileged, *map(str, command)],
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=folder,
         )
         if done.returncode:
             pytest.skip(f"PostgreSQL does not start here: {done.stderr.strip()[-300:]}")
 
     call(programs / "initdb", "-D", data, "-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    server = Postgres(port, data, partial(call, programs / "pg_ctl", "-D", data))
+    server = Postgres(reserved_port(), data, partial(call, programs / "pg_ctl", "-D", data))
     server.start()
     try:
         yield server

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 from starlette.websockets import WebSocketDisconnect
-from tests.waiting import wait_until, wait_until_async
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_server.service import accounts as accounts_module
@@ -37,6 +36,7 @@ from real2sim_server.service.token_file import (
     read_token_file,
     remove_token,
 )
+from tests.waiting import wait_until, wait_until_async
 
 SINGLE = "a long enough secret"
 

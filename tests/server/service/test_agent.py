@@ -10,10 +10,12 @@ from real2sim_server.service import prewarming, serve
 from real2sim_server.service.agent import Agent, Willingness
 from real2sim_server.service.prewarming import loads_of
 from real2sim_server.service.storage.leases import WorkerRow
+from tests.waiting import LIMIT_S, wait_until
 
-from .haproxy import free_port
-from .test_fleet import by, start, store_url  # noqa: F401, fixtures
-from .test_trouble import Site, wait_until
+from ..ports import reserved_port
+from .test_fleet import by, start, store_url, tell  # noqa: F401, fixtures
+from .test_trouble import Site
+from .waiting import succeeded
 
 
 @pytest.mark.parametrize(
@@ -31,30 +33,32 @@ def test_the_word_for_the_proxy(ready, full, handed_over, word):
 
 
 def ask(port: int) -> str:
-    with socket.create_connection(("127.0.0.1", port), 5) as asked, asked.makefile() as lines:
+    with socket.create_connection(("127.0.0.1", port), LIMIT_S) as asked, asked.makefile() as lines:
         return lines.readline()
 
 
 @pytest.mark.network
 def test_a_worker_tells_its_proxy_whether_it_takes_sessions(start):  # noqa: F811
-    port = free_port()
+    port = reserved_port()
     client = start("w0", agent_port=port, max_sessions=1)
-    wait_until(lambda: ask(port) == "up ready 100%\n")
+    wait_until(lambda: ask(port) == "up ready 100%\n", "the worker to be ready")
     Site(client)
     assert ask(port) == "up drain\n"
 
 
 def ready(client):
     """The same, once others know that it takes work."""
-    wait_until(lambda: client.get("/v1/fleet").json()["workers"][-1]["ready"])
+    worker = client.app.state.worker
+    wait_until(lambda: worker.readiness().ready, "the worker to be ready")
+    tell(client)
     return client
 
 
 def test_sessions_are_handed_over_without_waiting_for_a_lease(start):  # noqa: F811
-    first = start("w0", lease_seconds=300)
+    first = start("w0")
     site = Site(first)
     assert site.step().status_code == 200
-    second = ready(start("w1", lease_seconds=300))
+    second = ready(start("w1"))
     other = by(second, site)
     assert other.step().json()["code"] == "SESSION_ELSEWHERE"
 
@@ -66,13 +70,14 @@ def test_sessions_are_handed_over_without_waiting_for_a_lease(start):  # noqa: F
     assert site.step().json()["code"] == "SESSION_ELSEWHERE"
 
 
-def test_jobs_are_handed_over_too_and_nobody_has_died(start):  # noqa: F811
-    first, second = start("w0", lease_seconds=300), ready(start("w1", lease_seconds=300))
-    body = {"scene": "tiny", "camera": "front", "width": 640, "fps": 60}
+def test_jobs_are_handed_over_too_and_nobody_has_died(start, held_videos):  # noqa: F811
+    first, second = start("w0"), ready(start("w1"))
+    body = {"scene": "tiny", "camera": "front", "width": 64, "fps": 1}
     job = first.post("/v1/exports", json=body).headers["Location"]
+    assert held_videos.begun.wait(LIMIT_S)
     first.portal.call(first.app.state.worker.hand_over)
-    wait_until(lambda: second.get(job).json()["state"] == "succeeded", 120)
-    done = second.get(job).json()
+    held_videos.released.set()
+    done = succeeded(second, job)
     assert (done["worker"], done["attempt"]) == ("w1", 1)
 
 
@@ -122,6 +127,7 @@ def test_a_worker_loads_a_hot_scene_ahead(start, monkeypatch):  # noqa: F811
     monkeypatch.setattr(prewarming, "LOOK_S", 0.05)
     first, second = start("w0", hot_scene_sessions=1), start("w1", hot_scene_sessions=1)
     Site(first)
-    worker = second.app.state.worker
-    wait_until(lambda: "tiny" in second.get("/v1/fleet").json()["workers"][0]["scenes"])
-    wait_until(lambda: worker.scene_cache.resident_names == ["tiny"], 30)
+    for client in (first, second):
+        ready(client)
+    cache = second.app.state.worker.scene_cache
+    wait_until(lambda: cache.resident_names == ["tiny"], "the scene to be loaded")

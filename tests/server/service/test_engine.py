@@ -8,7 +8,6 @@ import time
 
 import pytest
 import torch
-from tests.waiting import LIMIT_S, wait_until, wait_until_async
 
 from real2sim_server.service.engine import (
     DeviceLostError,
@@ -17,6 +16,7 @@ from real2sim_server.service.engine import (
     QueueFullError,
 )
 from real2sim_server.service.lanes import Lane
+from tests.waiting import LIMIT_S, wait_until, wait_until_async
 
 
 @pytest.fixture

@@ -12,11 +12,13 @@ import pytest
 from fastapi.testclient import TestClient
 
 from real2sim_server.service.token_file import TokenLimits, add_token
+from tests.waiting import wait_until
 
 from .test_accounts import bearer
-from .test_trouble import Site, wait_until
+from .test_trouble import Site
 
-LEASE_S = 0.4
+LEASE_S = 300.0
+"""Longer than any test: a lease runs out where a test lets it, by :func:`put_to_sleep`."""
 
 
 @pytest.fixture
@@ -36,18 +38,28 @@ def start(run_worker, start_worker, store_url, tmp_path):
 
 
 def put_to_sleep(client: TestClient, monkeypatch) -> Callable[[], None]:
-    """A worker keeps its promises no more, and does not know it; what wakes it up."""
-    leases, awake = client.app.state.worker.leases, threading.Event()
-    promise = leases.renew
+    """Let a worker's lease run out without its knowledge; what wakes it up."""
+    worker, awake = client.app.state.worker, threading.Event()
+    leases, promise = worker.leases, worker.leases.renew
 
     async def renew(document) -> None:
         while not awake.is_set():
             await asyncio.sleep(0.02)
         await promise(document)
 
+    def wake() -> None:
+        worker.membership._renewed = time.monotonic() - 2 * LEASE_S
+        awake.set()
+        tell(client)
+
     monkeypatch.setattr(leases, "renew", renew)
-    time.sleep(2 * LEASE_S)
-    return awake.set
+    client.portal.call(leases.give_up, {})
+    return wake
+
+
+def tell(client: TestClient) -> None:
+    """Let a worker renew its lease now, tell others of itself, and hear of them."""
+    client.portal.call(client.app.state.worker.membership.tell)
 
 
 def by(client: TestClient, site: Site) -> Site:
@@ -102,8 +114,7 @@ def test_a_worker_that_wakes_up_leaves_what_was_taken_over(start, monkeypatch):
     other = by(start("w1"), site)
     assert other.step().status_code == 200
     wake()
-    sessions = first.app.state.worker.sessions
-    wait_until(lambda: len(sessions) == 1)
+    assert len(first.app.state.worker.sessions) == 1
     assert kept.step().status_code == 200
 
 
@@ -120,7 +131,7 @@ def test_a_driver_is_told_to_come_back_when_its_session_is_taken_over(start, mon
     put_to_sleep(first, monkeypatch)
     assert by(start("w1"), site).step().status_code == 200
     site.step()
-    wait_until(lambda: told == ["SESSION_ELSEWHERE"])
+    wait_until(lambda: told == ["SESSION_ELSEWHERE"], "the driver to be told")
 
 
 def test_a_session_comes_back_to_a_worker_that_is_there_again(start, run_worker):
@@ -139,39 +150,36 @@ def test_a_session_that_is_over_is_over_everywhere(start):
     assert by(start("w1"), site).step().json()["code"] == "SESSION_CLOSED"
 
 
-def test_sessions_and_jobs_of_a_token_are_limited_over_all_workers(start, tmp_path):
+def test_sessions_and_jobs_of_a_token_are_limited_over_all_workers(start, tmp_path, held_videos):
     tokens = tmp_path / "tokens.json"
     held = bearer(add_token(tokens, "alice", TokenLimits(sessions=2, jobs=1)))
     one, other = (start(name, tokens_file=tokens) for name in ("w0", "w1"))
     for client in (one, other):
         made = client.post("/v1/sessions?scene=tiny", json={}, headers=held)
         assert made.status_code == 201, made.text
-    slow = {"scene": "tiny", "camera": "front", "fps": 60, "width": 320}
-    assert one.post("/v1/exports", json=slow, headers=held).status_code == 202
-    time.sleep(1.5 * LEASE_S)
+    video = {"scene": "tiny", "camera": "front", "fps": 1, "width": 64}
+    assert one.post("/v1/exports", json=video, headers=held).status_code == 202
+    for client in (one, other, one):
+        tell(client)
     for client in (one, other):
         refused = client.post("/v1/sessions?scene=tiny", json={}, headers=held)
         assert (refused.status_code, refused.json()["code"]) == (429, "TOO_MANY_SESSIONS")
         assert "2 sessions are open" in refused.json()["detail"]
-    refused = other.post("/v1/exports", json=slow, headers=held)
+    refused = other.post("/v1/exports", json=video, headers=held)
     assert (refused.status_code, refused.json()["code"]) == (429, "TOO_MANY_JOBS")
     url = f"/v1/sessions/{made.json()['session_id']}"
     assert other.delete(url, headers=held).status_code == 204
-    wait_until(
-        lambda: one.post("/v1/sessions?scene=tiny", json={}, headers=held).status_code == 201
-    )
+    for client in (other, one):
+        tell(client)
+    assert one.post("/v1/sessions?scene=tiny", json={}, headers=held).status_code == 201
 
 
 def test_any_worker_tells_of_all(start, run_worker):
     with start("w1", run_worker):
-        Site(start("w0"))
-    client = start("w2")
-    wait_until(lambda: not _fleet(client)["w1"]["alive"])
-    wait_until(lambda: _fleet(client)["w0"]["sessions"] == 1)
-    found = _fleet(client)
+        first = start("w0")
+        Site(first)
+    tell(first)
+    found = {w["worker_id"]: w for w in start("w2").get("/v1/fleet").json()["workers"]}
+    assert found["w0"]["sessions"] == 1
     assert [found[name]["alive"] for name in ("w0", "w1", "w2")] == [True, False, True]
     assert found["w0"]["scenes"] == ["tiny"]
-
-
-def _fleet(client: TestClient) -> dict:
-    return {w["worker_id"]: w for w in client.get("/v1/fleet").json()["workers"]}

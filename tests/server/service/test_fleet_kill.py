@@ -21,8 +21,9 @@ import real2sim
 from real2sim_server.render.cast.warm_up import warm_up_casting
 from real2sim_server.scene.io import save_scene
 
+from ..ports import reserved_port
 from ..worker_processes import KillableWorker
-from .haproxy import free_port, running_haproxy
+from .haproxy import running_haproxy
 from .sessions.test_resume import FAN, SENSORS, hashed, plan
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -72,7 +73,7 @@ def fleet(tmp_path_factory, tiny_scene, postgres) -> Iterator[Fleet]:
     with ExitStack() as stack:
         workers, agents = {}, {}
         for name in WORKERS:
-            agents[name] = free_port()
+            agents[name] = reserved_port()
             settings = {
                 "REAL2SIM_STORE_URL": store_url,
                 "REAL2SIM_WORKER_ID": name,

@@ -5,12 +5,12 @@ import threading
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
-from tests.waiting import LIMIT_S, wait_until
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.scenes import Readiness
 from real2sim_server.service.app import create_app
 from real2sim_server.service.storage.store import StoreError
+from tests.waiting import LIMIT_S, wait_until
 
 HERE = {"Host": "127.0.0.1"}
 

@@ -6,14 +6,34 @@ import random
 import sqlite3
 import threading
 from contextlib import ExitStack, closing
+from pathlib import Path
 
 import httpx2
 import pytest
 
+from tests.waiting import wait_until
+
 from ..worker_processes import KillableWorker
-from .test_trouble import wait_until
+from .waiting import finished, succeeded, wait_ready
 
 pytestmark = pytest.mark.network
+
+HOLD = """
+import asyncio, os
+from real2sim_server.service.jobs import exports
+
+drawn, render_frame = [], exports._render_frame
+
+async def render_unless_held(renderer, render_request, context):
+    while drawn and os.path.exists({path!r}):
+        context.check()
+        await asyncio.sleep(0.01)
+    drawn.append(await render_frame(renderer, render_request, context))
+    return drawn[-1]
+
+exports._render_frame = render_unless_held
+"""
+"""Code for a worker, whose videos wait behind their first frame for as long as a file exists."""
 
 KILLS = 2
 MOST_BETWEEN = 6
@@ -22,8 +42,12 @@ MOST_BETWEEN = 6
 @pytest.fixture
 def start(scenes_dir, tmp_path):
     """Starts workers in processes of their own on the same store; the next kills the one before."""
-    folders = {"scenes": scenes_dir, "data": tmp_path / "data"}
-    worker = KillableWorker(**folders, log_file=tmp_path / "worker.log")
+    worker = KillableWorker(
+        scenes=scenes_dir,
+        data=tmp_path / "data",
+        log_file=tmp_path / "worker.log",
+        before=HOLD.format(path=str(tmp_path / "hold")),
+    )
     with ExitStack() as stack:
         stack.callback(worker.kill)
 
@@ -31,7 +55,7 @@ def start(scenes_dir, tmp_path):
             worker.kill()
             worker.start()
             worker.wait_listening()
-            client = httpx2.Client(base_url=worker.url, trust_env=False, timeout=60)
+            client = httpx2.Client(base_url=worker.url, trust_env=False, timeout=None)
             return stack.enter_context(client)
 
         yield another
@@ -80,12 +104,12 @@ def test_an_asset_whose_answer_was_not_stored_yet_is_answered_after_the_kill(sta
     cut = {"scene": "tiny", "object_id": "car_red", "asset_id": "cut"}
     request = {"url": "/v1/assets", "json": cut, "headers": {"Idempotency-Key": "once"}}
     bundle = tmp_path / "data/assets/cut.r2a"
-    wait_until(lambda: client.get("/readyz").status_code == 200, 60)
+    wait_ready(client)
     with closing(sqlite3.connect(tmp_path / "data/real2sim.db")) as store:
         store.execute("BEGIN IMMEDIATE")  # Whoever writes waits.
         asking = threading.Thread(target=_without_answer, args=(client, request))
         asking.start()
-        wait_until(bundle.exists)
+        wait_until(bundle.exists, "the asset's files")
         client = start()
         asking.join()
         store.rollback()
@@ -104,9 +128,10 @@ def _without_answer(client: httpx2.Client, request: dict) -> None:
 @pytest.fixture
 def two_workers(scenes_dir, tmp_path):
     """Two workers in processes of their own on one store."""
+    # A lease runs out where a test lets it.
     shared = {
         "REAL2SIM_STORE_URL": f"sqlite:///{tmp_path / 'shared.db'}",
-        "REAL2SIM_LEASE_SECONDS": "1",
+        "REAL2SIM_LEASE_SECONDS": "600",
     }
     with ExitStack() as stack:
         workers = []
@@ -116,51 +141,56 @@ def two_workers(scenes_dir, tmp_path):
                 data=tmp_path / name,
                 log_file=tmp_path / f"{name}.log",
                 settings=shared | {"REAL2SIM_WORKER_ID": name},
+                before=HOLD.format(path=str(tmp_path / "hold")),
             )
             stack.callback(worker.kill)
             worker.start()
             worker.wait_listening()
-            client = httpx2.Client(base_url=worker.url, trust_env=False, timeout=60)
+            client = httpx2.Client(base_url=worker.url, trust_env=False, timeout=None)
             workers.append((worker, stack.enter_context(client)))
         yield workers
 
 
-VIDEO = {"scene": "tiny", "camera": "front", "width": 960, "fps": 30}
+VIDEO = {"scene": "tiny", "camera": "front", "width": 64, "fps": 4}
 
 
-def running(client: httpx2.Client) -> str:
-    """Address of a job that draws."""
+def running(client: httpx2.Client, tmp_path: Path) -> str:
+    """Address of a job that has drawn one frame, and draws the next once ``hold`` is gone."""
+    (tmp_path / "hold").touch()
     job = client.post("/v1/exports", json=VIDEO).headers["Location"]
-    wait_until(lambda: client.get(job).json()["progress"] > 0, 60)
+    wait_until(lambda: client.get(job).json()["progress"] > 0, "the first frame")
     return job
 
 
 @pytest.mark.slow
-def test_a_job_of_a_killed_worker_is_done_by_another(two_workers):
+def test_a_job_of_a_killed_worker_is_done_by_another(two_workers, tmp_path):
     (first, client), (_, other) = two_workers
-    job = running(client)
+    job = running(client, tmp_path)
     assert other.get(job).json()["worker"] == "w0"
     first.kill()
-    wait_until(lambda: other.get(job).json()["state"] == "succeeded", 120)
-    done = other.get(job).json()
-    assert (done["worker"], done["attempt"], done["result"]["frames"]) == ("w1", 2, 61)
+    with closing(sqlite3.connect(tmp_path / "shared.db", timeout=60)) as store, store:
+        store.execute("UPDATE workers SET lease_until_us = 0 WHERE worker_id = 'w0'")
+    (tmp_path / "hold").unlink()
+    done = succeeded(other, job)
+    assert (done["worker"], done["attempt"], done["result"]["frames"]) == ("w1", 2, 9)
     assert other.get(f"{job}/files/video.webm").status_code == 200
 
 
 @pytest.mark.slow
-def test_a_job_is_cancelled_by_way_of_another_worker(two_workers):
+def test_a_job_is_cancelled_by_way_of_another_worker(two_workers, tmp_path):
     (_, client), (_, other) = two_workers
-    job = running(client)
-    assert other.delete(job).json()["state"] == "cancelled"
-    assert client.get(job).json()["state"] == "cancelled"
+    job = running(client, tmp_path)
+    assert other.delete(job).status_code == 200
+    assert finished(other, job)["state"] == finished(client, job)["state"] == "cancelled"
 
 
 @pytest.mark.slow
-def test_a_worker_that_was_killed_goes_on_with_its_jobs(start):
-    job = running(start())
+def test_a_worker_that_was_killed_goes_on_with_its_jobs(start, tmp_path):
+    job = running(start(), tmp_path)
     client = start()
     assert client.get(job).json()["attempt"] == 2
-    wait_until(lambda: client.get(job).json()["state"] == "succeeded", 120)
+    (tmp_path / "hold").unlink()
+    succeeded(client, job)
 
 
 @pytest.mark.slow
@@ -169,7 +199,7 @@ def test_a_data_set_goes_on_with_the_clips_that_it_had(start):
     client = start()
 
     def archive(job: str) -> bytes:
-        wait_until(lambda: client.get(job).json()["state"] == "succeeded", 120)
+        succeeded(client, job)
         return client.get(f"{job}/files/dataset.tar").content
 
     def begun() -> str:
@@ -178,9 +208,9 @@ def test_a_data_set_goes_on_with_the_clips_that_it_had(start):
 
     undisturbed = archive(begun())
     job = begun()
-    wait_until(lambda: client.get(job).json()["progress"] > 0.4, 120)
+    wait_until(lambda: client.get(job).json()["progress"] > 0.4, "some clips")
     client = start()
     seen: list[float] = []
-    wait_until(lambda: seen.append(client.get(job).json()["progress"]) or seen[-1] > 0, 120)
+    wait_until(lambda: seen.append(client.get(job).json()["progress"]) or seen[-1] > 0, "progress")
     assert seen[-1] > 0.2
     assert archive(job) == undisturbed

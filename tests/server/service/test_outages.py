@@ -3,6 +3,7 @@ half a minute: each has an answer of its own, nothing is lost, and all goes on b
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 import time
@@ -16,17 +17,18 @@ import pytest
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_server.demo.worker import worker_process
 from real2sim_server.scene.io import save_scene, write_splats
+from tests.waiting import wait_until
 
 from .failing_system import BROKEN, NO_SPACE, READ_ONLY, FailingSystem, failing_system
 from .postgres import Postgres, running_postgres
-from .test_trouble import Site, assert_told, filled, is_ready, stopped, wait_until
+from .test_trouble import Site, assert_told, filled, stopped
+from .waiting import accepted, finished, is_ready, succeeded, wait_ready
 
-pytestmark = [
-    pytest.mark.network,
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = pytest.mark.network
 
-OUTAGE_S = 30.0
+OUTAGE_S, LEAST_ROUNDS = 30.0, 20
+PATIENT = {"REAL2SIM_STORE_TIMEOUT_SECONDS": "60"}
+"""No disk that works is slower, however busy the machine is."""
 JOB = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
 CUT = {"scene": "tiny", "object_id": "car_red"}
 
@@ -47,11 +49,11 @@ def apart(system, tiny_scene, worker_kernels) -> Iterator[httpx2.Client]:
     save_scene(tiny_scene, scenes / "tiny.r2s")
     log_file = system.folder.parent / "worker.log"
     with (
-        mock.patch.dict(os.environ, system.environment),
+        mock.patch.dict(os.environ, system.environment | PATIENT),
         worker_process(scenes=scenes, data=system.folder, log_file=log_file) as worker,
-        httpx2.Client(base_url=worker.url, trust_env=False, timeout=60) as client,
+        httpx2.Client(base_url=worker.url, trust_env=False, timeout=None) as client,
     ):
-        wait_until(lambda: is_ready(client), 120)
+        wait_ready(client)
         yield client
         assert "Traceback" not in log_file.read_text()
 
@@ -75,7 +77,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_nothing_is_lost(apart, s
             assert apart.get("/livez").status_code == 200
             site.check_nothing_is_lost()
             assert apart.get("/v1/scenes/tiny/render?width=32").status_code == 200
-        wait_until(lambda: is_ready(apart))
+        wait_ready(apart)
         assert site.edit(f"edit {number}").status_code == 200
         assert site.step(f"step {number}").status_code == 200
         assert apart.post("/v1/assets", json=cut).status_code == 201
@@ -104,14 +106,22 @@ def test_an_upload_to_a_folder_that_cannot_be_written_to_is_told_so(
 
 
 @pytest.mark.timeout(300)
-def test_a_job_whose_folder_cannot_be_written_to_fails_by_name(apart, system):
-    job = apart.post("/v1/exports", json=JOB | {"fps": 60, "width": 96}).headers["Location"]
-    with system.refusing_writes(READ_ONLY):
-        time.sleep(1.0)
-    wait_until(lambda: apart.get(job).json()["finished_at"] is not None, 60)
-    ended = apart.get(job).json()
-    if ended["state"] != "succeeded":  # It may have been faster.
-        assert (ended["state"], ended["error"]["code"]) == ("failed", "STORAGE_UNAVAILABLE")
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [
+        (READ_ONLY, "STORAGE_UNAVAILABLE"),
+        (BROKEN, "STORAGE_UNAVAILABLE"),
+        (errno.EACCES, "STORAGE_UNAVAILABLE"),
+        (NO_SPACE, "STORAGE_FULL"),
+    ],
+)
+def test_a_job_whose_files_cannot_be_written_fails_by_name(apart, system, number, code):
+    # Its folder, what the encoder writes, and the video once it is whole.
+    for refused in ("jobs/job_*", "jobs/job_*/.video*", "jobs/job_*/video.webm"):
+        with system.refusing_writes(number, to=refused):
+            ended = finished(apart, apart.post("/v1/exports", json=JOB))
+        assert ended["state"] == "failed", refused
+        assert ended["error"]["code"] == code, refused
 
 
 @pytest.mark.timeout(300)
@@ -129,12 +139,20 @@ def test_a_clock_that_goes_back_by_an_hour_and_forth_again_changes_nothing(apart
         assert site.step(f"new {k}").headers["Idempotent-Replayed"] == "true"
         site.steps -= 1
         made.append(apart.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"])
-        job = apart.post("/v1/exports", json=JOB).headers["Location"]
-        wait_until(lambda at=job: apart.get(at).json()["state"] == "succeeded", 60)
+        succeeded(apart, apart.post("/v1/exports", json=JOB))
         assert is_ready(apart)
     listed = [s["scenario_id"] for s in apart.get("/v1/scenarios").json()["scenarios"]]
     assert [f"/v1/scenarios/{i}" for i in listed[len(before) :]] == made
     site.check_nothing_is_lost()
+
+
+def rounds() -> Iterator[None]:
+    """Rounds of an outage, until it has lasted long enough and there were some."""
+    began, count = time.monotonic(), 0
+    while count < LEAST_ROUNDS or time.monotonic() - began < OUTAGE_S:
+        yield
+        time.sleep(0.5)
+        count += 1
 
 
 # --- a database that is away ------------------------------------------------------------------
@@ -157,9 +175,9 @@ def test_a_database_that_is_away_for_half_a_minute_costs_nothing_but_the_time(
 ):
     client = start_worker(store_url=own_postgres.new_database(), store_timeout_seconds=2)
     site = Site(client)
-    assert site.edit().status_code == 200
-    job = client.post("/v1/exports", json=JOB).headers["Location"]
-    made = client.post("/v1/sessions?scene=tiny").json()
+    accepted(lambda: site.edit("first"))
+    job = accepted(lambda: client.post("/v1/exports", json=JOB))
+    made = accepted(lambda: client.post("/v1/sessions?scene=tiny")).json()
     url = f"/v1/sessions/{made['session_id']}/drive"
     with client.websocket_connect(
         url, subprotocols=[DRIVE_SUBPROTOCOL], headers={"Host": "127.0.0.1"}
@@ -175,30 +193,23 @@ def test_a_database_that_is_away_for_half_a_minute_costs_nothing_but_the_time(
         assert hello["type"] == "welcome"
         assert say(type="reset", spec={"action": "control"})["type"] == "obs"
         plan = {"kind": "control", "acceleration": 0.0, "steering": 0.0}
-        slowest, refused = 0.0, 0
         with trouble(own_postgres):
-            ended = time.monotonic() + OUTAGE_S
-            while time.monotonic() < ended:
-                began = time.monotonic()
+            for _ in rounds():
                 assert_told(site.edit("edit"), "STORAGE_UNAVAILABLE", 503)
                 assert_told(site.step("step"), "STORAGE_UNAVAILABLE", 503)
                 said = say(type="action", step=0, plan=plan)
                 assert (said["code"], said["fatal"]) == ("STORAGE_UNAVAILABLE", False)
                 assert not is_ready(client)
                 assert client.get("/livez").status_code == 200
-                slowest, refused = max(slowest, time.monotonic() - began), refused + 3
-                time.sleep(0.5)
-        assert refused > 20
-        assert slowest < 20
-        wait_until(lambda: is_ready(client))
-        assert say(type="action", step=0, plan=plan)["step"] == 1
+        wait_ready(client)
+        wait_until(lambda: say(type="action", step=0, plan=plan).get("step") == 1, "a step")
     for key in ("edit", "edit"):
-        assert site.edit(key).status_code == 200
+        accepted(lambda key=key: site.edit(key))
     site.edits -= 1
     for key in ("step", "step"):
-        assert site.step(key).status_code == 200
+        accepted(lambda key=key: site.step(key))
     site.steps -= 1
-    wait_until(lambda: client.get(job).json()["state"] == "succeeded", 60)
+    succeeded(client, job)
     site.check_nothing_is_lost()
 
 
@@ -217,16 +228,14 @@ def test_a_folder_that_takes_nothing_for_half_a_minute_costs_nothing_but_the_tim
     assert site.step().status_code == 200
     cut = CUT | {"asset_id": f"car_{code.lower()}"}
     with system.refusing_writes(number):
-        ended = time.monotonic() + OUTAGE_S
-        while time.monotonic() < ended:
+        for _ in rounds():
             assert_told(site.edit("edit"), code, status)
             assert_told(site.step("step"), code, status)
             assert_told(apart.post("/v1/assets", json=cut), code, status)
             assert not is_ready(apart)
             assert apart.get("/livez").status_code == 200
-            time.sleep(0.5)
         site.check_nothing_is_lost()
-    wait_until(lambda: is_ready(apart))
+    wait_ready(apart)
     assert site.edit("edit").status_code == 200
     assert site.step("step").status_code == 200
     assert apart.post("/v1/assets", json=cut).status_code == 201
@@ -240,22 +249,17 @@ def test_a_disk_that_is_full_for_half_a_minute_costs_nothing_but_the_time(small_
     client = start_worker(data_dir=small_disk / "data")
     site = Site(client)
     assert site.edit().status_code == 200
-    told = 0
     with filled(small_disk):
-        ended = time.monotonic() + OUTAGE_S
-        while time.monotonic() < ended:
+        for _ in rounds():
             # An episode has but few steps.
             steps = [site.step()] if site.steps < 10 else []
             for answer in (site.edit(), *steps):
                 if answer.status_code != 200:  # There may be some pages left in the journal.
                     assert_told(answer, "STORAGE_FULL", 507)
-                    told += 1
             assert client.get("/livez").status_code == 200
-            time.sleep(0.05)
-        assert told > 20
-        assert not is_ready(client)
+        wait_until(lambda: site.edit().status_code != 200 and not is_ready(client), "a full disk")
         site.check_nothing_is_lost()
-    wait_until(lambda: is_ready(client))
+    wait_ready(client)
     assert site.edit().status_code == 200
     assert site.step().status_code == 200
     site.check_nothing_is_lost()
@@ -269,8 +273,7 @@ def test_a_clock_that_is_an_hour_behind_for_half_a_minute_changes_nothing(apart,
     made = []
     system.set_clock(-3600)
     try:
-        ended = time.monotonic() + OUTAGE_S
-        while time.monotonic() < ended:
+        for _ in rounds():
             assert site.edit("before").headers["Idempotent-Replayed"] == "true"
             site.edits -= 1
             assert site.edit().status_code == 200
@@ -278,7 +281,6 @@ def test_a_clock_that_is_an_hour_behind_for_half_a_minute_changes_nothing(apart,
                 assert site.step().status_code == 200
             made.append(apart.post("/v1/scenarios", json={"scene": "tiny"}).headers["Location"])
             assert is_ready(apart)
-            time.sleep(0.5)
     finally:
         system.set_clock(0)
     assert site.edit("before").headers["Idempotent-Replayed"] == "true"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import subprocess
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -13,6 +12,8 @@ from pathlib import Path
 from socketserver import StreamRequestHandler, ThreadingTCPServer
 
 import pytest
+
+from tests.waiting import LIMIT_S, wait_until
 
 from .haproxy import SHIPPED, program, running_haproxy
 
@@ -66,7 +67,7 @@ class Site:
         self._address = url.removeprefix("http://")
 
     def ask(self, path: str, method: str = "GET") -> str:
-        connection = http.client.HTTPConnection(self._address, timeout=10)
+        connection = http.client.HTTPConnection(self._address, timeout=LIMIT_S)
         try:
             connection.request(method, path)
             return connection.getresponse().read().decode()
@@ -75,12 +76,6 @@ class Site:
 
     def new(self, scene: str) -> str:
         return self.ask(f"/v1/sessions?scene={scene}", "POST")
-
-    def wait(self, condition) -> None:
-        deadline = time.monotonic() + 20
-        while not condition():
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
 
 
 @pytest.fixture
@@ -91,7 +86,10 @@ def site(tmp_path: Path) -> Iterator[Site]:
     agents = {name: stand.agent.server_address[1] for name, stand in stands.items()}
     with running_haproxy(tmp_path, webs, agents) as url:
         site = Site(stands, url)
-        site.wait(lambda: all(site.ask(f"/v1/sessions/{name}.7f/step") == name for name in NAMES))
+        wait_until(
+            lambda: all(site.ask(f"/v1/sessions/{name}.7f/step") == name for name in NAMES),
+            "the proxy to know all workers",
+        )
         yield site
     for stand in stands.values():
         stand.stop()
@@ -121,15 +119,15 @@ def test_new_sessions_go_where_their_scene_is_and_scenes_to_all_workers(site):
 def test_a_worker_that_drains_keeps_its_sessions_and_gets_no_new_ones(site):
     scene = next(s for s in (f"scene_{k}" for k in range(200)) if site.new(s) == "w1")
     site.stands["w1"].word = "up drain"
-    site.wait(lambda: site.new(scene) != "w1")
+    wait_until(lambda: site.new(scene) != "w1", "the proxy to hear of it")
     assert [site.ask("/v1/sessions/w1.7f/step") for _ in range(5)] == ["w1"] * 5
     site.stands["w1"].word = READY
-    site.wait(lambda: site.new(scene) == "w1")
+    wait_until(lambda: site.new(scene) == "w1", "the proxy to hear of it")
 
 
 def test_sessions_of_a_worker_that_is_down_or_unknown_go_to_one_that_is_there(site):
     site.stands["w2"].word = "down"
-    site.wait(lambda: site.ask("/v1/sessions/w2.7f/step") != "w2")
+    wait_until(lambda: site.ask("/v1/sessions/w2.7f/step") != "w2", "the proxy to hear of it")
     assert site.ask("/v1/sessions/w9.7f/step") in ("w0", "w1")
 
 

@@ -11,7 +11,7 @@ from real2sim_server.service.http.roles import needed_role
 from real2sim_server.service.token_file import ROLES, TokenLimits, add_token, read_token_file
 
 from .test_accounts import bearer
-from .test_trouble import wait_until
+from .waiting import finished
 
 VIDEO = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
 CUT = {"scene": "tiny", "object_id": "car_red", "asset_id": "red"}
@@ -97,19 +97,17 @@ def test_a_token_of_before_there_were_roles_may_everything(tokens_file):
     assert read_token_file(tokens_file).tokens[0].role == "administer"
 
 
-def test_jobs_of_a_token_are_limited(start_worker, tokens_file):
+def test_jobs_of_a_token_are_limited(start_worker, tokens_file, held_videos):
     alice = add_token(tokens_file, "alice", TokenLimits(jobs=1))
     bob = add_token(tokens_file, "bob", TokenLimits())
     client = start_worker(tokens_file=tokens_file)
-    slow = VIDEO | {"fps": 60, "width": 320}
-    first = client.post("/v1/exports", json=slow, headers=bearer(alice)).json()["job_id"]
+    first = client.post("/v1/exports", json=VIDEO, headers=bearer(alice)).json()["job_id"]
     refused = client.post("/v1/exports", json=VIDEO, headers=bearer(alice))
     assert (refused.status_code, refused.json()["code"]) == (429, "TOO_MANY_JOBS")
     assert client.post("/v1/exports", json=VIDEO, headers=bearer(bob)).status_code == 202
     client.delete(f"/v1/jobs/{first}", headers=bearer(alice))
-    wait_until(
-        lambda: client.get(f"/v1/jobs/{first}", headers=bearer(bob)).json().get("finished_at")
-    )
+    client.headers.update(bearer(bob))
+    finished(client, f"/v1/jobs/{first}")
     assert client.post("/v1/exports", json=VIDEO, headers=bearer(alice)).status_code == 202
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from real2sim_server.service.app import create_app, trace
 from real2sim_server.service.tracing import provider_of
+from tests.waiting import LIMIT_S
 
 from .test_placement import site  # noqa: F401, a fixture
 
@@ -74,7 +75,7 @@ def test_the_proxy_begins_a_trace_where_there_is_none(site):  # noqa: F811
 
     web.do_GET = do_get
     site.ask("/v1/sessions/w0.7f/state")
-    connection = http.client.HTTPConnection(site._address, timeout=10)
+    connection = http.client.HTTPConnection(site._address, timeout=LIMIT_S)
     connection.request("GET", "/v1/sessions/w0.7f/state", headers={"traceparent": PARENT})
     connection.getresponse().read()
     connection.close()

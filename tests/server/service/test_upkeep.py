@@ -9,6 +9,8 @@ from real2sim_server._files import sweep_leftovers
 from real2sim_server.service.storage import store as store_module
 from real2sim_server.service.upkeep import Upkeep
 
+from .waiting import succeeded
+
 HOUR_S = 3600
 
 
@@ -54,15 +56,10 @@ def test_a_folder_that_was_moved_aside_goes_back_where_its_place_is_empty(tmp_pa
     assert {p.name for p in tmp_path.iterdir()} == {"kept.r2s", "gone.r2s", ".hidden"}
 
 
-def test_old_jobs_go_with_their_files(client, tmp_path, monkeypatch):
+def test_old_jobs_go_with_their_files(client):
     body = {"scene": "tiny", "camera": "front", "fps": 1, "width": 64}
-    job = client.post("/v1/exports", json=body).json()
-    assert client.get(f"/v1/jobs/{job['job_id']}?wait_s=30").status_code == 200
+    job = succeeded(client, client.post("/v1/exports", json=body))
     worker = client.app.state.worker
-    for _ in range(300):
-        if client.get(f"/v1/jobs/{job['job_id']}").json()["state"] == "succeeded":
-            break
-        time.sleep(0.1)
     folder = worker.settings.jobs_path / job["job_id"]
     assert folder.is_dir()
     client.portal.call(worker.jobs.forget_before, store_module.now_us() + 1)

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import asyncio
-import time
+import threading
 from fnmatch import fnmatch
 
 import pytest
@@ -11,6 +11,7 @@ from real2sim_server.service import first_run, warm_up
 from real2sim_server.service.warm_up import KernelWarmUp
 from real2sim_server.world import plans_ahead
 from real2sim_server.world.driving import advance_vehicle
+from tests.waiting import LIMIT_S, wait_until_async
 
 
 def episode(tracker: str) -> ResetSpec:
@@ -21,31 +22,22 @@ async def nothing() -> None:
     pass
 
 
-def is_waiting(work) -> bool:
-    """Whether a coroutine does not end within a moment."""
-
-    async def tried() -> bool:
-        done, _ = await asyncio.wait({asyncio.ensure_future(work)}, timeout=0.05)
-        return not done
-
-    return asyncio.run(tried())
-
-
 def test_only_ilqr_plans_ahead():
     trackers = ("pursuit", "lqr", "ilqr", "perfect")
     assert [t for t in trackers if plans_ahead(EgoSpec(tracker=t))] == ["ilqr"]
 
 
 def test_episodes_with_other_trackers_wait_for_nothing():
-    assert not is_waiting(KernelWarmUp().ready(episode("lqr")))
+    asyncio.run(KernelWarmUp().ready(episode("lqr")))
 
 
 def test_an_episode_whose_tracker_plans_ahead_waits_for_its_kernels(monkeypatch):
     monkeypatch.setattr(warm_up, "planning_on_disk", lambda: True)
-    ended = []
+    ended, begun, go_on = [], threading.Event(), threading.Event()
 
     def compiling() -> None:
-        time.sleep(0.2)
+        begun.set()
+        assert go_on.wait(LIMIT_S)
         ended.append("compiled")
 
     monkeypatch.setattr(warm_up, "warm_up_planning", compiling)
@@ -57,9 +49,12 @@ def test_an_episode_whose_tracker_plans_ahead_waits_for_its_kernels(monkeypatch)
             await kernels.ready(episode("ilqr"))
             ended.append("begun")
 
-        await asyncio.gather(begin(), kernels.run_planning())
+        both = asyncio.gather(begin(), kernels.run_planning())
+        await wait_until_async(begun.is_set, "the compiler")
+        assert ended == []
+        go_on.set()
+        await both
 
-    assert is_waiting(KernelWarmUp().ready(episode("ilqr")))
     asyncio.run(episode_while_compiling())
     assert ended == ["compiled", "begun"]
 
@@ -78,7 +73,7 @@ def test_where_kernels_fail_nobody_waits_for_them(monkeypatch, part):
     async def failed() -> None:
         with pytest.raises(RuntimeError, match="no compiler"):
             await (kernels.run(nothing) if part == "run" else kernels.run_planning())
-        await asyncio.wait_for(kernels.ready(episode("ilqr")), 1)
+        await kernels.ready(episode("ilqr"))
 
     asyncio.run(failed())
 
@@ -101,8 +96,7 @@ def test_kernels_of_deformation_are_made_from_the_first_episode_on_that_may_need
         kernels = KernelWarmUp()
         for spec in without:
             await kernels.ready(spec)
-        await asyncio.sleep(0.05)
-        assert made == []
+        assert kernels.deformation._making is None
         for _ in range(2):
             await kernels.ready(crash)
         await kernels.deformation.wait()
@@ -121,7 +115,7 @@ def test_where_kernels_of_deformation_fail_images_are_drawn_all_the_same(monkeyp
 
     async def wait() -> bool:
         kernels = warm_up.DeformationKernels()
-        await asyncio.wait_for(kernels.wait(), 5)
+        await kernels.wait()
         return kernels.ready
 
     assert asyncio.run(wait())
@@ -152,7 +146,7 @@ def test_compiling_begins_before_libraries_are_loaded_where_nothing_is_kept(
 
     process = first_run.take_begun()
     assert (process is None) == bool(kept)
-    assert process is None or process.wait(timeout=30) == 0
+    assert process is None or process.wait(timeout=LIMIT_S) == 0
 
 
 def test_what_names_the_kernel_on_disk_names_it_as_numba_does():
@@ -161,13 +155,13 @@ def test_what_names_the_kernel_on_disk_names_it_as_numba_does():
 
 
 def test_a_worker_that_ends_early_takes_the_second_process_with_it(monkeypatch):
-    monkeypatch.setattr(first_run, "_PROGRAM", "import time; time.sleep(60)")
+    monkeypatch.setattr(first_run, "_PROGRAM", "import time; time.sleep(3600)")
     process = first_run.compile_beside("warm_up")
     monkeypatch.setattr(first_run, "_begun", [process])
 
     async def ended_early() -> None:
         task = asyncio.ensure_future(KernelWarmUp().run(nothing))
-        await asyncio.sleep(0.1)
+        await wait_until_async(lambda: not first_run._begun, "the worker to wait for it")
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task

@@ -9,7 +9,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from tests.server.conftest import box_cloud, make_tiny_scene, standing
 
 from real2sim_proto.jobs import Observations
 from real2sim_server.edit.state import ScenarioState
@@ -28,6 +27,7 @@ from real2sim_server.simulation.embedding import Embedding
 from real2sim_server.simulation.playback import Playback
 from real2sim_server.simulation.presets import ObjectPhysics
 from real2sim_server.simulation.rollout import SimulateOptions, simulate
+from tests.server.conftest import box_cloud, make_tiny_scene, standing
 
 SIZE = (0.8, 0.6, 0.6)
 SOFT = FixedCorotated(young=1e5, poisson=0.3, density=200, viscosity=200)

@@ -65,8 +65,6 @@ async def export_video(
     await asyncio.to_thread(context.folder.mkdir, parents=True, exist_ok=True)
     loop = asyncio.get_running_loop()
     with ThreadPoolExecutor(1, thread_name_prefix="video") as encoder:
-        # The encoder tells no reason where it cannot write; the system does.
-        await asyncio.to_thread((context.folder / VIDEO).touch)
         video = VideoFile(context.folder / VIDEO, request.fps)
         try:
             for index, t_us in enumerate(times):

@@ -265,9 +265,7 @@ class Jobs:
         portable = new.portable and self.work_again is not None
         await self._log.add(info, reply=reply, portable=portable)
         job = self._hold(info, work, portable=portable)
-        job.task = asyncio.create_task(
-            self._run(job, light=new.light), name=info.job_id, context=_waiting_context()
-        )
+        await self._begin(job, light=new.light, context=_waiting_context())
         return info
 
     async def cancel(self, job_id: str) -> JobInfo | None:
@@ -451,7 +449,15 @@ class Jobs:
 
         await self._log.update(info, epoch=epoch)
         job = self._hold(info, work, epoch=epoch, portable=True)
-        job.task = asyncio.create_task(self._run(job, light=False), name=info.job_id)
+        await self._begin(job, light=False)
+
+    async def _begin(
+        self, job: _Job, *, light: bool, context: contextvars.Context | None = None
+    ) -> None:
+        running = self._run(job, light=light)
+        job.task = asyncio.create_task(running, name=job.info.job_id, context=context)
+        # A task that is cancelled before its first step would never put that on record.
+        await asyncio.sleep(0)
 
     def _has_room(self, lane: str) -> bool:
         return not self._turns[lane].locked()

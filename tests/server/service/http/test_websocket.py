@@ -28,6 +28,7 @@ from real2sim_server.service.http.websocket import (
     let_take,
     send_parts,
 )
+from tests.waiting import LIMIT_S, wait_until
 
 pytestmark = pytest.mark.network
 
@@ -57,11 +58,11 @@ def served(talk: Talk, *, deflate: bool = False) -> Iterator[str]:
         yield f"ws://127.0.0.1:{listener.getsockname()[1]}"
     finally:
         server.should_exit = True
-        thread.join(30)
+        thread.join(LIMIT_S)
 
 
 def client(url: str, **options: object):
-    return connect(url, max_size=None, proxy=None, close_timeout=2, **options)
+    return connect(url, max_size=None, proxy=None, **options)
 
 
 def noise(size: int, seed: int = 0) -> bytes:
@@ -104,9 +105,7 @@ def test_a_client_that_reads_late_gets_all_messages_in_order():
         await websocket.receive_bytes()
 
     with served(talk) as url, client(url, max_queue=1) as connection:
-        give_up = time.monotonic() + 30
-        while False not in ways and time.monotonic() < give_up:
-            time.sleep(0.01)
+        wait_until(lambda: False in ways, "the server to wait for the client")
         assert [connection.recv() for _ in messages] == messages
         connection.send(b"thanks")
     assert set(ways) == {True, False}
@@ -126,7 +125,7 @@ def test_the_client_of_a_closed_socket_is_told_to_be_gone():
     with served(talk) as url:
         with client(url):
             pass
-        assert raised.wait(10)
+        assert raised.wait(LIMIT_S)
 
 
 def test_compressed_connections_get_their_messages_by_uvicorn():
@@ -181,10 +180,10 @@ def taken(chunks: list[bytes]) -> tuple[list[bytes], list[bytes]]:
         connection.recv()
         for chunk in chunks:
             connection.socket.sendall(chunk)
-            time.sleep(0.02)
+            time.sleep(0.02)  # so that most arrive by themselves; what comes of them is the same
         connection.send(b"later, the end")
         with contextlib.suppress(ConnectionClosed):
-            connection.recv(20)
+            connection.recv(LIMIT_S)
     return messages, received
 
 

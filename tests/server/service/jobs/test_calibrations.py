@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from .test_simulations import PUSH, edit, finished, scenario
+from ..waiting import finished
+from .test_simulations import PUSH, edit, scenario
 
 __all__ = ["scenario"]
 

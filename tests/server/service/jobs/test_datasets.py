@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import tarfile
-import time
 
 import cv2
 import numpy as np
@@ -14,10 +13,12 @@ import pytest
 from fastapi.testclient import TestClient
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.jobs import JobInfo
 from real2sim_server.scene.io import save_scene
 from real2sim_server.service.app import create_app
 from real2sim_server.settings import Settings
+
+from ..waiting import finished
+from ..waiting import succeeded as job_succeeded
 
 ASKED = {
     "kind": "dataset",
@@ -48,20 +49,8 @@ def client(tiny_scene, tmp_path_factory):
         yield client
 
 
-def finished(client, response) -> dict:
-    assert response.status_code == 202, response.text
-    url = response.headers["Location"]
-    deadline = time.monotonic() + 60
-    while not JobInfo.model_validate(job := client.get(url).json()).over:
-        assert time.monotonic() < deadline, job
-        time.sleep(0.02)
-    return job
-
-
 def succeeded(client, **change) -> dict:
-    job = finished(client, client.post("/v1/exports", json=ASKED | change))
-    assert job["state"] == "succeeded", job
-    return job
+    return job_succeeded(client, client.post("/v1/exports", json=ASKED | change))
 
 
 def file_of(client, job: dict, name: str) -> bytes:

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import time
 from pathlib import Path
 
 import cv2
@@ -16,6 +14,9 @@ from real2sim_server.service.jobs.jobs import JobResult, Jobs, NewJob
 from real2sim_server.service.library.quotas import Quota
 from real2sim_server.service.storage.job_log import JobLog
 from real2sim_server.service.storage.store import Store
+from tests.waiting import LIMIT_S, wait_until_async
+
+from ..waiting import finished, succeeded
 
 VIDEO = {"scene": "tiny", "camera": "front", "width": 64}
 
@@ -45,7 +46,16 @@ def _quota(folder: Path) -> Quota:
 
 
 async def until_over(jobs: Jobs, job: JobInfo) -> JobInfo:
-    return await jobs.wait(job.job_id, 10)
+    return await jobs.wait(job.job_id, LIMIT_S)
+
+
+async def until_states(jobs: Jobs, started: list[JobInfo], states: list[str]) -> None:
+    """Return once jobs are in these states."""
+
+    def now() -> list[str]:
+        return [jobs._jobs[job.job_id].info.state.value for job in started]
+
+    await wait_until_async(lambda: now() == states, lambda: f"{states}: {now()}")
 
 
 async def nothing(_context) -> JobResult:
@@ -85,13 +95,12 @@ def test_cancelling_ends_running_and_waiting_jobs(with_jobs):
     async def work(jobs):
         running = await jobs.start(NewJob("simulate", "a"), for_ever)
         waiting = await jobs.start(NewJob("simulate", "b"), for_ever)
-        await asyncio.sleep(0.05)
-        before = [j.state for j in (await jobs.get(running.job_id), await jobs.get(waiting.job_id))]
-        return before, [await jobs.cancel(j.job_id) for j in (waiting, running)]
+        await until_states(jobs, [running, waiting], ["running", "queued"])
+        for job in (waiting, running):
+            await jobs.cancel(job.job_id)
+        return [await until_over(jobs, job) for job in (waiting, running)]
 
-    before, after = with_jobs(work)
-    assert before == [JobState.RUNNING, JobState.QUEUED]
-    assert [job.state for job in after] == [JobState.CANCELLED] * 2
+    assert [job.state for job in with_jobs(work)] == [JobState.CANCELLED] * 2
 
 
 def test_heavy_jobs_take_turns_and_light_ones_do_not_wait(with_jobs):
@@ -110,16 +119,16 @@ def test_exports_do_not_wait_for_physics_and_two_run_at_a_time(with_jobs):
     async def work(jobs):
         physics = [await jobs.start(NewJob("simulate", "a"), for_ever) for _ in range(2)]
         exports = [await jobs.start(NewJob("export", "a"), for_ever) for _ in range(3)]
-        await asyncio.sleep(0.05)
-        return [(await jobs.get(job.job_id)).state.value for job in physics + exports]
+        expected = ["running", "queued", "running", "running", "queued"]
+        await until_states(jobs, physics + exports, expected)
 
-    assert with_jobs(work) == ["running", "queued", "running", "running", "queued"]
+    with_jobs(work)
 
 
 def test_a_stopped_worker_marks_its_jobs_interrupted(with_jobs):
     async def work(jobs):
         jobs_started = [await jobs.start(NewJob("export", "a"), for_ever) for _ in range(2)]
-        await asyncio.sleep(0.02)
+        await until_states(jobs, jobs_started, ["running"] * 2)
         return jobs_started
 
     started = with_jobs(work)
@@ -162,7 +171,7 @@ def test_events_tell_every_change_in_order(with_jobs):
     async def three_steps(context):
         for share in (0.2, 0.4, 0.6):
             context.progress(share, "stepping")
-            await asyncio.sleep(0.01)
+            await asyncio.sleep(0)
         return JobResult()
 
     async def work(jobs):
@@ -187,19 +196,8 @@ def test_events_go_on_behind_the_last_one_seen(with_jobs):
 # --- over REST --------------------------------------------------------------------------------
 
 
-def finished(client, response) -> dict:
-    assert response.status_code == 202, response.text
-    url = response.headers["Location"]
-    deadline = time.monotonic() + 60
-    while not JobInfo.model_validate(job := client.get(url).json()).over:
-        assert time.monotonic() < deadline, job
-        time.sleep(0.05)
-    return job
-
-
 def test_a_video_of_a_scene_has_a_frame_for_every_instant(client, tmp_path):
-    job = finished(client, client.post("/v1/exports", json=VIDEO | {"fps": 5}))
-    assert job["state"] == "succeeded", job
+    job = succeeded(client, client.post("/v1/exports", json=VIDEO | {"fps": 5}))
     assert job["result"]["frames"] == 11
 
     answer = client.get(f"/v1/jobs/{job['job_id']}/files/video.webm")
@@ -273,18 +271,19 @@ def test_a_finished_job_can_be_removed_with_its_files(client):
     assert client.get(f"{url}/files/video.webm").json()["code"] == ErrorCode.UNKNOWN_JOB
 
 
-def test_a_running_export_can_be_cancelled(client):
-    job = client.post("/v1/exports", json=VIDEO | {"fps": 60, "width": 960}).json()
-    cancelled = client.delete(f"/v1/jobs/{job['job_id']}").json()
-    assert cancelled["state"] == "cancelled"
+def test_a_running_export_can_be_cancelled(client, held_videos):
+    job = client.post("/v1/exports", json=VIDEO)
+    assert held_videos.begun.wait(LIMIT_S)
+    assert client.delete(job.headers["Location"]).status_code == 200
+    assert finished(client, job)["state"] == "cancelled"
 
 
-def test_files_of_a_job_that_is_not_done_are_refused(client):
-    job = client.post("/v1/exports", json=VIDEO | {"fps": 60, "width": 960}).json()
-    answer = client.get(f"/v1/jobs/{job['job_id']}/files/video.webm")
-    assert answer.json()["code"] in {ErrorCode.JOB_NOT_DONE, ErrorCode.JOB_FAILED}
-    with contextlib.suppress(KeyError):
-        client.delete(f"/v1/jobs/{job['job_id']}")
+def test_files_of_a_job_that_is_not_done_are_refused(client, held_videos):
+    job = client.post("/v1/exports", json=VIDEO).headers["Location"]
+    assert client.get(f"{job}/files/video.webm").json()["code"] == ErrorCode.JOB_NOT_DONE
+    client.delete(job)
+    assert finished(client, job)["state"] == "cancelled"
+    assert client.get(f"{job}/files/video.webm").json()["code"] == ErrorCode.JOB_FAILED
 
 
 def test_loading_a_scene_that_takes_long_goes_on_as_a_job(client):

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import time
-
 import cv2
 import numpy as np
 import pytest
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.jobs import JobInfo
+
+from ..waiting import finished
 
 PUSH = {"op": "set_velocity", "object_id": "car_red", "linear": [6.0, 0.0, 0.0]}
 SHORT = {"end_us": 300_000, "frame_us": 100_000, "objects": ["car_red"]}
@@ -22,15 +21,6 @@ def scenario(client) -> str:
 def edit(client, url, *operations) -> None:
     answer = client.post(f"{url}/operations", json={"operations": list(operations)})
     assert answer.status_code == 200, answer.text
-
-
-def finished(client, answer) -> dict:
-    assert answer.status_code == 202, answer.text
-    deadline = time.monotonic() + 120
-    while not JobInfo.model_validate(job := client.get(answer.headers["Location"]).json()).over:
-        assert time.monotonic() < deadline, job
-        time.sleep(0.05)
-    return job
 
 
 def test_a_pushed_car_rolls_on_and_can_be_looked_at(client, scenario):

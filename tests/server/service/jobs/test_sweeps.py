@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import time
 
 import pyarrow.parquet as pq
 import pytest
@@ -16,6 +15,9 @@ from real2sim_server.scenarios.openscenario import read_openscenario_text, write
 from real2sim_server.service.sweeps.files import write_spec
 from real2sim_server.sweeps import load_sweep, run_sweep
 from real2sim_server.world.recording.recording import recording_of_bytes
+from tests.waiting import wait_until
+
+from ..waiting import finished
 
 GAP = {"kind": "float", "low": 6.0, "high": 14.0}
 CUT_IN = {
@@ -29,14 +31,14 @@ CUT_IN = {
 }
 
 
-def over(client, job: dict, seconds: float = 120.0) -> dict:
-    give_up = time.monotonic() + seconds
-    while job["state"] in {"queued", "running"}:
-        if time.monotonic() > give_up:
-            raise TimeoutError(job)
-        time.sleep(0.1)
-        job = client.get(f"/v1/jobs/{job['job_id']}").json()
-    return job
+def over(client, job: dict) -> dict:
+    return finished(client, f"/v1/jobs/{job['job_id']}")
+
+
+def wait_driving(client, job: dict) -> None:
+    """Return once a sweep drives its episodes."""
+    path = f"/v1/jobs/{job['job_id']}"
+    wait_until(lambda: "left" in client.get(path).json()["stage"], lambda: client.get(path).text)
 
 
 def begun(client, **changes) -> dict:
@@ -103,7 +105,7 @@ def test_a_search_leaves_its_failures_and_all_of_it_packed(client, tmp_path):
     ask = {"kind": "search", "episodes": 20, "shrink": 0}
     changes = {"method": ask, "planners": ["follow_route"]}
     body = {name: value for name, value in CUT_IN.items() if name != "worst"} | changes
-    job = over(client, client.post("/v1/sweeps", json=body).json(), 240.0)
+    job = over(client, client.post("/v1/sweeps", json=body).json())
     assert job["state"] == "succeeded", job["error"]
     found = json.loads(left(client, job, "failures.json"))
     assert found["episodes"] == job["result"]["episodes"] == 20
@@ -113,7 +115,7 @@ def test_a_search_leaves_its_failures_and_all_of_it_packed(client, tmp_path):
 
 def test_a_sweep_can_be_cancelled(client):
     job = begun(client, method={"kind": "sobol", "count": 4000})
-    time.sleep(1.0)
+    wait_driving(client, job)
     client.delete(f"/v1/jobs/{job['job_id']}")
     assert over(client, job)["state"] == "cancelled"
 
@@ -121,10 +123,7 @@ def test_a_sweep_can_be_cancelled(client):
 def test_a_stopped_worker_goes_on_where_its_sweep_was(start_worker, run_worker, tmp_path):
     with run_worker() as client:
         job = begun(client, method={"kind": "sobol", "count": 300})
-        give_up = time.monotonic() + 120
-        while "left" not in client.get(f"/v1/jobs/{job['job_id']}").json()["stage"]:
-            assert time.monotonic() < give_up
-            time.sleep(0.1)
+        wait_driving(client, job)
     with run_worker() as client:
         done = over(client, client.get(f"/v1/jobs/{job['job_id']}").json())
         assert (done["state"], done["result"]["episodes"]) == ("succeeded", 600)

@@ -14,6 +14,7 @@ from real2sim_server.scene.io import StagingLimits, import_splats, stage_scene, 
 from real2sim_server.scene.io.formats.spz_container import Header, Streams, write_streams
 from real2sim_server.service.library import imports
 from real2sim_server.service.library.import_queue import MAX_IMPORTS
+from tests.waiting import LIMIT_S
 
 MIB = 1024**2
 
@@ -59,7 +60,7 @@ def test_every_format_is_compared_with_the_limit(tmp_path, tiny_scene, suffix):
 
 
 def test_reading_takes_no_more_than_a_few_times_what_comes_out(tmp_path):
-    tight = StagingLimits(max_bytes=100 * MIB, memory_bytes=400 * MIB, seconds=60)
+    tight = StagingLimits(max_bytes=100 * MIB, memory_bytes=400 * MIB, seconds=600)
     file = many_splats(tmp_path / "many.spz", 400_000)
     # All at the origin: the whole way is gone, and the memory was enough.
     stage_scene(file, tmp_path / "many.r2s", name="many", limits=tight)
@@ -67,7 +68,7 @@ def test_reading_takes_no_more_than_a_few_times_what_comes_out(tmp_path):
 
 def test_what_needs_more_memory_than_allowed_is_refused(tmp_path):
     file = many_splats(tmp_path / "many.spz", 400_000)
-    tight = StagingLimits(max_bytes=100 * MIB, memory_bytes=60 * MIB, seconds=60)
+    tight = StagingLimits(max_bytes=100 * MIB, memory_bytes=60 * MIB, seconds=600)
     with pytest.raises(BundleTooLargeError, match=r"needs more than 60 MiB of memory"):
         stage_scene(file, tmp_path / "many.r2s", name="many", limits=tight)
 
@@ -84,7 +85,7 @@ def test_scenes_load_while_an_import_is_read(client, thing, monkeypatch):
 
     def slow(*arguments, **options):
         reading.set()
-        done.wait(30)
+        done.wait(LIMIT_S)
         staged(*arguments, **options)
 
     monkeypatch.setattr(imports, "stage_scene", slow)
@@ -94,7 +95,7 @@ def test_scenes_load_while_an_import_is_read(client, thing, monkeypatch):
     )
     importer.start()
     try:
-        assert reading.wait(30)
+        assert reading.wait(LIMIT_S)
         loaded = client.put("/v1/scenes/tiny/residency", headers={"Prefer": "wait=20"})
         assert loaded.status_code == 200
     finally:

@@ -16,6 +16,7 @@ from real2sim_server.service.library.assets import AssetLibrary
 from real2sim_server.service.library.memory import MemoryBudget
 from real2sim_server.service.library.scene_cache import SceneCache
 from real2sim_server.service.library.scene_catalog import SceneCatalog
+from tests.waiting import wait_until_async
 
 
 @pytest.fixture
@@ -100,13 +101,13 @@ def test_scenes_and_assets_make_room_for_each_other(tiny_scene, tmp_path):
             await cache.get("street")
             after_scene = (library.held_bytes, cache.held_bytes > 0)
             await asyncio.to_thread(find)
-            await asyncio.sleep(0)
-            await asyncio.sleep(0)
-            return after_scene, (library.held_bytes, cache.held_bytes)
+            after_asset = (large.nbytes, 0)
+            await wait_until_async(
+                lambda: (library.held_bytes, cache.held_bytes) == after_asset, "the scene to go"
+            )
+            return after_scene
         finally:
             cache.close()
             await asyncio.to_thread(engine.stop)
 
-    after_scene, after_asset = asyncio.run(inside())
-    assert after_scene == (0, True)
-    assert after_asset == (large.nbytes, 0)
+    assert asyncio.run(inside()) == (0, True)

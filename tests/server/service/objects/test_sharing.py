@@ -10,9 +10,11 @@ import pytest
 
 from real2sim_server.service import sharing
 from real2sim_server.service.objects.object_store import FolderObjects
+from tests.waiting import LIMIT_S, wait_until
 
 from ..library.test_assets import CUT
-from ..test_trouble import Site, wait_until
+from ..test_trouble import Site
+from ..waiting import succeeded
 
 
 @pytest.fixture(autouse=True)
@@ -45,9 +47,19 @@ def shared(client) -> set[tuple[str, str]]:
     return set(client.app.state.worker.sharing._known)
 
 
+def wait_shared(client, kind: str, name: str) -> None:
+    """Return once the store of objects has it."""
+    wait_until(lambda: (kind, name) in shared(client), f"{kind} {name} to be shared")
+
+
+def wait_status(client, path: str, status: int) -> None:
+    """Return once a GET is answered so."""
+    wait_until(lambda: client.get(path).status_code == status, f"{status} for {path}")
+
+
 def test_a_session_begins_where_its_scene_is_not(start, objects_url):
     first = start("w0", objects_url)
-    wait_until(lambda: ("scene", "tiny") in shared(first))
+    wait_shared(first, "scene", "tiny")
     second = start("w1", objects_url)
     ours, theirs = (
         c.app.state.worker.scene_cache.catalog.scan().get("tiny") for c in (second, first)
@@ -67,10 +79,9 @@ def test_files_of_a_job_are_had_from_any_worker(start, objects_url):
     asked = first.post("/v1/exports", json=body)
     assert asked.status_code == 202, asked.text
     job = asked.headers["Location"]
-    wait_until(lambda: first.get(job).json()["state"] == "succeeded", 60)
-    (name,) = (one["name"] for one in first.get(job).json()["files"])
+    (name,) = (one["name"] for one in succeeded(first, job)["files"])
     there = first.get(f"{job}/files/{name}")
-    wait_until(lambda: ("job", job.rpartition("/")[2]) in shared(first))
+    wait_shared(first, "job", job.rpartition("/")[2])
 
     second = start("w1", objects_url)
     here = second.get(f"{job}/files/{name}")
@@ -81,26 +92,26 @@ def test_files_of_a_job_are_had_from_any_worker(start, objects_url):
     assert signed.status_code == (307 if objects_url.startswith("s3") else 200)
 
     assert second.delete(job).status_code == 204
-    wait_until(lambda: ("job", job.rpartition("/")[2]) not in shared(second))
+    wait_until(lambda: ("job", job.rpartition("/")[2]) not in shared(second), "its files to go")
 
 
 def test_an_asset_is_everywhere_and_gone_everywhere(start):
     first, second = start("w0"), start("w1")
     assert first.post("/v1/assets", json=CUT).status_code == 201
-    wait_until(lambda: second.get("/v1/assets/red").status_code == 200)
+    wait_status(second, "/v1/assets/red", 200)
     assert second.get("/v1/assets/red").json() == first.get("/v1/assets/red").json()
     assert second.delete("/v1/assets/red").status_code == 204
-    wait_until(lambda: first.get("/v1/assets/red").status_code == 404)
+    wait_status(first, "/v1/assets/red", 404)
     # Its id may be given again, to something else.
     again = CUT | {"object_id": "post"}
     assert first.post("/v1/assets", json=again).status_code == 201
-    wait_until(lambda: second.get("/v1/assets/red").status_code == 200)
+    wait_status(second, "/v1/assets/red", 200)
     assert second.get("/v1/assets/red").json() == first.get("/v1/assets/red").json()
 
 
 def test_a_store_of_objects_that_is_gone_is_told_and_may_come_back(start, monkeypatch, tmp_path):
     first = start("w0")
-    wait_until(lambda: ("scene", "tiny") in shared(first))
+    wait_shared(first, "scene", "tiny")
     second = start("w1")
     hidden = tmp_path / "hidden"
     (tmp_path / "objects").rename(hidden)
@@ -116,17 +127,17 @@ def test_no_step_waits_for_the_store_of_objects(start, monkeypatch):
 
     def stuck(self, file, digest) -> None:
         waiting.set()
-        assert released.wait(60)
+        assert released.wait(LIMIT_S)
         put(self, file, digest)
 
     client = start("w0")
     site = Site(client)
-    wait_until(lambda: ("scene", "tiny") in shared(client))
+    wait_shared(client, "scene", "tiny")
     monkeypatch.setattr(FolderObjects, "put", stuck)
     assert client.post("/v1/assets", json=CUT).status_code == 201
-    assert waiting.wait(30)
+    assert waiting.wait(LIMIT_S)
     assert [site.step().status_code for _ in range(5)] == [200] * 5
     assert site.edit().status_code == 200
     assert ("asset", "red") not in shared(client)
     released.set()
-    wait_until(lambda: ("asset", "red") in shared(client))
+    wait_shared(client, "asset", "red")

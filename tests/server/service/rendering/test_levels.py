@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 
 import pytest
 
@@ -17,6 +16,7 @@ from real2sim_server.service.library.memory import MemoryBudget
 from real2sim_server.service.rendering.levels import DetailLevels
 
 from ...conftest import make_tiny_scene
+from ..waiting import wait_ready
 
 SMALL = {"action": "control", "sensors": [{"camera": "front", "detail": "auto"}]}
 
@@ -47,8 +47,7 @@ def make_ready(scene, levels: DetailLevels, **sensor: object) -> None:
 
 @pytest.mark.network
 def test_a_session_with_a_small_camera_waits_for_them_and_the_engine_does_not(client, makers):
-    while client.get("/readyz").status_code != 200:
-        time.sleep(0.05)
+    wait_ready(client)
     makers.clear()
     made = client.post("/v1/sessions", params={"scene": "tiny"}, json={"reset": SMALL})
     assert made.status_code == 201, made.text
@@ -71,8 +70,7 @@ def test_a_session_with_a_small_camera_waits_for_them_and_the_engine_does_not(cl
 
 @pytest.mark.network
 def test_an_edit_of_a_running_world_waits_for_them_and_the_engine_does_not(client, makers):
-    while client.get("/readyz").status_code != 200:
-        time.sleep(0.05)
+    wait_ready(client)
     made = client.post("/v1/sessions", params={"scene": "tiny"}, json={"reset": SMALL}).json()
     session = f"/v1/sessions/{made['session_id']}"
     headers = {"Authorization": f"Bearer {made['token']}"}

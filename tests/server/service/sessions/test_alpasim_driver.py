@@ -13,11 +13,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.waiting import LIMIT_S
 
 import real2sim
 from real2sim.planners import run_episode
 from real2sim.planners.alpasim import AlpasimDriver
+from tests.waiting import LIMIT_S
 
 pytestmark = [pytest.mark.network]
 

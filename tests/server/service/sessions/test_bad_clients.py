@@ -8,11 +8,11 @@ import socket as sockets
 
 import pytest
 import websockets
-from tests.waiting import wait_until
 from websockets.sync.client import connect
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, encode
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.network
 

@@ -6,12 +6,12 @@ import zlib
 
 import numpy as np
 import pytest
-from tests.waiting import wait_until
 
 import real2sim
 from real2sim_proto import decode
 from real2sim_server.render.cast.warm_up import warm_up_casting
 from real2sim_server.world.recording.recording import load_recording
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.network
 

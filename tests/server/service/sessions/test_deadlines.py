@@ -9,9 +9,9 @@ import contextlib
 from collections.abc import Iterator
 
 import pytest
-from tests.waiting import wait_until
 
 import real2sim
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.network
 

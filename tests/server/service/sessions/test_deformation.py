@@ -5,11 +5,11 @@ from __future__ import annotations
 import threading
 
 import pytest
-from tests.waiting import LIMIT_S
 
 from real2sim_server.service import warm_up
 from real2sim_server.service.warm_up import DeformationKernels
 from real2sim_server.world.collision.deformation import DeformationTracker
+from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.network
 

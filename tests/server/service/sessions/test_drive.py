@@ -8,13 +8,13 @@ from weakref import WeakSet
 
 import numpy as np
 import pytest
-from tests.waiting import LIMIT_S
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode
 from real2sim_proto.drive import SERVER_MESSAGE
 from real2sim_server.service.engine import QueueFullError
 from real2sim_server.service.http.websocket import try_send_parts
 from real2sim_server.service.sessions import handshake
+from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.network
 

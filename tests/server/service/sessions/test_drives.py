@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from tests.waiting import wait_until
 from typer.testing import CliRunner
 
 import real2sim
 from real2sim.cli import build_app
 from real2sim_server.service.sessions.clock_hold import ClockHold
 from real2sim_server.world.recording.recording import recording_of_bytes
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.network
 

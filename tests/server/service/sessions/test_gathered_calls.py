@@ -9,9 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
-from tests.waiting import LIMIT_S
 
 from real2sim_server.service.sessions.gathered_calls import MOST_TOGETHER, GatheredCalls, attempt
+from tests.waiting import LIMIT_S
 
 
 class Work:

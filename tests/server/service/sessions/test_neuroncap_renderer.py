@@ -24,13 +24,13 @@ import httpx2
 import numpy as np
 import pytest
 import torch
-from tests.waiting import LIMIT_S
 
 import real2sim
 from real2sim.planners.peer import PeerError
 from real2sim.renderers.neuroncap import NeuroNcapRenderer
 from real2sim.renderers.scene_link import SceneLink
 from real2sim_server.geometry.transform import invert_transform
+from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.network
 

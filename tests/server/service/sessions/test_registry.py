@@ -7,10 +7,10 @@ import sqlite3
 import tracemalloc
 
 import pytest
-from tests.waiting import wait_until
 
 from real2sim_proto import decode, encode
 from real2sim_server.render import RenderError
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.network
 

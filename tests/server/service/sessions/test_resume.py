@@ -11,11 +11,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from tests.waiting import LIMIT_S
 
 import real2sim
 from real2sim_server.render.cast.warm_up import warm_up_casting
 from real2sim_server.scene.io import save_scene
+from tests.waiting import LIMIT_S
 
 from ...worker_processes import KillableWorker, killable_worker
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.waiting import wait_until
 
 import real2sim
 from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
@@ -24,6 +23,7 @@ from real2sim_server.service.sessions.image_limits import MAX_IMAGE_BYTES
 from real2sim_server.service.sessions.segment import SLOTS, Segment, Segments, sweep_segments
 from real2sim_server.service.sessions.wire import PhaseTimer, pack_members, pack_with_frames
 from real2sim_server.settings import Settings
+from tests.waiting import wait_until
 
 pytestmark = [
     pytest.mark.network,
@@ -135,7 +135,8 @@ def test_images_that_lie_in_memory_count_as_sent_to_the_holder_of_the_token(atta
     answer = planner.ask("action", step=0, plan=CONTROL, slot=1)
     pixels = 96 * 64
     assert all("offset" in frame for frame in answer["frames"])
-    wait_until(lambda: account.sent_bytes - before > pixels * (3 + 4 + 2))
+    most = pixels * (3 + 4 + 2)
+    wait_until(lambda: account.sent_bytes - before > most, "all bytes to be counted")
 
 
 def test_nobody_else_opens_the_file(site, join):
@@ -186,7 +187,7 @@ def test_memory_is_counted_and_free_once_the_client_is_gone(attached, site):
     planner.ask("reset", spec={"sensors": SENSORS}, slot=0)
     assert segments.held_bytes >= 64 * 96 * 9
     planner.socket.socket.shutdown(socket.SHUT_RDWR)
-    wait_until(lambda: segments.held_bytes == 0)
+    wait_until(lambda: segments.held_bytes == 0, "the memory to be given back")
 
 
 # --- the SDK ------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_server.service.storage import tables
-from real2sim_server.service.storage.errors import StoreFullError
+from real2sim_server.service.storage.errors import StoreFullError, StoreUnavailableError
 from real2sim_server.service.storage.job_log import JobLog
 from real2sim_server.service.storage.session_log import ClaimedEntries
 from real2sim_server.service.storage.store import (
@@ -352,6 +352,25 @@ def test_a_write_without_space_leaves_the_connection_for_readers_and_later_write
 
     before, after = run(sqlite_url, fill)
     assert (len(before), len(after)) == (0, 1)
+
+
+def test_a_store_in_trouble_refuses_without_asking_its_database(sqlite_url, monkeypatch):
+    def ask(*_arguments, **_options):
+        raise AssertionError
+
+    async def work(store):
+        await store.create_scenario(SCENARIO)
+        database = store.database
+        monkeypatch.setattr(database, "_executed", ask)
+        monkeypatch.setattr(database, "_connected", ask)
+        database._noted(StoreUnavailableError("gone"))
+        with pytest.raises(StoreUnavailableError):
+            store.record_revision("sc_1", 1, entry("a"), created_us=1)
+        with pytest.raises(StoreUnavailableError):
+            await store.scenario_entries("sc_1")
+        monkeypatch.undo()
+
+    run(sqlite_url, work)
 
 
 def action(seq: int) -> SessionEntry:
