@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SOURCES := proto client server tests scripts docs/conf.py docs/images/make.py
-PYTEST := $(BIN)/python -m pytest -q
+# Not quiet: the first lines say the seed of the random order; --randomly-seed=N repeats it.
+PYTEST := $(BIN)/python -m pytest
 # One process more than cores, since many tests wait: for a worker, a time limit, a page.
 PARALLEL := -n $(shell $(PYTHON) -c "import os; print(min(4, os.cpu_count() + 1))") --dist loadfile
 
@@ -18,7 +19,7 @@ WITH_TORCH := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cub
 	nvidia-cufile nvidia-curand nvidia-cusolver nvidia-cusparse nvidia-cusparselt-cu13 \
 	nvidia-nccl-cu13 nvidia-nvjitlink nvidia-nvshmem-cu13 nvidia-nvtx
 
-.PHONY: demo check test kernels kernels-drawing kernels-physics test-slow lint lint-studio format schema coverage bench pins docs clean
+.PHONY: demo check test kernels kernels-drawing kernels-physics test-slow system-packages lint lint-studio format schema coverage bench pins docs clean
 
 demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
@@ -37,6 +38,12 @@ kernels-drawing kernels-physics: kernels-%: $(STAMP)
 
 test-slow: $(STAMP)
 	$(PYTEST) -n 0 --run-slow -m "slow or gpu or ray"
+
+# Programs that some tests start, from Debian's packages; where one is missing its tests skip.
+system-packages:
+	apt-get -qq update
+	DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends \
+	  chromium postgresql haproxy
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(SOURCES)
