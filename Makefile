@@ -19,7 +19,7 @@ WITH_TORCH := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cub
 	nvidia-cufile nvidia-curand nvidia-cusolver nvidia-cusparse nvidia-cusparselt-cu13 \
 	nvidia-nccl-cu13 nvidia-nvjitlink nvidia-nvshmem-cu13 nvidia-nvtx
 
-.PHONY: demo check test kernels kernels-drawing kernels-physics test-slow system-packages lint lint-studio format schema coverage bench pins docs clean
+.PHONY: demo check test kernels kernels-drawing kernels-learning kernels-physics test-slow system-packages lint lint-studio format schema coverage bench pins docs clean
 
 demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
@@ -30,10 +30,10 @@ check: lint
 test: $(STAMP)
 	$(PYTEST) $(PARALLEL)
 
-# Compiled kernels, by two processes beside one another with make -j; tests find them on disk.
-kernels: kernels-physics kernels-drawing
+# Compiled kernels, by processes beside one another with make -j; tests find them on disk.
+kernels: kernels-physics kernels-drawing kernels-learning
 
-kernels-drawing kernels-physics: kernels-%: $(STAMP)
+kernels-drawing kernels-learning kernels-physics: kernels-%: $(STAMP)
 	$(BIN)/python scripts/compile_kernels.py $*
 
 test-slow: $(STAMP)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import os
 
 import pytest
+
+from tests.waiting import LIMIT_S, wait_until
+
+from ..worker_processes import start_real2sim
 
 
 @pytest.fixture
@@ -18,16 +21,29 @@ def following(tmp_path, scene_folder):
         "method": {"kind": "sobol", "count": 1_000},
     }
     (tmp_path / "sweep.json").write_text(json.dumps(spec))
+    read, log_file = tmp_path / "input", tmp_path / "output"
+    os.mkfifo(read)
     options = ["--out", tmp_path / "out", "--scenes", scene_folder, "--follow"]
-    command = [sys.executable, "-m", "real2sim", "sweep", tmp_path / "sweep.json", *options]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe) as process:
-        yield process
+    process = start_real2sim(
+        [str(word) for word in ("sweep", tmp_path / "sweep.json", *options)],
+        log_file=log_file,
+        before=f"os.dup2(os.open({str(read)!r}, os.O_RDONLY), 0)",
+    )
+    try:
+        with read.open("wb") as standard_input:
+            yield process, standard_input, log_file
+    finally:
         process.kill()
+        process.join()
 
 
 def test_it_tells_how_far_it_is_and_ends_with_its_standard_input(following):
-    told = [json.loads(following.stdout.readline()) for _ in range(2)]
+    process, standard_input, log_file = following
+    wait_until(
+        lambda: log_file.exists() and log_file.read_text().count("\n") >= 2, "two lines of progress"
+    )
+    told = [json.loads(line) for line in log_file.read_text().splitlines()[:2]]
     assert told == [{"stage": "episodes", "done": done, "total": 1_000} for done in (1, 2)]
-    following.stdin.close()
-    assert following.wait() == 1
+    standard_input.close()
+    process.join(LIMIT_S)
+    assert process.exitcode == 1

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
-import sys
-from pathlib import Path
 
+import httpx2
 import pytest
+
+from ...worker_processes import KillableWorker
 
 pytestmark = pytest.mark.network
 
@@ -69,14 +69,18 @@ def test_while_others_drive(site, join):
     assert fingerprint(join(site.create())) == alone
 
 
-def test_in_a_new_process_with_another_number_of_threads(site, join):
+def test_in_a_new_process_with_another_number_of_threads(site, join, tmp_path):
     here = fingerprint(join(site.create()))
-    program = Path(__file__).with_name("drive_elsewhere.py")
-    done = subprocess.run(
-        [sys.executable, str(program), str(site.worker.settings.scenes_path)],
-        capture_output=True,
-        text=True,
-        check=False,
+    worker = KillableWorker(
+        scenes=site.worker.settings.scenes_path,
+        data=tmp_path / "data",
+        log_file=tmp_path / "log",
+        settings={"REAL2SIM_THREADS": "1"},
     )
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout.splitlines()[-1]) == here
+    worker.start()
+    try:
+        worker.wait_ready()
+        answer = httpx2.post(f"{worker.url}/v1/sessions?scene=tiny", timeout=60)
+        assert fingerprint(join(answer.raise_for_status().json())) == here
+    finally:
+        worker.kill()

@@ -47,7 +47,7 @@ def test_the_picture_has_most_of_the_page_and_panels_keep_the_size_they_are_give
     assert size(studio, "#stage")[0] < 600
 
 
-def test_panels_are_a_list_of_tabs_walked_by_arrow_keys(studio):
+def test_panels_are_tabs_walked_by_arrow_keys_and_cameras_stand_in_the_order_they_look(studio):
     studio.focus("[role=tab][aria-selected=true]")
     for _ in range(2):
         studio.keyboard.press("ArrowDown")
@@ -57,6 +57,16 @@ def test_panels_are_a_list_of_tabs_walked_by_arrow_keys(studio):
     assert studio.locator("[role=tab][aria-selected=true]").count() == 1
     visible = studio.locator("[role=tabpanel]:visible").get_attribute("aria-labelledby")
     assert visible == studio.evaluate("document.activeElement.id")
+    order = studio.evaluate(
+        "[...document.querySelectorAll('#cameras button')].map(b => b.dataset.camera)"
+    )
+    angles = shown(
+        studio,
+        "Object.fromEntries(model.scene.cameras.map((c) =>"
+        " [c.name, Math.atan2(c.T_vehicle_camera[1][2], c.T_vehicle_camera[0][2])]))",
+    )
+    ahead = [angles[name] for name in order[:-1] if abs(angles[name]) <= 1.6]
+    assert ahead == sorted(ahead, reverse=True)
 
 
 def test_axe_finds_nothing_serious_in_any_panel(studio):
@@ -127,19 +137,6 @@ def test_two_fingers_zoom_the_map_and_a_cancelled_drag_changes_nothing(studio):
     )
     assert shown(studio, "model.draft") is None
     kept(studio, 0)
-
-
-def test_cameras_stand_in_the_order_in_which_they_look(studio):
-    order = studio.evaluate(
-        "[...document.querySelectorAll('#cameras button')].map(b => b.dataset.camera)"
-    )
-    angles = shown(
-        studio,
-        "Object.fromEntries(model.scene.cameras.map((c) =>"
-        " [c.name, Math.atan2(c.T_vehicle_camera[1][2], c.T_vehicle_camera[0][2])]))",
-    )
-    ahead = [angles[name] for name in order[:-1] if abs(angles[name]) <= 1.6]
-    assert ahead == sorted(ahead, reverse=True)
 
 
 def test_a_wrong_link_leads_to_a_page_that_says_what_to_do(visit, running):

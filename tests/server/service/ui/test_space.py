@@ -73,12 +73,20 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / error))
 
 
-def test_the_page_draws_what_the_worker_draws(studio, running):
+def test_the_page_draws_what_the_worker_draws_and_goes_round_where_no_object_is(studio, running):
     page = opened(studio)
     ours, exact = drawn(page), of_worker(page, running)
     assert ours.shape == exact.shape
     assert exact.std() > 10
     assert psnr(ours, exact) > LEAST_PSNR
+    before = shown(page, "model.free")
+    box = page.locator("#stage").bounding_box()
+    drag(page, (box["x"] + 40, box["y"] + 20), (60, 0))
+    after = shown(page, "model.free")
+    assert np.abs(np.subtract(after, before)).max() > 0.1
+    assert shown(page, "model.scenario.revision") == 0
+    R = np.reshape(after, (4, 4))[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
 
 
 def middle_of(page: Any, name: str) -> tuple[float, float]:
@@ -106,18 +114,6 @@ def test_a_dragged_object_moves_at_once_and_makes_one_edit(studio):
     after = shown(page, place)
     assert np.hypot(after[0] - before[0], after[1] - before[1]) > 0.3
     assert shown(page, "model.history.entries.length") == 1
-
-
-def test_what_is_dragged_beside_objects_goes_round_and_edits_nothing(studio):
-    page = opened(studio)
-    before = shown(page, "model.free")
-    box = page.locator("#stage").bounding_box()
-    drag(page, (box["x"] + 40, box["y"] + 20), (60, 0))
-    after = shown(page, "model.free")
-    assert np.abs(np.subtract(after, before)).max() > 0.1
-    assert shown(page, "model.scenario.revision") == 0
-    R = np.reshape(after, (4, 4))[:3, :3]
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
 
 
 def test_the_ring_of_an_object_turns_it(studio):
@@ -206,19 +202,17 @@ CONVERGES = """async ([each, total]) => {
 }"""
 
 
-@pytest.mark.parametrize("each", [4e-3, 4e-4])
-def test_what_moves_shows_as_much_as_comes_in_time_and_all_of_it_at_rest(page, each):
+def test_what_moves_shows_as_much_as_comes_in_time_and_all_of_it_at_rest(page):
     total = 360_000
-    told = page.evaluate(CONVERGES, [each, total])
-    assert told["moving"]["share"] < 0.5
-    assert told["moving"]["scale"] < 1
-    assert told["moving"]["shown"] * each < 70 or told["moving"]["shown"] <= 16384
-    assert told["steps"] == sorted(told["steps"])
-    assert told["steps"][-1] == total
-    assert told["after"] == pytest.approx(told["moving"]["share"])
-
-
-def test_where_all_of_it_comes_in_time_all_of_it_moves(page):
+    for each in (4e-3, 4e-4):
+        told = page.evaluate(CONVERGES, [each, total])
+        assert told["moving"]["share"] < 0.5
+        assert told["moving"]["scale"] < 1
+        assert told["moving"]["shown"] * each < 70 or told["moving"]["shown"] <= 16384
+        assert told["steps"] == sorted(told["steps"])
+        assert told["steps"][-1] == total
+        assert told["after"] == pytest.approx(told["moving"]["share"])
+    # Where all of it comes in time, all of it moves.
     told = page.evaluate(CONVERGES, [1e-5, 360_000])
     assert told["moving"] == {"share": 1, "scale": 1, "shown": 360_000}
     assert told["steps"] == []
