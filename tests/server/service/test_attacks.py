@@ -14,9 +14,9 @@ import resource
 import signal
 import socket
 import threading
-import time
 from base64 import b64encode
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -35,19 +35,18 @@ from real2sim_server.service.routes import view as view_route
 from real2sim_server.service.serve import RunningWorker, running_worker
 from real2sim_server.service.sessions import handshake
 from real2sim_server.settings import Settings
+from tests.waiting import LIMIT_S, wait_until
 
 from ..worker_processes import printed_url, start_real2sim
+from .waiting import wait_ready
 
 TOKEN = "a long enough secret"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
-WAIT_S = 30
-"""For what takes a second or two."""
-
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory, tiny_scene) -> Iterator[RunningWorker]:
-    """A worker with a token on a real socket; connections may wait a second."""
+    """A worker with a token on a real socket, whose connections may wait for long."""
     root = tmp_path_factory.mktemp("attacked")
     save_scene(tiny_scene, root / "scenes" / "tiny.r2s")
     settings = Settings(
@@ -55,9 +54,9 @@ def site(tmp_path_factory, tiny_scene) -> Iterator[RunningWorker]:
         port=0,
         backend="cpu",
         token=TOKEN,
-        head_seconds=1,
-        body_seconds=1,
-        write_seconds=1,
+        head_seconds=600,
+        body_seconds=600,
+        write_seconds=600,
         max_connections=12,
     )
     with running_worker(settings) as running:
@@ -66,7 +65,7 @@ def site(tmp_path_factory, tiny_scene) -> Iterator[RunningWorker]:
 
 def opened(url: str) -> socket.socket:
     host, port = re.fullmatch(r"http://([^:]+):(\d+)", url).groups()
-    return socket.create_connection((host, int(port)), timeout=WAIT_S)
+    return socket.create_connection((host, int(port)), timeout=LIMIT_S)
 
 
 def read_to_end(connection: socket.socket) -> bytes:
@@ -114,79 +113,109 @@ def test_metrics_are_written_on_another_thread(client, monkeypatch):
 # --- connections that wait --------------------------------------------------------------------
 
 
+class Received:
+    """A client's connection as the worker has it."""
+
+    def __init__(self, site: RunningWorker, connection: socket.socket, monkeypatch: Any) -> None:
+        self._connections, self._client = site.worker.connections, connection.getsockname()
+        self._monkeypatch = monkeypatch
+        self.protocol: Any = wait_until(self._found, "the worker to accept the connection")
+
+    def _found(self) -> Any:
+        open_now = list(self._connections._open)
+        return next((c for c in open_now if c.client == self._client), None)
+
+    def wait_received(self, size: int) -> None:
+        """Return once the worker has so many bytes of the request."""
+        wait_until(lambda: self.protocol._received == size, f"{size} bytes to arrive")
+
+    def time_out(self) -> None:
+        """Nothing is waited for any more."""
+        hasty = replace(self._connections.limits, head_s=0.0, body_s=0.0)
+        self._monkeypatch.setattr(self._connections, "limits", hasty)
+
+
 @pytest.mark.network
-def test_a_silent_connection_is_closed(site):
+def test_a_silent_connection_is_closed(site, monkeypatch):
     with opened(site.url) as connection:
+        Received(site, connection, monkeypatch).time_out()
         assert read_to_end(connection) == b""
 
 
 @pytest.mark.network
-def test_headers_that_never_end_are_answered_and_closed(site):
+def test_headers_that_never_end_are_answered_and_closed_also_where_they_trickle(site, monkeypatch):
+    head = b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
     with opened(site.url) as connection:
-        connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: ")
+        received, began = Received(site, connection, monkeypatch), set()
+        for size, part in ((len(head), head), (len(head) + 1, b"a"), (len(head) + 2, b"a")):
+            connection.sendall(part)
+            received.wait_received(size)
+            began.add(received.protocol._head_since)
+        assert len(began) == 1
+        received.time_out()
         answer = read_to_end(connection)
     assert status_of(answer) == 408
     assert b"REQUEST_TIMEOUT" in answer
 
 
 @pytest.mark.network
-def test_headers_that_trickle_are_closed_too(site):
-    with opened(site.url) as connection:
-        connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: ")
-        connection.settimeout(0.2)
-        ended, answer = time.monotonic() + WAIT_S, b""
-        while not answer and time.monotonic() < ended:
-            connection.sendall(b"a")
-            with contextlib.suppress(TimeoutError):
-                answer = connection.recv(65536)
-    assert status_of(answer) == 408
-
-
-@pytest.mark.network
-def test_a_body_that_never_comes_is_answered_and_closed(site):
+def test_a_body_that_never_comes_is_answered_and_closed(site, monkeypatch):
     head = (
         f"POST /v1/scenarios HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
         "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{"
     )
     with opened(site.url) as connection:
+        received = Received(site, connection, monkeypatch)
         connection.sendall(head.encode())
+        received.wait_received(len(head))
+        received.time_out()
         answer = read_to_end(connection)
     assert status_of(answer) == 408
     assert b"Content-Security-Policy" in answer
 
 
 @pytest.mark.network
-def test_a_second_request_that_stays_half_sent_is_closed(site):
+def test_a_second_request_that_stays_half_sent_is_closed(site, monkeypatch):
     with opened(site.url) as connection:
+        received = Received(site, connection, monkeypatch)
         connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET /li")
         connection.sendall(b"v")
+        received.wait_received(len(b"GET /liv"))
+        received.time_out()
         answers = read_to_end(connection)
     assert answers.startswith(b"HTTP/1.1 200")
+    assert answers.count(b"HTTP/1.1 408") == 1
+
+
+@pytest.fixture
+def hasty(site, monkeypatch) -> RunningWorker:
+    """The same worker; who reads nothing for half a second is given up."""
+    connections = site.worker.connections
+    monkeypatch.setattr(connections, "limits", replace(connections.limits, write_s=0.5))
+    return site
 
 
 @pytest.mark.network
-def test_a_client_that_never_reads_is_given_up(site):
+def test_a_client_that_never_reads_is_given_up(hasty):
     request = b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-    with opened(site.url) as connection:
+    before = dropped(hasty, "write_timeout")
+    with opened(hasty.url) as connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         for _ in range(100):
             connection.sendall(request)
-        ended = time.monotonic() + WAIT_S
-        while dropped(site, "write_timeout") == 0:
-            assert time.monotonic() < ended
-            time.sleep(0.05)
+        wait_until(lambda: dropped(hasty, "write_timeout") > before, "it to be given up")
 
 
 @pytest.mark.network
-def test_a_driver_that_never_reads_is_given_up(site):
-    before = dropped(site, "write_timeout")
-    info = create_session(site)
+def test_a_driver_that_never_reads_is_given_up(hasty):
+    before = dropped(hasty, "write_timeout")
+    info = create_session(hasty)
     render = {"v": 1, "type": "render", "sensors": [{"camera": "front", "codec": "raw"}]}
     with contextlib.suppress(ConnectionClosed), joined(info, max_queue=1) as drive:
         drive.send(encode({"v": 1, "type": "reset", "id": 2, "spec": {}}))
         for k in range(5000):
             drive.send(encode(render | {"id": 3 + k}))
-    assert dropped(site, "write_timeout") > before
+    wait_until(lambda: dropped(hasty, "write_timeout") > before, "it to be given up")
 
 
 @pytest.mark.network
@@ -209,7 +238,7 @@ def test_silent_connections_make_room_for_those_who_ask(site):
     with contextlib.ExitStack() as stack:
         for _ in range(30):
             stack.enter_context(opened(site.url))
-        assert httpx2.get(f"{site.url}/livez", timeout=WAIT_S).status_code == 200
+        assert httpx2.get(f"{site.url}/livez", timeout=LIMIT_S).status_code == 200
     assert dropped(site, "crowded_out") > before
 
 
@@ -220,14 +249,14 @@ def test_sockets_stay_when_silent_connections_crowd(site):
         for _ in range(30):
             stack.enter_context(opened(site.url))
         drive.send(encode({"v": 1, "type": "reset", "id": 2, "spec": {}}))
-        assert drive.recv(timeout=WAIT_S)
+        assert drive.recv(timeout=LIMIT_S)
 
 
 @pytest.mark.network
 def test_where_all_connections_work_another_is_refused_with_503(make_settings, kernels):
     with running_worker(make_settings(max_connections=2)) as running:
         url = f"{running.url}/v1/sessions?scene=tiny"
-        info = httpx2.post(url, headers={"Connection": "close"}, timeout=WAIT_S).json()
+        info = httpx2.post(url, headers={"Connection": "close"}, timeout=LIMIT_S).json()
         with joined(info), joined(info, role="observer"), opened(running.url) as third:
             answer = read_to_end(third)
     assert status_of(answer) == 503
@@ -239,8 +268,8 @@ def test_a_thousand_silent_and_half_open_connections_lock_nobody_out(tmp_path, t
     wanted = 1000
     allow_descriptors(wanted + 200)
     save_scene(tiny_scene, tmp_path / "scenes" / "tiny.r2s")
-    with worker_process(tmp_path, descriptors=1024) as (url, errors):
-        answer = httpx2.post(f"{url}/v1/sessions?scene=tiny", timeout=WAIT_S)
+    with worker_process(tmp_path, descriptors=1024) as (url, log):
+        answer = httpx2.post(f"{url}/v1/sessions?scene=tiny", timeout=LIMIT_S)
         with joined(answer.json()) as drive, contextlib.ExitStack() as stack:
             for k in range(wanted):
                 connection = stack.enter_context(opened(url))
@@ -252,14 +281,16 @@ def test_a_thousand_silent_and_half_open_connections_lock_nobody_out(tmp_path, t
                         b"Content-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
                     )
             drive.send(encode({"v": 1, "type": "reset", "id": 2, "spec": {}}))
-            assert drive.recv(timeout=WAIT_S)
+            assert drive.recv(timeout=LIMIT_S)
             for _ in range(5):
-                assert httpx2.get(f"{url}/livez", timeout=WAIT_S).status_code == 200
-            time.sleep(1.5)  # the log is told once a second
-    entries = [json.loads(line) for line in errors if line.startswith("{")]
-    assert any(e["event"] == "connections near their limit" for e in entries)
-    told = [e["reasons"] for e in entries if e["event"] == "connections dropped"]
-    assert sum(reasons.get("crowded_out", 0) for reasons in told) > 100
+                assert httpx2.get(f"{url}/livez", timeout=LIMIT_S).status_code == 200
+
+            def crowded_out() -> int:
+                told = [e for e in log.entries() if e["event"] == "connections dropped"]
+                return sum(e["reasons"].get("crowded_out", 0) for e in told)
+
+            wait_until(lambda: crowded_out() > 100, "the log to tell of them")
+    assert any(e["event"] == "connections near their limit" for e in log.entries())
 
 
 def allow_descriptors(count: int) -> None:
@@ -270,9 +301,21 @@ def allow_descriptors(count: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (count, hard))
 
 
+@dataclass(frozen=True)
+class JsonLog:
+    """What a worker has logged up to now."""
+
+    file: Path
+
+    def entries(self) -> list[dict[str, Any]]:
+        # Whole lines: it may be writing one.
+        lines = [line for line in self.file.read_text().splitlines(True) if line.endswith("\n")]
+        return [json.loads(line) for line in lines if line.startswith("{")]
+
+
 @contextlib.contextmanager
-def worker_process(folder: Path, *, descriptors: int) -> Iterator[tuple[str, list[str]]]:
-    """A worker of its own; its address, and after the block the lines of its log."""
+def worker_process(folder: Path, *, descriptors: int) -> Iterator[tuple[str, JsonLog]]:
+    """A worker of its own: its address and its log."""
     limit = f"({descriptors}, {descriptors})"
     log_file = folder / "worker.log"
     process = start_real2sim(
@@ -285,23 +328,19 @@ def worker_process(folder: Path, *, descriptors: int) -> Iterator[tuple[str, lis
         },
         before=f"import resource; resource.setrlimit(resource.RLIMIT_NOFILE, {limit})",
     )
-    url = printed_url(process, log_file)
-    ended = time.monotonic() + 120
-    while httpx2.get(f"{url}/readyz", timeout=120).status_code != 200:
-        assert time.monotonic() < ended
-        time.sleep(0.1)
-    lines: list[str] = []
     try:
-        yield url, lines
+        url = printed_url(process, log_file)
+        ready = f"{url}/readyz"
+        wait_until(lambda: httpx2.get(ready, timeout=LIMIT_S).status_code == 200, "the worker")
+        yield url, JsonLog(log_file)
     finally:
         os.kill(process.pid, signal.SIGTERM)
-        process.join(60)
-        lines.extend(log_file.read_text().splitlines())
+        process.join(LIMIT_S)
 
 
 def create_session(site: RunningWorker) -> dict[str, Any]:
     url = f"{site.url}/v1/sessions?scene=tiny"
-    return httpx2.post(url, headers=BEARER, timeout=WAIT_S).json()
+    return httpx2.post(url, headers=BEARER, timeout=LIMIT_S).json()
 
 
 @contextlib.contextmanager
@@ -312,7 +351,7 @@ def joined(info: dict[str, Any], *, role: str = "controller", **options: Any) ->
     ) as drive:
         hello = {"protocols": [DRIVE_SUBPROTOCOL], "token": info["token"], "role": role}
         drive.send(encode({"v": 1, "type": "hello", "id": 1, **hello}))
-        while b"welcome" not in drive.recv(timeout=WAIT_S):
+        while b"welcome" not in drive.recv(timeout=LIMIT_S):
             pass
         yield drive
 
@@ -405,9 +444,9 @@ def test_a_first_message_that_is_no_hello_closes_the_drive_socket(site, data):
         info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None
     ) as drive:
         drive.send(data)
-        assert b"BAD_MESSAGE" in drive.recv(timeout=WAIT_S, decode=False)
+        assert b"BAD_MESSAGE" in drive.recv(timeout=LIMIT_S, decode=False)
         with contextlib.suppress(Exception):
-            drive.recv(timeout=WAIT_S)
+            drive.recv(timeout=LIMIT_S)
         assert drive.close_code == 1008
 
 
@@ -417,7 +456,7 @@ def test_a_message_of_no_version_of_ours_is_told_so(site, logged, version):
     info = create_session(site)
     with joined(info) as drive:
         drive.send(encode({"v": version, "type": "bye", "id": 7}))
-        told = decode(drive.recv(timeout=WAIT_S, decode=False))
+        told = decode(drive.recv(timeout=LIMIT_S, decode=False))
         assert (told["code"], told["id"]) == ("UNSUPPORTED_PROTOCOL", 7)
     assert not any("exc_info" in entry for entry in logged)
 
@@ -434,7 +473,7 @@ def test_text_that_is_no_utf8_closes_the_socket_and_leaves_no_traceback(site, ca
         drive.protocol.send_text(text)
         drive.socket.sendall(b"".join(drive.protocol.data_to_send()))
         with pytest.raises(ConnectionClosed):
-            drive.recv(timeout=WAIT_S)
+            drive.recv(timeout=LIMIT_S)
         assert drive.close_code == 1007
     assert caplog.records == []
 
@@ -445,11 +484,11 @@ def test_a_view_whose_client_leaves_while_its_hello_is_refused_leaves_no_error(
     site, caplog, monkeypatch, last
 ):
     async def refuse_late(*_arguments: Any) -> None:
-        await asyncio.sleep(0.3)
+        await asyncio.to_thread(left.wait, LIMIT_S)
         refused.set()
         raise view_route.NoHelloError(4400, "no hello")
 
-    refused = threading.Event()
+    left, refused = threading.Event(), threading.Event()
     monkeypatch.setattr(view_route, "_check_hello", refuse_late)
     handshake = (
         "GET /v1/scenarios/any/view HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
@@ -461,9 +500,10 @@ def test_a_view_whose_client_leaves_while_its_hello_is_refused_leaves_no_error(
         assert status_of(connection.recv(65536)) == 101
         connection.sendall(last)
         connection.shutdown(socket.SHUT_WR)
-        assert refused.wait(WAIT_S)
+        left.set()
+        assert refused.wait(LIMIT_S)
         read_to_end(connection)
-    time.sleep(0.1)
+    wait_until(lambda: len(site.worker.connections) == 0, "the connection to end")
     assert caplog.records == []
 
 
@@ -489,7 +529,7 @@ def test_a_drive_socket_without_a_hello_is_closed_in_time(site, monkeypatch):
     with connect(
         info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None
     ) as drive:
-        assert b"TIMEOUT" in drive.recv(timeout=WAIT_S, decode=False)
+        assert b"TIMEOUT" in drive.recv(timeout=LIMIT_S, decode=False)
 
 
 # --- pages of other sites ---------------------------------------------------------------------
@@ -637,8 +677,7 @@ def test_allow_names_all_methods(client, path, method, allowed):
 @pytest.mark.parametrize("path", ["/livez", "/readyz", "/v1/server", "/v1/scenes/tiny/render"])
 def test_head_is_answered_like_get_without_its_body(client, path):
     client.get("/v1/scenes/tiny/render")
-    while client.get("/readyz").status_code != 200:  # Warming up answers otherwise a moment later.
-        time.sleep(0.01)
+    wait_ready(client)  # Warming up answers otherwise a moment later.
     get, head = client.get(path), client.head(path)
     assert head.status_code == get.status_code
     assert head.headers["Content-Type"] == get.headers["Content-Type"]

@@ -7,7 +7,6 @@ import json
 import os
 import random
 import threading
-import time
 import urllib.error
 import urllib.request
 import uuid
@@ -17,14 +16,14 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from tests.waiting import LIMIT_S, wait_until
+
 from .test_fleet_kill import WORKERS, Fleet, fleet  # noqa: F401, a fixture
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 WRITES = int(os.environ.get("REAL2SIM_TEST_WRITES", "600"))
-SCENARIOS, SESSIONS, CLIENTS = 3, 4, 8
-BETWEEN_KILLS_S = 4.0
-PATIENCE_S = 60.0
+SCENARIOS, SESSIONS, CLIENTS, KILLS = 3, 4, 8, 3
 GIVE_UP = 0.05
 """Share of writes whose client asks once and never learns what came of it."""
 
@@ -50,15 +49,17 @@ def call(url: str, method: str, body: dict | None, headers: dict[str, str]) -> d
     data = json.dumps(body).encode() if body is not None else None
     given = {"Content-Type": "application/json"} | headers
     request = urllib.request.Request(url, data, given, method=method)
-    with urllib.request.urlopen(request, timeout=30) as answer:
+    with urllib.request.urlopen(request, timeout=LIMIT_S) as answer:
         return json.loads(answer.read() or b"null")
 
 
 def write(url: str, body: dict, headers: dict[str, str], *, once: bool) -> dict | None:
     """The answer to a write; sent again under its key until there is one, or once."""
     headers = headers | {"Idempotency-Key": uuid.uuid4().hex}
-    deadline = time.monotonic() + PATIENCE_S
-    while True:
+    last = ""
+
+    def tried() -> dict | None:
+        nonlocal last
         try:
             return call(url, "POST", body, headers)
         except urllib.error.HTTPError as error:
@@ -69,10 +70,9 @@ def write(url: str, body: dict, headers: dict[str, str], *, once: bool) -> dict 
                 return {"over": True}
         except (OSError, ValueError) as error:
             last = repr(error)
-        if once:
-            return None
-        assert time.monotonic() < deadline, f"no answer for a minute: {last}"
-        time.sleep(0.1)
+        return None
+
+    return tried() if once else wait_until(tried, lambda: f"an answer: {last}")
 
 
 class Site:
@@ -142,11 +142,13 @@ def check(name: str, found: list[tuple[int, int]], history: History) -> None:
 def test_no_acknowledged_write_is_lost_or_doubled_while_workers_are_killed(fleet):  # noqa: F811
     site = Site(fleet.url)
     over, kills = threading.Event(), []
-    counter, lock = iter(range(1, WRITES + 1)), threading.Lock()
+    counter, lock, begun = iter(range(1, WRITES + 1)), threading.Lock(), [0]
 
     def kill_now_and_then() -> None:
         chance = random.Random(11)
-        while not over.wait(BETWEEN_KILLS_S):
+        for k in range(KILLS):
+            due = (k + 1) * WRITES // (KILLS + 1)
+            wait_until(lambda due=due: begun[0] >= due or over.is_set(), f"{due} writes")
             name = chance.choice(WORKERS)
             fleet.workers[name].kill()
             kills.append(name)
@@ -159,6 +161,7 @@ def test_no_acknowledged_write_is_lost_or_doubled_while_workers_are_killed(fleet
         while True:
             with lock:
                 mark = next(counter, None)
+                begun[0] = mark or WRITES
             if mark is None:
                 return
             if session is not None:
@@ -190,4 +193,3 @@ def test_no_acknowledged_write_is_lost_or_doubled_while_workers_are_killed(fleet
     assert fleet.logs_are_whole()
     unknown = sum(map(len, site.history.unknown.values()))
     print(f"{WRITES} writes, {len(kills)} kills, {unknown} answers never read")
-    assert kills

@@ -180,7 +180,8 @@ def test_a_job_of_a_killed_worker_is_done_by_another(two_workers, tmp_path):
 def test_a_job_is_cancelled_by_way_of_another_worker(two_workers, tmp_path):
     (_, client), (_, other) = two_workers
     job = running(client, tmp_path)
-    assert other.delete(job).status_code == 200
+    cancelled = other.delete(job)
+    assert cancelled.status_code == 200, cancelled.text
     assert finished(other, job)["state"] == finished(client, job)["state"] == "cancelled"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import sqlite3
@@ -167,9 +168,12 @@ def file_of(url: str) -> Path | None:
 def make_private(file: Path) -> None:
     """Make sure that nobody but its owner can read a database file; made where it is missing.
 
-    SQLite gives its journals the permissions of the file.
+    SQLite gives its journals the permissions of the file. One that is there is not opened: to close
+    it again would give up all locks of this process on it, and with them its connections' hold on
+    the journal, which another process might then remove.
     """
-    os.close(os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+    with contextlib.suppress(FileExistsError):
+        os.close(os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
     for path in (file, *(file.with_name(file.name + end) for end in ("-wal", "-shm"))):
         if path.exists() and path.stat().st_mode & 0o077:
             path.chmod(0o600)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import gc
 import socket
+import sqlite3
+import subprocess
+import sys
 import warnings
+from contextlib import closing
 
 import pytest
 
-from real2sim_server.service.storage.connection import connect
+from real2sim_server.service.storage.connection import connect, make_private
 
 pytestmark = pytest.mark.network
 
@@ -24,3 +28,16 @@ def test_a_server_that_answers_nothing_leaves_no_socket_open():
                 engine.connect()
             gc.collect()
     assert [str(w.message) for w in warned if w.category is ResourceWarning] == []
+
+
+def test_an_open_database_keeps_its_journal_when_its_permissions_are_looked_at(tmp_path):
+    """To close another descriptor of the file would give up the locks of this process on it."""
+    file = tmp_path / "store.db"
+    with closing(sqlite3.connect(file)) as store:
+        store.execute("PRAGMA journal_mode=WAL")
+        store.execute("CREATE TABLE kept (x)")
+        make_private(file)
+        # The last to leave a database removes its journal: this one is not the last.
+        leave = "import sqlite3, sys; sqlite3.connect(sys.argv[1]).execute('SELECT * FROM kept')"
+        subprocess.run([sys.executable, "-c", leave, str(file)], check=True)
+        assert file.with_name("store.db-wal").exists()

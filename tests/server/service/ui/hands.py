@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
-STEP_MS = 60_000
+from tests.waiting import LIMIT_S, wait_until
+
+STEP_MS = LIMIT_S * 1e3
 
 
 def place(page: Any, canvas: str, module: str, call: str) -> tuple[float, float]:
@@ -47,14 +48,11 @@ def shown(page: Any, expression: str) -> Any:
     )
 
 
-def until(condition: Callable[[], bool]) -> None:
-    """Wait until it holds.
+def address(page: Any) -> dict[str, str]:
+    """What the address of the page says is open; it follows within a quarter of a second."""
+    return {k: v[0] for k, v in parse_qs(urlsplit(page.evaluate("location.href")).query).items()}
 
-    Raises:
-        TimeoutError: it did not.
-    """
-    give_up = time.monotonic() + STEP_MS / 1e3
-    while not condition():
-        if time.monotonic() > give_up:
-            raise TimeoutError(f"{condition} did not become true")
-        time.sleep(0.05)
+
+def wait_address(page: Any, **values: str) -> None:
+    """Return once the address says so."""
+    wait_until(lambda: values.items() <= address(page).items(), lambda: f"{values} in {page.url}")

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 import real2sim
-
-from .hands import until
+from tests.waiting import wait_until
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
@@ -45,7 +44,7 @@ def test_scenarios_are_renamed_deleted_and_taken_back(page, client):
     page.reload()
     page.wait_for_selector("[data-scenario]")
     assert page.locator("[data-scenario]").count() == 1
-    until(lambda: names(client) == ["hail"])
+    wait_until(lambda: names(client) == ["hail"], "the others to go")
 
     card.get_by_text("hail").click()
     page.wait_for_selector("body[data-ready]")

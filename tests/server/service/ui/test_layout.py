@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from real2sim_server.service.serve import running_worker
+from tests.waiting import wait_until
 
-from .hands import kept, shown, until
+from .hands import kept, shown, wait_address
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
@@ -38,7 +39,7 @@ def test_the_picture_has_most_of_the_page_and_panels_keep_the_size_they_are_give
     studio.keyboard.press("ArrowUp")
     assert size(studio, "#map-panel")[1] == pytest.approx(low + 24, abs=1)
     given = size(studio, "#side"), size(studio, "#map-panel")
-    studio.wait_for_timeout(400)  # the address follows
+    wait_address(studio, scenario=shown(studio, "model.scenario.scenario_id"))
     studio.reload()
     studio.wait_for_selector("body[data-ready]")
     assert (size(studio, "#side"), size(studio, "#map-panel")) == given
@@ -153,4 +154,4 @@ def test_a_worker_that_is_gone_is_told(visit, make_settings):
         page.click("[data-scene=tiny]")
         page.wait_for_selector("#picture[data-seq]")
         assert not page.is_visible("#gone")
-    until(lambda: page.is_visible("#gone"))
+    wait_until(lambda: page.is_visible("#gone"), "the message")

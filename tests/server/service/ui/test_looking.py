@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
 import httpx2
 import pytest
 
-from .hands import enter, field, kept, shown, until
+from tests.waiting import wait_until
+
+from .hands import address, enter, field, kept, shown, wait_address
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
@@ -18,10 +19,6 @@ def scenarios(running: Any) -> list[dict[str, Any]]:
     return listed
 
 
-def address(page: Any) -> dict[str, str]:
-    return {k: v[0] for k, v in parse_qs(urlsplit(page.evaluate("location.href")).query).items()}
-
-
 def test_whoever_looks_leaves_nothing_and_can_share_what_is_seen(looking, visit, running):
     looking.wait_for_selector("#picture[data-seq]")
     assert looking.inner_text("#name") == "tiny"
@@ -29,7 +26,7 @@ def test_whoever_looks_leaves_nothing_and_can_share_what_is_seen(looking, visit,
     looking.evaluate("async () => (await import('/ui/model.js')).select('car_red')")
     looking.click("#next")
     looking.keyboard.press("Control+z")
-    until(lambda: address(looking).get("selected") == "car_red")
+    wait_address(looking, selected="car_red")
     assert "scenario" not in address(looking)
     other = visit(looking.evaluate("location.href"))
     other.wait_for_selector("body[data-ready]")
@@ -46,11 +43,11 @@ def test_the_first_edit_makes_the_scenario_and_the_picture_follows(looking, runn
     kept(looking, 1)
     (made,) = scenarios(running)
     assert (made["name"], made["revision"]) == ("tiny edit", 1)
-    until(lambda: address(looking).get("scenario") == made["scenario_id"])
+    wait_address(looking, scenario=made["scenario_id"])
     assert looking.inner_text("#name") == "tiny edit"
     seq = looking.get_attribute("#picture", "data-seq")
     looking.click("#next")
-    until(lambda: looking.get_attribute("#picture", "data-seq") != seq)
+    wait_until(lambda: looking.get_attribute("#picture", "data-seq") != seq, "the next picture")
     enter(looking, "pose-x", before + 2)
     kept(looking, 2)
     assert len(scenarios(running)) == 1
@@ -62,8 +59,9 @@ def test_an_edit_that_is_refused_makes_nothing(looking, running):
         "async () => (await import('/ui/model.js')).edit([{ op: 'delete', object_id: 'nobody' }])"
     )
     looking.wait_for_selector("#messages:has-text('nobody')")
-    until(lambda: scenarios(running) == [])
+    wait_until(lambda: scenarios(running) == [], "the scenario to go")
     assert looking.inner_text("#saved") == "Nothing changed yet"
-    looking.wait_for_timeout(400)
+    looking.click("#next")
+    wait_address(looking, t=str(shown(looking, "model.t")))
     assert "scenario" not in address(looking)
     assert not looking.is_visible("#gone")

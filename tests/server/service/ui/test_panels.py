@@ -9,8 +9,9 @@ import pytest
 
 import real2sim
 from real2sim_server.service.serve import running_worker
+from tests.waiting import wait_until
 
-from .hands import drag, enter, field, kept, place, shown, until
+from .hands import drag, enter, field, kept, place, shown
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
@@ -76,7 +77,10 @@ def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio)
     assert studio.evaluate("document.activeElement.id") == "heading"
     studio.keyboard.press("Delete")
     studio.keyboard.press("Tab")
-    studio.wait_for_timeout(300)
+    # What comes later is stored behind what these keys might have done.
+    enter(studio, "pose-x", 6)
+    kept(studio, 2)
+    assert field(studio, "pose-x") == 6
     assert shown(studio, f"model.scenario.objects.some((o) => o.object_id === '{target}')")
     assert shown(studio, "model.scenario.revision") == 1
     # Two fields edited at once both hold.
@@ -189,7 +193,7 @@ def test_what_is_copied_as_python_or_curl_makes_the_same_scenario(studio, runnin
     exec(compile(script, "copied", "exec"), {})
     studio.click("#copy-curl")
     script = studio.evaluate("navigator.clipboard.readText()")
-    subprocess.run(["bash", "-ec", script], check=True, capture_output=True, timeout=60)
+    subprocess.run(["bash", "-ec", script], check=True, capture_output=True)
     with real2sim.connect(running.url) as sim:
         old, *new = (sim.scenarios.get(s.scenario_id).info for s in sim.scenarios.list())
     assert [made.objects for made in new] == [old.objects] * 2
@@ -205,7 +209,7 @@ def test_a_picture_that_shows_an_edit_of_somebody_else_brings_the_panels_up_to_d
     with real2sim.connect(running.url) as sim:
         sim.scenarios.get(scenario).objects[target].translate(x=3)
     at(studio, 0.5)
-    until(lambda: shown(studio, "model.scenario.revision") == 1)
+    wait_until(lambda: shown(studio, "model.scenario.revision") == 1, "the edit")
     at(studio, 0)
     assert field(studio, "pose-x") == pytest.approx(x + 3, abs=0.02)
 
@@ -242,7 +246,8 @@ def test_a_data_set_is_made_and_looked_at(studio):
     assert "3 frames, 6 images" in studio.inner_text("#dataset-told")
     studio.click("#make-dataset")
     studio.wait_for_selector(".dataset-entry[open] .sheets img")
-    until(lambda: studio.evaluate("document.querySelector('.sheets img').naturalWidth > 0"))
+    width = "document.querySelector('.sheets img').naturalWidth"
+    wait_until(lambda: studio.evaluate(width), "a picture")
     rows = studio.inner_text(".dataset-entry[open] table")
     assert "car\t6" in rows
     assert studio.locator(".shares").count() >= 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from .hands import drag, field, kept, place, shown
+from .hands import drag, field, kept, place, shown, wait_address
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
@@ -53,7 +53,7 @@ def test_a_person_edits_runs_and_finds_everything_again(page):
     page.wait_for_selector("#play:text-is('Play')")
     page.click("#leave-run")
 
-    page.wait_for_timeout(500)  # the address follows within a quarter of a second
+    wait_address(page, selected=twin, scenario=shown(page, "model.scenario.scenario_id"))
     page.reload()
     page.wait_for_selector("body[data-ready]")
     kept(page, 6)

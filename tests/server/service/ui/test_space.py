@@ -13,8 +13,9 @@ from PIL import Image
 
 import real2sim
 from real2sim_server.geometry.rotation import matrix_to_quaternion
+from tests.waiting import wait_until
 
-from .hands import drag, kept, shown, until
+from .hands import drag, kept, shown
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 LEAST_PSNR = 38.0
@@ -32,8 +33,20 @@ def opened(studio: Any, width: int = 700) -> Any:
     studio.set_viewport_size({"width": width, "height": 560})
     studio.click("#space-mode")
     studio.wait_for_selector("#space[data-whole][data-detail=whole]")
-    studio.wait_for_timeout(1500)
+    wait_drawn(studio)
     return studio
+
+
+def wait_drawn(page: Any) -> None:
+    """Return once the canvas stays as it is: some pictures are drawn after the last change."""
+    seen: list[np.ndarray] = []
+
+    def stays() -> bool:
+        seen.append(drawn(page))
+        page.wait_for_timeout(300)
+        return len(seen) > 3 and all(np.array_equal(seen[-1], one) for one in seen[-4:])
+
+    wait_until(stays, "the canvas to stay as it is")
 
 
 def image_of(encoded: str) -> np.ndarray:
@@ -75,10 +88,13 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 def test_the_page_draws_what_the_worker_draws_and_goes_round_where_no_object_is(studio, running):
     page = opened(studio)
-    ours, exact = drawn(page), of_worker(page, running)
-    assert ours.shape == exact.shape
+    exact = of_worker(page, running)
+    assert drawn(page).shape == exact.shape
     assert exact.std() > 10
-    assert psnr(ours, exact) > LEAST_PSNR
+    wait_until(
+        lambda: psnr(drawn(page), exact) > LEAST_PSNR,
+        lambda: f"the worker's picture: {psnr(drawn(page), exact):.1f} dB",
+    )
     before = shown(page, "model.free")
     box = page.locator("#stage").bounding_box()
     drag(page, (box["x"] + 40, box["y"] + 20), (60, 0))
@@ -107,8 +123,9 @@ def test_a_dragged_object_moves_at_once_and_makes_one_edit(studio):
     page.mouse.move(x + 25, y + 6, steps=4)
     assert shown(page, "model.selected") == "car_red"
     assert shown(page, "model.scenario.revision") == 0
-    page.wait_for_timeout(600)
-    assert np.abs(drawn(page).astype(int) - pixels).max() > 60
+    wait_until(
+        lambda: np.abs(drawn(page).astype(int) - pixels).max() > 60, "the object to move at once"
+    )
     page.mouse.up()
     kept(page, 1)
     after = shown(page, place)
@@ -165,8 +182,10 @@ def test_a_device_that_is_too_slow_shows_the_workers_picture_of_the_same_camera(
     drag(studio, (x, y), (25, 6))
     kept(studio, 1)
     assert shown(studio, place)[1] != pytest.approx(0.0, abs=1e-3)
-    studio.wait_for_timeout(500)
-    assert int(studio.get_attribute("#picture", "data-seq")) > int(before or 0)
+    wait_until(
+        lambda: int(studio.get_attribute("#picture", "data-seq")) > int(before or 0),
+        "the next picture",
+    )
 
 
 def test_without_webgl_the_workers_picture_stays(studio):
@@ -263,27 +282,33 @@ def test_people_assets_and_what_was_stretched_are_drawn_as_the_scenario_has_them
         scenario.objects["post"].scale(x=1.2, y=1.2, z=1.2)
     with page.expect_request("**/splats?object_id=visitor**"):
         page.evaluate("async () => (await import('/ui/model.js')).refresh()")
-    until(lambda: page.get_attribute("#space", "data-boxes") == "")
-    until(lambda: int(page.get_attribute("#space", "data-total")) > total + 1000)
-    page.wait_for_timeout(1500)
+    wait_until(lambda: page.get_attribute("#space", "data-boxes") == "", "all to come")
+    wait_until(
+        lambda: int(page.get_attribute("#space", "data-total")) > total + 1000, "the visitor"
+    )
     x, y = page.evaluate("async () => (await import('/ui/camera_view.js')).stagePlace('visitor')")
     around = (slice(int(y) - 8, int(y) + 8), slice(int(x) - 4, int(x) + 4))
-    assert np.abs(drawn(page).astype(int) - before)[around].max() > 60
+    wait_until(
+        lambda: np.abs(drawn(page).astype(int) - before)[around].max() > 60,
+        "the visitor to be drawn",
+    )
     # Who walks is asked for at every instant, others are not.
     asked = []
     page.on("request", lambda request: asked.append(request.url))
     page.click("#next")
     t_us = shown(page, "model.t")
-    until(lambda: any(f"object_id=visitor&t_us={t_us}" in url for url in list_of(page, asked)))
+    instant = f"object_id=visitor&t_us={t_us}"
+    wait_until(lambda: any(instant in url for url in list_of(page, asked)), "the instant")
     assert not [url for url in asked if "splats" in url and "visitor" not in url]
     # Their coming holds no picture up.
     pictures = int(page.get_attribute("#space", "data-drawn"))
     page.click("#play")
-    page.wait_for_timeout(1200)
-    assert int(page.get_attribute("#space", "data-drawn")) > pictures + 3
+    wait_until(
+        lambda: int(page.get_attribute("#space", "data-drawn")) > pictures + 3, "more pictures"
+    )
 
 
 def list_of(page: Any, asked: list[str]) -> list[str]:
     """What was asked for, once the browser has told."""
-    page.wait_for_timeout(50)
+    page.wait_for_timeout(1)
     return list(asked)
