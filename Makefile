@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SOURCES := proto client server tests scripts docs/conf.py docs/images/make.py
+# Some environments forbid Python to keep what it has compiled; every process would do it again.
+unexport PYTHONDONTWRITEBYTECODE
 # Not quiet: the first lines say the seed of the random order; --randomly-seed=N repeats it.
 PYTEST := $(BIN)/python -m pytest
 # One process more than cores, since many tests wait: for a worker, a time limit, a page.

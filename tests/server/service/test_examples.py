@@ -78,6 +78,12 @@ SDK_CLASSES: tuple[type, ...] = (
     real2sim.env.DriveEnv,
     real2sim.vector_env.DriveVectorEnv,
 )
+TWINS = {
+    sync: source
+    for sync in SDK_CLASSES
+    for source in SDK_CLASSES
+    if source.__name__ == f"Async{sync.__name__}"
+}
 TOKEN = "opens-every-session"
 PLANNERS = ("DepthSampling", "FollowRoute", "Idm", "LearnedPolicy", "PidFollowRoute")
 FUNCTIONS: tuple[Any, ...] = (
@@ -116,8 +122,11 @@ def documented() -> Iterator[Documented]:
     yield Documented("Real2SimError", real2sim.Real2SimError)
     for owner in SDK_CLASSES:
         yield Documented(owner.__name__, owner)
+        # The methods of a class that is generated from an asynchronous one are shown there.
+        source = {name for name, _ in methods_of(TWINS[owner])} if owner in TWINS else set()
         for name, value in methods_of(owner):
-            yield Documented(f"{owner.__name__}.{name}", value, owner)
+            if name not in source:
+                yield Documented(f"{owner.__name__}.{name}", value, owner)
 
 
 def methods_of(owner: type) -> Iterator[tuple[str, Any]]:

@@ -82,7 +82,7 @@ def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio)
     kept(studio, 2)
     assert field(studio, "pose-x") == 6
     assert shown(studio, f"model.scenario.objects.some((o) => o.object_id === '{target}')")
-    assert shown(studio, "model.scenario.revision") == 1
+    assert shown(studio, "model.scenario.revision") == 2
     # Two fields edited at once both hold.
     studio.evaluate(
         """() => ['x', 'y'].forEach((axis, k) => {
@@ -91,7 +91,7 @@ def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio)
           input.dispatchEvent(new Event('change'));
         })"""
     )
-    kept(studio, 3)
+    kept(studio, 4)
     assert [field(studio, f"pose-{axis}") for axis in "xy"] == [3, 4]
 
 
