@@ -11,10 +11,19 @@ PYTEST := $(BIN)/python -m pytest
 # One process more than cores, since many tests wait: for a worker, a time limit, a page.
 PARALLEL := -n $(shell $(PYTHON) -c "import os; print(min(4, os.cpu_count() + 1))") --dist loadfile
 
-# What a change breaks first: the contract, the SDK, the layers, and the packages whose tests
-# compile little. The others belong to `make test`.
-FAST := tests/test_architecture.py tests/test_docs.py tests/proto \
-	tests/client tests/server/geometry tests/server/scene tests/server/edit tests/server/cli
+# What a change breaks first, in two minutes with lint: the contract, the SDK, the layers, and of the
+# large packages the files that state the most in the least time. All others belong to `make test`.
+FAST := tests/test_architecture.py tests/test_docs.py tests/proto tests/client \
+	tests/server/geometry tests/server/edit \
+	$(addprefix tests/server/scene/, test_camera.py test_cloud.py test_scene.py test_trajectory.py \
+	  io/test_bundle.py io/test_splats.py) \
+	$(addprefix tests/server/physics/, test_layout.py test_materials.py test_materials_contract.py \
+	  test_matrices.py test_solver.py) \
+	$(addprefix tests/server/world/, storyboard test_path.py test_recording.py test_reverse.py \
+	  test_scores.py test_traffic.py test_vehicle.py test_world.py) \
+	$(addprefix tests/server/service/, test_sdk.py sessions/test_bad_clients.py \
+	  sessions/test_deadlines.py sessions/test_drive.py sessions/test_lockstep.py \
+	  sessions/test_rest.py sessions/test_wire.py storage/test_leases.py)
 
 WITH_TORCH := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cublas \
 	nvidia-cuda-cupti nvidia-cuda-nvrtc nvidia-cuda-runtime nvidia-cudnn-cu13 nvidia-cufft \

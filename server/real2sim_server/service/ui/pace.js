@@ -45,6 +45,8 @@ export class Pace {
         this.prepare();
         return;
       }
+      // Where the same Gaussians are shown they may be all of them now: the page has to know.
+      this.wanted = true;
     }
     if (this.wanted) {
       this.draw(resting);

@@ -188,6 +188,28 @@ def test_a_device_that_is_too_slow_shows_the_workers_picture_of_the_same_camera(
     )
 
 
+def test_a_picture_at_rest_tells_that_it_is_whole_also_where_it_shows_the_same(studio):
+    """Another object came while nothing moved, and is shown whole already."""
+    studio.evaluate(
+        """async () => {
+          const { Pace } = await import('/ui/pace.js');
+          const gl = {
+            TIMEOUT_EXPIRED: 1, fenceSync: () => ({}), clientWaitSync: () => 0,
+            deleteSync: () => {}, flush: () => {},
+          };
+          const world = { total: () => window.total, show: () => false, ordering: () => false };
+          Object.assign(window, { total: 100, told: [] });
+          window.pace = new Pace(gl, world, () => window.told.push(window.pace.whole()));
+          window.pace.moved();
+        }"""
+    )
+    rests = "() => window.pace.resting() && !window.pace.waiting && window.told.at(-1)"
+    studio.wait_for_function(rests)
+    studio.evaluate("() => { window.total = 150; window.pace.request(); }")
+    studio.wait_for_function("() => window.told.includes(false)")
+    studio.wait_for_function("() => window.told.at(-1)")
+
+
 def test_without_webgl_the_workers_picture_stays(studio):
     studio.evaluate(
         "() => { const real = HTMLCanvasElement.prototype.getContext;"
