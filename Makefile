@@ -4,15 +4,15 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SOURCES := proto client server tests scripts docs/conf.py docs/images/make.py
-# Some environments forbid Python to keep what it has compiled; every process would do it again.
+# Cache bytecode even where the environment says not to: else every test process compiles it anew.
 unexport PYTHONDONTWRITEBYTECODE
-# Not quiet: the first lines say the seed of the random order; --randomly-seed=N repeats it.
+# Without -q, so that the header shows the random seed; --randomly-seed=N repeats that order.
 PYTEST := $(BIN)/python -m pytest
 # One process more than cores, since many tests wait: for a worker, a time limit, a page.
 PARALLEL := -n $(shell $(PYTHON) -c "import os; print(min(4, os.cpu_count() + 1))") --dist loadfile
 
-# What a change breaks first, in two minutes with lint: the contract, the SDK, the layers, and of the
-# large packages the files that state the most in the least time. All others belong to `make test`.
+# The tests of `make check`: contract, SDK, layers, and the quick files of the large packages. With
+# lint they take two minutes.
 FAST := tests/test_architecture.py tests/test_docs.py tests/proto tests/client \
 	tests/server/geometry tests/server/edit \
 	$(addprefix tests/server/scene/, test_camera.py test_cloud.py test_scene.py test_trajectory.py \
@@ -41,7 +41,7 @@ check: lint
 test: $(STAMP)
 	$(PYTEST) $(PARALLEL)
 
-# Compiled kernels, by processes beside one another with make -j; tests find them on disk.
+# Compile the kernels that tests load from disk; make -j compiles the parts in parallel.
 kernels: kernels-physics kernels-drawing kernels-learning
 
 kernels-drawing kernels-learning kernels-physics: kernels-%: $(STAMP)

@@ -2,8 +2,7 @@
 
 ``python scripts/compile_kernels.py drawing`` compiles those of images and worlds, ``learning``
 those that make logs of streets, train scenes and drive batches of worlds, ``physics`` those of the
-Material Point Method in both precisions. Tests call the same functions where they need compiled
-kernels.
+Material Point Method in both precisions. Test fixtures call these functions, too.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def compile_physics() -> None:
 
 
 def compile_learning() -> None:
-    """A log of a street, a scene trained on it, labels of its objects, a batch of worlds."""
+    """A synthetic log, a scene trained on it, a batch of worlds."""
     import numpy as np
 
     from real2sim_proto.episode import ResetSpec

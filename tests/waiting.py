@@ -1,4 +1,4 @@
-"""The one way in which tests wait for something that another thread or process does."""
+"""Waiting for what another thread or process does."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 LIMIT_S = 120.0
-"""Far more than anything takes on a busy machine: only something that never comes reaches it."""
+"""Far longer than anything takes, even on a busy machine [s]."""
 
 POLL_S = 0.01
 
@@ -21,8 +21,8 @@ def wait_until(
     """Wait until ``holds()`` is true, and return what it returned.
 
     Args:
-        holds: asked every 10 ms.
-        what: the test waits for, for the error; a function is called only then.
+        holds: the condition, checked every 10 ms.
+        what: named in the error; a function is only called for that.
         seconds: to wait [s]. Leave it out: a limit that can be reached makes a test flaky.
 
     Raises:

@@ -108,7 +108,7 @@ class VideoFile:
         fourcc = cv2.VideoWriter.fourcc(*FOURCC_BY_SUFFIX[self._path.suffix])
         writer = cv2.VideoWriter(str(self._temporary), fourcc, self._rate, (width, height))
         if not writer.isOpened():
-            _ask_system(self._temporary)
+            _raise_write_error(self._temporary)
             raise VideoError(f"{self._path}: OpenCV cannot write it; it may lack the encoder")
         return writer
 
@@ -139,26 +139,25 @@ def video_file(path: Path, *, frames_per_second: float) -> Iterator[VideoFile]:
 
 
 def _check_whole(file: Path) -> None:
-    """Raise what the system says about a file that OpenCV has not written to its end.
+    """Check that OpenCV wrote the whole file.
 
-    OpenCV tells nobody of writes that failed. FFmpeg, which writes for it, leaves out all that
-    comes after the first of them; the last is the length of what the file holds.
+    OpenCV reports no failed writes. FFmpeg, which writes for it, stops at the first one, and writes
+    the length of the contents last.
 
     Raises:
-        OSError: with the system's reason, or EIO where it takes writes again.
+        OSError: the file is incomplete; with the system's reason, or EIO if it takes writes again.
     """
     with file.open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
         ends = _end_of_matroska if file.suffix == ".mkv" else _end_of_mp4
         if ends(opened) == size:
             return
-    _ask_system(file)
+    _raise_write_error(file)
     raise OSError(errno.EIO, "some of the video was not written", str(file))
 
 
-def _ask_system(file: Path) -> None:
-    """Raise the system's reason why OpenCV could not write to a file, where it has one: OpenCV
-    gives none."""
+def _raise_write_error(file: Path) -> None:
+    """Raise the system's reason for refusing writes to a file, if it still refuses them."""
     with file.open("ab", buffering=0) as opened:
         opened.write(b"\0")
         os.fsync(opened.fileno())
@@ -169,7 +168,7 @@ def _end_of_matroska(opened: BinaryIO) -> int | None:
     header = opened.read(256)
     at = header.find(MATROSKA_SEGMENT)
     start = at + len(MATROSKA_SEGMENT) + 8
-    # FFmpeg writes the length in eight bytes, the first of which says that; it is unknown first.
+    # FFmpeg writes the length in eight bytes; the first of them, 1, marks that form.
     if at < 0 or len(header) < start or header[start - 8] != 1:
         return None
     return start + int.from_bytes(header[start - 7 : start], "big")

@@ -27,7 +27,6 @@ from real2sim_server.service.accounts import (
     RevokedError,
 )
 from real2sim_server.service.engine import Engine
-from real2sim_server.service.jobs import exports
 from real2sim_server.service.sessions.transition import Transition
 from real2sim_server.service.token_file import (
     TokenFileError,
@@ -37,6 +36,8 @@ from real2sim_server.service.token_file import (
     remove_token,
 )
 from tests.waiting import wait_until, wait_until_async
+
+from .waiting import succeeded
 
 SINGLE = "a long enough secret"
 
@@ -354,27 +355,20 @@ def test_sessions_of_a_token_are_limited_forks_among_them(start_worker, tokens_f
 
 
 def test_jobs_keep_their_owner_and_wait_for_their_time_on_the_engine(
-    start_worker, tokens_file, manual_clock, monkeypatch
+    start_worker, tokens_file, manual_clock, held_videos
 ):
     alice = add_token(tokens_file, "alice", TokenLimits(engine_seconds_per_minute=60))
     client = start_worker(tokens_file=tokens_file)
-    over_limit, prepare = threading.Event(), exports._render_request
-    monkeypatch.setattr(
-        exports, "_render_request", lambda *given: over_limit.wait() and prepare(*given)
-    )
+    client.headers.update(bearer(alice))
     body = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
-    job = client.post("/v1/exports", json=body, headers=bearer(alice)).json()
-    assert job["owner"] == "alice"
+    answer = client.post("/v1/exports", json=body)
+    assert answer.json()["owner"] == "alice"
     client.app.state.worker.accounts.of_owner("alice").engine_seconds += 60.5
-    over_limit.set()
-
-    def seen() -> dict:
-        return client.get(f"/v1/jobs/{job['job_id']}", headers=bearer(alice)).json()
-
+    held_videos.released.set()
     wait_until(lambda: manual_clock.anything_due, "the job to wait")
-    assert seen()["state"] == "running"
+    assert client.get(answer.headers["Location"]).json()["state"] == "running"
     manual_clock.advance(0.6)
-    assert wait_until(lambda: (now := seen())["finished_at"] and now, seen)["state"] == "succeeded"
+    succeeded(client, answer)
 
 
 def test_keys_of_one_token_are_not_those_of_another(start_worker, tokens_file):

@@ -26,7 +26,6 @@ SCENES, EACH = 12, 4
 TIMED = int(os.environ.get("REAL2SIM_TEST_STEPS", "600"))
 
 
-@pytest.mark.timeout(900)
 def test_a_database_that_is_away_for_ten_seconds_loses_and_doubles_nothing(
     fleet: Fleet,  # noqa: F811
     undisturbed: list[list[str]],  # noqa: F811
@@ -46,7 +45,6 @@ def test_a_database_that_is_away_for_ten_seconds_loses_and_doubles_nothing(
 # --- what the proxy does and costs ------------------------------------------------------------
 
 
-@pytest.mark.timeout(900)
 def test_sessions_land_where_their_scene_is_and_no_worker_has_far_more_than_others(
     fleet: Fleet,  # noqa: F811
 ):
@@ -76,7 +74,6 @@ def test_sessions_land_where_their_scene_is_and_no_worker_has_far_more_than_othe
     assert most <= 1.5
 
 
-@pytest.mark.timeout(900)
 def test_observations_through_the_proxy_are_those_of_the_worker_and_its_cost_is_told(
     fleet: Fleet,  # noqa: F811
 ):

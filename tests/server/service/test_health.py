@@ -12,11 +12,9 @@ from real2sim_server.service.app import create_app
 from real2sim_server.service.storage.store import StoreError
 from tests.waiting import LIMIT_S, wait_until
 
+from .waiting import wait_ready
+
 HERE = {"Host": "127.0.0.1"}
-
-
-def wait_until_ready(client) -> None:
-    wait_until(lambda: client.get("/readyz").status_code == 200, lambda: client.get("/readyz").text)
 
 
 def samples(client) -> dict[str, float]:
@@ -30,7 +28,7 @@ def samples(client) -> dict[str, float]:
 
 def test_a_started_worker_lives_and_becomes_ready(client):
     assert client.get("/livez").json() == {"status": "alive"}
-    wait_until_ready(client)
+    wait_ready(client)
     assert Readiness.model_validate(client.get("/readyz").json()).ready
 
 
@@ -48,7 +46,7 @@ def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypa
         told = []
         client.app.state.worker.on_ready = lambda: told.append(client.app.state.worker.waiting_for)
         warm.set()
-        wait_until_ready(client)
+        wait_ready(client)
         assert told == [{"warming up kernels"}]
 
 
@@ -64,7 +62,7 @@ def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):
 
 def test_a_job_that_does_not_end_stalls_the_worker(start_worker, manual_clock):
     client = start_worker(stall_seconds=60)
-    wait_until_ready(client)
+    wait_ready(client)
     engine, go_on = client.app.state.worker.engine, threading.Event()
     stuck = threading.Thread(target=engine.call_sync, args=(go_on.wait,), kwargs={"label": "stuck"})
     stuck.start()
@@ -79,7 +77,7 @@ def test_a_job_that_does_not_end_stalls_the_worker(start_worker, manual_clock):
 
 
 def test_a_lost_device_is_neither_live_nor_ready(client):
-    wait_until_ready(client)
+    wait_ready(client)
 
     def lose():
         raise RuntimeError("CUDA error: unspecified launch failure")

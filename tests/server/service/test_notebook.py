@@ -46,7 +46,6 @@ def shown(source: str, names: dict[str, Any]) -> Any:
 
 
 @pytest.mark.network
-@pytest.mark.timeout(600)
 def test_every_cell_runs(
     worker: RunningWorker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

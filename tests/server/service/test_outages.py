@@ -57,7 +57,6 @@ def apart(system, tiny_scene, worker_kernels) -> Iterator[httpx2.Client]:
         assert "Traceback" not in log_file.read_text()
 
 
-@pytest.mark.timeout(300)
 def test_a_folder_that_cannot_be_written_to_is_told_and_nothing_is_lost(apart, system):
     site = Site(apart)
     assert site.edit().status_code == 200
@@ -83,7 +82,6 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_nothing_is_lost(apart, s
         site.check_nothing_is_lost()
 
 
-@pytest.mark.timeout(300)
 def test_an_upload_to_a_folder_that_cannot_be_written_to_is_told_so(
     apart, system, tmp_path, tiny_scene
 ):
@@ -104,7 +102,6 @@ def test_an_upload_to_a_folder_that_cannot_be_written_to_is_told_so(
     assert upload().status_code == 201
 
 
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("number", "code"),
     [
@@ -121,7 +118,6 @@ def test_a_job_whose_files_cannot_be_written_fails_by_name(apart, system, number
         assert ended["error"]["code"] == code, refused
 
 
-@pytest.mark.timeout(300)
 def test_a_clock_that_goes_back_by_an_hour_and_forth_again_changes_nothing(apart, system):
     site = Site(apart)
     assert site.edit("before").status_code == 200
@@ -165,7 +161,6 @@ def own_postgres() -> Iterator[Postgres]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("trouble", [stopped, Postgres.frozen], ids=["stopped", "frozen"])
 def test_a_database_that_is_away_for_half_a_minute_costs_nothing_but_the_time(
     trouble, own_postgres, start_worker
@@ -211,7 +206,6 @@ def test_a_database_that_is_away_for_half_a_minute_costs_nothing_but_the_time(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("number", "code", "status"),
     [(READ_ONLY, "STORAGE_UNAVAILABLE", 503), (NO_SPACE, "STORAGE_FULL", 507)],
@@ -240,7 +234,6 @@ def test_a_folder_that_takes_nothing_for_half_a_minute_costs_nothing_but_the_tim
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_disk_that_is_full_for_half_a_minute_costs_nothing_but_the_time(small_disk, start_worker):
     """A real one, where there is leave to mount one."""
     client = start_worker(data_dir=small_disk / "data")
@@ -263,7 +256,6 @@ def test_a_disk_that_is_full_for_half_a_minute_costs_nothing_but_the_time(small_
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_clock_that_is_an_hour_behind_for_half_a_minute_changes_nothing(apart, system):
     site = Site(apart)
     assert site.edit("before").status_code == 200

@@ -456,7 +456,7 @@ class Jobs:
     ) -> None:
         running = self._run(job, light=light)
         job.task = asyncio.create_task(running, name=job.info.job_id, context=context)
-        # A task that is cancelled before its first step would never put that on record.
+        # A task that is cancelled before its first step never runs, and never records its end.
         await asyncio.sleep(0)
 
     def _has_room(self, lane: str) -> bool:

@@ -168,9 +168,9 @@ def file_of(url: str) -> Path | None:
 def make_private(file: Path) -> None:
     """Make sure that nobody but its owner can read a database file; made where it is missing.
 
-    SQLite gives its journals the permissions of the file. One that is there is not opened: to close
-    it again would give up all locks of this process on it, and with them its connections' hold on
-    the journal, which another process might then remove.
+    SQLite gives its journals the permissions of the file. An existing file is not opened:
+    closing it would release all locks of this process on it (fcntl(2)), and another process could
+    then remove the journal that its connections still use.
     """
     with contextlib.suppress(FileExistsError):
         os.close(os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))

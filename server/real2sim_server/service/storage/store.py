@@ -31,7 +31,6 @@ __all__ = [
     "StoreTroubleError",
     "StoredReply",
     "Write",
-    "now_us",
 ]
 
 ROW_BYTES = 120

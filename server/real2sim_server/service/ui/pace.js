@@ -45,7 +45,7 @@ export class Pace {
         this.prepare();
         return;
       }
-      // Where the same Gaussians are shown they may be all of them now: the page has to know.
+      // Draw even where the same Gaussians are shown: they may be the whole scene now.
       this.wanted = true;
     }
     if (this.wanted) {

@@ -38,12 +38,17 @@ def kinds(obs: real2sim.Observation) -> list[str]:
     return [event.type for event in obs.events]
 
 
+def miss_deadlines(manual_clock, inside, *, to: int) -> None:
+    """Let the planner miss one deadline after another, until the worker has driven on to a step."""
+    for step in range(inside.world.steps + 1, to + 1):
+        manual_clock.expire_next()
+        wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
+
+
 def test_a_planner_that_hangs_is_driven_on_by_its_last_plan(episode, manual_clock, bystander):
     with episode(**LATE) as (session, inside):
         first = session.step(PLAN)
-        for step in (2, 3, 4):
-            manual_clock.expire_next()
-            wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
+        miss_deadlines(manual_clock, inside, to=4)
         # Its observation is sent before the next deadline begins.
         manual_clock.wait_for_sleeper()
         late = session.step(PLAN)
@@ -54,9 +59,7 @@ def test_a_planner_that_hangs_is_driven_on_by_its_last_plan(episode, manual_cloc
 
 def test_a_planner_that_hangs_for_good_comes_to_the_end_of_its_episode(episode, manual_clock):
     with episode(horizon=4, **LATE) as (session, inside):
-        for step in range(1, 5):
-            manual_clock.expire_next()
-            wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
+        miss_deadlines(manual_clock, inside, to=4)
         wait_until(lambda: inside.world.over, "the end of the episode")
         last = session.step(PLAN)
     assert (last.step, last.over, last.reason) == (4, True, "horizon")
@@ -64,9 +67,7 @@ def test_a_planner_that_hangs_for_good_comes_to_the_end_of_its_episode(episode, 
 
 def test_a_late_planner_can_be_braked_for(episode, manual_clock):
     with episode(on_timeout="brake", **LATE) as (session, inside):
-        for step in (1, 2, 3):
-            manual_clock.expire_next()
-            wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
+        miss_deadlines(manual_clock, inside, to=3)
         manual_clock.wait_for_sleeper()
         late = session.step(PLAN)
     # On the way to -6 m/s^2 behind the lag of the brakes.

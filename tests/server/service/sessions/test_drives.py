@@ -9,7 +9,8 @@ import real2sim
 from real2sim.cli import build_app
 from real2sim_server.service.sessions.clock_hold import ClockHold
 from real2sim_server.world.recording.recording import recording_of_bytes
-from tests.waiting import wait_until
+
+from ..waiting import finished
 
 pytestmark = pytest.mark.network
 
@@ -39,11 +40,7 @@ def steps_to(site, info, step: int) -> dict:
 
 
 def ended(site, job: dict) -> dict:
-    def now() -> dict | None:
-        seen = site.http.get(f"/v1/jobs/{job['job_id']}").json()
-        return None if seen["state"] in {"queued", "running"} else seen
-
-    return wait_until(now, f"the end of job {job['job_id']}")
+    return finished(site.http, f"/v1/jobs/{job['job_id']}")
 
 
 def test_who_drives_by_requests_leaves_a_recording_with_everything_of_every_instant(site, drive):
