@@ -86,6 +86,24 @@ OPEN: tuple[APIRouter, ...] = (
 """Routers that ask for a token themselves, where they want one."""
 
 
+def operation_id(route: APIRoute) -> str:
+    """Name of a call in OpenAPI, stable as long as its function's name is: ``scenes-render``."""
+    subject = str(route.tags[0]) if route.tags else "worker"
+    return f"{subject}-{route.name}"
+
+
+CALLS = APIRouter(
+    generate_unique_id_function=operation_id,
+    responses={"default": {"model": Problem, "description": "problem+json (RFC 9457)"}},
+)
+"""All routes of a worker."""
+
+for _router in OPEN:
+    CALLS.include_router(_router)
+for _router in PROTECTED:
+    CALLS.include_router(_router, dependencies=[Depends(require_token)])
+
+
 def create_app(settings: Settings) -> FastAPI:
     """The application of one worker; it starts and stops with the application's lifespan.
 
@@ -113,8 +131,6 @@ def create_app(settings: Settings) -> FastAPI:
         title="Real2Sim worker",
         version=version("real2sim"),
         lifespan=lifespan,
-        generate_unique_id_function=operation_id,
-        responses={"default": {"model": Problem, "description": "problem+json (RFC 9457)"}},
         docs_url=None,
         redoc_url=None,
         separate_input_output_schemas=False,
@@ -132,10 +148,8 @@ def create_app(settings: Settings) -> FastAPI:
     if settings.traces_url is not None:
         trace(app, worker, traces_to(settings.traces_url, worker_id=settings.worker_id))
     app.add_middleware(RequestContext, metrics=worker.metrics, on_end=partial(note_request, worker))
-    for router in OPEN:
-        app.include_router(router)
-    for router in PROTECTED:
-        app.include_router(router, dependencies=[Depends(require_token)])
+    # Not included anew: FastAPI would prepare every call again for each application of a process.
+    app.router.routes.extend(CALLS.routes)
     return app
 
 
@@ -151,12 +165,6 @@ async def _build_routes(app: FastAPI) -> None:
     unmatched = {"type": "http", "method": "GET", "path": "/unmatched", "headers": [], "app": app}
     with suppress(HTTPException):
         await app.router(unmatched | {"query_string": b"", "root_path": ""}, receive, send)
-
-
-def operation_id(route: APIRoute) -> str:
-    """Name of a call in OpenAPI, stable as long as its function's name is: ``scenes-render``."""
-    subject = str(route.tags[0]) if route.tags else "worker"
-    return f"{subject}-{route.name}"
 
 
 def trace(app: FastAPI, worker: Worker, provider: TracerProvider) -> None:

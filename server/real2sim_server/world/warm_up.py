@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import torch
 
@@ -22,6 +24,8 @@ from .driving import KINDS, PLANNING_AHEAD, advance_vehicle, prepare_schedule
 from .ego.motion import Motion
 from .ego.reference import PlannedTrajectory, ReferenceTrajectory
 from .ego.trackers import make_tracker
+from .scoring.comfort_kernels import windowed_sum
+from .scoring.update import NONE_AGAINST
 from .world import World
 
 PERIOD_US = 100_000
@@ -31,8 +35,10 @@ STEPS = 20
 """More than fill the window of the comfort metrics."""
 
 
+@cache
 def warm_up() -> None:
-    """Compile the kernels of a step and of an edit, or load them from the disk cache.
+    """Compile the kernels of a step and of an edit, or load them from the disk cache, once a
+    process.
 
     A small episode uses them all: afterwards neither waits for the compiler.
     """
@@ -53,6 +59,8 @@ def warm_up() -> None:
     _sweep(world)
     # Which lane an ego is in that has left its own.
     world.context.in_lane(world.instant.ego._replace(offset=10.0))
+    # What only an ego that goes against its route calls.
+    windowed_sum(NONE_AGAINST, 1.0, 2)
     # What only perfect tracking and sliding vehicles call.
     _track(EgoSpec(tracker="perfect"))
     # What edits, views and rollouts ask of the ground.

@@ -13,8 +13,10 @@ from real2sim_server.service.serve import RunningWorker, running_worker
 
 from .hands import STEP_MS, kept
 
+NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+"""The first that there is; headless shell is the lightest."""
 BROWSER = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+    filter(None, map(shutil.which, NAMES)), ""
 )
 
 
