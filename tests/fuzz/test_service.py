@@ -31,7 +31,7 @@ def _check():
 
 
 def test_damaged_requests_and_messages_are_refused_and_nobody_else_notices():
-    _check().check_service(*WAYS, inputs=15)
+    _check().check_service(*WAYS, inputs=8)
 
 
 @pytest.mark.slow

@@ -144,6 +144,7 @@ def test_edited_streets_are_the_same_for_the_same_seed(tiny_scene):
 
 @pytest.mark.slow
 def test_exported_frames_teach_a_detector_nearly_as_much_as_truth():
-    figures = detector.run()
+    options = detector.DetectorBenchOptions(frames=400, epochs=16, drives=2, period_us=200_000)
+    figures = detector.run(options)
     assert figures["ratio of ap50"] >= 0.95
     assert figures["ratio of ap"] > 0.85

@@ -18,7 +18,7 @@ from real2sim_server.scenarios.openscenario import write_openscenario
 from real2sim_server.scene import Lane, LaneGraph
 from real2sim_server.scene.io import save_scene
 from real2sim_server.service.app import create_app
-from real2sim_server.service.http.openapi import document, operations
+from real2sim_server.service.http.openapi import operations, published
 
 TOKEN = "a long enough secret"
 STREAMS = ("jobs-events",)
@@ -74,7 +74,7 @@ def samples(make_settings) -> dict[str, str]:
 
 
 def _operations(make_settings) -> list[tuple[str, str, dict[str, Any]]]:
-    return list(operations(document(create_app(make_settings()))))
+    return list(operations(published(create_app(make_settings()))))
 
 
 def call(client: TestClient, sample: str, variables: dict[str, str]) -> Any:
@@ -182,7 +182,7 @@ def test_the_token_of_a_session_opens_no_other(make_settings, demo_street):
 
 
 def test_the_document_says_how_sessions_are_opened(make_settings):
-    made = document(create_app(make_settings()))
+    made = published(create_app(make_settings()))
     schemes = made["components"]["securitySchemes"]
     assert set(schemes) == {"WorkerToken", "SessionToken"}
     assert "POST /v1/sessions" in schemes["SessionToken"]["description"]

@@ -15,9 +15,7 @@ from .hands import STEP_MS, kept
 
 NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 """The first that there is; headless shell is the lightest."""
-BROWSER = next(
-    filter(None, map(shutil.which, NAMES)), ""
-)
+BROWSER = next(filter(None, map(shutil.which, NAMES)), "")
 
 
 @pytest.fixture(scope="module")
