@@ -22,6 +22,7 @@ from real2sim_server.service.app import create_app
 from real2sim_server.service.http.documented_errors import OF_OPERATION
 from real2sim_server.service.http.openapi import BODIES, operations, published, text_of
 from real2sim_server.service.serve import running_worker
+from tests.waiting import LIMIT_S
 
 COMMITTED = Path(__file__).resolve().parents[4] / "docs" / "openapi.json"
 
@@ -153,7 +154,7 @@ def test_any_request_gets_a_documented_answer_by_all_checks_and_none_breaks_the_
         def ask(case) -> None:
             nonlocal asked
             asked += 1
-            response = case.call(base_url=worker.url, headers=BEARER, timeout=30)
+            response = case.call(base_url=worker.url, headers=BEARER, timeout=LIMIT_S)
             case.validate_response(response, headers=BEARER)
 
         for found in schema.get_all_operations():
@@ -199,7 +200,7 @@ def test_any_request_to_what_is_there_gets_a_documented_answer(
         def ask(case) -> None:
             known = {k: v for k, v in there.items() if k in case.path_parameters}
             case.path_parameters = {**case.path_parameters, **known}
-            response = case.call(base_url=worker.url, headers=headers, timeout=30)
+            response = case.call(base_url=worker.url, headers=headers, timeout=LIMIT_S)
             statuses.add(response.status_code)
             documented = case.operation.definition.raw["responses"]
             assert str(response.status_code) in documented, response.text
