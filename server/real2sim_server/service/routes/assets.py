@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Annotated, Any, TypeVar
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
+from pydantic_core import from_json
 from starlette.datastructures import FormData, UploadFile
 
 from real2sim_proto import ErrorCode
@@ -199,7 +199,7 @@ async def _extract(worker: Worker, body: bytes, claim: str | None) -> AssetInfo:
 
 def _names_a_build(body: bytes) -> bool:
     try:
-        given = json.loads(body)
+        given = from_json(body)  # Refuses deep nesting, where json.loads() raises RecursionError.
     except ValueError:
         return False
     return isinstance(given, dict) and "build" in given

@@ -31,6 +31,9 @@ def upload(client, path, **fields):
         return client.post("/v1/assets", files={"file": (path.name, file)}, data=fields)
 
 
+JSON = {"Content-Type": "application/json"}
+
+
 @pytest.fixture(params=[".ply", ".compressed.ply", ".spz", ".splat"])
 def splat_file(request, tmp_path, tiny_scene):
     path = tmp_path / f"thing{request.param}"
@@ -67,6 +70,11 @@ def test_assets_never_change(client):
 )
 def test_a_wrong_cut_is_refused(client, change, code):
     assert client.post("/v1/assets", json=CUT | change).json()["code"] == code
+
+
+def test_a_body_nested_too_deeply_is_refused(client):
+    answer = client.post("/v1/assets", content="[" * 100_000, headers=JSON)
+    assert (answer.status_code, answer.json()["code"]) == (422, "INVALID_REQUEST")
 
 
 def test_every_splat_format_can_be_uploaded_at_a_real_size(client, splat_file):
