@@ -126,4 +126,5 @@ def action(obs: Mapping[str, Any]) -> dict[str, Any]:
 
 def straight_on(t_us: int) -> dict[str, Any]:
     """A trajectory plan over the next two seconds."""
-    return {"kind": "trajectory", "times_us": [t_us + us for us in AHEAD_US], "poses": POSES}
+    poses = [list(pose) for pose in POSES]  # The caller's own: some planners damage them.
+    return {"kind": "trajectory", "times_us": [t_us + us for us in AHEAD_US], "poses": poses}

@@ -52,6 +52,8 @@ def test_an_attribute_that_is_not_supported_is_refused_by_name_and_line():
         ('<!DOCTYPE x [<!ENTITY a "b">]><OpenSCENARIO/>', "document type"),
         ("<a>" * 300, "nested deeper|no XML"),
         (CASE.replace('revMajor="1"', 'revMajor="2"'), "version 2"),
+        (CASE.replace('revMajor="1"', 'revMajor="NaN"'), "'NaN'; it must be a whole number"),
+        (CASE.replace('revMajor="1"', 'revMajor="INF"'), "'INF'; it must be a whole number"),
         (CASE.replace('"$gap', '"$gab').replace("$gap", "$gab"), "names no parameter"),
     ],
 )

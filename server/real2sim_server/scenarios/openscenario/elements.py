@@ -144,7 +144,7 @@ class Part:
             number = float(value)
         except (TypeError, ValueError):
             number = 0.5
-        if number != int(number):
+        if not number.is_integer():
             raise self.error(f"{name} of <{self.tag}> is {value!r}; it must be a whole number")
         return int(number)
 
