@@ -126,5 +126,5 @@ def action(obs: Mapping[str, Any]) -> dict[str, Any]:
 
 def straight_on(t_us: int) -> dict[str, Any]:
     """A trajectory plan over the next two seconds."""
-    poses = [list(pose) for pose in POSES]  # The caller's own: some planners damage them.
+    poses = [list(pose) for pose in POSES]  # A copy: some planners change it.
     return {"kind": "trajectory", "times_us": [t_us + us for us in AHEAD_US], "poses": poses}

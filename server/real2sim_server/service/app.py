@@ -148,7 +148,7 @@ def create_app(settings: Settings) -> FastAPI:
     if settings.traces_url is not None:
         trace(app, worker, traces_to(settings.traces_url, worker_id=settings.worker_id))
     app.add_middleware(RequestContext, metrics=worker.metrics, on_end=partial(note_request, worker))
-    # Not included anew: FastAPI would prepare every call again for each application of a process.
+    # Shared: include_router() would make FastAPI prepare all routes again for each application.
     app.router.routes.extend(CALLS.routes)
     return app
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-import numba
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -19,7 +23,6 @@ from real2sim_server.physics import (
     SolverError,
 )
 from real2sim_server.physics.backends import select_backend
-from real2sim_server.physics.backends.cpu import backend as cpu
 from real2sim_server.physics.materials import Structure
 
 from .scenes import SOFT, at, cube, ground, solve
@@ -162,18 +165,34 @@ def test_cpu_touches_colliders_as_the_reference_does(collider):
     np.testing.assert_allclose(runs[1].contacts[0].impulse, runs[0].contacts[0].impulse, atol=1e-7)
 
 
-def test_the_number_of_threads_does_not_change_a_bit(monkeypatch):
-    monkeypatch.setattr(cpu, "PARTICLES_PER_THREAD", 1)
-    threads, found = numba.get_num_threads(), set()
-    try:
-        for count in range(1, threads + 1):
-            numba.set_num_threads(count)
-            run = mixed("cpu", "single")
-            run.step(0.03)
-            found.add(b"".join(getattr(run.particles(), name).tobytes() for name in STATE))
-    finally:
-        numba.set_num_threads(threads)
-    assert len(found) == 1
+FINGERPRINT = """
+import hashlib
+import numba
+from real2sim_server.physics.backends.cpu import backend
+from tests.server.physics.test_backends import STATE, mixed
+
+backend.PARTICLES_PER_THREAD = 1
+run = mixed("cpu", "single")
+run.step(0.03)
+state = b"".join(getattr(run.particles(), name).tobytes() for name in STATE)
+print(numba.get_num_threads(), hashlib.sha256(state).hexdigest())
+"""
+
+
+def test_the_number_of_threads_does_not_change_a_bit():
+    root = Path(__file__).parents[3]
+    runs = [
+        subprocess.Popen(
+            [sys.executable, "-c", FINGERPRINT],
+            env={**os.environ, "NUMBA_NUM_THREADS": str(threads), "PYTHONPATH": str(root)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for threads in (1, 5)
+    ]
+    said = [run.communicate()[0].split() for run in runs]
+    assert [threads for threads, _ in said] == ["1", "5"]
+    assert len({digest for _, digest in said}) == 1
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])

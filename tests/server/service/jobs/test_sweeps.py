@@ -66,7 +66,9 @@ def test_a_callers_scenario_leaves_the_table_that_the_command_makes(client, scen
     (tmp_path / "sweep.json").write_text(json.dumps(spec))
     run_sweep(load_sweep(tmp_path / "sweep.json"), tmp_path / "out", InProcess())
     assert table == (tmp_path / "out" / "episodes.parquet").read_bytes()
-    assert job["result"]["episodes"] == pq.read_table(io.BytesIO(table)).num_rows == 6
+    episodes = pq.read_table(io.BytesIO(table))
+    assert job["result"]["episodes"] == episodes.num_rows == 6
+    assert sorted(set(episodes["gap"].to_pylist())) == [6.0, 10.0, 14.0]
     # The worst leave recordings and scenario files.
     assert len(job["result"]["worst"]) == 2
     for key in job["result"]["worst"]:
@@ -105,8 +107,7 @@ def test_a_search_leaves_its_failures_and_all_of_it_packed(client, tmp_path):
 
 def test_a_sweep_can_be_cancelled(client):
     job = begun(client, method={"kind": "sobol", "count": 400})
-    path = f"/v1/jobs/{job['job_id']}"
-    wait_until(lambda: client.get(path).json()["state"] == "running", "the sweep is not begun")
+    wait_driving(client, job)
     client.delete(f"/v1/jobs/{job['job_id']}")
     assert over(client, job)["state"] == "cancelled"
 

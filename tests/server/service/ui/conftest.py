@@ -13,9 +13,9 @@ from real2sim_server.service.serve import RunningWorker, running_worker
 
 from .hands import STEP_MS, kept
 
-NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-"""The first that there is; headless shell is the lightest."""
-BROWSER = next(filter(None, map(shutil.which, NAMES)), "")
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+"""The lightest first."""
+BROWSER = next(filter(None, map(shutil.which, BROWSERS)), "")
 
 
 @pytest.fixture(scope="module")
