@@ -9,7 +9,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Without -q, so that the header shows the random seed; --randomly-seed=N repeats that order.
 PYTEST := $(BIN)/python -m pytest
 # One process more than cores, since many tests wait: for a worker, a time limit, a page.
-PARALLEL := -n $(shell $(PYTHON) -c "import os; print(min(4, os.cpu_count() + 1))") --dist loadfile
+PARALLEL := -n $(shell $(PYTHON) -c "import os; print(min(4, os.cpu_count() + 1))") --dist loadfile --no-loadscope-reorder
 
 # The tests of `make check`: contract, SDK, layers, and the quick files of the large packages. With
 # lint they take two minutes.
@@ -48,7 +48,7 @@ kernels-drawing kernels-learning kernels-physics: kernels-%: $(STAMP)
 	$(BIN)/python scripts/compile_kernels.py $*
 
 test-slow: $(STAMP)
-	$(PYTEST) -n 0 --run-slow -m "slow or gpu or ray"
+	$(PYTEST) $(PARALLEL) --run-slow -m "slow or gpu or ray"
 
 # Programs that some tests start, from Debian's packages; where one is missing its tests skip.
 system-packages:
