@@ -11,6 +11,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 CLOSE_S = 3.0
+NICENESS = 10
+"""Of a command that gives way."""
+
 MAX_ERROR_BYTES = 16_384
 MAX_LINE_BYTES = 65_536
 
@@ -65,7 +68,7 @@ class CommandProcess:
         """Let it have what processor time others leave."""
         # It has ended, or the system has no such thing.
         with contextlib.suppress(OSError, AttributeError):
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, 10)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
 
     async def error(self) -> str | None:
         """What it said last, where it failed; after its end."""
