@@ -367,7 +367,8 @@ def test_jobs_keep_their_owner_and_wait_for_their_time_on_the_engine(
     held_videos.released.set()
     wait_until(lambda: manual_clock.anything_due, "the job to wait")
     assert client.get(answer.headers["Location"]).json()["state"] == "running"
-    manual_clock.advance(0.6)
+    # Its worlds take processor time, too, which no clock of the test holds.
+    manual_clock.advance(10.0)
     succeeded(client, answer)
 
 

@@ -70,8 +70,8 @@ def test_sessions_land_where_their_scene_is_and_no_worker_has_far_more_than_othe
     print(
         f"{len(found)} sessions: {right:.1%} where their scene is, busiest {most:.2f} of the mean"
     )
-    # Not all: a connection that is just being closed counts as load.
-    assert right >= 0.75
+    # Not all: a connection that is just being closed counts as load. By chance it would be 65 %.
+    assert right >= 0.8
     assert most <= 1.5
 
 

@@ -22,14 +22,14 @@ LATE = {"deadline_ms": 80}
 @pytest.fixture
 def episode(site):
     """Begins an episode by the SDK; keywords are its reset's. Gives the SDK's and the worker's
-    session."""
+    session, and the first observation."""
 
     @contextlib.contextmanager
     def begin(**spec) -> Iterator[tuple]:
         with real2sim.connect(site.url) as client, client.session(scene="tiny") as session:
-            session.reset(action="control", **spec)
+            first = session.reset(action="control", **spec)
             (inside,) = (s for s in site.worker.sessions if s.session_id == session.session_id)
-            yield session, inside
+            yield session, inside, first
 
     return begin
 
@@ -38,17 +38,20 @@ def kinds(obs: real2sim.Observation) -> list[str]:
     return [event.type for event in obs.events]
 
 
-def miss_deadlines(manual_clock, inside, *, to: int) -> None:
-    """Let the planner miss one deadline after another, until the worker has driven on to a step."""
-    for step in range(inside.world.steps + 1, to + 1):
+def miss_deadlines(manual_clock, inside, *, after: real2sim.Observation, to: int) -> None:
+    """Let the planner miss one deadline after another, until the worker has driven on to a step.
+
+    The session itself may show a step a moment later than its answer.
+    """
+    for step in range(after.step + 1, to + 1):
         manual_clock.expire_next()
         wait_until(lambda step=step: inside.world.steps == step, f"step {step}")
 
 
 def test_a_planner_that_hangs_is_driven_on_by_its_last_plan(episode, manual_clock, bystander):
-    with episode(**LATE) as (session, inside):
+    with episode(**LATE) as (session, inside, _):
         first = session.step(PLAN)
-        miss_deadlines(manual_clock, inside, to=4)
+        miss_deadlines(manual_clock, inside, after=first, to=4)
         # Its observation is sent before the next deadline begins.
         manual_clock.wait_for_sleeper()
         late = session.step(PLAN)
@@ -58,16 +61,16 @@ def test_a_planner_that_hangs_is_driven_on_by_its_last_plan(episode, manual_cloc
 
 
 def test_a_planner_that_hangs_for_good_comes_to_the_end_of_its_episode(episode, manual_clock):
-    with episode(horizon=4, **LATE) as (session, inside):
-        miss_deadlines(manual_clock, inside, to=4)
+    with episode(horizon=4, **LATE) as (session, inside, first):
+        miss_deadlines(manual_clock, inside, after=first, to=4)
         wait_until(lambda: inside.world.over, "the end of the episode")
         last = session.step(PLAN)
     assert (last.step, last.over, last.reason) == (4, True, "horizon")
 
 
 def test_a_late_planner_can_be_braked_for(episode, manual_clock):
-    with episode(on_timeout="brake", **LATE) as (session, inside):
-        miss_deadlines(manual_clock, inside, to=3)
+    with episode(on_timeout="brake", **LATE) as (session, inside, first):
+        miss_deadlines(manual_clock, inside, after=first, to=3)
         manual_clock.wait_for_sleeper()
         late = session.step(PLAN)
     # On the way to -6 m/s^2 behind the lag of the brakes.
@@ -76,7 +79,7 @@ def test_a_late_planner_can_be_braked_for(episode, manual_clock):
 
 
 def test_a_late_planner_can_be_waited_for(episode, manual_clock):
-    with episode(on_timeout="pause", **LATE) as (session, inside):
+    with episode(on_timeout="pause", **LATE) as (session, inside, _):
         manual_clock.expire_next()
         wait_until(lambda: inside.late, "the deadline to be missed")
         late = session.step(PLAN)
@@ -85,7 +88,7 @@ def test_a_late_planner_can_be_waited_for(episode, manual_clock):
 
 
 def test_a_late_planner_can_fail_its_episode(episode, manual_clock):
-    with episode(on_timeout="fail", **LATE) as (session, inside):
+    with episode(on_timeout="fail", **LATE) as (session, inside, _):
         manual_clock.expire_next()
         wait_until(lambda: inside.world.over, "the end of the episode")
         failed = session.step(PLAN)
@@ -94,7 +97,7 @@ def test_a_late_planner_can_fail_its_episode(episode, manual_clock):
 
 
 def test_an_episode_ends_with_its_wall_clock_time(episode, manual_clock):
-    with episode(wall_clock_s=0.2) as (session, inside):
+    with episode(wall_clock_s=0.2) as (session, inside, _):
         manual_clock.expire_next()
         wait_until(lambda: inside.world.over, "the end of the episode")
         ended = session.step(PLAN)
