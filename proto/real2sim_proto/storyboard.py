@@ -7,7 +7,7 @@ Numbers may be expressions of ``parameters``, so that a sweep sets those alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -15,12 +15,26 @@ from pydantic import Field, model_validator
 from .base import Identifier, Model
 from .storyboard_actions import (
     AnyAction,
+    Clothoid,
+    Dynamics,
     GlobalAction,
+    LateralDistanceAction,
+    LongitudinalDistanceAction,
     PrivateAction,
     Reference,
+    SpeedPoint,
+    SynchronizeAction,
     WorldPosition,
 )
-from .storyboard_conditions import Trigger
+from .storyboard_conditions import (
+    Condition,
+    EndOfRoad,
+    Offroad,
+    ReachPosition,
+    StandStill,
+    TraversedDistance,
+    Trigger,
+)
 from .storyboard_values import Name, Plain, Value, with_values
 
 MAX_ENTITIES = 64
@@ -274,9 +288,15 @@ DRAWN = (Uniform, Normal, Poisson, Choice, Histogram)
 class Storyboard(Model):
     """What happens in an episode.
 
-    Attributes that hold names are checked: an unknown entity or parameter is a ValueError.
+    Attributes that hold names are checked: an unknown entity or parameter is a ValueError. So are
+    times and distances: a negative one is refused by its name. Of rates the magnitude counts.
     """
 
+    version: Literal[1, 2] = Field(
+        default=2,
+        description="of the rules it runs by; 1 keeps the bits of recordings from before there "
+        "were versions",
+    )
     name: str = Field(default="", max_length=200)
     author: str = Field(default="", max_length=200)
     date: str = Field(default="", max_length=40)
@@ -302,13 +322,17 @@ class Storyboard(Model):
         default=False, description="moves the ego too, whatever the planner says"
     )
     ends_episode: bool = Field(
-        default=False, description="the episode ends with `stop`, or once all stories are complete"
+        default=False,
+        description="the episode ends with `stop`; without one, once all stories are complete",
     )
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Storyboard:
         _check_names(self)
-        resolved(self)
+        board = resolved(self)
+        if self.version >= 2:
+            for part in (board.controllers, board.init, board.stories, board.stop):
+                _check_magnitudes(part, "")
         return self
 
 
@@ -330,6 +354,11 @@ def resolved(board: Storyboard) -> Storyboard:
 _RESOLVED = (
     "entities", "signals", "controllers", "init", "global_init", "stories", "stop",
 )  # fmt: skip
+
+
+def stored_storyboard(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a storyboard as a log or file holds them: without a version, of version 1."""
+    return {"version": 1, **fields}
 
 
 def element_names(board: Storyboard) -> Iterator[tuple[str, ...]]:
@@ -401,6 +430,42 @@ def _check_entities(part: Any, names: frozenset[str]) -> None:
             _check_entities(value, names)
 
 
+_NEVER_NEGATIVE: Mapping[type[Model], tuple[str, ...]] = {
+    SpeedPoint: ("time",),
+    LongitudinalDistanceAction: ("distance", "time_gap"),
+    LateralDistanceAction: ("distance",),
+    SynchronizeAction: ("master_tolerance", "tolerance", "steady_distance", "steady_time"),
+    Clothoid: ("length",),
+    Condition: ("delay",),
+    ReachPosition: ("tolerance",),
+    TraversedDistance: ("value",),
+    StandStill: ("duration",),
+    Offroad: ("duration",),
+    EndOfRoad: ("duration",),
+    Phase: ("duration",),
+}
+"""Times and distances by model."""
+
+
+def _check_magnitudes(part: Any, where: str) -> None:
+    if isinstance(part, list):
+        for each in part:
+            _check_magnitudes(each, where)
+    if not isinstance(part, Model):
+        return
+    own = part.entity if isinstance(part, InitAction) else getattr(part, "name", "")
+    where = "::".join(name for name in (where, own) if name)
+    members = {name: name for name in _NEVER_NEGATIVE.get(type(part), ())}
+    if isinstance(part, Dynamics) and part.shape != "step" and part.dimension != "rate":
+        members = {"value": f"the {part.dimension} of its dynamics"}
+    for name, what in members.items():
+        value = getattr(part, name)
+        if isinstance(value, int | float) and value < 0:
+            raise ValueError(f"{where}: {what} is {value:g}; it must be 0 or more")
+    for value in part.__dict__.values():
+        _check_magnitudes(value, where)
+
+
 def _check_entity(name: str, names: Any) -> None:
     if name not in names and not name.startswith("$"):
         raise ValueError(f"{name!r} is no entity; there are: {', '.join(sorted(names)) or 'none'}")
@@ -425,4 +490,5 @@ __all__ = [
     "Storyboard",
     "element_names",
     "resolved",
+    "stored_storyboard",
 ]

@@ -86,6 +86,8 @@ def run(
         report = stack.enter_context(staged_progress())
         report("scene", 0, 1)
         loaded = _scene(scene, board, road_file, scene_out or folder / "scene")
+        if scene is not None and any(e.kind == "ego" and e.box for e in board.entities):
+            console.print("note: the ego is the scene's vehicle, and not the file's")
         if not as_it_is and (scene is not None or road_file is None):
             board = fitted_to_scene(board, loaded)
         report("scene", 1, 1)

@@ -17,7 +17,7 @@ from real2sim_proto.operations import (
     SetPhysics,
     SetVelocity,
 )
-from real2sim_proto.storyboard import Storyboard
+from real2sim_proto.storyboard import Storyboard, stored_storyboard
 
 from ..scene import Trajectory
 from .errors import EditError
@@ -62,7 +62,7 @@ def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
         regions = [EraseRegion.model_validate(r) for r in document["regions"]]
         colliders = [AddCollider.model_validate(c) for c in document["colliders"]]
         story = document.get("story")
-        board = None if story is None else Storyboard.model_validate(story)
+        board = None if story is None else Storyboard.model_validate(stored_storyboard(story))
         tombstones, next_instance_id = frozenset(document["gone"]), document["next_instance_id"]
     except (CodecError, KeyError, TypeError, ValueError) as error:
         raise EditError(

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from real2sim_proto.storyboard import MapRoads, RouteLanes, Storyboard, resolved
+from real2sim_proto.storyboard import MapRoads, Storyboard
 
 from ..geometry.rotation import Float, yaw_quaternion
 from ..maps import read_map
@@ -29,15 +29,16 @@ from ..scene.person import person_asset
 from ..world.path import LoggedPath
 from ..world.storyboard.entities import BOXES
 from ..world.storyboard.graph_roads import GraphNetwork
-from ..world.storyboard.positions import Places
-from ..world.storyboard.roads import Place, RoadNetwork, RouteNetwork, Way, straight
+from ..world.storyboard.roads import Place, Way, straight
+from ..world.storyboard.run import StoryboardRun
 from .errors import ScenarioError
+from .fit import begun_alone
 
 BEFORE, SECONDS = 60.0, 40.0
 """How far the road goes back from where the ego begins [m]; length of the recorded drive [s]."""
 
-SLOWEST = 5.0
-"""Of the recorded drive, so that it leads somewhere [m/s]."""
+SLOWEST, GAIN = 5.0, 1.0
+"""The recorded drive speeds up to this at least, so that it leads somewhere [m/s], [m/s^2]."""
 
 STEP_US = 100_000
 AWAY = (-1000.0, 0.0, -50.0)
@@ -56,8 +57,8 @@ def flat_scene(
 ) -> Scene:
     """A scene on which a storyboard can run by itself.
 
-    Its recorded drive begins where the storyboard puts the ego, and goes along the lane there as
-    fast as the ego begins; without an ego it goes straight on from the origin.
+    Its recorded drive begins where the storyboard puts the ego, as fast as it begins, in a vehicle
+    of its size, and goes along the lane there; without an ego it goes straight on from the origin.
 
     Args:
         board: the storyboard.
@@ -65,20 +66,23 @@ def flat_scene(
         seconds: length of the drive.
 
     Raises:
-        ScenarioError: the road network is needed and not there.
+        ScenarioError: the road network is needed and not there, or the storyboard is about objects
+            of a scene.
         MapError: it cannot be read.
         WorldError: the ego is put nowhere on it.
     """
     graph = _graph(board, road_file)
-    start, speed = _ego_start(resolved(board), graph)
+    run = begun_alone(board, None if graph is None else GraphNetwork(graph))
+    start, speed, more = _start(run)
     way = _way(start, graph)
     times = np.arange(int(seconds * 1e6) // STEP_US + 1, dtype=np.int64) * STEP_US
     near = way.path.nearest(start.x, start.y)
-    places = [way.path.at(near.s + max(speed, SLOWEST) * t * 1e-6) for t in times.tolist()]
+    places = [way.path.at(near.s + _gone(speed, t * 1e-6)) for t in times.tolist()]
     points = np.array([(x, y, 0.0) for x, y, _, _ in places])
     quaternions = np.array([yaw_quaternion(h) for *_, h in places])
-    ego = Trajectory(times, points, quaternions)
-    roads: dict[str, Any] = {} if graph is None else {"lanes": graph}
+    drive = Trajectory(times, points, quaternions)
+    if graph is not None:
+        more["lanes"] = graph
     background = _merged([*_surface(points, [h for *_, h in places]), *_lane_lines(graph)])
     return Scene(
         name="flat",
@@ -86,11 +90,11 @@ def flat_scene(
         objects=_looks(),
         sky=_sky(),
         rig=CameraRig(_cameras()),
-        ego=ego,
+        ego=drive,
         frame_times_us=times,
         stored_ground=_ground(points),
         provenance={"source": "flat", "storyboard": board.name},
-        **roads,
+        **more,
     )
 
 
@@ -105,31 +109,22 @@ def _graph(board: Storyboard, road_file: Path | None) -> LaneGraph | None:
     return read_map(road_file)
 
 
-def _ego_start(board: Storyboard, graph: LaneGraph | None) -> tuple[Place, float]:
-    """Where the storyboard puts the ego, and how fast it is."""
-    ego = next((e.name for e in board.entities if e.kind == "ego"), None)
-    place, speed = Place(0.0, 0.0, 0.0), 0.0
-    network: RoadNetwork = GraphNetwork(graph) if graph is not None else _straight_lanes(board)
-    for entry in board.init:
-        if entry.entity != ego:
-            continue
-        if entry.action.kind == "teleport":
-            place = Places({}, network, board.origin).of(entry.action.position)
-        elif entry.action.kind == "speed" and entry.action.relative_to is None:
-            speed = float(entry.action.speed)
-        elif entry.action.kind == "follow_trajectory":
-            curve = entry.action.curve
-            first = curve.vertices[0].position if curve.shape == "polyline" else None
-            first = getattr(curve, "position", first)
-            if first is not None:
-                place = Places({}, network, board.origin).of(first)
-    return place, speed
+def _start(run: StoryboardRun) -> tuple[Place, float, dict[str, Any]]:
+    """Where the recorded drive begins, how fast, and what else the scene has of the ego."""
+    if run.ego is None:
+        return Place(0.0, 0.0, 0.0), SLOWEST, {}
+    ego = run.entities[run.ego]
+    (x, y), speed = ego.axle, ego.speed if run.ego_put else SLOWEST
+    if ego.trajectory is not None and ego.trajectory.timing is not None:
+        speed = ego.trajectory.step(0.0, STEP_US * 1e-6)[0] / (STEP_US * 1e-6)
+    return Place(x, y, ego.h), max(speed, 0.0), {"ego_size": ego.size}
 
 
-def _straight_lanes(board: Storyboard) -> RouteNetwork:
-    """Lanes along the x axis of the world, the route at y = 0 and s at x."""
-    lanes = board.roads if isinstance(board.roads, RouteLanes) else RouteLanes()
-    return RouteNetwork.of(lanes, straight(0.0, 0.0, 0.0))
+def _gone(speed: float, t: float) -> float:
+    """Way of the recorded drive [m]: as fast as it begins, then up to ``SLOWEST``."""
+    gaining = min(max(t - STEP_US * 1e-6, 0.0), max(SLOWEST - speed, 0.0) / GAIN)
+    after = max(t - STEP_US * 1e-6 - gaining, 0.0)
+    return speed * (t - after) + GAIN * gaining**2 / 2 + max(speed, SLOWEST) * after
 
 
 def _way(start: Place, graph: LaneGraph | None) -> Way:

@@ -6,6 +6,9 @@ from typing import Any
 
 from .case import Fields
 
+EGO = {"size": (4.6, 1.85, 1.6), "centre": (1.35, 0.0, 0.8)}
+"""Of scenes that do not say more of their vehicle."""
+
 CAR = {"size": (4.5, 1.85, 1.5), "centre": (1.35, 0.0, 0.75)}
 VAN = {"size": (5.4, 2.0, 2.3), "centre": (1.6, 0.0, 1.15)}
 MOTORCYCLE = {"size": (2.1, 0.8, 1.6), "centre": (0.0, 0.0, 0.8)}
@@ -132,5 +135,5 @@ def board(
         {"name": n, "category": c, "box": b, "model": c, "mass": MASSES.get(c, 1500.0)}
         for n, c, b in entities
     ]
-    ego = {"name": "Ego", "kind": "ego", "box": CAR, "model": "ego"}
+    ego = {"name": "Ego", "kind": "ego", "box": EGO, "model": "ego"}
     return {"entities": [ego, *made], "init": init, "stories": stories}

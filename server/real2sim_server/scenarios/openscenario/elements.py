@@ -137,6 +137,18 @@ class Part:
         """A number, or None where it is absent."""
         return self.number(name) if name in self.raw.attributes else None
 
+    def magnitude(self, name: str, default: float | None = None) -> float | str:
+        """A time or distance, which is 0 or more; or the expression of parameters that it is."""
+        found = self.number(name, default)
+        value = float(self._evaluated(name, self._given(name, repr(default))))
+        if value < 0:
+            raise self.error(f"{name} of <{self.tag}> is {value:g}; it must be 0 or more")
+        return found
+
+    def magnitude_or_none(self, name: str) -> float | str | None:
+        """A time or distance, or None where it is absent."""
+        return self.magnitude(name) if name in self.raw.attributes else None
+
     def integer(self, name: str, default: int | None = None) -> int:
         """A whole number as it evaluates now."""
         value = self._evaluated(name, self._given(name, None if default is None else str(default)))

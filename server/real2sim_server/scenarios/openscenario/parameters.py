@@ -13,21 +13,27 @@ NUMBERS = frozenset({"double", "integer", "int", "unsignedInt", "unsignedShort"}
 KINDS = {name: name for name in (*NUMBERS, "string", "boolean", "dateTime")}
 
 
+def scoped(part: Part) -> Part:
+    """An element in the scope of the parameters that it declares for itself: inner names win."""
+    declarations = part.find("ParameterDeclarations")
+    return part if declarations is None else part.within(declared(declarations, {}, {}))
+
+
 def declared(part: Part | None, texts: Mapping[str, str], values: Mapping[str, Any]) -> Scope:
-    """The scope of declarations within an entry of a catalog: a parameter stands for what is
-    assigned to it, or for its default."""
-    scope = Scope({}, {})
+    """The scope of declarations below the top level, in the scope in which they stand: a parameter
+    stands for what is assigned to it, or for its default."""
+    scope = Scope({}, {}) if part is None else Scope(part.scope.texts, part.scope.values)
     for each in part.children("ParameterDeclaration") if part is not None else []:
         name, kind = each.text("name"), each.choice("parameterType", KINDS)
         own = each.within(scope)
-        given = own.raw.attributes.get("value", "")
         own.text("value")
+        given = own.raw.attributes["value"].strip()
         text, value = scope.expression(given), scope.value(given)
         if name in texts:
             text, value = texts[name], values[name]
         scope.texts[name] = _embedded(text)
         scope.values[name] = typed(each, value, kind)
-        check_constraints(each, name, scope.values[name])
+        check_constraints(own, name, scope.values[name])
     return scope
 
 
@@ -60,7 +66,7 @@ def top_level(part: Part | None, given: Mapping[str, Any]) -> tuple[Scope, dict[
         else:
             parameters[name] = value
             scope.texts[name] = str(value)
-        check_constraints(each, name, value)
+        check_constraints(own, name, value)
     if unknown := sorted(set(given) - set(scope.values)):
         names = ", ".join(scope.values) or "none"
         where = part.file if part is not None else "the scenario"

@@ -16,7 +16,7 @@ from .catalogs import Catalogs
 from .distributions import read_distributions
 from .elements import Part, RawElement, Scope, read_elements, unread
 from .names import PEDESTRIANS, PRIORITIES, VEHICLES
-from .parameters import top_level
+from .parameters import scoped, top_level
 from .read_actions import Actions
 from .read_conditions import Conditions, plain_value
 from .read_positions import Fields, Positions
@@ -153,6 +153,7 @@ class _Reader:
         positions = Positions(self.catalogs.entry)
         self._actions, self._conditions = Actions(positions), Conditions(positions)
         self.notes, self.road_file = list[str](), None
+        self._at_once = list[int]()
 
     road_file: Path | None
 
@@ -168,13 +169,21 @@ class _Reader:
         stop = self._conditions.trigger(board.find("StopTrigger"))
         # The element has to be there; without a condition it says nothing.
         stop = stop if stop is not None and stop["groups"] else None
+        stories = [self._story(s) for s in board.children("Story")]
+        if self._at_once:
+            lines = ", ".join(map(str, self._at_once[:5]))
+            more = ", ..." if len(self._at_once) > 5 else ""
+            self.notes.append(
+                f"{len(self._at_once)} of the acts and events have a start trigger without "
+                f"conditions and begin at once (line {lines}{more})"
+            )
         return {
             **road,
             "variables": self._variables(whole.find("VariableDeclarations")),
             "entities": entities,
             "init": init,
             "global_init": global_init,
-            "stories": [self._story(s) for s in board.children("Story")],
+            "stories": stories,
             "stop": stop,
             "ends_episode": stop is not None,
         }
@@ -222,7 +231,7 @@ class _Reader:
             }
             phases.append(
                 {
-                    "name": phase.text("name"), "duration": phase.number("duration"),
+                    "name": phase.text("name"), "duration": phase.magnitude("duration"),
                     "states": states,
                 }
             )  # fmt: skip
@@ -255,8 +264,7 @@ class _Reader:
         if len(holders) != 1:
             raise part.error(f"<ScenarioObject> needs one of {', '.join(kinds)}")
         model = holders[0]
-        if model.tag == "CatalogReference":
-            model = self._of_catalog(model)
+        model = self._of_catalog(model) if model.tag == "CatalogReference" else scoped(model)
         self._object_controllers(part, name, ego)
         size, centre = _box(model)
         fields: Fields = {
@@ -329,8 +337,8 @@ class _Reader:
     def _environment(self, part: Part) -> None:
         """Weather has no effect but friction, which is refused where it is not 1."""
         found = part.only({"Environment", "CatalogReference"})
-        if found.tag == "CatalogReference":
-            found = self.catalogs.entry(found, "Environment")
+        is_named = found.tag == "CatalogReference"
+        found = self.catalogs.entry(found, "Environment") if is_named else scoped(found)
         road = found.find("RoadCondition")
         if road is not None and road.number("frictionScaleFactor", 1.0) != 1.0:
             raise road.error("frictionScaleFactor is not supported but as 1")
@@ -341,17 +349,24 @@ class _Reader:
         )
 
     def _story(self, part: Part) -> Fields:
-        if (declarations := part.find("ParameterDeclarations")) is not None:
-            raise declarations.error("<ParameterDeclarations> of a story are not supported")
+        part = scoped(part)
         return {"name": part.text("name"), "acts": [self._act(a) for a in part.children("Act")]}
 
     def _act(self, part: Part) -> Fields:
         return {
             "name": part.text("name"),
             "groups": [self._group(g) for g in part.children("ManeuverGroup")],
-            "start": self._conditions.trigger(part.find("StartTrigger")),
+            "start": self._start(part),
             "stop": self._conditions.trigger(part.find("StopTrigger")),
         }
+
+    def _start(self, part: Part) -> Fields | None:
+        """When an act or event begins; None: with what it is part of."""
+        start = self._conditions.trigger(part.find("StartTrigger"))
+        if start is None or start["groups"]:
+            return start
+        self._at_once.append(part.raw.line)
+        return None
 
     def _group(self, part: Part) -> Fields:
         who = part.child("Actors")
@@ -359,9 +374,8 @@ class _Reader:
             raise who.error("selectTriggeringEntities is not supported but as false")
         maneuvers = list[Fields]()
         for each in part.children("Maneuver", "CatalogReference"):
-            found = each
-            if each.tag == "CatalogReference":
-                found = self.catalogs.entry(each, "Maneuver")
+            is_named = each.tag == "CatalogReference"
+            found = self.catalogs.entry(each, "Maneuver") if is_named else scoped(each)
             maneuvers.append(self._maneuver(found))
         return {
             "name": part.text("name"),
@@ -386,7 +400,7 @@ class _Reader:
             "priority": part.choice("priority", PRIORITIES, "override"),
             "times": part.integer("maximumExecutionCount", 1),
             "actions": actions,
-            "start": self._conditions.trigger(part.find("StartTrigger")),
+            "start": self._start(part),
         }
 
 

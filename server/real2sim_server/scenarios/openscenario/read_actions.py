@@ -48,7 +48,7 @@ class Actions:
     def _speed_profile(self, part: Part) -> Fields:
         part.choice("followingMode", MODES, "position")
         points = [
-            {"time": p.number("time", 0.0), "speed": p.number("speed")}
+            {"time": p.magnitude("time", 0.0), "speed": p.number("speed")}
             for p in part.children("SpeedProfileEntry")
         ]
         return {
@@ -60,8 +60,8 @@ class Actions:
         return {
             "kind": "longitudinal_distance",
             "entity": part.text("entityRef"),
-            "distance": part.number_or_none("distance"),
-            "time_gap": part.number_or_none("timeGap"),
+            "distance": part.magnitude_or_none("distance"),
+            "time_gap": part.magnitude_or_none("timeGap"),
             "place": part.choice("displacement", PLACES, "any"),
             "freespace": part.flag("freespace"),
             "continuous": part.flag("continuous"),
@@ -107,7 +107,7 @@ class Actions:
         return {
             "kind": "lateral_distance",
             "entity": part.text("entityRef"),
-            "distance": part.number("distance", 0.0),
+            "distance": part.magnitude("distance", 0.0),
             "side": part.choice("displacement", SIDES, "any"),
             "freespace": part.flag("freespace"),
             "continuous": part.flag("continuous"),
@@ -122,8 +122,8 @@ class Actions:
             "master": part.text("masterEntityRef"),
             "master_target": self._positions.position(part.child("TargetPositionMaster")),
             "target": self._positions.position(part.child("TargetPosition")),
-            "master_tolerance": part.number("targetToleranceMaster", 0.0),
-            "tolerance": part.number("targetTolerance", 0.0),
+            "master_tolerance": part.magnitude("targetToleranceMaster", 0.0),
+            "tolerance": part.magnitude("targetTolerance", 0.0),
         }
         final = part.find("FinalSpeed")
         if final is None:
@@ -140,9 +140,9 @@ class Actions:
             speed.find("TargetTimeSteadyState"),
         )
         if distance is not None:
-            fields["steady_distance"] = distance.number("distance")
+            fields["steady_distance"] = distance.magnitude("distance")
         if time is not None:
-            fields["steady_time"] = time.number("time")
+            fields["steady_time"] = time.magnitude("time")
         return fields
 
     def _follow_trajectory(self, part: Part) -> Fields:
@@ -224,11 +224,12 @@ class Actions:
 
 def _dynamics(part: Part) -> Fields:
     part.choice("followingMode", MODES, "position")
-    return {
-        "shape": part.choice("dynamicsShape", SHAPES),
-        "dimension": part.choice("dynamicsDimension", DIMENSIONS),
-        "value": part.number("value"),
-    }
+    shape = part.choice("dynamicsShape", SHAPES)
+    dimension = part.choice("dynamicsDimension", DIMENSIONS)
+    # Some write braking as a negative rate, whose magnitude counts.
+    signed = shape == "step" or dimension == "rate"
+    value = part.number("value") if signed else part.magnitude("value")
+    return {"shape": shape, "dimension": dimension, "value": value}
 
 
 def _limits(part: Part) -> Fields:

@@ -35,7 +35,7 @@ class Conditions:
         return {"groups": groups}
 
     def _condition(self, part: Part) -> Fields:
-        edge, delay = part.choice("conditionEdge", EDGES, "none"), part.number("delay", 0.0)
+        edge, delay = part.choice("conditionEdge", EDGES, "none"), part.magnitude("delay", 0.0)
         kind = part.only({"ByEntityCondition", "ByValueCondition"})
         if kind.tag == "ByValueCondition":
             found = kind.only(_BY_VALUE)
@@ -110,7 +110,7 @@ class Conditions:
     def _reach(self, part: Part) -> Fields:
         place = self._positions.position(part.child("Position"))
         return {
-            "kind": "reach_position", "position": place, "tolerance": part.number("tolerance"),
+            "kind": "reach_position", "position": place, "tolerance": part.magnitude("tolerance"),
         }  # fmt: skip
 
     def _speed(self, part: Part) -> Fields:
@@ -130,7 +130,7 @@ class Conditions:
         return {"kind": "collision", "category": kind}
 
     def _traversed(self, part: Part) -> Fields:
-        return {"kind": "traversed_distance", "value": part.number("value")}
+        return {"kind": "traversed_distance", "value": part.magnitude("value")}
 
     def _lasting(self, part: Part) -> Fields:
         kinds = {
@@ -138,7 +138,7 @@ class Conditions:
             "OffroadCondition": "offroad",
             "EndOfRoadCondition": "end_of_road",
         }
-        return {"kind": kinds[part.tag], "duration": part.number("duration")}
+        return {"kind": kinds[part.tag], "duration": part.magnitude("duration")}
 
     def _angle(self, part: Part) -> Fields:
         part.choice("angleType", {"heading": "heading"})

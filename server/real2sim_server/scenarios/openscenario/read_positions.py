@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .elements import Part
+from .parameters import scoped
 
 Fields = dict[str, Any]
 """Of a model of the storyboard."""
@@ -29,8 +30,8 @@ class Positions:
     def route(self, part: Part) -> Fields:
         """Of ``RouteRef`` or ``AssignRouteAction``: a route here, or of a catalog."""
         found = part.only({"Route", "CatalogReference"})
-        if found.tag == "CatalogReference":
-            found = self._entry(found, "Route")
+        is_named = found.tag == "CatalogReference"
+        found = self._entry(found, "Route") if is_named else scoped(found)
         points = found.children("Waypoint")
         for point in points:
             point.optional("routeStrategy")
@@ -43,8 +44,8 @@ class Positions:
     def trajectory(self, part: Part) -> Fields:
         """Of ``TrajectoryRef``: name, closed and curve."""
         found = part.only({"Trajectory", "CatalogReference"})
-        if found.tag == "CatalogReference":
-            found = self._entry(found, "Trajectory")
+        is_named = found.tag == "CatalogReference"
+        found = self._entry(found, "Trajectory") if is_named else scoped(found)
         shape = found.child("Shape").only(_SHAPES)
         return {
             "name": found.text("name", "trajectory"),
@@ -146,7 +147,7 @@ class Positions:
             "position": self.position(part.child("Position")),
             "curvature": part.number("curvature"),
             "curvature_rate": part.number(rate, 0.0),
-            "length": part.number("length"),
+            "length": part.magnitude("length"),
             "start_time": part.number_or_none("startTime"),
             "stop_time": part.number_or_none("stopTime"),
         }

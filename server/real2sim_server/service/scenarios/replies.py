@@ -9,7 +9,14 @@ from functools import cached_property
 from typing import Any, overload
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.operations import OPERATIONS, Insert, Operation, Replace, Spawn
+from real2sim_proto.operations import (
+    OPERATIONS,
+    Insert,
+    Operation,
+    Replace,
+    Spawn,
+    stored_operations,
+)
 from real2sim_proto.scenarios import HistoryEntry, OperationResult, ScenarioInfo
 
 from ...edit import AssetLookup, LogEntry, PlannedEntry, Scenario, ScenarioState
@@ -77,7 +84,7 @@ class StoredOperations(Sequence[Operation]):
 
     @cached_property
     def _models(self) -> list[Operation]:
-        return OPERATIONS.validate_python(self._stored)
+        return OPERATIONS.validate_python(stored_operations(self._stored))
 
 
 def stored_entry(stored: Mapping[str, Any]) -> LogEntry:

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from real2sim_proto import decode, encode
 from real2sim_proto.episode import ResetSpec
-from real2sim_proto.operations import Operation
+from real2sim_proto.operations import Operation, stored_operations
 from real2sim_proto.plans import PLAN, Plan
 
 from ...edit import ScenarioState
@@ -142,7 +142,7 @@ def _apply_entry(world: World, kind: str, fields: dict[str, Any]) -> None:
                 missed=fields.get("missed", False),
             )
         case "edit":
-            world.apply(_OPERATIONS.validate_python(fields["operations"]))
+            world.apply(_OPERATIONS.validate_python(stored_operations(fields["operations"])))
         case "agent":
             poses = [(x, y, yaw) for x, y, yaw in fields["poses"]]
             world.set_agent_plan(fields["object_id"], fields["times_us"], poses)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from real2sim_proto.episode import ResetSpec
+from real2sim_proto.storyboard import stored_storyboard
 
 BEFORE: Mapping[str, Any] = {
     "ego": {
@@ -36,7 +37,10 @@ def stored_spec(fields: Mapping[str, Any]) -> ResetSpec:
     Raises:
         ValueError: it is no spec.
     """
-    spec = ResetSpec.model_validate(_completed(fields, BEFORE))
+    completed = _completed(fields, BEFORE)
+    if isinstance(board := completed.get("storyboard"), Mapping):
+        completed["storyboard"] = stored_storyboard(board)
+    spec = ResetSpec.model_validate(completed)
     if fields.get("horizon") is None:
         # To the end of the log, also where the episode could have gone on.
         return spec.model_copy(update={"horizon": None})

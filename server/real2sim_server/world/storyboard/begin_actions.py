@@ -30,7 +30,7 @@ from ..errors import WorldError
 from ..evolve import evolved
 from ..path import LoggedPath
 from .dynamics import duration, gentle_duration
-from .entity_state import EntityState
+from .entity_state import ACROSS, EntityState
 from .lateral import FollowOffset, HoldOffset, KeepAside, OffsetChange, lane_offset
 from .longitudinal import (
     FollowIdm,
@@ -45,6 +45,9 @@ from .roads import Place, RoadPoint, Way, path_through
 from .trajectory import Trajectory, course_of
 from .view import View, across, ahead_on_way
 
+BESIDE_ROUTE = 10.0
+"""Who is teleported no further than this from the assigned route goes on along it [m]."""
+
 SLOWEST_DESIRED = 3.0
 """Desired speed of an entity that stands when its controller is activated [m/s]."""
 
@@ -57,11 +60,13 @@ class Beginning:
         view: the instant.
         places: resolves positions then.
         token: of the action.
+        version: of the storyboard.
     """
 
     view: View
     places: Places
     token: int
+    version: int
 
 
 def begun(actor: EntityState, action: Any, at: Beginning) -> EntityState:
@@ -75,6 +80,13 @@ def begun(actor: EntityState, action: Any, at: Beginning) -> EntityState:
 
 def _done(actor: EntityState, at: Beginning, **changes: Any) -> EntityState:
     return evolved(actor, finished=actor.finished | {at.token}, **changes)
+
+
+def _dynamics(dynamics: Dynamics, at: Beginning) -> Dynamics:
+    """With the magnitude of a rate: some write braking as a negative one."""
+    if at.version < 2 or dynamics.dimension != "rate":
+        return dynamics
+    return dynamics.model_copy(update={"value": abs(float(dynamics.value))})
 
 
 def _freed(actor: EntityState) -> EntityState:
@@ -97,7 +109,7 @@ def _on_lane(actor: EntityState, at: Beginning) -> EntityState:
 
 def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityState:
     actor = _freed(actor)
-    value, dynamics = float(action.speed), action.dynamics
+    value, dynamics = float(action.speed), _dynamics(action.dynamics, at)
     if action.continuous and action.relative_to is not None:
         rate = float(dynamics.value) if dynamics.dimension == "rate" else math.inf
         rate = math.inf if dynamics.shape == "step" else rate
@@ -187,7 +199,7 @@ def _lane_change(actor: EntityState, action: LaneChangeAction, at: Beginning) ->
         lane = network.neighbour(base.road, base.lane, base.s, lane * sense)
     actor = actor.on_way(network.way(here.road, lane, here.s, along=along))
     end = float(action.offset) * (1.0 if along else -1.0)
-    dynamics, change = action.dynamics, end - actor.offset
+    dynamics, change = _dynamics(action.dynamics, at), end - actor.offset
     by_way = dynamics.dimension == "distance" and dynamics.shape != "step"
     extent = float(dynamics.value) if by_way else duration(dynamics, change)
     return _shifted(actor, dynamics.shape, end, extent, at, by_way=by_way)
@@ -276,13 +288,27 @@ def _acquire_position(
 
 
 def _on_route(actor: EntityState, path: LoggedPath) -> EntityState:
-    way = Way("route", 1, True, path)
+    way = Way("route", 1, True, path, assigned=True)
     return evolved(actor, trajectory=None, lateral=None).on_way(way)
 
 
 def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> EntityState:
-    put = actor.put(at.places.of(action.position), at.view.network)
+    place = at.places.of(action.position)
+    put = actor.put(place, at.view.network)
+    route = actor.way
+    if at.version >= 2 and route is not None and route.assigned and _is_beside(place, route):
+        put = put.on_way(route)
     return _done(put, at, lateral=None)
+
+
+def _is_beside(place: Place, route: Way) -> bool:
+    """Whether a place is one to drive a route from."""
+    near = route.path.nearest(place.x, place.y)
+    # Headings of a route turn between its places, which may be far apart: its points tell more.
+    (x0, y0, *_), (x1, y1, *_) = (route.path.at(near.s + ds) for ds in (-0.5, 0.5))
+    turn = math.remainder(math.atan2(y1 - y0, x1 - x0) - place.h, math.tau)
+    away = math.dist((place.x, place.y), near.position[:2])
+    return away <= BESIDE_ROUTE and abs(turn) <= ACROSS
 
 
 def _visibility(actor: EntityState, action: VisibilityAction, at: Beginning) -> EntityState:

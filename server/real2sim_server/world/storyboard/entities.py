@@ -58,6 +58,15 @@ def box_of(entity: Entity, subject: ObjectState | None, ego_size: Vector) -> tup
     return size, (ahead, 0.0, size[2] / 2)
 
 
+def own_centre(ego: Entity, ego_size: Vector) -> Vector | None:
+    """Where the middle of the ego's box is from its reference point [m], as the storyboard says of
+    a vehicle of that size; None: it speaks of another vehicle, or of none."""
+    if ego.box is None or not np.allclose([float(v) for v in ego.box.size], ego_size, atol=1e-6):
+        return None
+    x, y, z = (float(v) for v in ego.box.centre)
+    return x, y, z
+
+
 def subjects_of(
     entities: Iterable[Entity], state: ScenarioState, scene: Scene
 ) -> dict[str, ObjectState]:

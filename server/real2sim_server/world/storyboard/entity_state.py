@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 from ...edit import ObjectState
 from ...scene import Ground
+from ..ego.box import REAR_OVERHANG
 from ..evolve import evolved
 from ..traffic.driver import AgentPose, ObservedEgo, level_quaternion
 from .roads import Place, RoadNetwork, Way, straight
@@ -111,6 +112,18 @@ class EntityState:
         return self.x + cx * cos - cy * sin, self.y + cx * sin + cy * cos
 
     @property
+    def axle(self) -> tuple[float, float]:
+        """Of the ego: the middle of its rear axle [m], which need not be its reference point."""
+        ahead, left = self._axle
+        cos, sin = math.cos(self.h), math.sin(self.h)
+        return self.x + ahead * cos - left * sin, self.y + ahead * sin + left * cos
+
+    @property
+    def _axle(self) -> tuple[float, float]:
+        """Of the ego: its rear axle from the reference point, ahead and to the left [m]."""
+        return self.centre[0] - (self.size[0] / 2 - REAR_OVERHANG), self.centre[1]
+
+    @property
     def velocity(self) -> tuple[float, float]:
         """Of its reference point, world [m/s]."""
         yaw = self.h
@@ -176,8 +189,10 @@ class EntityState:
 def observed(actor: EntityState, ego: ObservedEgo, dt: float) -> EntityState:
     """The ego as the planner has moved it in the step of ``dt`` seconds that led here; ``actor``
     is as it was taken to be."""
-    ahead = ego.front - ego.length / 2
-    x, y = ego.x - ahead * math.cos(ego.yaw), ego.y - ahead * math.sin(ego.yaw)
+    axle_ahead, left = actor._axle
+    ahead = ego.front - ego.length / 2 + axle_ahead
+    cos, sin = math.cos(ego.yaw), math.sin(ego.yaw)
+    x, y = ego.x - ahead * cos + left * sin, ego.y - ahead * sin - left * cos
     rate = (ego.speed - actor.speed) / dt if dt > 0.0 else 0.0
     return evolved(actor, x=x, y=y, h=ego.yaw, speed=ego.speed, acceleration=rate, way=None)
 

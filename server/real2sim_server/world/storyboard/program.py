@@ -6,8 +6,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from real2sim_proto.storyboard import Event, Storyboard
+from real2sim_proto import ErrorCode
+from real2sim_proto.base import Model
+from real2sim_proto.storyboard import Event, InitAction, Storyboard
 from real2sim_proto.storyboard_conditions import ElementType, Trigger
+
+from ..errors import WorldError
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +63,14 @@ class Program:
 
     Attributes:
         board: with the values of its parameters.
+        init: what holds when the episode begins, in the order in which it is done.
         stories: top elements.
         elements: all of them by number.
         stop: of the whole.
     """
 
     board: Storyboard
+    init: tuple[InitAction, ...]
     stories: tuple[Element, ...]
     elements: tuple[Element, ...]
     stop: Start | None
@@ -76,16 +82,72 @@ class Program:
 
 
 def program_of(board: Storyboard) -> Program:
-    """The program of a storyboard whose parameters have their values."""
-    maker = _Maker()
+    """The program of a storyboard whose parameters have their values.
+
+    Raises:
+        WorldError: INVALID_REQUEST, entities are placed relative to each other.
+    """
+    maker = _Maker(board.version)
     stories = tuple(maker.story(story) for story in board.stories)
     elements = sorted((e for s in stories for e in s.within()), key=lambda e: e.number)
-    return Program(board, stories, tuple(elements), maker.start(board.stop))
+    init = tuple(board.init) if board.version < 2 else _in_order(board.init)
+    return Program(board, init, stories, tuple(elements), maker.start(board.stop))
+
+
+PLACING = frozenset({"teleport", "follow_trajectory"})
+"""Kinds of actions that put an entity somewhere."""
+
+_SPEEDING = frozenset({"speed", "speed_profile"})
+_ENTITY_MEMBERS = ("entity", "relative_to", "master")
+
+
+def _in_order(entries: Sequence[InitAction]) -> tuple[InitAction, ...]:
+    """In the order of the file, but after what they refer to: a place relative to an entity comes
+    after that entity's place, a speed relative to another's after that speed."""
+    waiting, done = list(entries), list[InitAction]()
+    while waiting:
+        ready = next((e for k, e in enumerate(waiting) if _is_ready(e, waiting, k)), None)
+        if ready is None:
+            # Who keeps a distance to somebody need not wait for them.
+            ready = next((e for e in waiting if e.action.kind not in PLACING | _SPEEDING), None)
+        if ready is None:
+            names = " and ".join(repr(e) for e in dict.fromkeys(e.entity for e in waiting))
+            raise WorldError(
+                ErrorCode.INVALID_REQUEST,
+                f"{names} are placed relative to each other at the start",
+                hint="give one of them a place or speed of its own in the storyboard's init",
+            )
+        waiting.remove(ready)
+        done.append(ready)
+    return tuple(done)
+
+
+def _is_ready(entry: InitAction, waiting: Sequence[InitAction], k: int) -> bool:
+    if any(earlier.entity == entry.entity for earlier in waiting[:k]):
+        return False
+    kinds = _SPEEDING if entry.action.kind in _SPEEDING else PLACING
+    others = set(_references(entry.action)) - {entry.entity}
+    return not any(w.entity in others and w.action.kind in kinds for w in waiting)
+
+
+def _references(part: Any) -> Iterator[str]:
+    """Names of the entities that an action refers to."""
+    if isinstance(part, list):
+        for each in part:
+            yield from _references(each)
+    if not isinstance(part, Model):
+        return
+    for member, value in part.__dict__.items():
+        if member in _ENTITY_MEMBERS and isinstance(value, str):
+            yield value
+        else:
+            yield from _references(value)
 
 
 class _Maker:
-    def __init__(self) -> None:
+    def __init__(self, version: int) -> None:
         self._elements, self._conditions = 0, 0
+        self._version = version
 
     def start(self, trigger: Trigger | None) -> Start | None:
         if trigger is None:
@@ -97,6 +159,11 @@ class _Maker:
             numbers.append(tuple(range(first, self._conditions)))
         return Start(trigger, tuple(numbers))
 
+    def _begin(self, trigger: Trigger | None) -> Trigger | None:
+        """A start trigger without conditions lets its element begin with its parent."""
+        asked = trigger is not None and (trigger.groups or self._version < 2)
+        return trigger if asked else None
+
     def story(self, story: Any) -> Element:
         path = (story.name,)
         return self._made("story", path, story, [self._act(a, path) for a in story.acts])
@@ -104,7 +171,8 @@ class _Maker:
     def _act(self, act: Any, above: tuple[str, ...]) -> Element:
         path = (*above, act.name)
         groups = [self._group(g, path) for g in act.groups]
-        return self._made("act", path, act, groups, start=act.start, stop=act.stop)
+        start = self._begin(act.start)
+        return self._made("act", path, act, groups, start=start, stop=act.stop)
 
     def _group(self, group: Any, above: tuple[str, ...]) -> Element:
         path, entities = (*above, group.name), tuple(group.entities)
@@ -123,7 +191,8 @@ class _Maker:
         actions = [
             self._made("action", (*path, a.name), a.action, (), entities) for a in event.actions
         ]
-        return self._made("event", path, event, actions, entities, start=event.start)
+        start = self._begin(event.start)
+        return self._made("event", path, event, actions, entities, start=start)
 
     def _made(
         self,

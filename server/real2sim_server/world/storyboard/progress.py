@@ -129,10 +129,9 @@ class Progress:
 
     def initialise(self, t_us: int, elapsed: float) -> None:
         """Do what the storyboard says of the beginning."""
-        board = self._program.board
-        for action in board.global_init:
+        for action in self._program.board.global_init:
             self._global(action, t_us, elapsed)
-        for entry in board.init:
+        for entry in self._program.init:
             self._begin_private(entry.entity, entry.action, elapsed, first=True)
 
     def pass_instant(self, t_us: int, elapsed: float, *, first: bool) -> None:
@@ -300,7 +299,7 @@ class Progress:
                 hint="let the storyboard drive the ego (drives_ego), or leave the action out",
             )
         view = self._view(elapsed, first=True)
-        at = Beginning(view, self._places(), self._token)
+        at = Beginning(view, self._places(), self._token, self._program.board.version)
         self._token += 1
         self.entities[name] = begun(actor, action, at)
 

@@ -49,6 +49,7 @@ class Way(NamedTuple):
         along: in the direction of the reference line.
         path: its middle, in the direction of driving.
         length: where it ends along the path [m]; infinite where it does not.
+        assigned: whether it is a route that was assigned, and no lane.
     """
 
     road: str
@@ -56,6 +57,7 @@ class Way(NamedTuple):
     along: bool
     path: LoggedPath
     length: float = math.inf
+    assigned: bool = False
 
 
 class RoadNetwork(Protocol):

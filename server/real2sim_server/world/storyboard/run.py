@@ -19,10 +19,10 @@ from ..traffic.driver import Surroundings
 from ..traffic.replay import recorded_pose
 from ..traffic.scripted import ScriptedEntity
 from .draw import drawn_values
-from .entities import box_of
+from .entities import box_of, own_centre
 from .entity_state import EntityState, observed
 from .positions import Places
-from .program import Program, program_of
+from .program import PLACING, Program, program_of
 from .progress import COMPLETE, ElementChange, Memories, Progress
 from .roads import Place, RoadNetwork, RouteNetwork
 from .shown_signal import ShownSignal
@@ -105,8 +105,7 @@ class StoryboardRun:
         progress.initialise(surroundings.t_us, 0.0)
         ego = next((e.name for e in board.entities if e.kind == "ego"), None)
         put = any(
-            entry.entity == ego and entry.action.kind in {"teleport", "speed", "follow_trajectory"}
-            for entry in board.init
+            entry.entity == ego and entry.action.kind in {"speed", *PLACING} for entry in board.init
         )
         run = cls(
             program, network, MappingProxyType(progress.entities), progress.memories,
@@ -141,12 +140,12 @@ class StoryboardRun:
 
     @property
     def over(self) -> bool:
-        """Whether it has been stopped, or all its stories are complete."""
-        stories = self.program.stories
-        status = self.memories.status
-        return self.memories.over or (
-            bool(stories) and all(status[s.number] == COMPLETE for s in stories)
-        )
+        """Whether it has been stopped; without a stop trigger, whether all its stories are
+        complete."""
+        program, status = self.program, self.memories.status
+        if self.memories.over or (program.stop is not None and program.board.version >= 2):
+            return self.memories.over
+        return bool(program.stories) and all(status[s.number] == COMPLETE for s in program.stories)
 
     @property
     def drives_ego(self) -> bool:
@@ -158,7 +157,8 @@ class StoryboardRun:
         assert self.ego is not None
         actor = self.entities[self.ego]
         turned = math.remainder(actor.h - before.yaw, math.tau)
-        return Motion(actor.x, actor.y, before.yaw + turned, actor.speed, actor.acceleration)
+        x, y = actor.axle
+        return Motion(x, y, before.yaw + turned, actor.speed, actor.acceleration)
 
     def signals(self) -> tuple[ShownSignal, ...]:
         """What traffic signals show now."""
@@ -207,6 +207,8 @@ def _first(
     """An entity before the storyboard has put it anywhere: the ego and objects of the scene where
     they were recorded, others not in the world."""
     size, centre = box_of(entity, subject, ego_size)
+    if entity.kind == "ego" and board.version >= 2:
+        centre = own_centre(entity, size) or centre
     scripted = entity.kind != "ego" or board.drives_ego
     actor = EntityState(
         entity.name, entity.category, subject, size, centre, 0.0, 0.0, 0.0,
@@ -215,7 +217,7 @@ def _first(
     if entity.kind == "ego":
         return observed(actor, surroundings.ego, 0.0).on_lane(network)
     if entity.kind == "new":
-        placed = any(e.entity == entity.name and e.action.kind in _PLACING for e in board.init)
+        placed = any(e.entity == entity.name and e.action.kind in PLACING for e in board.init)
         there = EntityState.put(actor, Place(0.0, 0.0, 0.0), network)
         return evolved(there, visible=placed)
     assert subject is not None
@@ -230,9 +232,6 @@ def _first(
     )
     speed = pose.velocity[0] * cos + pose.velocity[1] * sin
     return evolved(actor, speed=speed, visible=True).put(place, network)
-
-
-_PLACING = frozenset({"teleport", "follow_trajectory"})
 
 
 def _nothing_yet(program: Program) -> Memories:

@@ -53,6 +53,15 @@ def test_a_rate_is_the_highest_acceleration_of_every_form(run):
         assert -rates.min() == pytest.approx(3.0, abs=0.02)
 
 
+@pytest.mark.parametrize(("version", "at_once"), [(1, True), (2, False)])
+def test_a_negative_rate_is_its_magnitude_since_there_are_versions(run, version, at_once):
+    dynamics = {"shape": "linear", "dimension": "rate", "value": -3.0}
+    slow = {"kind": "speed", "speed": 4.0, "dynamics": dynamics}
+    v = speeds(run(action_at(1.0, slow), version=version))
+
+    assert np.diff(v).min() == pytest.approx(-6.0 if at_once else -0.3, abs=0.002)
+
+
 def test_a_speed_by_distance_is_reached_after_it(run):
     dynamics = {"shape": "linear", "dimension": "distance", "value": 21.0}
     worlds = run(action_at(1.0, {"kind": "speed", "speed": 4.0, "dynamics": dynamics}))

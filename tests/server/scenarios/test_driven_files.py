@@ -1,0 +1,277 @@
+"""``real2sim run FILE``: what is driven is what the file says."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from real2sim.cli import build_app
+from real2sim_server.world.recording.recording import Recording, load_recording
+
+DT = 0.1
+"""Step of an episode [s]."""
+
+ROAD = """<OpenDRIVE><header revMajor="1" revMinor="5"/>
+<road id="1" junction="-1" length="600" rule="RHT"><planView>
+<geometry s="0" x="0" y="0" hdg="0" length="600"><line/></geometry></planView>
+<lanes><laneSection s="0"><center><lane id="0" type="none"/></center><right>
+<lane id="-1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+<lane id="-2" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+</right></laneSection></lanes></road></OpenDRIVE>"""
+CUT_IN = """<LateralAction><LaneChangeAction>
+<LaneChangeActionDynamics dynamicsShape="sinusoidal" dynamicsDimension="time" value="2"/>
+<LaneChangeTarget><AbsoluteTargetLane value="-2"/></LaneChangeTarget>
+</LaneChangeAction></LateralAction>"""
+AT_HALF_A_SECOND = """<StartTrigger><ConditionGroup>
+<Condition name="t" delay="0" conditionEdge="none"><ByValueCondition>
+<SimulationTimeCondition value="0.5" rule="greaterThan"/></ByValueCondition></Condition>
+</ConditionGroup></StartTrigger>"""
+
+
+def vehicle(name: str, box: str = "", inside: str = "") -> str:
+    box = box or '<Center x="2" y="0" z="0.9"/><Dimensions width="2" length="5" height="1.8"/>'
+    return f"""<ScenarioObject name="{name}"><Vehicle name="car" vehicleCategory="car">{inside}
+    <BoundingBox>{box}</BoundingBox>
+    <Performance maxSpeed="69" maxAcceleration="10" maxDeceleration="10"/>
+    <Axles><FrontAxle maxSteering="0.5" wheelDiameter="0.8" trackWidth="1.7" positionX="2.98"
+    positionZ="0.4"/><RearAxle maxSteering="0.5" wheelDiameter="0.8" trackWidth="1.7" positionX="0"
+    positionZ="0.4"/></Axles></Vehicle></ScenarioObject>"""
+
+
+def speed(value: Any, how: str = "") -> str:
+    how = how or 'dynamicsShape="step" dynamicsDimension="time" value="0"'
+    return f"""<LongitudinalAction><SpeedAction><SpeedActionDynamics {how}/><SpeedActionTarget>
+    <AbsoluteTargetSpeed value="{value}"/></SpeedActionTarget></SpeedAction></LongitudinalAction>"""
+
+
+def put(position: str) -> str:
+    return f"<TeleportAction><Position>{position}</Position></TeleportAction>"
+
+
+def lane(number: int, s: float) -> str:
+    return f'<LanePosition roadId="1" laneId="{number}" s="{s}"/>'
+
+
+def private(entity: str, *actions: str) -> str:
+    made = "".join(f"<PrivateAction>{a}</PrivateAction>" for a in actions)
+    return f'<Private entityRef="{entity}">{made}</Private>'
+
+
+EGO = private("Ego", put(lane(-2, 50.0)), speed(10.0))
+TARGET = private("Target", put(lane(-1, 110.0)), speed(10.0))
+
+
+def scenario(
+    *,
+    init: str = EGO + TARGET,
+    actor: str = "Target",
+    action: str = CUT_IN,
+    event_start: str = AT_HALF_A_SECOND,
+    act_start: str = "",
+    stop: str = "",
+    entities: str = "",
+    inside_story: str = "",
+) -> str:
+    entities = entities or vehicle("Ego") + vehicle("Target")
+    return f"""<OpenSCENARIO><FileHeader description="a" author="b" revMajor="1" revMinor="3"
+    date="2026-01-01T00:00:00"/><CatalogLocations/>
+    <RoadNetwork><LogicFile filepath="road.xodr"/></RoadNetwork><Entities>{entities}</Entities>
+    <Storyboard><Init><Actions>{init}</Actions></Init>
+    <Story name="story">{inside_story}<Act name="act"><ManeuverGroup name="group"
+    maximumExecutionCount="1"><Actors selectTriggeringEntities="false">
+    <EntityRef entityRef="{actor}"/></Actors><Maneuver name="maneuver">
+    <Event name="event" priority="parallel" maximumExecutionCount="1"><Action name="action">
+    <PrivateAction>{action}</PrivateAction></Action>{event_start}</Event></Maneuver></ManeuverGroup>
+    {act_start}</Act></Story><StopTrigger>{stop}</StopTrigger></Storyboard></OpenSCENARIO>"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run has printed, and what it has left."""
+
+    output: str
+    exit_code: int
+    figures: dict[str, Any]
+    recording: Recording | None
+
+    @property
+    def ego(self) -> list[Any]:
+        """At each step."""
+        assert self.recording is not None, self.output
+        return [i.ego for i in self.recording.instants]
+
+    def begins(self, event: str) -> list[float]:
+        """When an event has begun [s]."""
+        return [
+            e["t"]
+            for e in self.figures["events"]
+            if e["what"].endswith(event) and e["change"] == "start"
+        ]
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run a file that stands beside its road."""
+
+    def made(text: str, *options: str, planner: str = "storyboard", seconds: float = 5.0) -> Run:
+        (tmp_path / "road.xodr").write_text(ROAD)
+        file, figures = tmp_path / "case.xosc", tmp_path / "figures.json"
+        recording = tmp_path / "case.r2e"
+        for old in (figures, recording):
+            old.unlink(missing_ok=True)
+        file.write_text(text)
+        words = ["run", str(file), "--planner", planner, "--seconds", str(seconds)]
+        words += ["--json", str(figures), "--save", str(recording), *options]
+        result = CliRunner().invoke(build_app(), words)
+        found = json.loads(figures.read_text()) if figures.is_file() else {}
+        return Run(
+            result.output + str(result.exception or ""), result.exit_code, found,
+            load_recording(Path(recording)) if recording.is_file() else None,
+        )  # fmt: skip
+
+    return made
+
+
+def test_an_episode_lasts_until_the_stop_trigger(run):
+    stop = AT_HALF_A_SECOND.replace('value="0.5"', 'value="4"').replace("StartTrigger", "X")
+    stop = stop.removeprefix("<X>").removesuffix("</X>")
+    for planner in ("storyboard", "idm"):
+        found = run(scenario(stop=stop), planner=planner, seconds=8.0)
+        assert found.figures["seconds"] == pytest.approx(4.1), planner
+        assert found.figures["reason"] == "storyboard"
+
+
+@pytest.mark.parametrize("element", ["act", "event"])
+def test_an_empty_start_trigger_starts_at_once_and_is_noted(run, element):
+    found = run(scenario(**{f"{element}_start": "<StartTrigger/>"}), seconds=1.0)
+
+    first = 0.0 if element == "event" else 0.51
+    assert found.begins("event") == [pytest.approx(first, abs=0.011)]
+    assert "begin at once" in " ".join(found.output.split())
+
+
+@pytest.mark.parametrize("rate", [4.0, -4.0])
+def test_of_a_rate_the_magnitude_counts(run, rate):
+    how = f'dynamicsShape="linear" dynamicsDimension="rate" value="{rate}"'
+    found = run(scenario(actor="Ego", action=speed(2.0, how)))
+
+    v = [e.speed for e in found.ego]
+    assert min(b - a for a, b in itertools.pairwise(v)) == pytest.approx(-0.4, abs=1e-6)
+    assert v[-1] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("dimension", ["time", "distance"])
+def test_a_negative_time_or_distance_is_refused_by_name_and_line(run, dimension):
+    how = f'dynamicsShape="linear" dynamicsDimension="{dimension}" value="-4"'
+    text = scenario(actor="Ego", action=speed(2.0, how))
+    line = text[: text.index('value="-4"')].count("\n") + 1
+    found = run(text)
+
+    assert found.exit_code != 0
+    told = " ".join(found.output.split())
+    assert f"line {line}: value of <SpeedActionDynamics> is -4" in told
+
+
+def test_a_route_outlasts_a_teleport_onto_it(run):
+    waypoint = '<Waypoint routeStrategy="shortest"><Position>{}</Position></Waypoint>'
+    # Without a map it goes straight from place to place, here off the road to the left.
+    there = ((50.0, -3.5), (150.0, -3.5), (150.0, 100.0))
+    places = [f'<WorldPosition x="{x}" y="{y}"/>' for x, y in there]
+    route = "".join(waypoint.format(p) for p in places)
+    route = f"""<RoutingAction><AssignRouteAction><Route name="r" closed="false">{route}</Route>
+    </AssignRouteAction></RoutingAction>"""
+    before = private("Ego", put(lane(-2, 50.0)), route, put(lane(-2, 100.0)), speed(20.0))
+    text = scenario(init=before + private("Target", put(lane(-1, 400.0))))
+    found = run(text.replace('<LogicFile filepath="road.xodr"/>', ""))
+
+    ego = found.ego[-1]
+    assert (ego.x, ego.y) == (pytest.approx(150.0, abs=1.0), pytest.approx(46.5, abs=1.0))
+
+
+def test_an_ego_without_a_speed_stands(run):
+    init = private("Ego", put(lane(-2, 50.0))) + TARGET
+
+    assert max(abs(e.speed) for e in run(scenario(init=init)).ego) == 0.0
+    assert run(scenario(init=init), planner="idm").ego[0].speed == 0.0
+
+
+def test_a_first_speed_that_takes_time_begins_at_none(run):
+    how = 'dynamicsShape="linear" dynamicsDimension="time" value="4"'
+    init = private("Ego", put(lane(-2, 50.0)), speed(8.0, how)) + TARGET
+    found = run(scenario(init=init))
+
+    for step, ego in enumerate(found.ego):
+        assert ego.speed == pytest.approx(min(2.0 * step * DT, 8.0), abs=1e-6)
+    assert run(scenario(init=init), planner="idm").ego[0].speed == 0.0
+
+
+def test_the_ego_has_the_box_of_the_file(run):
+    box = '<Center x="3.5" y="0" z="1.5"/><Dimensions width="2.5" length="12" height="3"/>'
+    entities = vehicle("Ego", box) + vehicle("Target")
+    init = EGO + private("Target", put(lane(-2, 110.0)), speed(0.0))
+    found = run(scenario(init=init, entities=entities), seconds=8.0)
+
+    assert found.recording.context.ego_size == (12.0, 2.5, 3.0)
+    assert found.figures["reason"] == "collision"
+    # Its front, 9.5 m ahead of where the file has it, meets the target's rear, 0.5 m behind where
+    # the file has that; its rear axle is taken to be 0.95 m before its rear end.
+    reference = 10.0 * found.figures["seconds"] + 50.0
+    assert reference + 9.5 == pytest.approx(109.5, abs=1.01)
+    assert found.ego[0].x == pytest.approx(50.0 + 3.5 - 6.0 + 0.95)
+
+
+def test_an_ego_is_placed_relative_to_who_is_placed_later_in_the_file(run):
+    relative = put('<RelativeLanePosition entityRef="Target" dLane="-1" ds="-30"/>')
+    found = run(scenario(init=private("Ego", relative, speed(10.0)) + TARGET), seconds=1.0)
+
+    axle = 50.0 + 30.0 + 2.0 - (2.5 - 0.95)
+    assert (found.ego[0].x, found.ego[0].y) == (pytest.approx(axle), pytest.approx(-5.25))
+
+
+def test_entities_placed_relative_to_each_other_are_refused(run):
+    relative = '<RelativeLanePosition entityRef="{}" dLane="0" ds="-30"/>'
+    init = private("Ego", put(relative.format("Target"))) + private(
+        "Target", put(relative.format("Ego"))
+    )
+    found = run(scenario(init=init))
+
+    assert found.exit_code != 0
+    assert "'Ego' and 'Target' are placed relative to each other" in " ".join(found.output.split())
+
+
+EMPTY = "<ParameterDeclarations/>"
+
+
+def declared(**values: Any) -> str:
+    made = "".join(
+        f'<ParameterDeclaration name="{k}" parameterType="double" value="{v}"/>'
+        for k, v in values.items()
+    )
+    return f"<ParameterDeclarations>{made}</ParameterDeclarations>"
+
+
+def test_empty_declarations_below_the_top_level_change_nothing(run):
+    entities = vehicle("Ego", inside=EMPTY) + vehicle("Target", inside=EMPTY)
+    text = scenario(inside_story=EMPTY, entities=entities)
+    text = text.replace('<Maneuver name="maneuver">', f'<Maneuver name="maneuver">{EMPTY}')
+
+    assert run(text, seconds=1.0).figures == run(scenario(), seconds=1.0).figures
+
+
+def test_of_declarations_within_each_other_the_inner_name_wins(run):
+    text = scenario(
+        actor="Ego", action=speed("${$v / $share}"), inside_story=declared(v=4.0, share=2.0)
+    )
+    text = text.replace(
+        '<Maneuver name="maneuver">', f'<Maneuver name="maneuver">{declared(v=6.0)}'
+    ).replace("<CatalogLocations/>", f"{declared(v=1.0, share=1.0)}<CatalogLocations/>")
+    found = run(text, seconds=1.0)
+
+    assert math.isclose(found.ego[-1].speed, 3.0), found.output
