@@ -12,6 +12,8 @@ from urllib.parse import quote
 
 from pydantic import BaseModel, ValidationError
 
+from real2sim_proto.base import bearer_token
+
 from ._models import sent_fields
 from ._replies import MEDIA_TYPES, Reply, describe, parse_image
 from .images import Image
@@ -123,8 +125,8 @@ def segment(name: str) -> str:
 
 
 def bearer(token: str | None) -> dict[str, str]:
-    """The header that shows a token."""
-    return {} if token is None else {"Authorization": f"Bearer {token}"}
+    """The header that shows a token. Raises ValueError for one that a header cannot hold."""
+    return {} if token is None else {"Authorization": f"Bearer {bearer_token(token)}"}
 
 
 def image(path: str, view: ViewRequest) -> Call[Image]:

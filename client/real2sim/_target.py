@@ -8,6 +8,8 @@ import re
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
+from real2sim_proto.base import bearer_token
+
 from ._call import bearer
 from ._retry import RetryPolicy
 
@@ -50,6 +52,8 @@ class Target:
             raise ValueError(f"name {self.name!r} is not 1 to 80 printable ASCII characters")
         if self.timeout <= 0:
             raise ValueError(f"timeout is {self.timeout!r}; give seconds above 0")
+        if self.token is not None:
+            object.__setattr__(self, "token", bearer_token(self.token) or None)
         object.__setattr__(self, "url", self.url.rstrip("/"))
         object.__setattr__(self, "long_timeout", max(self.long_timeout, self.timeout))
 

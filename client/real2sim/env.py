@@ -196,7 +196,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             return None
         # Of a slower camera, the last one that was due.
         shown = self._images or dict(_images_in(self._last))
-        return next(image for name, image in shown.items() if "/" not in name)
+        return next(image.copy() for name, image in shown.items() if "/" not in name)
 
     @property
     def last(self) -> Observation:
@@ -248,7 +248,9 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             self._images[name] = np.minimum(image, most).astype(dtype)
         for name, cloud in obs.clouds.items():
             self._clouds[name] = _rows_of(cloud, self._rows[cloud.modality])
-        return seen | self._images | self._clouds
+        # Copies: who changes an observation must not change the next one.
+        kept = {**self._images, **self._clouds}
+        return seen | {name: array.copy() for name, array in kept.items()}
 
     @staticmethod
     def _info(obs: Observation) -> dict[str, Any]:

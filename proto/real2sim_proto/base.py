@@ -38,6 +38,22 @@ Quaternion = Annotated[
 ]
 
 
+def bearer_token(text: str) -> str:
+    """A token as a header holds it: without white space around it, which files and shells add.
+
+    Raises:
+        ValueError: it holds what no header may hold. The sentence does not show the token.
+    """
+    token = text.strip()
+    for place, character in enumerate(token, 1):
+        if not " " <= character <= "~":
+            raise ValueError(
+                f"character {place} of the token is U+{ord(character):04X}; a token is printable "
+                "ASCII on one line"
+            )
+    return token
+
+
 def one_of(values: Any) -> Any:
     """Field of an answer that has one of a ``Literal``'s values today; newer workers may have more,
     and readers take them as they come."""

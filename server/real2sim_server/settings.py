@@ -8,8 +8,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, SecretStr, model_validator
+from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from real2sim_proto.base import bearer_token
 
 GIB = 1024**3
 MIB = 1024**2
@@ -165,6 +167,11 @@ class Settings(BaseSettings):
             raise ValueError("token and token_file are both given; one of them is enough")
         return given | {"token": read_token(Path(file))}
 
+    @field_validator("token", mode="before")
+    @classmethod
+    def _token_fits_a_header(cls, given: Any) -> Any:
+        return bearer_token(given) if isinstance(given, str) else given
+
     @property
     def wants_token(self) -> bool:
         """Whether requests need a token."""
@@ -209,13 +216,17 @@ def read_token(file: Path) -> str:
     """The token in a file, without the end of its line.
 
     Raises:
-        ValueError: the file cannot be read.
+        ValueError: the file cannot be read, or holds what is no token.
     """
     try:
-        return file.read_text("utf-8").strip()
+        text = file.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not text"
         raise ValueError(f"the token cannot be read from {str(file)!r}: {reason}") from error
+    try:
+        return bearer_token(text)
+    except ValueError as error:
+        raise ValueError(f"{str(file)!r}: {error}") from None
 
 
 def unknown_variables(names: Iterable[str]) -> dict[str, str | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -62,18 +62,19 @@ def drive(
         int | None, typer.Option(min=16, help="Pixels of its images; default: recorded.")
     ] = None,
     codec: Annotated[str, typer.Option(help="auto, raw, jpeg or png.")] = "auto",
-    seed: Annotated[int, typer.Option(min=0, help="Of the episode.")] = 0,
-    dt_us: Annotated[int, typer.Option(help="Clock step.")] = 100_000,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the episode; default: 0.")] = None,
+    dt_us: Annotated[int | None, typer.Option(help="Clock step [us]; default: 100000.")] = None,
     warmup_us: Annotated[
-        int, typer.Option(min=0, help="The vehicle moves as recorded for so long; plans wait.")
-    ] = 0,
+        int | None,
+        typer.Option(min=0, help="The vehicle moves as recorded for so long; plans wait."),
+    ] = None,
     beyond_log: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="What --steps beyond the recording lead to: 'end' of the episode, 'loop' or "
-            "'extend'."
+            help="What --steps beyond the recording lead to: 'end' of the episode (default), "
+            "'loop' or 'extend'."
         ),
-    ] = "end",
+    ] = None,
     spawn: Annotated[
         str | None,
         typer.Option(
@@ -94,8 +95,8 @@ def drive(
         str | None,
         typer.Option(
             metavar="JSON",
-            help='Any other options of reset, for example \'{"ego": {"tracker": "lqr"}}\'; '
-            "those that have flags of their own are not taken from here.",
+            help='Any other options of reset, for example \'{"ego": {"tracker": "lqr"}}\'. They '
+            "go before what the planner needs; an option may not be in a flag of its own as well.",
         ),
     ] = None,
     lidar: Annotated[
@@ -118,7 +119,21 @@ def drive(
 
     if sum(given is not None for given in (scene, scenario, session)) != 1:
         raise typer.BadParameter("give exactly one of --scene, --scenario and --session")
-    options = _reset_options(reset, beyond_log, spawn=spawn, randomization=randomization)
+    flags = {
+        "--seed": ("seed", seed),
+        "--dt-us": ("dt_us", dt_us),
+        "--warmup-us": ("warmup_us", warmup_us),
+        "--beyond-log": ("beyond_log", beyond_log),
+        "--randomization": (
+            "randomization",
+            None if randomization is None else json_object("--randomization", randomization),
+        ),
+        "--lidar": ("lidars", _names(lidar) or None),
+        "--radar": ("radars", _names(radar) or None),
+        "--cameras": ("sensors", _names(cameras) or None),
+        "--width": ("sensors", width),
+    }
+    options = _reset_options(reset, flags, spawn)
     driver = load_planner(planner)
     needs = needs_of(driver)
     with (
@@ -126,8 +141,7 @@ def drive(
         _opened(_named(client, session, session_token, scene, scenario, codec)) as opened,
     ):
         names = opened.cameras if cameras == "all" else _names(cameras)
-        for kind, named in (("lidars", _names(lidar)), ("radars", _names(radar))):
-            options |= {kind: named} if named else {}
+        sensors = _sensors(names, width, needs.sensors(opened.welcome.cameras))
         with _progress(steps) as advance, _saver(out) as save:
 
             def on_observation(obs: Observation) -> None:
@@ -138,17 +152,14 @@ def drive(
                 opened,
                 driver,
                 steps=steps,
-                sensors=_sensors(names, width, needs.sensors(opened.welcome.cameras)),
                 on_observation=on_observation,
-                **options
-                | {
-                    "seed": seed,
-                    "dt_us": dt_us,
-                    "warmup_us": warmup_us,
+                **{
+                    "sensors": sensors,
                     "action": needs.action,
                     # A planner that does not say what it needs is shown everything.
                     "privileged": needs.privileged or not hasattr(driver, "needs"),
-                },
+                }
+                | options,
             )
     _report(summary, out=out, json_file=json_file)
 
@@ -158,23 +169,28 @@ def _names(text: str) -> list[str]:
 
 
 def _reset_options(
-    reset: str | None, beyond_log: str, *, spawn: str | None, randomization: str | None
+    reset: str | None, flags: Mapping[str, tuple[str, Any]], spawn: str | None
 ) -> dict[str, Any]:
-    """Options of reset that flags name as JSON.
+    """Options of reset: those of ``--reset``, and of the flags that are given.
 
     Raises:
-        typer.BadParameter: no JSON object.
+        typer.BadParameter: no JSON object, or an option that is given twice.
     """
     options = json_object("--reset", reset)
-    if beyond_log != "end":
-        options["beyond_log"] = beyond_log
+    agents = options.get("agents", {})
+    for flag, (name, value) in flags.items():
+        if value is None:
+            continue
+        if name in options:
+            raise typer.BadParameter(f"{name} is given by {flag} and in --reset; give it once")
+        if name != "sensors":
+            options[name] = value
     if spawn is not None:
-        options["agents"] = {
-            **options.get("agents", {}),
-            "spawn": json_object("--spawn", spawn),
-        }
-    if randomization is not None:
-        options["randomization"] = json_object("--randomization", randomization)
+        if "spawn" in agents:
+            raise typer.BadParameter(
+                "agents.spawn is given by --spawn and in --reset; give it once"
+            )
+        options["agents"] = {**agents, "spawn": json_object("--spawn", spawn)}
     return options
 
 

@@ -16,6 +16,24 @@ def test_the_environment_sets_what_is_not_given(monkeypatch):
     assert settings.token.get_secret_value() == "correct horse"
 
 
+@pytest.mark.parametrize("end", ["\r", "\r\n", " \n"])
+def test_a_token_loses_the_end_of_its_line(monkeypatch, tmp_path, end):
+    monkeypatch.setenv("REAL2SIM_TOKEN", "correct horse" + end)
+    assert Settings().token.get_secret_value() == "correct horse"
+    monkeypatch.delenv("REAL2SIM_TOKEN")
+    (tmp_path / "token").write_bytes(f"correct horse{end}".encode())
+    found = Settings(token_file=tmp_path / "token").token
+    assert found.get_secret_value() == "correct horse"
+
+
+def test_a_token_that_no_header_can_hold_is_refused_without_showing_it():
+    with pytest.raises(
+        ValidationError, match=r"token\n.*character 8 of the token is U\+000D"
+    ) as error:
+        Settings(token="correct\rhorse")
+    assert "horse" not in str(error.value)
+
+
 def test_the_token_is_not_shown():
     assert "correct" not in repr(Settings(token="correct horse"))
 

@@ -23,7 +23,8 @@ def worker(make_settings):
 def printed(worker, *words: str) -> str:
     """What a command prints, whatever its exit code."""
     result = CliRunner().invoke(build_app(), [*words, "--url", worker.url])
-    return result.output + str(result.exception or "")
+    hint = getattr(result.exception, "hint", None) or ""
+    return f"{result.output}{result.exception or ''} {hint}"
 
 
 def test_a_case_of_the_gallery_goes_out_as_a_file_comes_in_and_is_driven(worker, tmp_path):
@@ -39,6 +40,60 @@ def test_a_case_of_the_gallery_goes_out_as_a_file_comes_in_and_is_driven(worker,
         assert client.scenarios.get(scenario).storyboard.parameters["gap"] == 30.0
     driven = printed(worker, "drive", "--scenario", scenario, "--cameras", "", "--steps", "5")
     assert re.search(r"storyboard \S+ start", driven), driven
+
+
+PLANNER = """
+from real2sim import Control
+{head}
+class Mine:
+    {needs}
+    def reset(self, obs): pass
+    def plan(self, obs):
+        obs.image("front")
+        return Control(acceleration=0.0, steering=0.0)
+"""
+
+
+@pytest.mark.parametrize("asks", ["by its class", "by --reset"])
+def test_an_own_planner_sees_pictures_and_sends_controls(worker, tmp_path, monkeypatch, asks):
+    monkeypatch.chdir(tmp_path)
+    head = needs = ""
+    options: tuple[str, ...] = ()
+    if asks == "by its class":
+        head = "from real2sim.planners import Needs"
+        needs = 'needs = Needs(modalities=("rgb",), action="control")'
+    else:
+        options = ("--reset", '{"action": "control", "sensors": ["front"]}')
+    module = f"planner_{asks[-5:].strip('-')}"
+    (tmp_path / f"{module}.py").write_text(PLANNER.format(head=head, needs=needs))
+    words = ("drive", "--scene", "tiny", "--planner", f"{module}:Mine", "--steps", "2", *options)
+
+    assert "2 steps" in printed(worker, *words)
+
+
+def test_a_planner_that_does_not_say_what_it_needs_is_told_the_line(worker, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = PLANNER.format(head="", needs="")
+    (tmp_path / "blind.py").write_text(text)
+    (tmp_path / "steering.py").write_text(text.replace('obs.image("front")', "pass"))
+    words = ("drive", "--scene", "tiny", "--steps", "2", "--planner")
+
+    assert "needs = Needs(modalities=('rgb',))" in printed(worker, *words, "blind:Mine")
+    assert "needs = Needs(action='control')" in printed(worker, *words, "steering:Mine")
+
+
+def test_an_option_of_reset_that_is_given_twice_is_refused_by_name(worker):
+    words = ("drive", "--scene", "tiny", "--steps", "1", "--seed", "3", "--reset")
+
+    assert "seed is given by --seed and in --reset" in printed(worker, *words, '{"seed": 4}')
+
+
+def test_a_token_with_the_end_of_its_line_is_sent_without_it(make_settings):
+    with running_worker(make_settings(token="correct-horse")) as worker:
+        assert "ready" in printed(worker, "status", "--token", "correct-horse\r\n")
+        told = printed(worker, "status", "--token", "correct-\rhorse")
+    assert "character 9 of the token is U+000D" in told
+    assert "horse" not in told
 
 
 def test_a_case_that_is_refused_leaves_no_scenario(worker):

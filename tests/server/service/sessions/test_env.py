@@ -69,6 +69,21 @@ def test_lidars_and_radars_are_rows_of_numbers(site):
         made.close()
 
 
+def test_who_changes_an_observation_does_not_change_the_next_one(site):
+    slow = {"camera": "front", "period_us": 300_000}
+    made = real2sim.make_env(url=site.url, scene="tiny", sensors=[slow], render_mode="rgb_array")
+    try:
+        obs, _ = made.reset(seed=0)
+        first = obs["front"].copy()
+        obs["front"][:] = 0
+        made.render()[:] = 0
+        later = made.step(np.zeros(2, np.float32))[0]["front"]
+        assert later is not obs["front"]
+        np.testing.assert_array_equal(later, first)
+    finally:
+        made.close()
+
+
 def test_an_episode_by_random_actions_ends(env):
     env.action_space.seed(0)
     obs, _ = env.reset(seed=1)
