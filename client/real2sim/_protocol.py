@@ -341,5 +341,6 @@ def error_of(message: Error | WorldError) -> Exception:
             detail=message.detail,
             hint=message.hint,
             step=message.step,
+            retry_after=message.retry_after_s,
         )
     )

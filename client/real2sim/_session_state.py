@@ -12,7 +12,7 @@ from real2sim_proto.drive import Frame, Result, Welcome
 from real2sim_proto.sessions import SessionInfo
 
 from ._protocol import PendingRequest, ProtocolState
-from ._retry import RETRYABLE_STATUS
+from ._retry import RETRYABLE_CODES, RETRYABLE_STATUS
 from ._shared_frames import SharedFrames
 from ._target import Target
 from .errors import (
@@ -47,6 +47,12 @@ def is_transient(error: Real2SimError) -> bool:
     return isinstance(error, UnreachableError | CapacityError | ReplyTimeoutError)
 
 
+def is_passing(error: Real2SimError) -> bool:
+    """Whether the worker has refused a message for now: its store is away, or the holder of the
+    token sends too much. The same message may be sent again."""
+    return is_away(error) or (isinstance(error, StatusError) and error.code in RETRYABLE_CODES)
+
+
 def is_away(error: Real2SimError) -> bool:
     """Whether nothing has happened because what the worker writes to is away, or because a proxy
     finds no worker that may take anything new meanwhile."""
@@ -67,8 +73,8 @@ class SessionPlan:
         token: of the session that is joined.
         role: ``controller`` or ``observer``.
         codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
-        reconnect: seconds for which a lost connection, or a store that is away, is tried again;
-            0 gives up at once.
+        reconnect: seconds for which a lost connection, or a message that the worker refuses for
+            now, is tried again; 0 gives up at once.
         shared_memory: True must have it, False must not; None has it where it can, unless the
             client says otherwise.
     """

@@ -347,7 +347,9 @@ class FakeWorker:
             case "":
                 return False
             case code:
+                code, _, retry = code.partition(" ")
                 answer = {"type": "error", "code": code, "detail": "refused by the test", "step": 7}
+                answer |= {"retry_after_s": 7} if retry else {}
         await socket.send_bytes(encode(envelope | answer))
         return True
 

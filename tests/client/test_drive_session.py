@@ -218,13 +218,34 @@ def test_progress_is_waited_through(worker: FakeWorker) -> None:
 def test_refusals_on_the_socket_are_told_apart_and_leave_it_open(
     worker: FakeWorker, code: str, error: type[real2sim.StatusError]
 ) -> None:
-    with connect(worker) as client, client.session(scene="street") as session:
+    with connect(worker) as client, client.session(scene="street", reconnect=0) as session:
         session.reset()
         worker.mischief = code
         with pytest.raises(error, match="refused by the test") as caught:
             session.step(STRAIGHT)
         assert session.step(STRAIGHT).step == 1
     assert (caught.value.code, caught.value.step) == (code, 7)
+
+
+def test_what_the_worker_refuses_for_now_is_sent_again_after_the_time_it_asks_for(
+    worker: FakeWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited: list[float] = []
+    monkeypatch.setattr("real2sim._sync.reconnecting.sleep", waited.append)
+    with connect(worker) as client, client.session(scene="street", reconnect=240.0) as session:
+        session.reset()
+        for code in ("STORAGE_UNAVAILABLE", "TOO_MANY_REQUESTS retry", "TOO_MUCH_ENGINE_TIME"):
+            worker.mischief = code
+            session.step(STRAIGHT)
+        actions = [m for m in worker.messages if m["type"] == "action"]
+        assert [a["step"] for a in actions] == [0, 0, 1, 1, 2, 2]
+        assert waited[1] == 7.0
+
+        worker.mischief = "TOO_MANY_REQUESTS retry"
+        monkeypatch.setattr(session, "_plan", replace(session._plan, reconnect=5.0))
+        with pytest.raises(CapacityError) as caught:
+            session.step(STRAIGHT)
+        assert caught.value.retry_after == 7.0
 
 
 def test_the_async_session_drives_the_same_episode(worker: FakeWorker) -> None:

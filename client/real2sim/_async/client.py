@@ -163,8 +163,9 @@ class AsyncClient:
             scenario: a scenario or its id.
             codec: of cameras that name none: ``auto`` (raw when the worker is on this machine,
                 else jpeg), ``raw``, ``jpeg`` or ``png``.
-            reconnect: seconds for which a lost connection is tried again, and a worker whose store
-                is away is asked again: the session goes on as if nothing had happened, also after
+            reconnect: seconds for which a lost connection is tried again, and for which a message
+                is sent again that the worker refuses for now, because its store is away or a limit
+                of the token is reached. The session goes on as if nothing had happened, also after
                 the worker was restarted. 0 gives up.
             shared_memory: raw images come by memory shared with a worker on this machine: None,
                 where both can; True, or opening the session fails; False, never. The images are
@@ -206,7 +207,7 @@ class AsyncClient:
             scenario: a scenario or its id.
             worlds: how many sessions, 1 to 256; the worker has to have as many free.
             codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
-            reconnect: seconds for which a lost connection is tried again; 0 gives up.
+            reconnect: as of :meth:`session`.
 
         Raises:
             TypeError: something else than a scene or a scenario.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
 
@@ -18,11 +19,11 @@ from .._batch_protocol import BatchProtocol
 from .._drive_socket import check_subprotocol, handshake_errors, lost_connection, socket_options
 from .._protocol import PendingRequest, error_of
 from .._sensors import ResetOptions, Sensor, reset_spec
-from .._session_state import LOST_ERRORS, SessionPlan, not_open
+from .._session_state import LOST_ERRORS, SessionPlan, is_passing, not_open
 from ..batch_observation import BatchObservation, batch_observation_from_wire
 from ..errors import Real2SimError, ReplyTimeoutError
 from .concurrency import AsyncSocket, connect_socket, receive
-from .reconnecting import reconnect
+from .reconnecting import outlast, reconnect
 from .transport import AsyncTransport
 
 A = TypeVar("A", bound=Envelope)
@@ -196,6 +197,11 @@ class AsyncDriveBatch:
         await self.close()
 
     async def _request(self, request: PendingRequest[A]) -> A:
+        """The answer to a request, once the worker takes it."""
+        seconds = self._plan.reconnect
+        return await outlast(partial(self._sent, request), seconds=seconds, passes=is_passing)
+
+    async def _sent(self, request: PendingRequest[A]) -> A:
         """The answer to a request, over a new connection where the old one is lost: worlds that
         have moved already answer a repeated action once more."""
         try:

@@ -6,31 +6,34 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
-from .._session_state import MAX_RECONNECTS, backoff, is_away, is_transient
-from ..errors import Real2SimError
+from .._session_state import MAX_RECONNECTS, backoff, is_transient
+from ..errors import Real2SimError, StatusError
 from .concurrency import sleep
 
 A = TypeVar("A")
 
 
-async def outlast(ask: Callable[[], Awaitable[A]], *, seconds: float) -> A:
-    """Ask again while the worker's store is away; each time nothing has happened.
+async def outlast(
+    ask: Callable[[], Awaitable[A]], *, seconds: float, passes: Callable[[Real2SimError], bool]
+) -> A:
+    """Ask again while the worker refuses for now; each time nothing has happened.
 
     Args:
         ask: sends the same request each time.
         seconds: within which the last try begins.
+        passes: whether an error is one to wait for.
 
     Raises:
-        CapacityError: STORAGE_UNAVAILABLE, of the last try.
-        Real2SimError: another one, at once.
+        Real2SimError: of the last try, or one that does not pass.
     """
     until = time.monotonic() + seconds
     for attempt in range(MAX_RECONNECTS):
         try:
             return await ask()
         except Real2SimError as error:
-            wait = backoff(attempt)
-            if not is_away(error) or time.monotonic() + wait > until:
+            asked = error.retry_after if isinstance(error, StatusError) else None
+            wait = backoff(attempt) if asked is None else asked
+            if not passes(error) or time.monotonic() + wait > until:
                 raise
             await sleep(wait)
     return await ask()

@@ -32,7 +32,14 @@ from .._sensors import (
     reset_spec,
     sensor_specs,
 )
-from .._session_state import LOST_ERRORS, SessionBase, SessionPlan, not_open
+from .._session_state import (
+    LOST_ERRORS,
+    SessionBase,
+    SessionPlan,
+    is_away,
+    is_passing,
+    not_open,
+)
 from ..errors import Real2SimError, ReplyTimeoutError, StatusError
 from ..images import write_atomically
 from ..observation import Observation, View, observation_from_wire, view_from_frames
@@ -80,7 +87,7 @@ class DriveSession(SessionBase):
         if session_id is None:
             call = _requests.create_session(self._plan.scene, self._plan.scenario, None)
             create = partial(self._transport.send, call)
-            self._info = outlast(create, seconds=self._plan.reconnect)
+            self._info = outlast(create, seconds=self._plan.reconnect, passes=is_away)
             session_id, self._token = self._info.session_id, self._info.token
         try:
             self._connect_first(session_id)
@@ -321,8 +328,9 @@ class DriveSession(SessionBase):
         return observation_from_wire(obs, self._pixels_of(obs.frames))
 
     def _request(self, request: PendingRequest[A]) -> A:
-        """The answer to a request, once the worker can write down what it changes."""
-        return outlast(partial(self._sent, request), seconds=self._plan.reconnect)
+        """The answer to a request, once the worker takes it."""
+        seconds = self._plan.reconnect
+        return outlast(partial(self._sent, request), seconds=seconds, passes=is_passing)
 
     def _sent(self, request: PendingRequest[A]) -> A:
         """The answer to a request, over a new connection where the old one is lost."""
