@@ -248,7 +248,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
             self._images[name] = np.minimum(image, most).astype(dtype)
         for name, cloud in obs.clouds.items():
             self._clouds[name] = _rows_of(cloud, self._rows[cloud.modality])
-        # Copies: who changes an observation must not change the next one.
+        # Copies, so that changing an observation in place does not change the next one.
         kept = {**self._images, **self._clouds}
         return seen | {name: array.copy() for name, array in kept.items()}
 

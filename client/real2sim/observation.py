@@ -65,9 +65,9 @@ class View:
         except KeyError:
             there = ", ".join(f"{c}/{m}" for c, ms in self.frames.items() for m in ms) or "none"
             raise KeyError(
-                f"no frame {camera}/{modality} at {self.t_us} us; there: {there}. Reset with "
-                "sensors=[...]; the class of a planner that a command drives asks for pictures by "
-                f"`needs = Needs(modalities=({modality!r},))`, from real2sim.planners"
+                f"no frame {camera}/{modality} at {self.t_us} us; there: {there}. Pass "
+                "sensors=[...] to reset; in a planner class for `real2sim drive`, write "
+                f"`needs = Needs(modalities=({modality!r},))` (from real2sim.planners)"
             ) from None
 
     def lidar(self, name: str) -> LidarCloud:

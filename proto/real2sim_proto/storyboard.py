@@ -405,29 +405,28 @@ def _check_names(board: Storyboard) -> None:
         raise ValueError("one entity at most may be the ego")
     if unknown := sorted(set(board.distributions) - set(board.parameters)):
         raise ValueError(f"distribution of {unknown[0]!r}, which is no parameter")
-    for entry in board.init:
-        _check_entity(entry.entity, names)
     for part in (board.init, board.global_init, board.stories, board.stop):
-        _check_entities(part, frozenset(names))
+        for name in entity_references(part):
+            _check_entity(name, names)
     count = sum(1 for _ in element_names(board))
     if count > MAX_ELEMENTS:
         raise ValueError(f"{count} elements of stories; {MAX_ELEMENTS} are allowed")
 
 
-def _check_entities(part: Any, names: frozenset[str]) -> None:
+def entity_references(part: Any) -> Iterator[str]:
+    """Names of the entities that part of a storyboard refers to."""
     if isinstance(part, list):
         for each in part:
-            _check_entities(each, names)
+            yield from entity_references(each)
     if not isinstance(part, Model):
         return
     for member, value in part.__dict__.items():
         if member in _ENTITY_MEMBERS and isinstance(value, str):
-            _check_entity(value, names)
-        elif member in {"entities"} and value and isinstance(value[0], str):
-            for name in value:
-                _check_entity(name, names)
+            yield value
+        elif member == "entities" and value and isinstance(value[0], str):
+            yield from value
         else:
-            _check_entities(value, names)
+            yield from entity_references(value)
 
 
 _NEVER_NEGATIVE: Mapping[type[Model], tuple[str, ...]] = {
@@ -489,6 +488,7 @@ __all__ = [
     "Story",
     "Storyboard",
     "element_names",
+    "entity_references",
     "resolved",
     "stored_storyboard",
 ]

@@ -96,7 +96,7 @@ def drive(
         typer.Option(
             metavar="JSON",
             help='Any other options of reset, for example \'{"ego": {"tracker": "lqr"}}\'. They '
-            "go before what the planner needs; an option may not be in a flag of its own as well.",
+            "override the planner's needs. Give an option here or by its own flag, not both.",
         ),
     ] = None,
     lidar: Annotated[

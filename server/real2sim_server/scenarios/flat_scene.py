@@ -121,7 +121,7 @@ def _start(run: StoryboardRun) -> tuple[Place, float, dict[str, Any]]:
 
 
 def _gone(speed: float, t: float) -> float:
-    """Way of the recorded drive [m]: as fast as it begins, then up to ``SLOWEST``."""
+    """Distance driven after ``t`` seconds [m]: at the initial speed, which rises to ``SLOWEST``."""
     gaining = min(max(t - STEP_US * 1e-6, 0.0), max(SLOWEST - speed, 0.0) / GAIN)
     after = max(t - STEP_US * 1e-6 - gaining, 0.0)
     return speed * (t - after) + GAIN * gaining**2 / 2 + max(speed, SLOWEST) * after

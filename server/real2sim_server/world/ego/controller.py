@@ -172,9 +172,9 @@ class EgoController:
                 ErrorCode.INVALID_ACTION,
                 f"a plan of kind {plan.kind!r} in an episode that was reset for "
                 f"{self.spec.action!r}",
-                hint=f"send {self.spec.action!r} plans, or reset with action {plan.kind!r}; the "
-                "class of a planner that a command drives says so by "
-                f"`needs = Needs(action={plan.kind!r})`, from real2sim.planners",
+                hint=f"send {self.spec.action!r} plans, or reset with action {plan.kind!r}; in a "
+                "planner class for `real2sim drive`, write "
+                f"`needs = Needs(action={plan.kind!r})` (from real2sim.planners)",
             )
         if isinstance(plan, Control) and plan.gear == "reverse" and not can_reverse(self.spec.ego):
             raise WorldError(

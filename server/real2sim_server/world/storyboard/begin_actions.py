@@ -46,7 +46,7 @@ from .trajectory import Trajectory, course_of
 from .view import View, across, ahead_on_way
 
 BESIDE_ROUTE = 10.0
-"""Who is teleported no further than this from the assigned route goes on along it [m]."""
+"""An entity teleported within this distance of its assigned route keeps the route [m]."""
 
 SLOWEST_DESIRED = 3.0
 """Desired speed of an entity that stands when its controller is activated [m/s]."""

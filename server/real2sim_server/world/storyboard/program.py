@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.base import Model
-from real2sim_proto.storyboard import Event, InitAction, Storyboard
+from real2sim_proto.storyboard import Event, InitAction, Storyboard, entity_references
 from real2sim_proto.storyboard_conditions import ElementType, Trigger
 
 from ..errors import WorldError
@@ -98,7 +97,6 @@ PLACING = frozenset({"teleport", "follow_trajectory"})
 """Kinds of actions that put an entity somewhere."""
 
 _SPEEDING = frozenset({"speed", "speed_profile"})
-_ENTITY_MEMBERS = ("entity", "relative_to", "master")
 
 
 def _in_order(entries: Sequence[InitAction]) -> tuple[InitAction, ...]:
@@ -126,22 +124,8 @@ def _is_ready(entry: InitAction, waiting: Sequence[InitAction], k: int) -> bool:
     if any(earlier.entity == entry.entity for earlier in waiting[:k]):
         return False
     kinds = _SPEEDING if entry.action.kind in _SPEEDING else PLACING
-    others = set(_references(entry.action)) - {entry.entity}
+    others = set(entity_references(entry.action)) - {entry.entity}
     return not any(w.entity in others and w.action.kind in kinds for w in waiting)
-
-
-def _references(part: Any) -> Iterator[str]:
-    """Names of the entities that an action refers to."""
-    if isinstance(part, list):
-        for each in part:
-            yield from _references(each)
-    if not isinstance(part, Model):
-        return
-    for member, value in part.__dict__.items():
-        if member in _ENTITY_MEMBERS and isinstance(value, str):
-            yield value
-        else:
-            yield from _references(value)
 
 
 class _Maker:
