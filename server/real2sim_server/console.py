@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -132,13 +133,22 @@ def _flat(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
-    """Write figures to ``path``, whole or not at all; nothing where it is None."""
+    """Write figures to ``path``, whole or not at all; nothing where it is None.
+
+    Numbers and arrays may be NumPy's.
+    """
     if path is None:
         return
     from ._files import atomic_file
 
     with atomic_file(path) as file:
-        file.write((json.dumps(figures, indent=2) + "\n").encode())
+        file.write((json.dumps(figures, indent=2, default=_plain) + "\n").encode())
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, np.generic | np.ndarray):
+        raise TypeError(f"a {type(value).__name__} is no figure that JSON has")
+    return value.tolist()
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:

@@ -35,6 +35,8 @@ def log_info(
     for line in report.lines():
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if check:
-        check_log(opened)
-        console.print("every file of the log was looked at: none is missing or cut off")
+        empty = check_log(opened)
+        console.print("every image's header and every sweep was read: none is missing or cut off")
+        if empty:
+            console.print(f"but the sweeps of {len(empty)} frames hold no points: {empty}")
     write_json(json, report.as_json())

@@ -68,7 +68,9 @@ def map_(
         save_scene(replace(loaded, lanes=lanes), target, overwrite=out is None)
         figures["scene"] = str(target)
     print_figures(f"lanes of {scene.name}", figures)
-    write_json(json, figures)
+    write_json(json, figures | {"notes": list(lanes.notes)})
+    for note in lanes.notes:
+        console.print(f"note: {note}", soft_wrap=True, markup=False)
     if picture is not None:
         from ..maps.picture import draw_lanes
 

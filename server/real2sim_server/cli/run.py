@@ -183,9 +183,12 @@ def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made:
     if bundle is not None:
         return open_scene(str(bundle))
     try:
-        save_scene(flat_scene(board, road_file), made)
+        flat = flat_scene(board, road_file)
     except (ScenarioError, MapError, WorldError) as error:
         raise CommandError(str(error)) from error
+    for note in flat.lanes.notes if flat.lanes is not None else ():
+        console.print(f"note: {note}", markup=False, highlight=False)
+    save_scene(flat, made)
     return load_scene(made)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from .driving_log import DrivingLog, LogError
 
-SWEEPS_CHECKED = 3
 FARTHEST_M = 100_000.0
 """Of the world's zero; single precision is 8 mm there."""
 
@@ -28,17 +27,19 @@ def check_log(
     *,
     decode_images: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
-) -> None:
+) -> list[int]:
     """Touch everything that training will read, and stop at the first thing that is wrong.
 
-    Opening a log has checked its tables already; this goes on to its heavy files.
+    Opening a log has checked its tables already; this reads every sweep, and the header, the size
+    and the end marker of every image.
 
     Args:
         log: any log.
-        decode_images: decode every image and read every sweep, which finds damage inside files
-            too; by default image headers, sizes and end markers are checked, and the first, middle
-            and last sweep are read.
+        decode_images: decode every image, which finds damage inside files too.
         on_progress: called with (done, total) after each frame.
+
+    Returns:
+        Frames whose sweep holds no points, where those of other frames do.
 
     Raises:
         LogError: names the file (or camera, frame, object), what is wrong and what is expected.
@@ -47,17 +48,18 @@ def check_log(
     _check_times(log)
     _check_place(log)
     _check_tracks(log)
-    sweeps = range(log.frame_count) if decode_images else _few(log.frame_count)
+    empty = []
     for frame in range(log.frame_count):
         for camera in log.rig.names:
             if decode_images:
                 log.image(camera, frame)
             elif isinstance(log.source, ChecksImages):
                 log.source.check_image(camera, frame)
-        if frame in sweeps:
-            log.lidar(frame)
+        if not len(log.lidar(frame).points):
+            empty.append(frame)
         if on_progress is not None:
             on_progress(frame + 1, log.frame_count)
+    return empty if len(empty) < log.frame_count else []
 
 
 def _check_cameras(log: DrivingLog) -> None:
@@ -111,7 +113,3 @@ def _check_tracks(log: DrivingLog) -> None:
                 f"log {log.name!r}: object {track.object_id!r} needs a positive length, width and "
                 f"height, not {track.size}"
             )
-
-
-def _few(count: int) -> set[int]:
-    return {round(i) for i in np.linspace(0, count - 1, min(SWEEPS_CHECKED, count)).tolist()}

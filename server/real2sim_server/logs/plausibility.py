@@ -109,6 +109,12 @@ def _times(log: DrivingLog) -> list[str]:
     without = log.provenance.get("cameras_without_images")
     if without:
         found.append(f"cameras without images, left out: {', '.join(without)}")
+    lost = [t * 1e-6 for t in log.provenance.get("frames_without_sweep_us", ())]
+    if lost:
+        found.append(
+            f"frames without a LiDAR sweep, left out: {len(lost)}, at "
+            f"{', '.join(f'{t:.2f}' for t in lost[:5])}{' ...' if len(lost) > 5 else ''} s"
+        )
     speed = ego_steps(log) / steps
     if speed.max() > MAX_EGO_SPEED:
         frame = int(speed.argmax())

@@ -50,7 +50,10 @@ class Argoverse2MapReader:
             kept = [lane for lane in lanes if lane is not None]
             if not kept:
                 raise MapError(f"{file}: has no lane segments")
-            return joined(kept, areas=areas, source=f"argoverse2 {file.name}")
+            short = [str(key) for key, lane in zip(segments, lanes, strict=True) if lane is None]
+            told = f"lane segments left out, which have no length: {', '.join(short)}"
+            notes = (told,) if short else ()
+            return joined(kept, areas=areas, source=f"argoverse2 {file.name}", notes=notes)
 
 
 def _archive(path: Path) -> Path | None:

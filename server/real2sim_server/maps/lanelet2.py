@@ -39,7 +39,9 @@ AREAS: dict[str, AreaKind] = {
     "walkway": "sidewalk",
     "intersection_area": "junction",
 }
-SPEED = re.compile(r"^\s*([0-9.]+)\s*(km/h|kmh|mph|m/s|mps)?\s*$")
+GERMAN_LIMIT = re.compile(r"^de274(?:\.1)?-([0-9]+)$")
+"""A sign by its number in the German catalogue of 2017, whose last part is the limit [km/h]."""
+SPEED = re.compile(r"^\s*([0-9]+(?:\.[0-9]*)?)\s*(km/h|kmh|mph|m/s|mps)?\s*$")
 UNITS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0, None: 1 / 3.6}
 
 
@@ -49,7 +51,7 @@ class Lanelet2Reader:
 
     Places are ``local_x``, ``local_y`` and ``ele`` of the nodes where they have them; else
     latitude and longitude about the middle of the file, on a plane (within some centimetres for
-    a few kilometres).
+    a few kilometres). Elements that an editor has marked as deleted are not there.
     """
 
     name = "lanelet2"
@@ -84,26 +86,25 @@ class _Osm:
     relations: dict[str, _Relation]
     origin: str = ""
     way_of: dict[tuple[str, ...], str] = field(default_factory=dict)
+    left_out: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
 
     @classmethod
     def of(cls, root: ET.Element, file: str) -> _Osm:
-        ways = {
-            w.get("id", ""): [n.get("ref", "") for n in w.findall("nd")]
-            for w in root.findall("way")
-        }
-        places, origin = _places(root.findall("node"), file)
-        for way_id, nodes in ways.items():
-            for node in nodes:
+        nodes, drawn, relations_ = (_kept(root, kind) for kind in ("node", "way", "relation"))
+        ways = {w.get("id", ""): [n.get("ref", "") for n in w.findall("nd")] for w in drawn}
+        places, origin = _places(nodes, file)
+        for way_id, refs in ways.items():
+            for node in refs:
                 if node not in places:
                     raise MapError(f"{file}: way {way_id} names node {node}, which is not there")
         relations = {}
-        for element in root.findall("relation"):
+        for element in relations_:
             members: dict[str, list[tuple[str, str]]] = defaultdict(list)
             for m in element.findall("member"):
                 members[m.get("role", "")].append((m.get("type", ""), m.get("ref", "")))
             relations[element.get("id", "")] = _Relation(_tags(element), members)
-        tags = {w.get("id", ""): _tags(w) for w in root.findall("way")}
-        way_of = {tuple(nodes): way for way, nodes in ways.items()}
+        tags = {w.get("id", ""): _tags(w) for w in drawn}
+        way_of = {tuple(refs): way for way, refs in ways.items()}
         return cls(file, places, ways, tags, relations, origin, way_of)
 
     def line(self, way_id: str) -> Float:
@@ -114,6 +115,18 @@ class _Osm:
         """Ways of a role, of those that are there."""
         named = relation.members.get(role, ())
         return [ref for kind, ref in named if kind == "way" and ref in self.ways]
+
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, by kind, with how many of them there are and the first names."""
+        return tuple(
+            f"{what}: {len(names)} ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})"
+            for what, names in self.left_out.items()
+        )
+
+
+def _kept(root: ET.Element, kind: str) -> list[ET.Element]:
+    """Elements of a kind, without those that JOSM keeps in the file as deleted."""
+    return [e for e in root.findall(kind) if e.get("action") != "delete"]
 
 
 def _tags(element: ET.Element) -> dict[str, str]:
@@ -160,7 +173,12 @@ def _value(text: str, where: str) -> float:
 
 def _graph(osm: _Osm, name: str) -> LaneGraph:
     lanelets = {k: r for k, r in osm.relations.items() if r.tags.get("type") == "lanelet"}
-    rims = {k: r for k, v in lanelets.items() if (r := _rims(osm, k, v)) is not None}
+    rims = {}
+    for key, relation in lanelets.items():
+        if (pair := _rims(osm, relation)) is not None:
+            rims[key] = pair
+        else:
+            osm.left_out["lanelets left out, which lack a rim"].append(key)
     lanes: dict[str, Lane] = {}
     areas: list[Area] = []
     index = _Index(rims)
@@ -171,31 +189,33 @@ def _graph(osm: _Osm, name: str) -> LaneGraph:
             areas.append(Area(key, "crosswalk", np.concatenate([left_line, right_line[::-1]])))
             continue
         shape, beside = between(*_oriented(osm, left, right)), index.beside(key)
-        if shape is not None:
-            lanes[key] = Lane(
-                key,
-                KINDS.get(tags.get("subtype", "road"), "other"),
-                *shape,
-                speed_limit=_speed_limit(osm, lanelets[key]),
-                may_change_left=_may_cross(osm, left, "left"),
-                may_change_right=_may_cross(osm, right, "right"),
-                junction="intersection" if "turn_direction" in tags else None,
-                left=beside["left"],
-                right=beside["right"],
-                opposite=beside["opposite"],
-                successors=index.successors(key),
-            )
+        if shape is None:
+            osm.left_out["lanelets left out, which have no length"].append(key)
+            continue
+        lanes[key] = Lane(
+            key,
+            KINDS.get(tags.get("subtype", "road"), "other"),
+            *shape,
+            speed_limit=_speed_limit(osm, key, lanelets[key]),
+            may_change_left=_may_cross(osm, left, "left"),
+            may_change_right=_may_cross(osm, right, "right"),
+            junction="intersection" if "turn_direction" in tags else None,
+            left=beside["left"],
+            right=beside["right"],
+            opposite=beside["opposite"],
+            successors=index.successors(key),
+        )
     if not lanes:
         raise MapError(f"{osm.file}: has no lanelets, relations of type lanelet with two rims")
     areas += [a for k, r in osm.relations.items() if (a := _area(osm, k, r)) is not None]
     stop_lines, signals = _rules(osm, lanelets, set(lanes))
     return joined(
         lanes.values(), areas=areas, stop_lines=stop_lines, signals=signals,
-        source=f"lanelet2 {name}", geo_reference=osm.origin,
+        source=f"lanelet2 {name}", geo_reference=osm.origin, notes=osm.notes(),
     )  # fmt: skip
 
 
-def _rims(osm: _Osm, key: str, relation: _Relation) -> tuple[list[str], list[str]] | None:
+def _rims(osm: _Osm, relation: _Relation) -> tuple[list[str], list[str]] | None:
     """Node ids of both rims, each of one way or several that follow each other."""
     sides = [_chained(osm, osm.member_ways(relation, side)) for side in ("left", "right")]
     if any(len(side) < 2 for side in sides):
@@ -297,17 +317,30 @@ def _may_cross(osm: _Osm, rim: list[str], side: str) -> bool:
     return not subtype.startswith("solid")
 
 
-def _speed_limit(osm: _Osm, relation: _Relation) -> float | None:
+def _speed_limit(osm: _Osm, key: str, relation: _Relation) -> float | None:
     texts = [relation.tags.get("speed_limit", "")]
     for _, ref in relation.members.get("regulatory_element", ()):
         rule = osm.relations.get(ref)
         if rule is not None and rule.tags.get("subtype") == "speed_limit":
-            texts.insert(0, rule.tags.get("sign_type", "") or rule.tags.get("limit", ""))
+            signs = [
+                osm.way_tags[way].get("subtype", "") for way in osm.member_ways(rule, "refers")
+            ]
+            texts = [rule.tags.get("sign_type", ""), rule.tags.get("limit", ""), *signs, *texts]
     for text in texts:
-        found = SPEED.match(text)
-        if found and float(found[1]) > 0:
-            return float(found[1]) * UNITS[found[2]]
+        if (limit := _speed(text)) is not None:
+            return limit
+    if unknown := next((text for text in texts if text), None):
+        osm.left_out[f"lanes without a limit, for {unknown[:40]!r} is not known"].append(key)
     return None
+
+
+def _speed(text: str) -> float | None:
+    """A limit [m/s] of a speed with its unit, km/h without one, or of a sign."""
+    if sign := GERMAN_LIMIT.match(text.strip()):
+        limit = int(sign[1])
+        return limit / 3.6 if limit == 5 or (0 < limit <= 130 and limit % 10 == 0) else None
+    found = SPEED.match(text)
+    return float(found[1]) * UNITS[found[2]] if found and float(found[1]) > 0 else None
 
 
 def _area(osm: _Osm, key: str, relation: _Relation) -> Area | None:
@@ -316,6 +349,7 @@ def _area(osm: _Osm, key: str, relation: _Relation) -> Area | None:
     nodes = _chained(osm, osm.member_ways(relation, "outer"))
     nodes = nodes[:-1] if len(nodes) > 1 and nodes[0] == nodes[-1] else nodes
     if len(nodes) < 3:
+        osm.left_out["areas left out, whose outline has less than three points"].append(key)
         return None
     kind = AREAS.get(relation.tags.get("subtype", ""), "other")
     return Area(f"area_{key}", kind, np.array([osm.places[n] for n in nodes]))
@@ -346,6 +380,7 @@ def _rules(
             lines[stop] = StopLine(stop, osm.line(stop), both)
         refers = osm.member_ways(rule, "refers") or ([stop] if stop is not None else [])
         if not refers or not len(osm.ways[refers[0]]):
+            osm.left_out["signals left out, which are placed nowhere"].append(key)
             continue
         line = osm.line(refers[0])
         x, y, z = line.mean(axis=0).tolist()

@@ -81,4 +81,5 @@ def _near(graph: LaneGraph, driven: Float, where: str) -> LaneGraph:
         source=graph.source,
         accuracy=graph.accuracy,
         geo_reference=graph.geo_reference,
+        notes=graph.notes,
     )

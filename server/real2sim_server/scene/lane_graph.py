@@ -34,6 +34,7 @@ class LaneGraph:
         accuracy: how far centre lines may be from those of the street: an estimate of the median
             error [m]; None where nothing is known of it (maps as their makers give them).
         geo_reference: projection of the map that it was read from (PROJ text), or empty.
+        notes: what the reader of a map left out, one sentence each; not stored with a scene.
 
     Raises:
         SceneError: an id that is stored under another or that nothing has.
@@ -47,6 +48,7 @@ class LaneGraph:
     source: str = ""
     accuracy: float | None = None
     geo_reference: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("lanes", "areas", "stop_lines", "signals", "roads"):

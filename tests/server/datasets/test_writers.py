@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import lzma
 import tarfile
@@ -15,9 +16,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from scipy.spatial import KDTree
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim_server.datasets.writers import WRITERS
 from real2sim_server.logs import open_log
+from real2sim_server.scene.io import save_scene
 
 FRAMES, CAMERAS = 5, 2
 FRONTS = {"image_02", "cam_front", "ring_front_center", "front"}
@@ -183,6 +187,52 @@ def test_coco_masks_are_the_pixels_of_their_objects(exported):
         x, y, width, height = row["bbox"]
         assert (x, y) == (columns[0], rows[0])
         assert (x + width, y + height) == (columns[-1] + 1, rows[-1] + 1)
+
+
+@pytest.fixture(scope="module")
+def exports(tiny_scene, tmp_path_factory):
+    """Exports of scenes whose objects are of the categories given, by the command."""
+    folder = tmp_path_factory.mktemp("categories")
+
+    def export(*categories: str) -> Path:
+        name = "_".join(categories)
+        objects = {
+            key: dataclasses.replace(subject, category=category)
+            for (key, subject), category in zip(
+                tiny_scene.objects.items(), categories, strict=False
+            )
+        }
+        scene = dataclasses.replace(tiny_scene, objects=objects)
+        save_scene(scene, folder / f"{name}.r2s")
+        given = ["export-dataset", folder / f"{name}.r2s", "--out", folder / name, "--no-flow"]
+        given += ["-f", "coco", "-f", "nuscenes", "--period", 1, "--width", 64, "--end-us", 10**6]
+        done = CliRunner().invoke(build_app(), [str(a) for a in given])
+        assert done.exit_code == 0, done.output
+        return folder / name
+
+    return export
+
+
+def test_ids_of_categories_do_not_depend_on_which_are_there(exports):
+    found = []
+    for folder in (exports("cyclist", "kiosk", "car"), exports("cyclist", "kiosk")):
+        kinds = ("instances", "panoptic")
+        paths = [folder / f"coco/annotations/{kind}_train.json" for kind in kinds]
+        ids = [
+            {c["id"]: c["name"] for c in json.loads(path.read_text())["categories"]}
+            for path in paths
+        ]
+        rows = json.loads(next(folder.rglob("v1.0-real2sim/category.json")).read_text())
+        found.append([*ids, {row["name"]: row["index"] for row in rows}])
+    assert found[0] == found[1]
+    instances, panoptic, lidarseg = found[0]
+    coco = ["person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck"]
+    assert {1, 2, 3, 4, 6, 7, 8} <= set(instances) <= set(panoptic)
+    assert all(coco[number - 1] == instances[number] for number in (1, 2, 3, 4, 6, 7, 8))
+    assert instances[94] == "cyclist"
+    assert next(number for number, name in instances.items() if name == "kiosk") >= 1000
+    assert len(lidarseg) == 32
+    assert (lidarseg["vehicle.car"], lidarseg["flat.driveable_surface"]) == (17, 24)
 
 
 def test_pycocotools_scores_labels_fed_as_detections_with_100(exported):

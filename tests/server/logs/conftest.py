@@ -65,9 +65,16 @@ def _layout(name: str) -> ModuleType:
 
 
 @pytest.fixture(scope="session")
-def written_waymo_v1(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def waymo_v1() -> ModuleType:
+    return _layout("waymo_v1")
+
+
+@pytest.fixture(scope="session")
+def written_waymo_v1(
+    waymo_v1: ModuleType, tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     folder = tmp_path_factory.mktemp("waymo_v1")
-    _layout("waymo_v1").write(tiny_log, folder / "tiny.tfrecord")
+    waymo_v1.write(tiny_log, folder / "tiny.tfrecord")
     return folder
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, check_log, open_log
 from real2sim_server.logs.images import encode_image
 from real2sim_server.scene import CameraRig
@@ -71,6 +73,19 @@ def test_broken_sweep_is_named(native_folder: Path) -> None:
     (native_folder / "lidar/000002.npz").write_bytes(b"PK\x03\x04 no archive")
     with pytest.raises(LogError, match=r"lidar/000002\.npz"):
         check_log(open_log(native_folder))
+
+
+def test_every_sweep_is_read(native_folder: Path) -> None:
+    first, empty, broken = (native_folder / f"lidar/00000{i}.npz" for i in range(3))
+    with np.load(first) as parts:
+        np.savez(empty, **{k: v[:0] if k != "origin" else v for k, v in parts.items()})
+    assert check_log(open_log(native_folder)) == [1]
+    told = CliRunner().invoke(build_app(), ["log-info", str(native_folder), "--check"])
+    assert "the sweeps of 1 frames hold no points: [1]" in told.output
+    broken.write_bytes(b"PK no archive")
+    told = CliRunner().invoke(build_app(), ["log-info", str(native_folder), "--check"])
+    assert told.exit_code != 0
+    assert "lidar/000002.npz" in told.output.replace("\n", "")
 
 
 def test_log_without_images_says_which_cameras_lack_them(

@@ -2,11 +2,14 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim_server.geometry.transform import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
 from real2sim_server.logs.readers.formats.wire_format import (
@@ -164,6 +167,22 @@ def _corners_in_camera(log: DrivingLog, camera: str, track: ObjectTrack) -> np.n
     pose = track.trajectory.transform(track.trajectory.start_us)
     to_camera = invert_transform(log.rig[camera].T_vehicle_camera) @ pose
     return apply_transform(to_camera, signs * np.array(track.size))
+
+
+def test_a_frame_without_a_sweep_is_left_out_and_told(
+    waymo_v1: ModuleType, tiny_log: SyntheticLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laser = waymo_v1._laser
+    monkeypatch.setattr(waymo_v1, "_laser", lambda log, f: b"" if f == 1 else laser(log, f))
+    waymo_v1.write(tiny_log, tmp_path / "tiny.tfrecord")
+    log = open_log(tmp_path)
+    assert log.frame_times_us.tolist() == tiny_log.frame_times_us[[0, 2]].tolist()
+    for ours, frame in enumerate((0, 2)):
+        assert len(log.lidar(ours).points) > 1000
+        assert (log.image("front", ours) == tiny_log.image("front", frame)).all()
+    told = CliRunner().invoke(build_app(), ["log-info", str(tmp_path), "--check"])
+    assert told.exit_code == 0, told.output
+    assert "frames without a LiDAR sweep, left out: 1, at 0.10 s" in told.output
 
 
 def test_broken_record_is_named(folder: Path) -> None:

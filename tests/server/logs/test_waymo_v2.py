@@ -9,7 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from scipy.spatial import cKDTree
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim_server.logs import DrivingLog, LogError, open_log
 from real2sim_server.synthetic import SyntheticLog
 
@@ -85,6 +87,33 @@ def test_segment_with_lidar_only_opens(folder: Path) -> None:
     assert len(log.lidar(0).points) > 1000
 
 
+@pytest.mark.parametrize("lost", ["row", "image", "laser"])
+def test_a_frame_without_a_sweep_is_left_out_and_told(
+    folder: Path, tiny_log: SyntheticLog, lost: str
+) -> None:
+    if lost == "image":
+        for i in (1, 2):
+            _set(folder, "lidar", f"[LiDARComponent].range_image_return{i}.shape", 1, [0, 0, 4])
+            _set(folder, "lidar", f"[LiDARComponent].range_image_return{i}.values", 1, [])
+    elif lost == "row":
+        start_us = _column(folder, "lidar", "key.frame_timestamp_micros")[1]
+        _keep_rows(folder, "lidar", lambda row: row["key.frame_timestamp_micros"] != start_us)
+    else:
+        _set(folder, "lidar", "key.laser_name", 1, 2)  # of another laser than the other frames
+        path = next((folder / "lidar_calibration").glob("*.parquet"))
+        table = pq.read_table(path)
+        pq.write_table(pa.concat_tables([table, table]), path)
+        _set(folder, "lidar_calibration", "key.laser_name", 1, 2)
+    log = open_log(folder)
+    assert log.frame_times_us.tolist() == tiny_log.frame_times_us[[0, 2]].tolist()
+    for ours, frame in enumerate((0, 2)):
+        assert len(log.lidar(ours).points) == len(tiny_log.lidar(frame).points)
+        assert (log.image("front", ours) == tiny_log.image("front", frame)).all()
+    told = CliRunner().invoke(build_app(), ["log-info", str(folder), "--check"])
+    assert told.exit_code == 0, told.output
+    assert "frames without a LiDAR sweep, left out: 1, at 0.10 s" in told.output
+
+
 def test_camera_without_images_is_left_out_and_named(folder: Path) -> None:
     _keep_rows(folder, "camera_image", lambda row: row["key.camera_name"] != 3)
     log = open_log(folder)
@@ -102,6 +131,11 @@ def test_real_poses_of_a_segment_open(test_data: Path) -> None:
     steps = np.linalg.norm(np.diff(log.ego.positions, axis=0), axis=1)
     assert steps.max() < 2.5
     assert np.abs(log.ego.positions[:, 2]).max() < 20
+
+
+def _column(folder: Path, component: str, column: str) -> list:
+    path = next((folder / component).glob("*.parquet"))
+    return pq.read_table(path, columns=[column]).column(column).to_pylist()
 
 
 def _keep_rows(folder: Path, component: str, keep: Callable[[dict], bool]) -> None:

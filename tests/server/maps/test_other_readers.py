@@ -8,8 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim_server.maps import MAP_READERS, MapError, read_map
+from real2sim_server.scene.io import save_scene
 from real2sim_server.scene.io.lane_document import lane_document
 
 NODES = {
@@ -156,6 +159,75 @@ def test_lanelets_are_joined_by_their_points_and_ruled_by_their_elements(tmp_pat
     light = graph.signals["31"]
     assert (light.kind, light.lanes, light.stop_line) == ("traffic_light", ("21",), "16")
     np.testing.assert_allclose(graph.stop_lines["16"].points[:, 0], 40.0)
+
+
+@pytest.fixture
+def from_map(tiny_scene, tmp_path):
+    """What ``real2sim map --from FILE`` gives a scene: the lanes, the figures and the output."""
+    save_scene(tiny_scene, tmp_path / "scene.r2s")
+
+    def read(osm):
+        path, lanes, figures = (tmp_path / name for name in ("map.osm", "lanes.json", "told.json"))
+        path.write_text(f"<osm>{osm}</osm>")
+        given = ["map", tmp_path / "scene.r2s", "--from", path, "--as-it-is", "--out", lanes]
+        done = CliRunner().invoke(build_app(), [str(a) for a in (*given, "--json", figures)])
+        assert done.exit_code == 0, done.output
+        return json.loads(lanes.read_text())["lanes"], json.loads(figures.read_text()), done.output
+
+    return read
+
+
+def lanelet(number, sides=("left", "right"), more="", action=""):
+    """A lanelet 3 m beside the one before, of its own nodes and ways."""
+    parts = []
+    for i, side in enumerate(sides):
+        y, key = 3 * number - i, f"{number}{i}"
+        for n, x in enumerate((0, 40)):
+            place = f'<tag k="local_x" v="{x}"/><tag k="local_y" v="{y}"/>'
+            parts.append(f'<node id="{key}{n}" lat="0" lon="0"{action}>{place}</node>')
+        parts.append(f'<way id="{key}"{action}><nd ref="{key}0"/><nd ref="{key}1"/></way>')
+        more += f'<member type="way" role="{side}" ref="{key}"/>'
+    tags = '<tag k="type" v="lanelet"/><tag k="subtype" v="road"/>'
+    return "".join(parts) + f'<relation id="l{number}"{action}>{more}{tags}</relation>'
+
+
+def limited_by(sign, key="9"):
+    tags = {"type": "regulatory_element", "subtype": "speed_limit", "sign_type": sign}
+    rule = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+    return lanelet(1, more=f'<member type="relation" role="regulatory_element" ref="{key}"/>') + (
+        f'<relation id="{key}">{rule}</relation>'
+    )
+
+
+def test_what_an_editor_marked_as_deleted_is_no_lane(from_map):
+    lanes, figures, _ = from_map(lanelet(1) + lanelet(2, action=' action="delete"'))
+    assert [lane["lane_id"] for lane in lanes] == ["l1"]
+    assert figures["notes"] == []
+
+
+@pytest.mark.parametrize("sign", ["de274-60", "de274.1-60", "60", "60 km/h"])
+def test_a_limit_given_by_a_sign_is_read(from_map, sign):
+    lanes, figures, _ = from_map(limited_by(sign))
+    assert lanes[0]["speed_limit"] == pytest.approx(60 / 3.6)
+    assert figures["notes"] == []
+
+
+@pytest.mark.parametrize("sign", ["de274-56", "usR2-1", "1.2.3"])
+def test_a_limit_that_cannot_be_read_is_noted(from_map, sign):
+    lanes, figures, told = from_map(limited_by(sign))
+    assert lanes[0]["speed_limit"] is None
+    [note] = figures["notes"]
+    assert f"{sign!r} is not known: 1 (l1)" in note
+    assert note in told
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_lanelets_that_lack_a_rim_are_noted(from_map, side):
+    lanes, figures, told = from_map(lanelet(1) + lanelet(2, [side]) + lanelet(3, [side]))
+    assert [lane["lane_id"] for lane in lanes] == ["l1"]
+    [note] = figures["notes"]
+    assert "lack a rim: 2 (l2, l3)" in note
+    assert note in told
 
 
 def test_segments_of_argoverse_2_have_middles_neighbours_and_areas(tmp_path):

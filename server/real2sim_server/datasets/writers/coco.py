@@ -7,6 +7,7 @@ masks run-length encoded column by column.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,25 @@ from real2sim_proto.semantics import SEMANTIC_CLASSES, UNLABELED
 from ...body.model import KEYPOINTS
 from ...render import encode_image
 from ..labels.views import without_blobs
-from .writer import LabelledDrive, categories_of, objects_of, write_json
+from .writer import LabelledDrive, objects_of, write_json
+
+CATEGORY_IDS = {
+    "person": 1, "bicycle": 2, "car": 3, "motorcycle": 4, "bus": 6, "train": 7, "truck": 8,
+    "traffic light": 10, "van": 91, "trailer": 92, "tram": 93, "cyclist": 94, "motorcyclist": 95,
+    "animal": 96, "barrier": 97, "cone": 98, "debris": 99, "pole": 100, "sign": 101,
+    "traffic_sign": 102,
+}  # fmt: skip
+"""Every export has these categories. Up to 90 they are COCO's own; all others have an id of 1000
+and above that follows from their name."""
+
+COCO_NAMES = {"pedestrian": "person", "traffic_light": "traffic light"}
+"""COCO's name by ours, where they differ."""
 
 STUFF_FROM = 200
-"""Categories of what is no object begin here; those of objects at 1."""
+"""A category of the background is this plus its semantic class."""
 
-SEGMENTS_OF_A_CATEGORY = 1000
-"""A panoptic id is the category's times this, plus the number of the object."""
+THINGS_FROM = 1 << 16
+"""The panoptic id of an object is this plus its number; that of background is its category."""
 
 QUALITY = 95
 PERSON = {
@@ -52,7 +65,6 @@ class CocoWriter:
 
     def write(self, drive: LabelledDrive, folder: Path) -> None:
         """See :class:`DatasetWriter`. Raises OSError."""
-        things = {name: 1 + k for k, name in enumerate(categories_of(drive))}
         splits: dict[str, _Split] = {}
         for clip in drive.clips:
             split = splits.setdefault(clip.split, _Split(clip.split))
@@ -68,7 +80,7 @@ class CocoWriter:
                     path.write_bytes(encode_image(rgb, "rgb", "jpeg", quality=QUALITY).data)
                     instance = clip.pixels("instance", camera.name, index)
                     semantic = clip.pixels("semantic", camera.name, index)
-                    split.add_objects(image_id, frame, camera.name, instance, things)
+                    split.add_objects(image_id, frame, camera.name, instance)
                     split.add_panoptic(
                         folder,
                         stem,
@@ -76,10 +88,15 @@ class CocoWriter:
                         image_id=image_id,
                         instance=instance,
                         semantic=semantic,
-                        things=things,
                     )
         for split in splits.values():
-            split.write(folder, drive, things)
+            split.write(folder, drive)
+
+
+def category_of(category: str) -> tuple[int, str]:
+    """Id and name in COCO of a category of objects, the same in every export."""
+    name = COCO_NAMES.get(category, category)
+    return CATEGORY_IDS.get(name) or 1000 + zlib.crc32(name.encode()) % (1 << 30), name
 
 
 class _Split:
@@ -91,6 +108,7 @@ class _Split:
         self.annotations: list[dict[str, Any]] = []
         self.keypoints: dict[int, list[tuple[float, float, int]]] = {}
         self.panoptic: list[dict[str, Any]] = []
+        self.categories = {number: name for name, number in CATEGORY_IDS.items()}
 
     def add_image(
         self, stem: str, size: Mapping[str, int], frame: Mapping[str, Any], camera: str, clip: str
@@ -114,7 +132,6 @@ class _Split:
         frame: Mapping[str, Any],
         camera: str,
         instance: NDArray[np.uint16],
-        things: Mapping[str, int],
     ) -> None:
         objects = objects_of(frame)
         for view in frame["views"][camera]:
@@ -128,7 +145,7 @@ class _Split:
                 {
                     "id": len(self.annotations) + 1,
                     "image_id": image_id,
-                    "category_id": things[objects[view["object_id"]]["category"]],
+                    "category_id": self._category(objects[view["object_id"]]["category"]),
                     "bbox": [left, top, right - left, bottom - top],
                     "area": int(mask.sum()),
                     "iscrowd": 0,
@@ -149,19 +166,15 @@ class _Split:
         image_id: int,
         instance: NDArray[np.uint16],
         semantic: NDArray[np.uint8],
-        things: Mapping[str, int],
     ) -> None:
         ids = np.where(semantic == UNLABELED, 0, STUFF_FROM + semantic.astype(np.int64))
         category = {int(i): int(i) for i in np.unique(ids) if i}
-        ids *= SEGMENTS_OF_A_CATEGORY
-        category = {k * SEGMENTS_OF_A_CATEGORY: k for k in category}
         for subject in frame["objects"]:
             own = instance == subject["instance_id"]
             if own.any():
-                kind = things[subject["category"]]
-                segment = kind * SEGMENTS_OF_A_CATEGORY + subject["instance_id"]
+                segment = THINGS_FROM + subject["instance_id"]
                 ids[own] = segment
-                category[segment] = kind
+                category[segment] = self._category(subject["category"])
         segments = [
             _segment(ids == segment, segment, category[segment])
             for segment in np.unique(ids).tolist()
@@ -175,13 +188,18 @@ class _Split:
             {"image_id": image_id, "file_name": f"{stem}.png", "segments_info": segments}
         )
 
-    def write(self, folder: Path, drive: LabelledDrive, things: Mapping[str, int]) -> None:
+    def _category(self, category: str) -> int:
+        number, name = category_of(category)
+        self.categories[number] = name
+        return number
+
+    def write(self, folder: Path, drive: LabelledDrive) -> None:
         info = {"description": drive.name, "version": "1.0"}
         licences = [{"id": 1, "name": drive.licence, "url": ""}]
         images = [{**image, "license": 1} for image in self.images]
         objects = [
             {"id": number, "name": name, "supercategory": "object"}
-            for name, number in things.items()
+            for number, name in sorted(self.categories.items())
         ]
         common = {"info": info, "licenses": licences, "images": images}
         write_json(

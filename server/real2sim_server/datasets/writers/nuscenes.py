@@ -22,7 +22,7 @@ from ...geometry.transform import apply_transform, invert_transform
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip
-from .writer import LabelledDrive, categories_of, objects_of, write_json
+from .writer import LabelledDrive, objects_of, write_json
 
 VERSION = "v1.0-real2sim"
 KEY_PERIOD_US = 500_000
@@ -42,15 +42,31 @@ CATEGORIES = {
     "animal": "animal",
     "barrier": "movable_object.barrier",
     "cone": "movable_object.trafficcone",
+    "trafficcone": "movable_object.trafficcone",
     "debris": "movable_object.debris",
+    "pushable_pullable": "movable_object.pushable_pullable",
+    "bicycle_rack": "static_object.bicycle_rack",
 }
 """nuScenes' category by ours."""
 OTHER = "static.other"
 """All others: the devkit opens no data set with classes of points that it has no colour for."""
 
+CLASSES = (
+    "noise", "animal", "human.pedestrian.adult", "human.pedestrian.child",
+    "human.pedestrian.construction_worker", "human.pedestrian.personal_mobility",
+    "human.pedestrian.police_officer", "human.pedestrian.stroller", "human.pedestrian.wheelchair",
+    "movable_object.barrier", "movable_object.debris", "movable_object.pushable_pullable",
+    "movable_object.trafficcone", "static_object.bicycle_rack", "vehicle.bicycle",
+    "vehicle.bus.bendy", "vehicle.bus.rigid", "vehicle.car", "vehicle.construction",
+    "vehicle.emergency.ambulance", "vehicle.emergency.police", "vehicle.motorcycle",
+    "vehicle.trailer", "vehicle.truck", "flat.driveable_surface", "flat.other", "flat.sidewalk",
+    "flat.terrain", "static.manmade", "static.other", "static.vegetation", "vehicle.ego",
+)  # fmt: skip
+"""The categories of nuScenes-lidarseg in their order: the place is the index."""
+
 LEVELS = ("v0-40", "v40-60", "v60-80", "v80-100")
 BOUNDS = (0.4, 0.6, 0.8)
-NOISE, DRIVEABLE, MANMADE = "noise", "flat.driveable_surface", "static.manmade"
+DRIVEABLE, MANMADE = "flat.driveable_surface", "static.manmade"
 PANOPTIC = 1000
 """A panoptic label is this times the index of the category, plus the object's number."""
 SPEED_MOVING = 0.2
@@ -131,8 +147,7 @@ class _Tables:
         )
 
     def add_categories(self) -> None:
-        names = sorted({_category(c) for c in categories_of(self.drive)})
-        for index, name in enumerate((NOISE, *names, DRIVEABLE, MANMADE)):
+        for index, name in enumerate(CLASSES):
             self.add("category", (name,), name=name, description="", index=index)
         for level, name in enumerate(LEVELS, start=1):
             share = name.removeprefix("v")
@@ -252,11 +267,12 @@ class _Tables:
     def _point_labels(self, clip: Clip, frame: int, sample_data: str, folder: Path) -> None:
         """Classes and objects of the points of a key frame: lidarseg and panoptic."""
         rows = clip.points(frame)
-        index = {row["name"]: row["index"] for row in self.rows["category"]}
-        classes = np.where(rows["semantic"] == GROUND, index[DRIVEABLE], index[MANMADE])
+        classes = np.where(
+            rows["semantic"] == GROUND, CLASSES.index(DRIVEABLE), CLASSES.index(MANMADE)
+        )
         for subject in clip.frames[frame]["objects"]:
             own = rows["instance"] == subject["instance_id"]
-            classes[own] = index[_category(subject["category"])]
+            classes[own] = CLASSES.index(_category(subject["category"]))
         things = rows["instance"].astype(np.int64) % PANOPTIC
         files = {
             "lidarseg": ("_lidarseg.bin", classes.astype(np.uint8).tobytes()),

@@ -66,11 +66,6 @@ def write_json(path: Path, content: Any) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def categories_of(drive: LabelledDrive) -> list[str]:
-    """All categories of objects, sorted."""
-    return sorted({o["category"] for c in drive.clips for f in c.frames for o in f["objects"]})
-
-
 def objects_of(frame: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Objects of a frame by id."""
     return {o["object_id"]: o for o in frame["objects"]}

@@ -23,7 +23,7 @@ from ...driving_log import DrivingLog, FrameSource, LogError
 from ..box_tracks import FrameBox, build_tracks, upright_pose
 from ..formats.tables import check_frame_times, check_rigid
 from ..lens import Lens
-from .lidar import SweepTiming
+from .lidar import TOP, SweepTiming
 
 CAMERA_NAMES = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 FRONT = 1
@@ -124,18 +124,30 @@ class WaymoFrame:
         pose: ``T_world_vehicle`` [4, 4], in Waymo's world.
         images: by camera number.
         boxes: of the lasers.
+        lasers: numbers of those that have a range image.
     """
 
     start_us: int
     pose: Float
     images: Mapping[int, WaymoImage] = field(default_factory=dict)
     boxes: Sequence[WaymoBox] = ()
+    lasers: frozenset[int] = frozenset()
 
     @property
     def time_us(self) -> int:
         """When ``pose`` holds [us]."""
         front = self.images.get(FRONT)
         return front.time_us if front is not None else self.start_us + SWEEP_US // 2
+
+
+def with_sweeps(frames: Sequence[WaymoFrame]) -> list[int]:
+    """Which frames have a sweep: all of them in a segment without LiDAR.
+
+    A frame without the TOP laser, which has most of the points, counts as one without a sweep.
+    """
+    there = frozenset[int]().union(*(f.lasers for f in frames))
+    needed = there & {TOP} or there
+    return [i for i, f in enumerate(frames) if not needed or f.lasers & needed]
 
 
 def sweep_timings(frames: Sequence[WaymoFrame]) -> list[SweepTiming]:
@@ -153,11 +165,12 @@ def build_waymo_log(
     source: FrameSource,
     where: str,
     provenance: Mapping[str, Any],
+    left_out: Sequence[WaymoFrame] = (),
 ) -> DrivingLog:
     """The log; its world is the vehicle frame of the first frame.
 
     The ego's path goes through the poses of all frames and of all images. Cameras without any
-    image are left out and named in the provenance.
+    image, and the frames ``left_out`` for want of a sweep, are named in the provenance.
 
     Raises:
         LogError: times out of order, poses that are not rigid, images or boxes that are missing
@@ -184,6 +197,7 @@ def build_waymo_log(
             "track_ids": keys,
             "rolling_shutter": {c.name: _shutter(c, frames) for c in used},
             "cameras_without_images": [c.name for c in cameras if c not in used],
+            "frames_without_sweep_us": [f.time_us for f in left_out],
         },
         image_times_us={
             c.name: np.array([f.images[c.number].time_us for f in frames], dtype=np.int64)

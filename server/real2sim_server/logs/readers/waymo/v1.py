@@ -29,6 +29,7 @@ from .segment import (
     build_waymo_log,
     sweep_timings,
     waymo_camera,
+    with_sweeps,
 )
 
 SUFFIX = ".tfrecord"
@@ -56,12 +57,14 @@ class WaymoV1Reader:
         name = select_sequence(path, sorted(p.stem for p in path.glob(f"*{SUFFIX}")), sequence)
         file = path / f"{name}{SUFFIX}"
         records = list_records(file)
-        frames, first = [], None
+        read, first = [], None
         for i, record in enumerate(records):
             message = ProtoMessage(read_record(file, record), f"{file} frame {i}")
-            frames.append(_read_frame(message))
+            read.append(_read_frame(message))
             first = first or message.message(1, "context")
         assert first is not None
+        kept = with_sweeps(read)
+        frames, records = [read[i] for i in kept], [records[i] for i in kept]
         cameras = [_read_camera(m) for m in first.messages(2, "camera_calibrations")]
         lasers = [_read_laser(m) for m in first.messages(3, "laser_calibrations")]
         source = _WaymoV1Source(
@@ -78,6 +81,7 @@ class WaymoV1Reader:
                 "sequence": first.text(1) or name,
                 "reader": self.name,
             },
+            left_out=[frame for i, frame in enumerate(read) if i not in kept],
         )
 
 
@@ -120,6 +124,11 @@ def _read_frame(message: ProtoMessage) -> WaymoFrame:
         pose=_transform(message, 3, "pose"),
         images=images,
         boxes=[_read_box(m) for m in message.messages(6, "laser_label")],
+        lasers=frozenset(
+            laser.integer(1)
+            for laser in message.messages(5, "laser")
+            if any(laser.message(i, "return").blob(2) for i in (2, 3))
+        ),
     )
 
 

@@ -28,6 +28,7 @@ from .segment import (
     build_waymo_log,
     sweep_timings,
     waymo_camera,
+    with_sweeps,
 )
 
 TIME = "key.frame_timestamp_micros"
@@ -73,13 +74,15 @@ class WaymoV2Reader:
         segment = select_sequence(root / "vehicle_pose", known, sequence)
         files = _SegmentFiles(root, segment)
         cameras = _read_cameras(files)
-        images = _read_images(files)
-        frames = _read_frames(files, images, _read_boxes(files))
+        images, lidar = _read_images(files), _open_lidar(files)
+        read = _read_frames(files, images, _read_boxes(files), lidar)
+        kept = with_sweeps(read)
+        frames = [read[i] for i in kept]
         source = _WaymoV2Source(
             images=files.optional("camera_image"),
             rows={k: row for k, (row, _) in images.items()},
             cameras={c.name: c for c in cameras},
-            lidar_files=_open_lidar(files),
+            lidar_files=lidar,
             frames=tuple(frames),
             timings=tuple(sweep_timings(frames)),
         )
@@ -94,6 +97,7 @@ class WaymoV2Reader:
                 "sequence": segment,
                 "reader": self.name,
             },
+            left_out=[frame for i, frame in enumerate(read) if i not in kept],
         )
 
 
@@ -210,6 +214,7 @@ def _read_frames(
     files: _SegmentFiles,
     images: Mapping[tuple[int, int], tuple[int, WaymoImage]],
     boxes: Mapping[int, list[WaymoBox]],
+    lidar: _Lidar | None,
 ) -> list[WaymoFrame]:
     file = files.open("vehicle_pose")
     times, poses = file.numbers(TIME).tolist(), _transforms(file, POSE)
@@ -221,8 +226,11 @@ def _read_frames(
     by_time: dict[int, dict[int, WaymoImage]] = defaultdict(dict)
     for (number, time), (_, image) in images.items():
         by_time[time][number] = image
+    lasers: dict[int, set[int]] = defaultdict(set)
+    for number, time in lidar.rows if lidar is not None else ():
+        lasers[time].add(number)
     return [
-        WaymoFrame(time, pose, by_time.get(time, {}), boxes.get(time, ()))
+        WaymoFrame(time, pose, by_time.get(time, {}), boxes.get(time, ()), frozenset(lasers[time]))
         for time, pose in zip(times, poses, strict=True)
     ]
 
@@ -247,7 +255,9 @@ def _open_lidar(files: _SegmentFiles) -> _Lidar | None:
         ranges.require([f"{LIDAR}.range_image_return{i}.{part}" for part in ("values", "shape")])
     if poses is not None:
         poses.require([f"{LIDAR_POSE}.values", f"{LIDAR_POSE}.shape"])
-    rows = _rows(ranges)
+    shapes = [ranges.lists(f"{LIDAR}.range_image_return{i}.shape") for i in (1, 2)]
+    seen = [any(s and 0 not in s for s in both) for both in zip(*shapes, strict=True)]
+    rows = {key: row for key, row in _rows(ranges).items() if seen[row]}
     lasers = _read_lasers(files.open("lidar_calibration"))
     for number, _ in rows:
         if number not in lasers:
