@@ -60,7 +60,11 @@ class AssetUpload(Model):
 
     asset_id: Identifier | None = Field(default=None, description="default: the file's name")
     category: Category = "car"
-    up_axis: UpAxis = Field(default="-y", description="which axis of the file points up")
+    up_axis: UpAxis | None = Field(
+        default=None,
+        description="which axis of the file points up; default: what the file says (y for spz; an "
+        "exported ply has it in its header), else -y",
+    )
     yaw: float = Field(
         default=0.0, ge=-6.3, le=6.3, description="turn about z after that [rad]: front to x"
     )

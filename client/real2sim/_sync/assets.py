@@ -113,7 +113,7 @@ class Assets(Collection[AssetInfo]):
         *,
         asset_id: str | None = None,
         category: str = "car",
-        up_axis: str = "-y",
+        up_axis: str | None = None,
         yaw: float = 0.0,
         length: float | None = None,
     ) -> AssetInfo:
@@ -123,7 +123,9 @@ class Assets(Collection[AssetInfo]):
             path: the file.
             asset_id: default: the file's name.
             category: for example ``car``, ``truck``, ``pedestrian``.
-            up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``.
+            up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``; default: what the file
+                says, as spz and exported ply do, else ``-y``. ``provenance["up_axis"]`` of the
+                asset is the one that was taken.
             yaw: turn about z after that [rad], to bring the front to x.
             length: real length [m]; default: usual for the category.
 

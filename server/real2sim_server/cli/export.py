@@ -36,16 +36,18 @@ def export(
     """Write a scene for other programs: per object, baked at a time, animated as glTF, or as
     plain points: all in one .ply, or in a folder the background and each object apart."""
     from ..scene.io import export_scene, load_scene
+    from ..scene.io.formats import FORMATS
 
     refuse_existing(out, overwrite=overwrite)
     loaded = load_scene(scene)
     if file_format == "points":
         files = _write_points(loaded, out, t_us, objects)
-        _tell(scene, loaded.gaussian_count, files, json)
+        _tell(scene, loaded.gaussian_count, files, "z", json)
         return
     # export_scene itself refuses formats and objects that it does not know, with those there are.
     files = export_scene(loaded, out, format=file_format, t_us=t_us, objects=objects or None)
-    _tell(scene, loaded.gaussian_count, files, json)
+    axes = {"gltf": "y"} | {known.suffix[1:]: known.up_axis for known in FORMATS}
+    _tell(scene, loaded.gaussian_count, files, axes[file_format], json)
 
 
 def _write_points(
@@ -76,11 +78,14 @@ def _write_points(
     return tuple(out / f"{name}.ply" for name in parts)
 
 
-def _tell(scene: Path, gaussians: int, files: Sequence[Path], json: Path | None) -> None:
+def _tell(
+    scene: Path, gaussians: int, files: Sequence[Path], up_axis: str, json: Path | None
+) -> None:
     figures: dict[str, object] = {
         "files": [str(file) for file in files],
         "bytes": sum(file.stat().st_size for file in files),
         "gaussians": gaussians,
+        "up_axis": up_axis,
     }
     print_figures(f"exported {scene.name}", figures)
     write_json(json, figures)

@@ -31,8 +31,12 @@ def import_(
     ] = False,
     category: Annotated[str, typer.Option(help="Class of an asset.")] = "car",
     up_axis: Annotated[
-        str, typer.Option(help="Axis that points up in the file: z, y or -y.")
-    ] = "z",
+        str | None,
+        typer.Option(
+            help="Axis that points up in the file: z, y or -y; default: what the file says (y for "
+            "spz), else z."
+        ),
+    ] = None,
     dataset: Annotated[
         Path | None, typer.Option(help="Folder that a checkpoint was trained on.")
     ] = None,
@@ -46,12 +50,14 @@ def import_(
     refuse_existing(out, overwrite=overwrite)
     if file.suffix == CHECKPOINT_SUFFIX:
         figures = _import_checkpoint(file, out, dataset, frames, overwrite=overwrite)
-    elif up_axis not in get_args(UpAxis):
+    elif up_axis not in (None, *get_args(UpAxis)):
         raise CommandError(f"--up-axis {up_axis!r}; allowed are {', '.join(get_args(UpAxis))}")
     elif asset:
-        figures = _import_asset(file, out, category, cast(UpAxis, up_axis), overwrite=overwrite)
+        figures = _import_asset(
+            file, out, category, cast("UpAxis | None", up_axis), overwrite=overwrite
+        )
     else:
-        figures = _import_scene(file, out, cast(UpAxis, up_axis), overwrite=overwrite)
+        figures = _import_scene(file, out, cast("UpAxis | None", up_axis), overwrite=overwrite)
     print_figures(f"imported {file.name}", figures)
     write_json(json, figures)
 
@@ -83,7 +89,7 @@ def _import_checkpoint(
 
 
 def _import_asset(
-    file: Path, out: Path, category: str, up_axis: UpAxis, *, overwrite: bool
+    file: Path, out: Path, category: str, up_axis: UpAxis | None, *, overwrite: bool
 ) -> dict[str, object]:
     from ..scene.io import import_splats, save_asset
 
@@ -91,19 +97,23 @@ def _import_asset(
     asset = save_asset(asset, out, overwrite=overwrite)
     return {
         "asset": str(out),
+        "up_axis": asset.provenance["up_axis"],
         "gaussians": len(asset.cloud),
         "size_m": " x ".join(f"{edge:.2f}" for edge in asset.size),
         "content_hash": asset.content_hash,
     }
 
 
-def _import_scene(file: Path, out: Path, up_axis: UpAxis, *, overwrite: bool) -> dict[str, object]:
+def _import_scene(
+    file: Path, out: Path, up_axis: UpAxis | None, *, overwrite: bool
+) -> dict[str, object]:
     from ..scene.io import import_splats, save_scene
 
     scene = import_splats(file, name=out.name, up_axis=up_axis)
     scene = save_scene(scene, out, overwrite=overwrite)
     return {
         "scene": str(out),
+        "up_axis": scene.provenance["up_axis"],
         "gaussians": scene.gaussian_count,
         "content_hash": scene.content_hash,
     }

@@ -73,13 +73,14 @@ def export_scene(
         _check_file(path, ".glb")
         write_gltf(scene, path, objects=chosen, t_us=t_us)
         return (path,)
-    turn = invert_transform(upright(up_axis or splat_formats[format].up_axis, 0.0))
+    axis = up_axis or splat_formats[format].up_axis
+    turn = invert_transform(upright(axis, 0.0))
     if t_us is None:
-        return _write_folder(scene, chosen, path, f".{format}", turn)
+        return _write_folder(scene, chosen, path, f".{format}", axis)
     _check_file(path, f".{format}")
     if format_to_write(path).suffix != f".{format}":
         raise SceneError(f"{path}: this ending means {format_to_write(path).name}, not {format}")
-    write_splats(bake(scene, t_us, objects=chosen).moved(turn), path)
+    write_splats(bake(scene, t_us, objects=chosen).moved(turn), path, up_axis=axis)
     return (path,)
 
 
@@ -121,9 +122,10 @@ def _check_file(path: Path, suffix: str) -> None:
 
 
 def _write_folder(
-    scene: Scene, objects: dict[str, SceneObject], out: Path, suffix: str, turn: Float
+    scene: Scene, objects: dict[str, SceneObject], out: Path, suffix: str, axis: UpAxis
 ) -> tuple[Path, ...]:
-    """Background and objects as files of their own, each in its own frame turned by ``turn``."""
+    """Background and objects as files of their own, each in its own frame with ``axis`` up."""
+    turn = invert_transform(upright(axis, 0.0))
     if out.exists() and not _is_replaceable(out):
         raise SceneError(
             f"{out}: is there and holds something else than an export; choose another folder or "
@@ -132,9 +134,10 @@ def _write_folder(
     names = {k: _file_name(i, k) + suffix for i, k in enumerate(objects, start=1)}
     background = f"background{suffix}"
     with atomic_folder(out) as folder:
-        write_splats(scene.background.moved(turn), folder / background)
+        write_splats(scene.background.moved(turn), folder / background, up_axis=axis)
         for object_id, scene_object in objects.items():
-            write_splats(scene_object.cloud.moved(turn), folder / names[object_id])
+            cloud = scene_object.cloud.moved(turn)
+            write_splats(cloud, folder / names[object_id], up_axis=axis)
         with atomic_file(folder / INDEX_NAME) as file:
             index = _index(scene, objects, names, background=background, turn=turn)
             file.write(json.dumps(index, indent=1).encode())

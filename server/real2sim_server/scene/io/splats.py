@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, cast, overload
 
 import numpy as np
 
@@ -16,7 +17,15 @@ from ..cloud import GaussianCloud
 from ..errors import BundleError, SceneError
 from ..scene import Scene
 from ..trajectory import Trajectory
-from .formats import FORMATS, SplatFormat, UpAxis, inria_ply, suffixes
+from .formats import (
+    FORMATS,
+    InriaPly,
+    PlayCanvasPly,
+    SplatFormat,
+    UpAxis,
+    inria_ply,
+    suffixes,
+)
 
 HEAD_BYTES = 1 << 16
 
@@ -56,11 +65,18 @@ def read_splats(path: str | PathLike[str], *, max_bytes: int | None = None) -> G
     raise BundleError(f"{file}: not a ply nor any other known splat format; known are: {known}")
 
 
-def write_splats(cloud: GaussianCloud, path: str | PathLike[str]) -> None:
+def write_splats(
+    cloud: GaussianCloud, path: str | PathLike[str], *, up_axis: UpAxis | None = None
+) -> None:
     """Write ``cloud`` in the format that the name ends with, atomically, in its own frame.
 
     ``.compressed.ply``, ``.ply``, ``.spz`` (version 3) or ``.splat``; what each format rounds is
     said at its class in :mod:`.formats`.
+
+    Args:
+        cloud: the Gaussians.
+        path: file to write.
+        up_axis: which axis points up; the header of a ply says so. None: unknown.
 
     Raises:
         SceneError: another ending, values that are not finite or out of range, or values the
@@ -70,7 +86,25 @@ def write_splats(cloud: GaussianCloud, path: str | PathLike[str]) -> None:
     file = Path(path)
     splat_format = format_to_write(file)
     cloud.check_values(f"cloud for {file}")
-    splat_format.write(cloud, file)
+    if up_axis is not None and isinstance(splat_format, InriaPly | PlayCanvasPly):
+        splat_format.write(cloud, file, comment=f"up_axis {up_axis}")
+    else:
+        splat_format.write(cloud, file)
+
+
+def up_axis_of(path: str | PathLike[str]) -> UpAxis | None:
+    """The axis of a splat file that points up, where its format (spz) or its header says so.
+
+    Raises:
+        BundleError: it cannot be read.
+    """
+    head = _head(Path(path))
+    if head.startswith(b"ply"):
+        said = re.search(rb"^comment up_axis (z|y|-y)\r?$", head.split(b"end_header")[0], re.M)
+        return cast("UpAxis", said[1].decode()) if said else None
+    known = (f.up_axis for f in FORMATS if f.recognises(head))
+    # A format whose users agree on nothing has the scene's own axis.
+    return next((axis for axis in known if axis != "z"), None)
 
 
 def format_to_write(path: Path) -> SplatFormat:
@@ -102,7 +136,7 @@ def import_splats(
     *,
     name: str,
     as_asset: Literal[False] = False,
-    up_axis: UpAxis = "z",
+    up_axis: UpAxis | None = None,
     yaw: float = 0.0,
     scale: float = 1.0,
     max_bytes: int | None = None,
@@ -116,7 +150,7 @@ def import_splats(
     name: str,
     as_asset: Literal[True],
     category: str = "object",
-    up_axis: UpAxis = "z",
+    up_axis: UpAxis | None = None,
     yaw: float = 0.0,
     scale: float = 1.0,
     max_bytes: int | None = None,
@@ -129,7 +163,7 @@ def import_splats(
     name: str,
     as_asset: bool = False,
     category: str = "object",
-    up_axis: UpAxis = "z",
+    up_axis: UpAxis | None = None,
     yaw: float = 0.0,
     scale: float = 1.0,
     max_bytes: int | None = None,
@@ -141,7 +175,8 @@ def import_splats(
         name: name of the scene, or id of the asset.
         as_asset: make an asset instead of a scene.
         category: class of the asset.
-        up_axis: which axis of the file points up; trained splats mostly have ``-y``.
+        up_axis: which axis of the file points up; trained splats mostly have ``-y``. None: what
+            its format or header says (:func:`up_axis_of`), else ``z``.
         yaw: turn about z after that [rad], to bring the front of a thing to x.
         scale: metres per unit of the file.
         max_bytes: what its Gaussians may take in memory; None for any amount.
@@ -153,6 +188,7 @@ def import_splats(
     """
     file = Path(path)
     cloud = read_splats(file, max_bytes=max_bytes)
+    up_axis = up_axis or up_axis_of(file) or "z"
     if not len(cloud):
         raise BundleError(f"{file}: holds no splats; nothing to import")
     placed = cloud.moved(upright(up_axis, yaw), scale=scale)

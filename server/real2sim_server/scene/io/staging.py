@@ -16,7 +16,8 @@ import numpy as np
 from ..._confined import ConfinedError, Limits, run_confined
 from ..errors import BundleError, BundleTooLargeError, SceneError
 from .bundle import load_scene, save_asset, save_scene
-from .splats import import_splats
+from .formats import UpAxis
+from .splats import import_splats, up_axis_of
 
 MIB = 1024**2
 LOADED_EARLY = ("cv2", "scipy.ndimage", "scipy.spatial")
@@ -116,7 +117,7 @@ def read_and_save_asset(
     max_bytes: int,
     asset_id: str,
     category: str,
-    up_axis: Any,
+    up_axis: UpAxis | None,
     yaw: float,
     length: float | None,
 ) -> None:
@@ -126,7 +127,8 @@ def read_and_save_asset(
         name=asset_id,
         as_asset=True,
         category=category,
-        up_axis=up_axis,
+        # Most files that say nothing of their axes come from trainers that look along z.
+        up_axis=up_axis or up_axis_of(source) or "-y",
         yaw=yaw,
         max_bytes=max_bytes,
     )

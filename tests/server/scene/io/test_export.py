@@ -3,10 +3,18 @@ import json
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from real2sim.cli import build_app
 from real2sim_server.geometry.transform import apply_transform
 from real2sim_server.scene import GaussianCloud, SceneError, Trajectory, UnknownObjectError
-from real2sim_server.scene.io import export_scene, import_splats, read_splats
+from real2sim_server.scene.io import (
+    export_scene,
+    import_splats,
+    load_scene,
+    read_splats,
+    save_scene,
+)
 from real2sim_server.scene.io.export import bake
 
 SPLATS = ["ply", "compressed.ply", "spz", "splat"]
@@ -24,7 +32,7 @@ def extent(cloud):
 @pytest.mark.parametrize("name", SPLATS)
 def test_a_baked_scene_holds_everything_where_it_was(scene, t_us, tmp_path, name):
     (file,) = export_scene(scene, tmp_path / f"a.{name}", format=name, t_us=t_us)
-    back = import_splats(file, name="a", up_axis="y" if name == "spz" else "z").background
+    back = import_splats(file, name="a").background
     expected = [scene.background.means.numpy()]
     for scene_object in scene.objects.values():
         pose = scene_object.trajectory.transform(t_us)
@@ -37,6 +45,27 @@ def test_a_baked_scene_holds_everything_where_it_was(scene, t_us, tmp_path, name
     # A chunk spans about 60 m, which compressed ply cuts into 1023 steps across and more along.
     assert distances.min(axis=0).max() < (0.06 if name == "compressed.ply" else 4e-4)
     assert distances.min(axis=1).max() < (0.06 if name == "compressed.ply" else 4e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "axis", "within"),
+    [("spz", "y", 1e-3), ("ply", "z", 1e-6), ("compressed.ply", "z", 0.06), ("splat", "z", 1e-6)],
+)
+def test_what_the_command_exports_it_imports_as_it_was(scene, t_us, tmp_path, name, axis, within):
+    save_scene(scene, tmp_path / "a.r2s")
+
+    def run(*words):
+        figures = tmp_path / "figures.json"
+        done = CliRunner().invoke(build_app(), [*map(str, words), "--json", str(figures)])
+        assert done.exit_code == 0, done.output
+        return json.loads(figures.read_text())
+
+    file = tmp_path / f"out.{name}"
+    told = run("export", tmp_path / "a.r2s", "--out", file, "--format", name, "--t-us", t_us)
+    back = run("import", file, "--out", tmp_path / "b.r2s")
+    assert (told["up_axis"], back["up_axis"]) == (axis, axis)
+    expected = extent(bake(scene, t_us))
+    assert extent(load_scene(tmp_path / "b.r2s").background) == pytest.approx(expected, abs=within)
 
 
 def test_a_baked_ply_equals_the_clouds_moved_to_the_world(scene, t_us, tmp_path):
@@ -72,7 +101,7 @@ def test_the_axis_asked_for_points_up(scene, t_us, tmp_path, up_axis, file_up):
     scene.background.means[:, 2] += 1000
     export_scene(scene, tmp_path / "a.ply", format="ply", t_us=t_us, up_axis=up_axis)
     assert read_splats(tmp_path / "a.ply").means[:100].mean(0)[file_up] > 900
-    back = import_splats(tmp_path / "a.ply", name="a", up_axis=up_axis).background
+    back = import_splats(tmp_path / "a.ply", name="a").background
     np.testing.assert_allclose(back.means, bake(scene, t_us).means, atol=1e-3)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.assets import AssetInfo
-from real2sim_server.scene.io import write_splats
+from real2sim_server.scene.io import export_scene, write_splats
 
 CUT = {"scene": "tiny", "object_id": "car_red", "asset_id": "red"}
 THERE = {"position": [20.0, 3.0, 5.0]}
@@ -85,6 +85,16 @@ def test_every_splat_format_can_be_uploaded_at_a_real_size(client, splat_file):
     assert info.size[0] == pytest.approx(8.0)
     # As wide and high against its length as the file's Gaussians are.
     assert info.size[1] / info.size[0] == pytest.approx(1.8 / 4.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "axis"), [("spz", "y"), ("ply", "z"), ("compressed.ply", "z")])
+def test_an_exported_object_is_uploaded_upright(client, tiny_scene, tmp_path, name, axis):
+    export_scene(tiny_scene, tmp_path / "out", format=name, objects=["car_red"])
+    answer = upload(client, tmp_path / "out" / f"001_car_red.{name}", length="4")
+    info = AssetInfo.model_validate(answer.json())
+    assert info.provenance["up_axis"] == axis
+    # As long, wide and high as the car is.
+    assert info.size == pytest.approx((4.0, 1.8, 1.5), rel=0.1)
 
 
 def test_a_file_that_is_no_splat_is_refused_without_a_trace(client, tmp_path):

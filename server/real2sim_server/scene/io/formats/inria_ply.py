@@ -59,12 +59,12 @@ class InriaPly:
             sh=_spherical_harmonics(path, vertex, rest),
         )
 
-    def write(self, cloud: GaussianCloud, path: Path) -> None:
+    def write(self, cloud: GaussianCloud, path: Path, *, comment: str = "") -> None:
         """Write ``cloud``; see :func:`write_ply`."""
-        write_ply(cloud, path)
+        write_ply(cloud, path, comment=comment)
 
 
-def write_ply(cloud: GaussianCloud, path: Path) -> None:
+def write_ply(cloud: GaussianCloud, path: Path, *, comment: str = "") -> None:
     """Write ``cloud`` as an INRIA-style binary little-endian PLY, atomically.
 
     Positions and harmonics keep their bits; scales and opacities pass through log and logit in
@@ -89,7 +89,9 @@ def write_ply(cloud: GaussianCloud, path: Path) -> None:
         cloud.quats.detach().cpu().numpy(),
     ]
     header = "\n".join(
-        ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
+        ["ply", "format binary_little_endian 1.0"]
+        + [f"comment {comment}"] * bool(comment)
+        + [f"element vertex {len(cloud)}"]
         + [f"property float {name}" for name in names]
         + ["end_header\n"]
     )

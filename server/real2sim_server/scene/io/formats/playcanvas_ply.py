@@ -93,7 +93,7 @@ class PlayCanvasPly:
             sh=np.concatenate([first, _rest(path, sh, len(vertex))], axis=1),
         )
 
-    def write(self, cloud: GaussianCloud, path: Path) -> None:
+    def write(self, cloud: GaussianCloud, path: Path, *, comment: str = "") -> None:
         """Write ``cloud`` in Z-curve order, so that chunks are small; the order is not kept.
 
         Raises:
@@ -102,7 +102,8 @@ class PlayCanvasPly:
         cloud = cloud.select(torch.from_numpy(morton_order(host_array(cloud.means))))
         chunks, words = _packed(cloud)
         sh = _packed_rest(host_array(cloud.sh[:, 1:]))
-        lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(chunks)}"]
+        lines = ["ply", "format binary_little_endian 1.0"]
+        lines += [f"comment {comment}"] * bool(comment) + [f"element chunk {len(chunks)}"]
         lines += [f"property float {name}" for name in CHUNK_FIELDS]
         lines += [f"element vertex {len(cloud)}", *(f"property uint {name}" for name in PACKED)]
         if sh.shape[1]:
