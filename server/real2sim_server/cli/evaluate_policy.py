@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from .._files import atomic_file
-from ..console import CommandError, console, staged_progress, write_json
+from ..console import CommandError, console, errors, staged_progress, write_json
 from .command import command
 
 if TYPE_CHECKING:
@@ -74,11 +74,15 @@ def evaluate_policy(
 ) -> None:
     """Drive cases with planners; leave scores, recordings and a page that compares them.
 
+    Each planner runs in a process of its own. One that raises, sends a plan that is refused or
+    ends its process fails that episode: the rest is driven, and the exit code is 1.
+
     A suite names cases: a scene or a scenario, options of `reset`, edits, and the `jitter` of
     numbers in them, by which seeds differ. Its format is described in docs/policies.md.
     """
-    from ..policies.episodes import WorkerTarget, run_episodes
+    from ..policies.episodes import run_episodes
     from ..policies.page import render_page
+    from ..policies.planner_process import WorkerTarget
     from ..policies.suite import EpisodeGrid
     from ..policies.summary import report_figures, unconfirmed_scores
 
@@ -107,6 +111,22 @@ def evaluate_policy(
     _print_scores(results)
     _print_what_ran_once(grid)
     console.print(f"in {out}: {PAGE}, {FIGURES}, {RECORDINGS}/", highlight=False)
+    _tell_failures(results)
+
+
+def _tell_failures(results: Sequence[EpisodeResult]) -> None:
+    """Why planners have failed; ends the command with exit code 1 where any has."""
+    failed = [one for one in results if one.error is not None]
+    for policy in dict.fromkeys(one.policy for one in failed):
+        own = [one for one in failed if one.policy == policy]
+        driven = sum(one.policy == policy for one in results)
+        errors.print(
+            f"planner {policy} failed in {len(own)} of {driven} episodes, first in "
+            f"{own[0].case}, seed {own[0].seed}: {own[0].error}",
+            highlight=False, markup=False, soft_wrap=True, style="red",
+        )  # fmt: skip
+    if failed:
+        raise typer.Exit(1)
 
 
 def _cases(
@@ -174,7 +194,9 @@ def _print_scores(results: Sequence[EpisodeResult]) -> None:
     for name in groups[0].scores:
         scores = [group.scores[name] for group in groups]
         table.add_row(name, *("–" if s is None else f"{s.mean:.3g}" for s in scores))
-    table.add_row("collisions at fault", *(str(group.at_fault) for group in groups))
+    at_fault = ("–" if group.failed else str(group.at_fault) for group in groups)
+    table.add_row("collisions at fault", *at_fault)
+    table.add_row("failed episodes", *(f"{g.failed} of {g.episodes}" for g in groups))
     console.print(table)
 
 

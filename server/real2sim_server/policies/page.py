@@ -101,7 +101,7 @@ def _table(groups: Sequence[ScoreGroup]) -> str:
 
 def _row(group: ScoreGroup) -> str:
     cells = "".join(f"<td>{_score(group.scores[name])}</td>" for name in METRICS)
-    hits = f"{group.collisions} <small>{group.at_fault}</small>"
+    hits = f"{group.collisions} <small>{group.at_fault}</small>" if not group.failed else "–"
     if group.at_fault:
         hits = f'<span class="bad">{hits}</span>'
     ended = ", ".join(f"{escape(reason)} {n}" for reason, n in group.reasons.items())

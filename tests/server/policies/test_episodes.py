@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import html
 import json
 import re
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+import real2sim
 from real2sim.cli import build_app
 from real2sim_server.policies.page import render_page
 from real2sim_server.policies.summary import (
@@ -104,6 +106,70 @@ def evaluated(site, tmp_path_factory) -> tuple[Path, str]:
     done = CliRunner().invoke(build_app(), [*command, "--url", site.url, "--out", str(out)])
     assert done.exit_code == 0, done.output
     return out, done.output
+
+
+BAD = """
+import os, sys
+from real2sim.planners import FollowRoute
+class Bad(FollowRoute):
+    steps = 0
+    def plan(self, obs):
+        self.steps += 1
+        return self.tenth() if self.steps == 10 else super().plan(obs)
+class Exits(Bad):
+    def tenth(self): os._exit(3)
+class Leaves(Bad):
+    def tenth(self): sys.exit("no more")
+class Refused(Bad):
+    def tenth(self): return {"kind": "pose", "x": 1e9, "y": 0.0, "yaw": 0.0}
+class Other(FollowRoute):
+    def plan(self, obs): return {"kind": "control", "acceleration": 0.0, "steering": 0.0}
+class Nothing(FollowRoute):
+    def plan(self, obs): pass
+class Early(Bad):
+    def begin(self, welcome): os._exit(4)
+"""
+FAILURES = {
+    "bad:Exits": "the planner ended its process with exit code 3",
+    "bad:Leaves": "SystemExit: no more",
+    "bad:Refused": "plan refused: plan: pose/x",
+    "bad:Other": "plan refused: ",
+    "bad:Nothing": "plan refused: plan: ",
+    "bad:Early": "the planner ended its process with exit code 4",
+}
+
+
+def test_planners_that_fail_are_told_and_the_rest_is_driven(site, tmp_path, monkeypatch):
+    (tmp_path / "bad.py").write_text(BAD)
+    monkeypatch.chdir(tmp_path)
+    out = tmp_path / "out"
+    command = ["evaluate-policy", "--scene", "tiny", "--url", site.url, "--out", str(out)]
+    policies = [word for name in (*FAILURES, "pid") for word in ("--policy", name)]
+    done = CliRunner().invoke(build_app(), [*command, *policies, "--sessions", "1"])
+    assert done.exit_code == 1, done.output
+    figures = json.loads((out / "report.json").read_text())
+    episodes = {e["policy"]: e for e in figures["episodes"]}
+    assert (episodes["pid"]["error"], episodes["pid"]["reason"]) == (None, "horizon")
+    page = (out / "report.html").read_text()
+    for name, reason in FAILURES.items():
+        error = episodes[name]["error"]
+        assert error.startswith(reason)
+        assert error in html.unescape(page)
+        assert f"planner {name} failed in 1 of 1 episodes, first in tiny, seed 0: {error}" in (
+            done.output
+        )
+        assert load_recording(out / episodes[name]["recording"]).instants
+    with real2sim.connect(site.url, token=site.token) as client:
+        assert client.sessions.list() == []
+
+
+def test_a_planner_that_failed_has_no_number_of_collisions(site, tmp_path, monkeypatch):
+    (tmp_path / "bad_too.py").write_text(BAD)
+    monkeypatch.chdir(tmp_path)
+    command = ["evaluate-policy", "--policy", "bad_too:Exits", "--scene", "tiny"]
+    done = CliRunner().invoke(build_app(), [*command, "--url", site.url, "--out", "out"])
+    assert re.search("collisions at fault *│ *–", done.output)
+    assert re.search("failed episodes *│ *1 of 1", done.output)
 
 
 def test_the_command_leaves_a_report_of_a_running_worker(evaluated):
