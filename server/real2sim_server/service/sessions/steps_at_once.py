@@ -26,6 +26,7 @@ from .deadline_timer import DeadlineTimer
 from .handshake import SMALL_BYTES, error_message
 from .messages import action_in
 from .observation import EncodedObservation
+from .segment import SLOTS
 from .session import Session
 from .step import BrokenStep, DueAction, Stepper
 from .wire import EncodedMessage
@@ -98,7 +99,8 @@ class StepsAtOnce:
         if session.closed is not None or session.lock.locked() or not self._is_driving():
             return False
         action = action_in(data)
-        if action is None or action.message.slot is not None:
+        # Without sensors nothing is written to a slot.
+        if action is None or (action.message.slot or 0) >= SLOTS:
             return False
         return self._context.run(self._begin, action.message, action.content)
 

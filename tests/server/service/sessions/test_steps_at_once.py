@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+import real2sim
 from real2sim_server.service.accounts import Account
-from real2sim_server.service.sessions import connection
+from real2sim_server.service.sessions import connection, messages
 from real2sim_server.service.sessions.connection import Connection
 from real2sim_server.service.token_file import TokenLimits
 
@@ -33,6 +34,36 @@ def test_a_due_action_without_sensors_wakes_no_task(planner, woken):
     planner.reset(sensors=[])
     assert [planner.act(step)["step"] for step in range(3)] == [1, 2, 3]
     assert woken == []
+
+
+def test_steps_of_the_sdk_on_the_same_machine_wake_no_task(site, woken, monkeypatch):
+    decoded = []
+    for name in ("unpack", "decode"):
+        read = getattr(messages, name)
+
+        def counted(data, read=read, **limits):
+            decoded.append(data)
+            return read(data, **limits)
+
+        monkeypatch.setattr(messages, name, counted)
+    with (
+        real2sim.connect(site.url) as client,
+        client.session(scene="tiny", shared_memory=True) as session,
+    ):
+        session.reset(action="control")
+        before = len(decoded)
+        for step in range(3):
+            obs = session.step(CONTROL)
+            assert obs.step == step + 1
+        assert len(decoded) - before == 3
+    assert woken == []
+
+
+def test_a_slot_that_is_not_there_goes_the_ordinary_way(planner, woken):
+    planner.reset(sensors=[])
+    # Nobody has attached, so that slots do not matter yet.
+    assert planner.ask("action", step=0, plan=CONTROL, slot=4)["step"] == 1
+    assert woken == [0]
 
 
 def test_an_action_with_sensors_goes_the_ordinary_way(planner, woken):
