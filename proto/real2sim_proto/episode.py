@@ -466,6 +466,12 @@ class ContactSpec(Model):
     masses: dict[Identifier, Annotated[float, Field(gt=0, le=1e6)]] = Field(
         default_factory=dict, description="[kg] by object; default: by category and box"
     )
+    weighed_by_height: bool = Field(
+        default=True,
+        description="people weigh by their height, where `masses` names no mass; false: by the "
+        "volume of their box, three to five times too much, as in episodes recorded before this "
+        "option was there",
+    )
     pulse: bool = Field(
         default=True,
         description="impacts take the time that masses and structures need, about a tenth of a "

@@ -23,6 +23,8 @@ class ContactLog:
         self._impulses: dict[tuple[str, str], Float] = {}
         self._friction_work: dict[tuple[str, str], float] = {}
         self._times: dict[tuple[str, str], list[float]] = {}
+        self._unheard: dict[tuple[str, str], float] = {}
+        self._asleep: dict[tuple[str, str], float] = {}
         self._solver_totals: dict[tuple[str, str], tuple[Float, float, float]] = {}
         self.collider_work = 0.0
 
@@ -57,6 +59,13 @@ class ContactLog:
         self._friction_work[key] = self._friction_work.get(key, 0.0) + friction_work
         times = self._times.setdefault(key, [time, time])
         times[1] = time
+        self._asleep[key] = self._asleep.get(key, 0.0) + self._unheard.pop(key, 0.0)
+
+    def add_sleep(self, bodies: set[str], time: float, duration: float) -> None:
+        """Say who was asleep in a step at a time [s]: mostly nobody asks what holds them then."""
+        for key, (_, last) in self._times.items():
+            if key[0] in bodies and last != time:
+                self._unheard[key] = self._unheard.get(key, 0.0) + duration
 
     def totals(self) -> dict[tuple[str, str], Float]:
         """Impulses so far, by (body, other) [N s]."""
@@ -90,14 +99,15 @@ class ContactLog:
         )
 
     def _impact_delta_v(self, key: tuple[str, str], mass: float, gravity: Float) -> float:
-        """Of the impulse beyond what the weight asks for in the time of contact; only the impulse's
-        part against gravity can be that."""
+        """Of the impulse beyond what the weight asks for from the first touch to the last, but for
+        sleep in between; only the impulse's part against gravity can be that."""
         impulse, (first, last) = self._impulses[key] / mass, self._times[key]
+        awake = last - first - self._asleep[key]
         strength = float(np.linalg.norm(gravity))
         if strength == 0:
             return float(np.linalg.norm(impulse))
         up = -gravity / strength
-        carried = float(np.clip(impulse @ up, 0.0, strength * (last - first)))
+        carried = float(np.clip(impulse @ up, 0.0, strength * awake))
         return float(np.linalg.norm(impulse - carried * up))
 
 

@@ -15,9 +15,13 @@ from .structure import VEHICLES
 class ClassMass:
     """Default mass of a category.
 
+    A person's mass goes by height, since a tracked box is wider and longer than who walks in it.
+
     Attributes:
         per_volume: mass per volume of the object's box [kg/m^3].
         source: where the figure comes from.
+        person: whether it holds a person as high as the box.
+        besides: what comes to a person [kg].
         stability: static stability factor, half the track over the height of the centre of mass;
             None where it lies where the filled shape has it.
         stability_source: where that comes from.
@@ -25,6 +29,8 @@ class ClassMass:
 
     per_volume: float
     source: str
+    person: bool = False
+    besides: float = 0.0
     stability: float | None = None
     stability_source: str = ""
 
@@ -40,7 +46,15 @@ CAR = ClassMass(
     stability=1.41,
     stability_source=NHTSA_SSF + ": passenger cars",
 )
-PERSON = ClassMass(270.0, "Hybrid III 50th percentile dummy, 78 kg in 1.75 x 0.50 x 0.33 m")
+PERSON = ClassMass(
+    270.0,
+    "Hybrid III 50th percentile dummy, 78 kg in 1.75 x 0.50 x 0.33 m; otherwise by the 2.5th power "
+    "of height (L. N. Trefethen, letter to The Economist, 2013)",
+    person=True,
+)
+PERSON_KG, PERSON_HEIGHT, GROWTH = 78.0, 1.75, 2.5
+HEIGHTS = (0.6, 2.0)
+"""Of persons [m]; boxes that are lower or higher are wrong."""
 CLASS_MASSES = {
     "car": CAR,
     "vehicle": CAR,
@@ -53,7 +67,16 @@ CLASS_MASSES = {
     "truck": ClassMass(130.0, "two-axle lorry, half laden: about 11 t in 8.5 x 2.5 x 4.0 m"),
     "bus": ClassMass(125.0, "12 m city bus, about 12 t kerb in 12 x 2.55 x 3.1 m"),
     "pedestrian": PERSON,
-    "cyclist": ClassMass(85.0, "78 kg rider and 14 kg bicycle in 1.8 x 0.6 x 1.0 m of box"),
+    "cyclist": ClassMass(
+        85.0,
+        "78 kg rider and 14 kg bicycle in 1.8 x 0.6 x 1.0 m of box; the rider's head is about as "
+        "high as when walking",
+        person=True,
+        besides=14.0,
+    ),
+    "motorcyclist": ClassMass(
+        100.0, "rider as for a cyclist, and 200 kg machine", person=True, besides=200.0
+    ),
     "motorcycle": ClassMass(150.0, "200 kg machine and 78 kg rider in 2.1 x 0.8 x 1.1 m of box"),
 }
 """Typical figures for want of better ones; give a mass where it is known."""
@@ -79,8 +102,14 @@ def yaw_inertia(category: str, mass: float, size: Sequence[float]) -> float:
     return mass * (size[0] * size[0] + size[1] * size[1]) / 12
 
 
-def default_mass(category: str, size: Sequence[float]) -> float:
+def default_mass(category: str, size: Sequence[float], *, by_height: bool = True) -> float:
     """Mass [kg] of an object of that category and box size (length, width, height) [m].
+
+    Args:
+        category: of the object.
+        size: of its box.
+        by_height: persons weigh by their height; False: by the volume of their box, as episodes of
+            earlier versions had it.
 
     Raises:
         ParticleError: for a size that is not three positive lengths.
@@ -88,7 +117,11 @@ def default_mass(category: str, size: Sequence[float]) -> float:
     edges = np.asarray(size, dtype=np.float64)
     if edges.shape != (3,) or not (edges > 0).all():
         raise ParticleError(f"size must be three positive lengths [m], not {size!r}")
-    return CLASS_MASSES.get(category, OTHER).per_volume * float(edges.prod())
+    known = CLASS_MASSES.get(category, OTHER)
+    if known.person and by_height:
+        height = min(max(float(edges[2]), HEIGHTS[0]), HEIGHTS[1])
+        return PERSON_KG * (height / PERSON_HEIGHT) ** GROWTH + known.besides
+    return known.per_volume * float(edges.prod())
 
 
 def centre_height(category: str, track: float) -> float | None:

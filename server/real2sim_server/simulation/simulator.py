@@ -115,6 +115,8 @@ class HybridSimulator:
         for r in self._resting.solve(duration, starts):
             self.contact_log.add(r.body, r.other, r.impulse, r.heat, self.time)
         self._lay_to_rest(duration)
+        asleep = {b.name for b in self.bodies if b.mode == BodyMode.SLEEPING}
+        self.contact_log.add_sleep(asleep, self.time, duration)
         if not deforming:
             self.colliders = [c.after(duration) for c in self.colliders]
         self.time += duration

@@ -84,6 +84,21 @@ def test_mass_comes_from_the_category_when_none_is_given():
     assert particles.mass == pytest.approx(default_mass("car", SIZE))
 
 
+@pytest.mark.parametrize(
+    ("category", "size", "mass"),
+    [
+        ("pedestrian", (0.5, 0.33, 1.75), 78.0),
+        ("pedestrian", (0.9, 0.9, 1.75), 78.0),  # as wide as a box tracked while walking
+        ("pedestrian", (0.5, 0.5, 1.1), 24.4),  # six years: 20.6 kg by the CDC's growth charts
+        ("pedestrian", (1.0, 1.0, 3.0), 108.9),  # no more than of two metres
+        ("cyclist", (1.9, 0.9, 1.75), 92.0),
+        ("motorcyclist", (2.2, 1.0, 1.75), 278.0),
+    ],
+)
+def test_people_weigh_by_their_height(category, size, mass):
+    assert default_mass(category, size) == pytest.approx(mass, abs=0.1)
+
+
 @pytest.mark.parametrize("options", [{"spacing": 0}, {"spacing": 0.1, "mass": -1.0}])
 def test_nonsense_is_refused(options):
     with pytest.raises(ParticleError, match="must be positive"):

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
+from real2sim_server.edit import ScenarioState
 from real2sim_server.physics.solver import Solver, SolverOptions
 from real2sim_server.simulation.experiments.crash_tests import CAR_SIZE, MALIBU_MASS, whole_car
 from real2sim_server.simulation.masses import YAW_RADIUS, yaw_inertia
 from real2sim_server.simulation.structure import STRUCTURES, stiffness_of
+from real2sim_server.world import World
 from real2sim_server.world.collision.face_pulse import advance_face_pulse, face_contact
 from real2sim_server.world.collision.manifold import contact_impulse, contact_manifold, corners
 from real2sim_server.world.collision.obstacles import ObstacleGrid
@@ -105,6 +109,24 @@ def test_specs_of_older_logs_keep_their_sudden_impacts(make_world, moving):
     recorded = recorded_spec(Entry(0, "reset", reset_payload(spec))).contact
     assert recorded.pulse
     assert recorded.residual_crush
+
+
+def test_a_struck_person_weighs_by_height_and_in_older_logs_as_before(make_scene, moving):
+    scene = make_scene(None, walker=moving(20, 0, z=0.8))
+    objects = {"walker": replace(scene.objects["walker"], category="pedestrian")}
+    scene = replace(scene, objects=objects)
+    length, width, height = scene.objects["walker"].size
+    spec = ResetSpec(**GO_ON, contact={"dents": False}, horizon=400)
+    fields = spec.model_dump(mode="json")
+    del fields["contact"]["weighed_by_height"]
+    masses = []
+    for given in (spec, stored_spec(fields)):
+        world = World(scene, ScenarioState.of(scene), given)
+        speeds(world, steps=1)
+        masses.append(world.traffic.drivers["walker"].properties.mass)
+    assert masses == pytest.approx(
+        [78.0 * (height / 1.75) ** 2.5, 270.0 * length * width * height], rel=1e-6
+    )
 
 
 def test_a_struck_car_turns_by_the_inertia_of_its_class(make_world, moving):

@@ -59,7 +59,7 @@ def object_properties(
     given = subject.physics
     mass = contact.masses.get(subject.object_id, given.mass if given else None)
     if mass is None:
-        mass = default_mass(subject.category, size)
+        mass = default_mass(subject.category, size, by_height=contact.weighed_by_height)
     if given is not None and given.friction is not None:
         friction = given.friction
     rolls = subject.category in ROLLING

@@ -22,6 +22,7 @@ BEFORE: Mapping[str, Any] = {
         "distributed": False,
         "progressive": False,
         "breakage": False,
+        "weighed_by_height": False,
     },
 }
 """How episodes ran before members had their present defaults, or before there were such members.
