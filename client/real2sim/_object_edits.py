@@ -113,14 +113,27 @@ class ObjectEdits(Generic[R]):
         start_us: int | None = None,
         end_us: int | None = None,
         blend_us: int | None = None,
+        about_us: int | None = None,
     ) -> R:
-        """Turn it about its own centre [rad]; times as of :meth:`translate`.
+        """Turn it [rad]; times as of :meth:`translate`.
+
+        Args:
+            angle: [rad].
+            axis: of any length.
+            frame: of the axis, ``world`` or ``object``.
+            start_us, end_us, blend_us: as of :meth:`translate`.
+            about_us: turns its path with it, about where it is at this instant [us]. Without one it
+                turns in place at each pose: an object that moves then goes sideways, of which
+                ``warnings`` of the result tell.
 
         Examples:
             >>> result = car.rotate(angle=0.26)
+            >>> result = car.rotate(angle=-0.26, about_us=0)
         """
         when = _time_range(start_us, end_us, blend_us)
-        return self._make(Rotate, angle=angle, axis=axis, frame=frame, time_range=when)
+        return self._make(
+            Rotate, angle=angle, axis=axis, frame=frame, time_range=when, about_us=about_us
+        )
 
     def scale(self, *, x: float = 1.0, y: float = 1.0, z: float = 1.0, anchor: str = "bottom") -> R:
         """Multiply the size along the object's axes; ``anchor``: ``bottom`` or ``centre`` stays.

@@ -83,7 +83,8 @@ class Translate(Model):
 
 
 class Rotate(Model):
-    """Turn an object about its own centre, at all times or in a time range with smooth ends."""
+    """Turn an object, at all times or in a time range with smooth ends: in place at each of its
+    poses, so that one that moves then goes sideways; or with its path, see `about_us`."""
 
     op: Literal["rotate"] = "rotate"
     object_id: ObjectId
@@ -91,6 +92,11 @@ class Rotate(Model):
     axis: Vector3 = Field(default=(0.0, 0.0, 1.0), description="of any length above 0")
     frame: Frame = Field(default="world", description="frame of the axis")
     time_range: TimeRange | None = Field(default=None, description="default: at all times")
+    about_us: Microseconds | None = Field(
+        default=None,
+        description="turns its path with it, about where it is at this instant; a time range "
+        "should then begin or end there",
+    )
     snap: Snap = False
 
     @field_validator("axis")

@@ -73,7 +73,7 @@ class OperationBatch(Model):
 class EditWarning(Reply):
     """Something a person should look at; the operation took effect all the same."""
 
-    code: str = one_of(Literal["overlap", "off_ground", "outside_map"])
+    code: str = one_of(Literal["overlap", "off_ground", "outside_map", "sideways"])
     object_id: str
     message: str
 

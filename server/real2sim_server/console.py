@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -146,7 +145,7 @@ def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    if not isinstance(value, np.generic | np.ndarray):
+    if not hasattr(value, "tolist"):
         raise TypeError(f"a {type(value).__name__} is no figure that JSON has")
     return value.tolist()
 

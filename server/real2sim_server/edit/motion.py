@@ -61,16 +61,26 @@ def translate(state: ScenarioState, subject: ObjectState, operation: Translate) 
 
 @object_operation(Rotate)
 def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> AppliedOperation:
-    """Turn it about its own centre, at all times or in a time range."""
+    """Turn it about its own centre or with its path, at all times or in a time range."""
     axis = np.array(operation.axis) / np.linalg.norm(operation.axis)
     track, weights = _weighted(subject.trajectory, operation.time_range)
     half = operation.angle / 2 * (weights if weights is not None else np.ones(1))[:, None]
-    turns = np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
-    if operation.frame == "world":
-        quaternions = multiply_quaternions(turns, track.quaternions)
+    positions, about_us = track.positions, operation.about_us
+    if about_us is None:
+        turns = np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
     else:
+        at = min(max(about_us, track.start_us), track.end_us)
+        [pivot], [facing] = sample_poses(track, np.array([at]))
+        if operation.frame == "object":
+            axis = quaternion_to_matrix(facing) @ axis
+        turns = np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
+        away = (positions - pivot)[:, :, None]
+        positions = _within_limits(pivot + (quaternion_to_matrix(turns) @ away)[..., 0])
+    if operation.frame == "object" and about_us is None:
         quaternions = multiply_quaternions(track.quaternions, turns)
-    turned = Trajectory(track.times_us, track.positions, quaternions)
+    else:
+        quaternions = multiply_quaternions(turns, track.quaternions)
+    turned = Trajectory(track.times_us, positions, quaternions)
     if operation.time_range is None and not operation.snap:
         inverse = operation.model_copy(update={"angle": -operation.angle})
         return _moved(state, subject, turned, inverse)
@@ -176,13 +186,7 @@ def shifted(
         offset = quaternion_to_matrix(trajectory.quaternions) @ offset
     if weights is not None:
         offset = weights[:, None] * offset
-    positions = trajectory.positions + offset
-    if np.abs(positions).max() > MAX_COORDINATE:
-        raise invalid_operation(
-            f"the object would be {np.abs(positions).max():.6g} m away from the origin; "
-            f"{MAX_COORDINATE:g} m is allowed",
-            hint="shift it by less",
-        )
+    positions = _within_limits(trajectory.positions + offset)
     return Trajectory(trajectory.times_us, positions, trajectory.quaternions)
 
 
@@ -210,6 +214,16 @@ def rescaled(
 
 
 # --- inside -------------------------------------------------------------------------------------
+
+
+def _within_limits(positions: Float) -> Float:
+    if np.abs(positions).max() > MAX_COORDINATE:
+        raise invalid_operation(
+            f"the object would be {np.abs(positions).max():.6g} m away from the origin; "
+            f"{MAX_COORDINATE:g} m is allowed",
+            hint="move it by less",
+        )
+    return positions
 
 
 def _follow(

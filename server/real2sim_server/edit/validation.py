@@ -1,4 +1,4 @@
-"""Validation of an edit: warnings of overlaps, floating objects, objects far outside."""
+"""Validation of an edit: warnings of overlaps, of objects that float, slip or are far outside."""
 
 from __future__ import annotations
 
@@ -25,6 +25,10 @@ OFF_GROUND = 0.3
 
 OUTSIDE_MAP = 100.0
 """An object this far outside the rectangle that the recording reached is reported [m]."""
+
+SLIP, SLIP_STEPS, MOVING = np.radians(20), 5, 1.0
+"""An object that goes this far off its heading [rad] for so many samples more than in the recording
+is reported; what is slower than this [m/s] counts as standing."""
 
 NAMED_OVERLAPS = 5
 
@@ -53,6 +57,7 @@ def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[Edit
         recorded = None if subject.asset else state.recorded[subject.source_id]
         yield from _off_ground(subject, recorded, transforms, state.ground)
         yield from _outside_map(subject, state.extent, transforms)
+        yield from _sideways(subject, recorded, times, transforms)
 
 
 def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> _Samples:
@@ -166,3 +171,34 @@ def _outside_map(subject: ObjectState, extent: Float, transforms: Float) -> Iter
             object_id=subject.object_id,
             message=f"{subject.object_id!r} gets {farthest:.0f} m away from everything recorded",
         )
+
+
+def _sideways(
+    subject: ObjectState, recorded: ObjectState | None, times: NDArray[np.int64], own: Float
+) -> Iterator[EditWarning]:
+    if not subject.edited or subject.standing:
+        return
+    slips = _slips(times, own)
+    usual = 0
+    if recorded is not None:
+        track = recorded.trajectory
+        theirs, _ = _sampled(track, track.start_us, track.end_us)
+        usual = int((_slips(_sample_times(track.start_us, track.end_us), theirs) > SLIP).sum())
+    if (slips > SLIP).sum() >= usual + SLIP_STEPS:
+        yield EditWarning(
+            code="sideways",
+            object_id=subject.object_id,
+            message=f"{subject.object_id!r} goes sideways, up to {np.degrees(slips.max()):.0f} "
+            "degrees off its heading; a rotation with about_us turns its path with it",
+        )
+
+
+def _slips(times: NDArray[np.int64], transforms: Float) -> Float:
+    """Angle [T - 1] between way and heading, forwards or backwards [rad]; 0 while it stands."""
+    way = np.diff(transforms[:, :2, 3], axis=0)
+    length = np.linalg.norm(way, axis=1)
+    ahead = transforms[:-1, :2, 0] + transforms[1:, :2, 0]
+    along = np.abs((way * ahead).sum(axis=1))
+    across = np.abs(way[:, 0] * ahead[:, 1] - way[:, 1] * ahead[:, 0])
+    slips: Float = np.where(length > MOVING * np.diff(times) * 1e-6, np.arctan2(across, along), 0.0)
+    return slips

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -120,7 +121,7 @@ def default_mass(category: str, size: Sequence[float], *, by_height: bool = True
     known = CLASS_MASSES.get(category, OTHER)
     if known.person and by_height:
         height = min(max(float(edges[2]), HEIGHTS[0]), HEIGHTS[1])
-        return PERSON_KG * (height / PERSON_HEIGHT) ** GROWTH + known.besides
+        return PERSON_KG * math.pow(height / PERSON_HEIGHT, GROWTH) + known.besides
     return known.per_volume * float(edges.prod())
 
 

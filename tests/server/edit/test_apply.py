@@ -14,11 +14,13 @@ from real2sim_proto.operations import (
     Scale,
     SetPose,
     SetTrajectory,
+    TimeRange,
     Translate,
 )
 from real2sim_server.edit import EditError, ObjectState, ScenarioState, apply_operations
 from real2sim_server.edit.apply import replay_operations
 from real2sim_server.geometry.box import box_corners
+from real2sim_server.geometry.rotation import quaternion_yaw
 
 
 def after(state: ScenarioState, *operations: Operation, of: str = "turning") -> ObjectState:
@@ -52,6 +54,57 @@ def test_rotate_turns_about_the_own_centre(state, frame):
     old, new = transforms(state.objects["turning"]), transforms(turned)
     np.testing.assert_allclose(new[:, :3, 3], old[:, :3, 3])
     np.testing.assert_allclose(new[:, :3, 0], old[:, :3, 1], atol=1e-12)
+
+
+ANGLE = 0.7
+
+
+def slips(trajectory) -> np.ndarray:
+    """Angles between way and heading [rad], of what moves on a plane."""
+    way = np.diff(trajectory.positions[:, :2], axis=0)
+    headings = quaternion_yaw(trajectory.quaternions)
+    off = np.arctan2(way[:, 1], way[:, 0]) - (headings[1:] + headings[:-1]) / 2
+    return np.abs((off + np.pi) % (2 * np.pi) - np.pi)
+
+
+@pytest.mark.parametrize("frame", ["world", "object"])
+@pytest.mark.parametrize("name", ["crossing", "turning"])
+def test_a_rotation_about_an_instant_turns_the_path(state, name, frame):
+    before = state.objects[name].trajectory
+    rotation = Rotate(object_id=name, angle=ANGLE, frame=frame, about_us=500_000)
+    turned = apply_operations(state, [rotation])
+    now = turned.state.objects[name].trajectory
+    assert slips(now).max() < 1e-6
+    np.testing.assert_allclose(now.pose(500_000)[0], before.pose(500_000)[0], atol=1e-9)
+    ways = [t.positions[-1] - t.positions[0] for t in (before, now)]
+    headings = [np.arctan2(way[1], way[0]) for way in ways]
+    assert headings[1] - headings[0] == pytest.approx(ANGLE)
+    assert "sideways" not in {w.code for w in turned.warnings}
+    back = apply_operations(turned.state, turned.inverse).state.objects[name].trajectory
+    np.testing.assert_allclose(back.positions, before.positions, atol=1e-9)
+
+
+def test_a_rotation_from_an_instant_on_turns_the_rest_of_the_path(state):
+    before = state.objects["crossing"].trajectory
+    when = TimeRange(start_us=800_000, blend_us=400_000)
+    turned = apply_operations(
+        state, [Rotate(object_id="crossing", angle=ANGLE, about_us=1_000_000, time_range=when)]
+    )
+    now = turned.state.objects["crossing"].trajectory
+    for t_us in (0, 400_000, 800_000):
+        np.testing.assert_allclose(now.pose(t_us)[0], before.pose(t_us)[0], atol=1e-9)
+    way = now.pose(now.end_us)[0] - now.pose(1_300_000)[0]
+    assert np.arctan2(way[1], way[0]) == pytest.approx(0.3 + ANGLE)
+    assert "sideways" not in {w.code for w in turned.warnings}
+
+
+def test_who_goes_sideways_is_warned_of(state):
+    for name, warned in (("crossing", True), ("turning", True), ("parked", False)):
+        rotation = Rotate(object_id=name, angle=np.radians(42))
+        found = {w.code: w.message for w in apply_operations(state, [rotation]).warnings}
+        assert ("sideways" in found) == warned
+        if warned:
+            assert f"{name!r} goes sideways, up to 42 degrees" in found["sideways"]
 
 
 def test_rotate_about_a_world_axis_differs_from_the_objects_own(state):

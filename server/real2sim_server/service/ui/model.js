@@ -129,9 +129,17 @@ export function draftOperations() {
     });
   }
   if (draft.angle) {
-    list.push({ op: "rotate", object_id: draft.id, angle: draft.angle, time_range });
+    list.push(rotation(draft.id, draft.angle, time_range));
   }
   return list;
+}
+
+// Turns an object [rad] with the path that it follows, where it is now; for a short while it turns
+// in place.
+export function rotation(object_id, angle, time_range) {
+  const passes = time_range && "start_us" in time_range && "end_us" in time_range;
+  const about_us = passes ? undefined : model.t;
+  return { op: "rotate", object_id, angle, time_range, about_us };
 }
 
 // For how long moves hold, until another object is selected: nobody remembers for longer.

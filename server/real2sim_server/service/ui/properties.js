@@ -9,6 +9,7 @@ import {
   select,
   emit,
   timeRange,
+  rotation,
   setWhen,
 } from "./model.js";
 import { yawOf, present } from "./poses.js";
@@ -180,7 +181,7 @@ function turnTo(id, yaw) {
   const time_range = timeRange();
   return edit(() => {
     const angle = yaw - yawOf(scenarioPoseOf(object(id)).quaternion);
-    return [{ op: "rotate", object_id: id, angle, time_range }];
+    return [rotation(id, angle, time_range)];
   });
 }
 const beginsAt = (o) => (o.start_us - model.scene.start_us) / 1e6;

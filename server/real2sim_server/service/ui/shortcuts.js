@@ -1,5 +1,5 @@
 // Keys, and the page that lists them.
-import { model, undo, redo, edit, select } from "./model.js";
+import { model, undo, redo, edit, select, rotation } from "./model.js";
 import { toggle, step } from "./timeline.js";
 import { toggleFree, toggleUncertainty } from "./camera_view.js";
 import { toggleSpace } from "./space.js";
@@ -41,9 +41,9 @@ const KEYS = [
     "[ ]",
     "turn the selection by 5°",
     "[",
-    selected((id) => edit([{ op: "rotate", object_id: id, angle: 0.0872665 }])),
+    selected((id) => edit([rotation(id, 0.0872665)])),
   ],
-  [null, "", "]", selected((id) => edit([{ op: "rotate", object_id: id, angle: -0.0872665 }]))],
+  [null, "", "]", selected((id) => edit([rotation(id, -0.0872665)]))],
   ["Arrows", "while you drive: faster, brake, left, right", "", null],
   ["F", "free camera; drag looks, right drag moves, the wheel goes", "f", toggleFree],
   ["3", "three dimensions, drawn by this page", "3", toggleSpace],
@@ -59,6 +59,23 @@ const KEYS = [
   ["Esc", "select nothing", "Escape", () => select(null)],
   ["?", "this page", "?", () => help()],
 ];
+const TYPED =
+  "input:not([type=range], [type=checkbox], [type=radio], [type=button]), select, textarea, [contenteditable]";
+const PRESSED = "button, a[href], summary, input[type=checkbox], input[type=radio], input[type=button]";
+const MOVED = "[role=tab], [role=separator], input[type=radio], input[type=range]:not(#time)";
+// Whether a key is for the control that has the focus: what is typed there, what presses or moves
+// it. Delete never means the selected object there. The slider of the time goes by frames.
+function isNative({ target, key, ctrlKey, metaKey }) {
+  if (target.closest(TYPED)) {
+    return true;
+  }
+  if (ctrlKey || metaKey) {
+    return false;
+  }
+  const presses = key === " " || key === "Enter" || key === "Delete";
+  const moves = key.startsWith("Arrow") || key === "Home" || key === "End";
+  return (presses && target.closest(`${PRESSED}, ${MOVED}`)) || (moves && target.closest(MOVED));
+}
 export function startShortcuts() {
   const rows = KEYS.filter(([label]) => label).flatMap(([label, what]) => [
     el("dt", {}, el("kbd", { textContent: label })),
@@ -69,10 +86,7 @@ export function startShortcuts() {
   dialog.onclick = () => dialog.close();
   document.getElementById("help-button").onclick = help;
   document.addEventListener("keydown", (e) => {
-    if (
-      e.target.matches("input:not([type=range], [type=checkbox]), select, textarea") ||
-      document.querySelector("dialog[open]")
-    ) {
+    if (isNative(e) || document.querySelector("dialog[open]")) {
       return;
     }
     const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;

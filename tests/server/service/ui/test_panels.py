@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 from typing import Any
 
@@ -65,6 +66,45 @@ def test_the_speed_shown_is_the_one_that_holds_and_an_object_may_do_the_same_lat
     enter(studio, "begins", field(studio, "begins") + 0.5)
     kept(studio, 3)
     assert shown(studio, "model.scenario.objects[0].start_us") == start + 500_000
+
+
+def test_the_heading_of_what_moves_turns_its_path(studio):
+    studio.click(".object-list button:has-text('car_blue')")
+    at(studio, 0.4)
+    place_then = field(studio, "pose-x"), field(studio, "pose-y")
+    enter(studio, "heading", 42)
+    kept(studio, 1)
+    assert (field(studio, "pose-x"), field(studio, "pose-y")) == pytest.approx(place_then, abs=0.02)
+    ends = []
+    for share in (0.0, 1.0):
+        at(studio, share)
+        ends.append((field(studio, "pose-x"), field(studio, "pose-y")))
+        assert field(studio, "heading") == pytest.approx(42, abs=0.1)
+    (x0, y0), (x1, y1) = ends
+    assert math.degrees(math.atan2(y1 - y0, x1 - x0)) == pytest.approx(42, abs=0.5)
+
+
+def test_keys_are_for_the_control_that_has_the_focus(studio):
+    target = first(studio)
+    studio.focus("[data-tab='properties'], [role=tab] >> nth=0")
+    studio.keyboard.press("Delete")
+    before = shown(studio, "model.t")
+    studio.focus("#next")
+    studio.keyboard.press("Space")
+    wait_until(lambda: shown(studio, "model.t") > before, "the next frame")
+    assert studio.inner_text("#play") == "Play"
+    studio.click("[data-tab='work']")
+    ticked = studio.is_checked("#work-of-all")
+    studio.focus("#work-of-all")
+    studio.keyboard.press("Space")
+    assert studio.is_checked("#work-of-all") != ticked
+    assert studio.inner_text("#play") == "Play"
+    # Nothing was deleted, and letters go on as shortcuts.
+    assert shown(studio, "model.scenario.revision") == 0
+    assert shown(studio, f"model.scenario.objects.some((o) => o.object_id === '{target}')")
+    studio.focus("#next")
+    studio.keyboard.press("m")
+    wait_until(lambda: shown(studio, "model.mosaic"), "all cameras")
 
 
 def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio):
