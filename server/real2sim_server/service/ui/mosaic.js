@@ -1,6 +1,7 @@
 // Tabs of cameras, and all of them at once.
 import { model, on, emit } from "./model.js";
 import { picture } from "./api.js";
+import { attempt } from "./messages.js";
 
 const $ = (id) => document.getElementById(id);
 let busy = false;
@@ -12,7 +13,7 @@ export function startMosaic() {
     ...names.map((name) => tab(name, name)),
     ...(names.length > 1 ? [tab("All cameras", null)] : []),
   );
-  on("time scenario run mosaic", draw);
+  on("time scenario run mosaic", attempt(draw));
   mark();
 }
 // As one turns round: what looks ahead from left to right, then what looks back.

@@ -104,7 +104,10 @@ def test_keys_are_for_the_control_that_has_the_focus(studio):
     assert shown(studio, f"model.scenario.objects.some((o) => o.object_id === '{target}')")
     studio.focus("#next")
     studio.keyboard.press("m")
-    wait_until(lambda: shown(studio, "model.mosaic"), "all cameras")
+    wait_until(
+        lambda: studio.evaluate("document.querySelectorAll('#mosaic img[src]').length") == 2,
+        "the pictures of all cameras",
+    )
 
 
 def test_fields_are_tabbed_through_and_keys_typed_there_are_no_shortcuts(studio):
