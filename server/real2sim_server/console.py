@@ -146,7 +146,7 @@ def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
 
 def _plain(value: Any) -> Any:
     if not hasattr(value, "tolist"):
-        raise TypeError(f"a {type(value).__name__} is no figure that JSON has")
+        raise TypeError(f"a {type(value).__name__} cannot be written as JSON")
     return value.tolist()
 
 

@@ -51,7 +51,7 @@ class Argoverse2MapReader:
             if not kept:
                 raise MapError(f"{file}: has no lane segments")
             short = [str(key) for key, lane in zip(segments, lanes, strict=True) if lane is None]
-            told = f"lane segments left out, which have no length: {', '.join(short)}"
+            told = f"lane segments left out because they have no length: {', '.join(short)}"
             notes = (told,) if short else ()
             return joined(kept, areas=areas, source=f"argoverse2 {file.name}", notes=notes)
 

@@ -90,7 +90,7 @@ class _Osm:
 
     @classmethod
     def of(cls, root: ET.Element, file: str) -> _Osm:
-        nodes, drawn, relations_ = (_kept(root, kind) for kind in ("node", "way", "relation"))
+        nodes, drawn, related = (_kept(root, kind) for kind in ("node", "way", "relation"))
         ways = {w.get("id", ""): [n.get("ref", "") for n in w.findall("nd")] for w in drawn}
         places, origin = _places(nodes, file)
         for way_id, refs in ways.items():
@@ -98,7 +98,7 @@ class _Osm:
                 if node not in places:
                     raise MapError(f"{file}: way {way_id} names node {node}, which is not there")
         relations = {}
-        for element in relations_:
+        for element in related:
             members: dict[str, list[tuple[str, str]]] = defaultdict(list)
             for m in element.findall("member"):
                 members[m.get("role", "")].append((m.get("type", ""), m.get("ref", "")))
@@ -178,7 +178,7 @@ def _graph(osm: _Osm, name: str) -> LaneGraph:
         if (pair := _rims(osm, relation)) is not None:
             rims[key] = pair
         else:
-            osm.left_out["lanelets left out, which lack a rim"].append(key)
+            osm.left_out["lanelets left out because they lack a rim"].append(key)
     lanes: dict[str, Lane] = {}
     areas: list[Area] = []
     index = _Index(rims)
@@ -190,7 +190,7 @@ def _graph(osm: _Osm, name: str) -> LaneGraph:
             continue
         shape, beside = between(*_oriented(osm, left, right)), index.beside(key)
         if shape is None:
-            osm.left_out["lanelets left out, which have no length"].append(key)
+            osm.left_out["lanelets left out because they have no length"].append(key)
             continue
         lanes[key] = Lane(
             key,
@@ -330,7 +330,9 @@ def _speed_limit(osm: _Osm, key: str, relation: _Relation) -> float | None:
         if (limit := _speed(text)) is not None:
             return limit
     if unknown := next((text for text in texts if text), None):
-        osm.left_out[f"lanes without a limit, for {unknown[:40]!r} is not known"].append(key)
+        osm.left_out[f"lanes without a speed limit because {unknown[:40]!r} is not known"].append(
+            key
+        )
     return None
 
 
@@ -349,7 +351,7 @@ def _area(osm: _Osm, key: str, relation: _Relation) -> Area | None:
     nodes = _chained(osm, osm.member_ways(relation, "outer"))
     nodes = nodes[:-1] if len(nodes) > 1 and nodes[0] == nodes[-1] else nodes
     if len(nodes) < 3:
-        osm.left_out["areas left out, whose outline has less than three points"].append(key)
+        osm.left_out["areas left out because they have fewer than three points"].append(key)
         return None
     kind = AREAS.get(relation.tags.get("subtype", ""), "other")
     return Area(f"area_{key}", kind, np.array([osm.places[n] for n in nodes]))
@@ -380,7 +382,7 @@ def _rules(
             lines[stop] = StopLine(stop, osm.line(stop), both)
         refers = osm.member_ways(rule, "refers") or ([stop] if stop is not None else [])
         if not refers or not len(osm.ways[refers[0]]):
-            osm.left_out["signals left out, which are placed nowhere"].append(key)
+            osm.left_out["signals left out because they have no place"].append(key)
             continue
         line = osm.line(refers[0])
         x, y, z = line.mean(axis=0).tolist()

@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
@@ -67,15 +68,15 @@ def run_episodes(
         Real2SimError: the worker refuses, or has ended.
         ValueError: a planner that does not exist, or cannot drive in a scene.
     """
-    with PlannerProcess() as process:
-        for policy in grid.policies:
-            process.check(policy)
     episodes = grid.episodes()
     with contextlib.ExitStack() as stack:
         slots = max(min(target.sessions, len(episodes)), 1)
+        processes = [stack.enter_context(closing(PlannerProcess())) for _ in range(slots)]
+        for policy in grid.policies:
+            processes[0].check(policy)
         free: SimpleQueue[PlannerProcess] = SimpleQueue()
-        for _ in range(slots):
-            free.put(stack.enter_context(PlannerProcess()))
+        for process in processes:
+            free.put(process)
         pool = stack.enter_context(ThreadPoolExecutor(slots))
         futures = [pool.submit(_run_episode, episode, target, folder, free) for episode in episodes]
         try:

@@ -7,8 +7,7 @@ import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import real2sim
 from real2sim._protocol import valid_plan
@@ -144,28 +143,18 @@ class PlannerProcess:
             self._process.join(END_S)
             self._process.kill()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
 
 def _serve(pipe: Connection) -> None:
     """Answer until the other end closes."""
     with contextlib.suppress(EOFError, ConnectionError):
         while True:
             asked = pipe.recv()
-            answer: Any
+            answer: Any = None
             try:
-                answer = _driven(asked) if isinstance(asked, PlannedEpisode) else None
-                if answer is None:
+                if isinstance(asked, str):
                     load_planner(asked)
+                else:
+                    answer = _driven(asked)
             # Only what a pipe can carry: not every class of errors can be sent.
             except ValueError as error:
                 answer = ValueError(str(error))

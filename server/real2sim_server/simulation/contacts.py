@@ -23,7 +23,7 @@ class ContactLog:
         self._impulses: dict[tuple[str, str], Float] = {}
         self._friction_work: dict[tuple[str, str], float] = {}
         self._times: dict[tuple[str, str], list[float]] = {}
-        self._unheard: dict[tuple[str, str], float] = {}
+        self._dozing: dict[tuple[str, str], float] = {}
         self._asleep: dict[tuple[str, str], float] = {}
         self._solver_totals: dict[tuple[str, str], tuple[Float, float, float]] = {}
         self.collider_work = 0.0
@@ -59,13 +59,17 @@ class ContactLog:
         self._friction_work[key] = self._friction_work.get(key, 0.0) + friction_work
         times = self._times.setdefault(key, [time, time])
         times[1] = time
-        self._asleep[key] = self._asleep.get(key, 0.0) + self._unheard.pop(key, 0.0)
+        self._asleep[key] = self._asleep.get(key, 0.0) + self._dozing.pop(key, 0.0)
 
     def add_sleep(self, bodies: set[str], time: float, duration: float) -> None:
-        """Say who was asleep in a step at a time [s]: mostly nobody asks what holds them then."""
+        """Count a step of sleep at a time [s].
+
+        What holds a sleeping body is recorded only in steps in which others rest beside it; all
+        other steps count as sleep once another impulse follows.
+        """
         for key, (_, last) in self._times.items():
             if key[0] in bodies and last != time:
-                self._unheard[key] = self._unheard.get(key, 0.0) + duration
+                self._dozing[key] = self._dozing.get(key, 0.0) + duration
 
     def totals(self) -> dict[tuple[str, str], Float]:
         """Impulses so far, by (body, other) [N s]."""

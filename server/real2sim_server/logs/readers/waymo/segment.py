@@ -140,14 +140,16 @@ class WaymoFrame:
         return front.time_us if front is not None else self.start_us + SWEEP_US // 2
 
 
-def with_sweeps(frames: Sequence[WaymoFrame]) -> list[int]:
-    """Which frames have a sweep: all of them in a segment without LiDAR.
+def with_sweeps(frames: Sequence[WaymoFrame]) -> tuple[list[int], list[WaymoFrame]]:
+    """Indices of frames that have a sweep, all of them in a segment without LiDAR; and the others.
 
     A frame without the TOP laser, which has most of the points, counts as one without a sweep.
     """
     there = frozenset[int]().union(*(f.lasers for f in frames))
     needed = there & {TOP} or there
-    return [i for i, f in enumerate(frames) if not needed or f.lasers & needed]
+    lost = [bool(needed) and not f.lasers & needed for f in frames]
+    kept = [i for i, is_lost in enumerate(lost) if not is_lost]
+    return kept, [f for f, is_lost in zip(frames, lost, strict=True) if is_lost]
 
 
 def sweep_timings(frames: Sequence[WaymoFrame]) -> list[SweepTiming]:

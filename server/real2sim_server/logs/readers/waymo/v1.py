@@ -63,7 +63,7 @@ class WaymoV1Reader:
             read.append(_read_frame(message))
             first = first or message.message(1, "context")
         assert first is not None
-        kept = with_sweeps(read)
+        kept, left_out = with_sweeps(read)
         frames, records = [read[i] for i in kept], [records[i] for i in kept]
         cameras = [_read_camera(m) for m in first.messages(2, "camera_calibrations")]
         lasers = [_read_laser(m) for m in first.messages(3, "laser_calibrations")]
@@ -81,7 +81,7 @@ class WaymoV1Reader:
                 "sequence": first.text(1) or name,
                 "reader": self.name,
             },
-            left_out=[frame for i, frame in enumerate(read) if i not in kept],
+            left_out=left_out,
         )
 
 

@@ -76,7 +76,7 @@ class WaymoV2Reader:
         cameras = _read_cameras(files)
         images, lidar = _read_images(files), _open_lidar(files)
         read = _read_frames(files, images, _read_boxes(files), lidar)
-        kept = with_sweeps(read)
+        kept, left_out = with_sweeps(read)
         frames = [read[i] for i in kept]
         source = _WaymoV2Source(
             images=files.optional("camera_image"),
@@ -97,7 +97,7 @@ class WaymoV2Reader:
                 "sequence": segment,
                 "reader": self.name,
             },
-            left_out=[frame for i, frame in enumerate(read) if i not in kept],
+            left_out=left_out,
         )
 
 
