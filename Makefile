@@ -91,8 +91,6 @@ pins: $(STAMP)
 	$(BIN)/python scripts/third_party.py
 
 docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
-	  -c constraints.txt -e '.[docs]'
 	$(BIN)/python -m sphinx -q -W --keep-going -j auto -d out/doctrees docs site
 
 bench: $(STAMP)
@@ -102,7 +100,7 @@ bench: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
-	  -c constraints.txt -e '.[server,dev]'
+	  -c constraints.txt -e '.[server,dev,docs]'
 	@touch $@
 
 clean:

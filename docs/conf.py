@@ -12,8 +12,10 @@ import os
 import posixpath
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
@@ -45,7 +47,8 @@ suppress_warnings = ["ref.python"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
-autodoc_default_options = {"show-inheritance": False}
+autodoc_default_options = {"show-inheritance": False, "exclude-members": "model_config"}
+autodoc_type_aliases = {name: name for name in ("Operation", "Plan")}
 python_maximum_signature_line_length = 88
 napoleon_use_ivar = True
 napoleon_use_rtype = False
@@ -79,6 +82,7 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", show_root_page)
     app.connect("autodoc-process-docstring", list_fields)
     app.connect("autodoc-process-signature", hide_model_signature)
+    app.connect("autodoc-skip-member", skip_constrained)
 
 
 def show_root_page(app: Sphinx, page: str, text: list[str]) -> None:
@@ -123,13 +127,24 @@ def list_fields(  # noqa: PLR0917 - as Sphinx calls it
     own = {n: f for n, f in value.model_fields.items() if n not in inherited_fields(value)}
     lines.append("")
     for field_name, field in own.items():
-        kind = inspect.formatannotation(field.annotation).replace("real2sim_proto.", "")
+        kind = inspect.formatannotation(bare(field.annotation)).replace("real2sim_proto.", "")
         kind = re.sub(r"\b(?:typing|types|annotated_types)\.|\w+\.(?=[A-Z])", "", kind)
         given = field.get_default(call_default_factory=False)
         default = "" if given is PydanticUndefined else f", default ``{short(given)}``"
         description = f": {field.description}" if field.description else ""
         lines.append(f"* ``{field_name}`` (``{short(kind)}``{default}){description}")
     lines.append("")
+
+
+def bare(annotation: Any) -> Any:
+    """A type without the limits of its values."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return bare(inner[0])
+    if origin in (None, Literal, Callable):
+        return annotation
+    parts = tuple(bare(part) for part in inner)
+    return Union[parts] if origin in (Union, UnionType) else origin[parts]
 
 
 def inherited_fields(model: type[BaseModel]) -> set[str]:
@@ -142,6 +157,13 @@ def short(value: Any) -> str:
     text = value if isinstance(value, str) and "[" in value else repr(value)
     text = value if isinstance(value, str) and not text.startswith("'") else text
     return text if len(text) <= 70 else f"{text[:67]}..."
+
+
+def skip_constrained(  # noqa: PLR0917 - as Sphinx calls it
+    app: Sphinx, what: str, name: str, value: Any, skip: bool, options: Any
+) -> bool | None:
+    """A type with limits is told where a field has it; by itself it would show pydantic's objects."""
+    return True if get_origin(value) is Annotated else None
 
 
 def hide_model_signature(  # noqa: PLR0917 - as Sphinx calls it

@@ -107,7 +107,7 @@ class DerivedParameter(CaseParameter):
     kind: Literal["derived"]
     expression: str = Field(
         max_length=1000,
-        description="numbers, names, + - * / **, abs cos max min radians sin sqrt",
+        description="numbers, names, `+ - * / **`, abs cos max min radians sin sqrt",
     )
 
 

@@ -130,8 +130,8 @@ class Sweeps:
         ``failures.tar`` with a page, cases and films.
 
         Args:
-            scene, parameters, corner_case, openscenario, storyboard, ego, leave_out, reset,
-            operations: as of :meth:`start`.
+            scene, parameters, corner_case, openscenario: as of :meth:`start`.
+            storyboard, ego, leave_out, reset, operations: likewise.
             planner: ``follow_route``, ``pid``, ``idm`` or ``depth_sampling``.
             episodes: that are driven at most, 20 or more.
             seed: the same one finds the same failures.

@@ -37,7 +37,6 @@ from real2sim_server.service.token_file import (
 )
 from tests.waiting import LIMIT_S, wait_until, wait_until_async
 
-
 SINGLE = "a long enough secret"
 
 

@@ -1,10 +1,8 @@
-"""The Gymnasium environment, and the example of the README, against a worker as it is."""
+"""The Gymnasium environment against a worker as it is."""
 
 from __future__ import annotations
 
-import re
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +11,6 @@ import real2sim
 
 gymnasium = pytest.importorskip("gymnasium")
 pytestmark = pytest.mark.network
-
-README = Path(__file__).resolve().parents[4] / "README.md"
 
 
 @pytest.fixture
@@ -216,13 +212,3 @@ def test_ppo_of_stable_baselines3_runs_2000_steps_without_changes(env):
     assert all(bool(v.isfinite().all()) for v in after.values())
     assert any(bool((after[k] != v).any()) for k, v in before.items())
     assert len(agent.ep_info_buffer) >= 50
-
-
-def test_the_planner_example_of_the_readme_is_short_and_works(site, monkeypatch, capsys):
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
-    (example,) = (b for b in blocks if "session.step(" in b)
-    assert len([line for line in example.splitlines() if line.strip()]) <= 15
-    connect = real2sim.connect
-    monkeypatch.setattr(real2sim, "connect", lambda *_a, **_k: connect(site.url))
-    exec(example.replace('"street"', '"tiny"'), {})
-    assert "pdms" in capsys.readouterr().out
