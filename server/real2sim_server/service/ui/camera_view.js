@@ -1,7 +1,17 @@
 // The camera picture: asks for frames, selects on a click, outlines the selection, flies freely.
-import { model, on, emit, object, poseOf, draftOperations, select, refresh } from "./model.js";
+import {
+  model,
+  on,
+  emit,
+  object,
+  isHere,
+  poseOf,
+  draftOperations,
+  select,
+  refresh,
+} from "./model.js";
 import { ViewSocket } from "./view_socket.js";
-import { project, rotate, present } from "./poses.js";
+import { project, rotate } from "./poses.js";
 import { attempt, notify } from "./messages.js";
 import { drawSweepInPicture } from "./sweep.js";
 import { startFlight } from "./flight.js";
@@ -162,7 +172,7 @@ function outline() {
   pen.clip();
   layers.forEach((layer) => layer(pen, toStage));
   pen.restore();
-  if (!subject || !present(subject, model.t)) {
+  if (!subject || !isHere(subject)) {
     return;
   }
   pen.strokeStyle = ink().selected;

@@ -35,6 +35,9 @@ export async function fork(id, step) {
   return info.session_id;
 }
 export const advance = (id, plan) => post(path(id, "step"), { n: 1, plan }, headersOf(id));
+// Edits of the running world, before its next step.
+export const editDrive = (id, operations) =>
+  post(path(id, "operations"), { operations }, headersOf(id));
 const remove = (id) => call("DELETE", `/v1/sessions/${id}`, { headers: headersOf(id) });
 export const stateAfter = async (id, step) => {
   const after = step === null ? "" : `?after=${step}&wait_s=2`;

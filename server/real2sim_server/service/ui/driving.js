@@ -1,9 +1,8 @@
 // Who drives now: a planner on the worker, or whoever holds the arrow keys; and what is seen of it.
-import { model, own, on, emit, setTime, stopRun } from "./model.js";
+import { model, object, own, on, emit, setTime, stopRun } from "./model.js";
 import { events, get } from "./api.js";
 import { notify } from "./messages.js";
 import { showLive } from "./camera_view.js";
-import { choose } from "./mosaic.js";
 import { show } from "./physics.js";
 import * as sessions from "./drive_session.js";
 
@@ -40,9 +39,6 @@ async function sit(session, who) {
 export async function take(job, who) {
   const { session_id: session } = job.request;
   seat = { session, job: job.job_id, who, held: false };
-  if (model.mosaic) {
-    choose(model.camera);
-  }
   emit("drive");
   const mine = seat;
   const watching = watch(mine);
@@ -92,6 +88,7 @@ async function ended({ job }) {
 }
 function leave() {
   seat = model.live = null;
+  model.selected = object(model.selected) ? model.selected : null;
   pressed.clear();
   emit("drive");
   emit("run");
@@ -108,7 +105,10 @@ async function watch(mine) {
       seat.held = mine.who === "hand" ? seat.held : state.held;
       setTime(state.t_us);
       emit("drive-step");
-      showLive(await sessions.pictureOf(mine.session, model.camera, width()), () => seat === mine);
+      if (!model.mosaic) {
+        const seen = await sessions.pictureOf(mine.session, model.camera, width());
+        showLive(seen, () => seat === mine && !model.mosaic);
+      }
     }
     if (!state || state.terminated || state.truncated) {
       await pause(NOT_YET_MS);

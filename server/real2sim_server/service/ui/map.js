@@ -1,6 +1,6 @@
 // The map from above: what is where. `map_hands` moves and turns it.
-import { model, on, object, poseOf, egoPoseAt } from "./model.js";
-import { yawOf, present } from "./poses.js";
+import { model, on, object, isHere, poseOf, egoPoseAt } from "./model.js";
+import { yawOf } from "./poses.js";
 import { fromAbove } from "./colliders.js";
 import { drawSweepAbove } from "./sweep.js";
 import { drawLanes } from "./lanes.js";
@@ -109,12 +109,8 @@ function draw() {
     model.live || model.playback?.ego ? "driven vehicle" : "recording vehicle",
   );
   layers.forEach((layer) => layer(pen, toScreen, { line, box }));
-  if (
-    object(model.selected) &&
-    present(object(model.selected), model.t) &&
-    !model.job &&
-    !model.live
-  ) {
+  const subject = object(model.selected);
+  if (subject && isHere(subject) && !model.job) {
     handle();
   }
 }

@@ -51,7 +51,7 @@ function down(e) {
     select(hit.object_id);
     return begin("move", hit.object_id, at);
   }
-  if (!hit && !model.selected && model.box && inside(at)) {
+  if (!hit && !model.selected && model.box && !model.live && inside(at)) {
     drag = { kind: "box", at, from: [...model.box.position] };
     return;
   }

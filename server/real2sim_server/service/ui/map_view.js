@@ -1,6 +1,5 @@
 // Where the map looks: world x to the right, y up.
-import { model, object, poseOf, egoPoseAt } from "./model.js";
-import { present } from "./poses.js";
+import { model, object, objects, isHere, poseOf, egoPoseAt } from "./model.js";
 
 const SCALES = [0.5, 120];
 let canvas;
@@ -32,10 +31,7 @@ export function zoomAt(place, factor) {
 export const panBy = (dx, dy) =>
   lookAt({ ...view, x: view.x - dx / view.scale, y: view.y + dy / view.scale });
 
-export const shown = () =>
-  model.scenario.objects.filter((o) =>
-    model.live ? model.live.agents.some((a) => a.object_id === o.object_id) : present(o, model.t),
-  );
+export const shown = () => objects().filter(isHere);
 export function lookAtEverything() {
   const points = [...(model.scene.ego?.positions ?? []), ...shown().map((o) => poseOf(o).position)];
   const [xs, ys] = [0, 1].map((k) => points.map((p) => p[k]));

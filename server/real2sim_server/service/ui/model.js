@@ -1,6 +1,7 @@
 // What is open: scenario, selection, time. Everything else listens.
 import { call, get, post, ApiError } from "./api.js";
-import { poseAt, aboutZ, multiply } from "./poses.js";
+import { editDrive, stateAfter } from "./drive_session.js";
+import { poseAt, present, aboutZ, multiply } from "./poses.js";
 import { notify } from "./messages.js";
 
 export const model = {
@@ -81,19 +82,29 @@ export async function refresh() {
   emit("scenario");
 }
 
-export const object = (id) => model.scenario.objects.find((o) => o.object_id === id);
+// The objects of the scenario; of a drive that is watched those in its world, among them what a
+// storyboard brought and what was put there while driving.
+export function objects() {
+  const { objects: all } = model.scenario;
+  return model.live ? model.live.agents.map((a) => ({ ...inDrive(a), ...find(all, a) })) : all;
+}
+const find = (list, { object_id: id }) => list.find((o) => o.object_id === id);
+const inDrive = ({ position, quaternion, ...agent }) => ({
+  ...agent,
+  start_us: model.t,
+  end_us: model.t,
+  trajectory: { times_us: [model.t], positions: [position], quaternions: [quaternion] },
+});
+export const object = (id) => find(objects(), { object_id: id });
+export const isHere = (subject) => !!model.live || present(subject, model.t);
 
 // Pose as shown: of a physics run while one is played, else with what is being dragged.
 export function poseOf(subject) {
-  const now = model.live?.agents.find((a) => a.object_id === subject.object_id);
-  if (now) {
-    return now;
-  }
   const run = model.playback?.tracks[subject.object_id];
   if (model.job && run) {
     return poseAt({ times_us: model.playback.times_us, ...run }, model.t);
   }
-  const pose = scenarioPoseOf(subject);
+  const pose = editedPoseOf(subject);
   const draft = model.draft;
   if (draft?.id !== subject.object_id) {
     return pose;
@@ -109,7 +120,9 @@ export function poseOf(subject) {
 export const egoPoseAt = (t) =>
   model.live?.ego ?? poseAt(model.playback?.ego ?? model.scene.ego, t);
 
-export const scenarioPoseOf = (subject) => poseAt(subject.trajectory, model.t);
+// The pose that an edit starts from: in the drive that is watched, else in the scenario.
+export const editedPoseOf = (subject) =>
+  find(model.live?.agents ?? [], subject) ?? poseAt(subject.trajectory, model.t);
 
 export function draftOperations() {
   const draft = model.draft;
@@ -163,13 +176,17 @@ export function timeRange() {
   return undefined;
 }
 
-// Operations, or a function that makes them when their turn has come, of what is there then.
+// Operations, or a function that makes them when their turn has come, of what is there then. While
+// a drive is watched they change that drive, and the scenario stays.
 export async function edit(operations) {
   stopRun();
   const made = typeof operations === "function" ? operations : () => operations;
   return inTurn(() => {
     const list = made();
-    return list.length ? change("/operations", { operations: list }) : null;
+    if (!list.length) {
+      return null;
+    }
+    return model.live ? changeDrive(list) : change("/operations", { operations: list });
   });
 }
 // A corner case of the gallery, with other values for some parameters, is what happens from now on.
@@ -177,8 +194,14 @@ export const letHappen = (name, parameters) => {
   stopRun();
   return inTurn(() => change("/corner-case", { name, parameters }));
 };
-export const undo = () => inTurn(() => !isRecorded() && change("/undo"));
-export const redo = () => inTurn(() => !isRecorded() && change("/redo"));
+export const undo = () => inTurn(() => stepBack("/undo"));
+export const redo = () => inTurn(() => stepBack("/redo"));
+function stepBack(rest) {
+  if (model.live) {
+    return notify("A drive goes on: what changed in it cannot be undone.", "warm");
+  }
+  return !isRecorded() && change(rest);
+}
 
 // Changes of this page follow one another, so that each knows the revision that the last has made.
 let turn = Promise.resolve();
@@ -195,12 +218,8 @@ async function change(rest, body) {
       "If-Match": model.scenario.etag,
       "Idempotency-Key": crypto.randomUUID?.() ?? `${Date.now()}-${Math.random()}`,
     });
-    result.warnings.forEach((w) => notify(w.message, "warm"));
     await refresh();
-    if (result.created.length) {
-      select(result.created[0]);
-    }
-    return result;
+    return told(result);
   } catch (error) {
     const stale = error instanceof ApiError && error.status === 412;
     notify(
@@ -215,6 +234,32 @@ async function change(rest, body) {
     model.draft = null;
     emit("draft");
   }
+}
+
+async function changeDrive(operations) {
+  const { session_id: session } = model.live;
+  try {
+    const result = await editDrive(session, operations);
+    const state = await stateAfter(session, null);
+    if (model.live?.session_id === session) {
+      model.live = state;
+      emit("drive-step");
+    }
+    return told(result);
+  } catch (error) {
+    notify(error.message, "bad");
+    return null;
+  } finally {
+    model.draft = null;
+    emit("draft");
+  }
+}
+function told(result) {
+  result.warnings.forEach((w) => notify(w.message, "warm"));
+  if (result.created.length) {
+    select(result.created[0]);
+  }
+  return result;
 }
 
 export function select(id) {

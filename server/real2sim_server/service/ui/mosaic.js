@@ -1,9 +1,11 @@
 // Tabs of cameras, and all of them at once.
 import { model, on, emit } from "./model.js";
 import { picture } from "./api.js";
+import { pictureOf } from "./drive_session.js";
 import { attempt } from "./messages.js";
 
 const $ = (id) => document.getElementById(id);
+const WIDTH = 400;
 let busy = false;
 let again = false;
 
@@ -63,14 +65,8 @@ async function draw() {
   }
   busy = true;
   try {
-    const base = model.job
-      ? `/v1/jobs/${model.job}`
-      : `/v1/scenarios/${model.scenario.scenario_id}`;
     for (const { name } of inOrder()) {
-      const src = await picture(
-        `${base}/preview?camera=${encodeURIComponent(name)}&t_us=${model.t}&width=400`,
-      );
-      tile(name, src);
+      tile(name, await pictureFrom(name));
     }
   } finally {
     busy = false;
@@ -79,6 +75,15 @@ async function draw() {
     again = false;
     draw();
   }
+}
+// Of the drive that is watched, of the run that is played, or of the scenario.
+async function pictureFrom(camera) {
+  if (model.live) {
+    return URL.createObjectURL(await pictureOf(model.live.session_id, camera, WIDTH));
+  }
+  const base = model.job ? `/v1/jobs/${model.job}` : `/v1/scenarios/${model.scenario.scenario_id}`;
+  const query = `camera=${encodeURIComponent(camera)}&t_us=${model.t}&width=${WIDTH}`;
+  return picture(`${base}/preview?${query}`);
 }
 function tile(name, src) {
   let figure = [...$("mosaic").children].find((f) => f.dataset.camera === name);

@@ -3,8 +3,10 @@ import {
   model,
   on,
   object,
+  objects,
+  isHere,
   poseOf,
-  scenarioPoseOf,
+  editedPoseOf,
   edit,
   select,
   emit,
@@ -12,7 +14,7 @@ import {
   rotation,
   setWhen,
 } from "./model.js";
-import { yawOf, present } from "./poses.js";
+import { yawOf } from "./poses.js";
 import { el, number, row, tidy } from "./dom.js";
 import { refreshBox, scenePanel } from "./scene_panel.js";
 
@@ -23,14 +25,21 @@ export function startProperties() {
   on("selection", draw);
   on("scenario", () => (object(drawn) ? refreshFields() : draw()));
   on("run time draft", refreshFields);
+  on("drive drive-step", () => (drawnOf === ofNow() ? refreshFields() : draw()));
   on("box", refreshBox);
   on("when", drawWhen);
   draw();
 }
 // A panel stays while its object does, so that whoever is typing or tabbing through it can go on.
 let drawn = null;
+let drawnOf = "";
+const ofNow = () => {
+  const ids = object(model.selected) ? [model.selected] : objects().map((o) => o.object_id);
+  return [!!model.live, ...ids].join();
+};
 function draw() {
   drawn = model.selected;
+  drawnOf = ofNow();
   const focused = page().contains(document.activeElement) ? document.activeElement.id : "";
   page().replaceChildren(...(object(drawn) ? panel(drawn) : list()));
   refreshFields();
@@ -39,22 +48,61 @@ function draw() {
   }
 }
 function list() {
-  const rows = model.scenario.objects.map((o) =>
+  const rows = objects().map((o) =>
     el(
       "button",
       { onclick: () => select(o.object_id) },
       el("span", { textContent: o.object_id }),
-      el("small", { textContent: present(o, model.t) ? o.category : `${o.category} · not now` }),
+      el("small", { textContent: isHere(o) ? o.category : `${o.category} · not now` }),
     ),
   );
   return [
     el("p", { textContent: "Click an object in the picture, on the map or here." }),
     el("div", { class: "object-list" }, ...rows),
-    ...scenePanel(),
+    ...(model.live ? [] : scenePanel()),
   ];
 }
 function panel(id) {
   const o = object(id);
+  const gaussians = o.gaussians ? ` · ${o.gaussians.toLocaleString("en")} Gaussians` : "";
+  return [
+    el(
+      "header",
+      {},
+      el("h2", { id: "selected-name", textContent: id }),
+      el("small", { textContent: `${o.category}${gaussians}` }),
+    ),
+    el(
+      "div",
+      { class: "actions" },
+      action("Duplicate", "duplicate", () => duplicate(id)),
+      action("To the ground", "snap", () => edit([{ op: "translate", object_id: id, snap: true }])),
+      action("Delete", "delete", () => edit([{ op: "delete", object_id: id }]), "danger"),
+    ),
+    el(
+      "fieldset",
+      {},
+      el("legend", { textContent: "Pose now" }),
+      row(
+        "x y z [m]",
+        ["x", "y", "z"].map((axis, k) =>
+          number(`pose-${axis}`, 0, (v) => v !== null && moveTo(id, axis, k, v)),
+        ),
+      ),
+      row("heading [°]", [
+        number("heading", 0, (v) => v !== null && turnTo(id, (v * Math.PI) / 180), {
+          class: "wide",
+        }),
+      ]),
+      row("holds", [when()]),
+    ),
+    ...(model.live
+      ? [el("p", { textContent: "Edits change the drive that goes on; the scenario stays." })]
+      : ofScenario(id)),
+  ];
+}
+// What an object of the scenario has beyond its pose.
+function ofScenario(id) {
   const setPhysics = (name, value) =>
     edit(() => {
       const physics = object(id).physics ?? {};
@@ -92,36 +140,6 @@ function panel(id) {
     ]);
   return [
     el(
-      "header",
-      {},
-      el("h2", { id: "selected-name", textContent: id }),
-      el("small", { textContent: `${o.category} · ${o.gaussians.toLocaleString("en")} Gaussians` }),
-    ),
-    el(
-      "div",
-      { class: "actions" },
-      action("Duplicate", "duplicate", () => duplicate(id)),
-      action("To the ground", "snap", () => edit([{ op: "translate", object_id: id, snap: true }])),
-      action("Delete", "delete", () => edit([{ op: "delete", object_id: id }]), "danger"),
-    ),
-    el(
-      "fieldset",
-      {},
-      el("legend", { textContent: "Pose now" }),
-      row(
-        "x y z [m]",
-        ["x", "y", "z"].map((axis, k) =>
-          number(`pose-${axis}`, 0, (v) => v !== null && moveTo(id, axis, k, v)),
-        ),
-      ),
-      row("heading [°]", [
-        number("heading", 0, (v) => v !== null && turnTo(id, (v * Math.PI) / 180), {
-          class: "wide",
-        }),
-      ]),
-      row("holds", [when()]),
-    ),
-    el(
       "fieldset",
       {},
       el("legend", { textContent: "Timing" }),
@@ -145,7 +163,7 @@ function panel(id) {
         ["x", "y", "z"].map((axis, k) =>
           number(
             `size-${axis}`,
-            o.size[k],
+            object(id).size[k],
             (v) =>
               v > 0 && edit(() => [{ op: "scale", object_id: id, [axis]: v / object(id).size[k] }]),
           ),
@@ -169,18 +187,18 @@ function panel(id) {
     ),
   ];
 }
-// What is typed is where the scenario's object will be, also while a run shows it elsewhere.
+// What is typed is where the object will be, also while a run shows it elsewhere.
 function moveTo(id, axis, k, value) {
   const time_range = timeRange();
   return edit(() => {
-    const here = scenarioPoseOf(object(id)).position[k];
+    const here = editedPoseOf(object(id)).position[k];
     return [{ op: "translate", object_id: id, [axis]: value - here, time_range }];
   });
 }
 function turnTo(id, yaw) {
   const time_range = timeRange();
   return edit(() => {
-    const angle = yaw - yawOf(scenarioPoseOf(object(id)).quaternion);
+    const angle = yaw - yawOf(editedPoseOf(object(id)).quaternion);
     return [rotation(id, angle, time_range)];
   });
 }
@@ -275,13 +293,16 @@ function refreshFields() {
     return;
   }
   const { position, quaternion } = poseOf(o);
+  ["x", "y", "z"].forEach((axis, k) => put(`pose-${axis}`, position[k], 2));
+  put("heading", (yawOf(quaternion) * 180) / Math.PI, 2);
+  if (!document.getElementById("begins")) {
+    return;
+  }
   const physics = o.physics ?? {};
   ["x", "y", "z"].forEach((axis, k) => {
-    put(`pose-${axis}`, position[k], 2);
     put(`size-${axis}`, o.size[k]);
     put(`velocity-${axis}`, o.velocity?.linear?.[k]);
   });
-  put("heading", (yawOf(quaternion) * 180) / Math.PI, 2);
   put("begins", beginsAt(o));
   put("retime-speed", speedOf(o));
   ["mass", "friction", "restitution"].forEach((name) => put(`p-${name}`, physics[name]));

@@ -6,8 +6,11 @@ from typing import Any
 
 import pytest
 
-from .hands import enter, kept, shown
+from tests.waiting import wait_until
 
+from .hands import enter, field, kept, shown
+
+RECORDED = ["car_red", "car_blue", "post"]
 pytestmark = [pytest.mark.browser, pytest.mark.network]
 
 
@@ -105,3 +108,66 @@ def test_a_corner_case_is_chosen_by_its_picture_taken_over_undone_and_dropped(st
     kept(studio, 2)
     studio.keyboard.press("Control+z")
     studio.wait_for_selector("#corner-case-now:has-text('Cut-in')")
+
+
+def held_drive(studio: Any) -> None:
+    """Start a planner, and hold it."""
+    studio.click("[data-tab=drive]")
+    studio.select_option("#drive-who", "follow_route")
+    studio.select_option("#drive-pace", "0.25")
+    studio.click("#drive-start")
+    driven(studio, "plans in")
+    studio.keyboard.press("Space")
+    driven(studio, "held")
+
+
+def test_all_cameras_show_the_drive_that_is_watched(studio):
+    held_drive(studio)
+    asked: list[str] = []
+    studio.on("request", lambda request: asked.append(request.url))
+    studio.click("[data-camera='*']")
+    studio.wait_for_selector("#mosaic figure[data-camera=left] img[src]")
+    assert sum("/render" in url for url in asked) >= 2
+    assert not any("/preview" in url for url in asked)
+    # Another step, other pictures.
+    source = "document.querySelector('#mosaic figure[data-camera=left] img').src"
+    before = studio.evaluate(source)
+    studio.click("#drive-step")
+    studio.wait_for_function(f"before => {source} !== before", arg=before)
+
+
+def test_edits_while_driving_change_the_drive_and_not_the_scenario(studio):
+    held_drive(studio)
+    studio.click("[data-tab=properties]")
+    studio.click("#properties button:has-text('post')")
+    before = field(studio, "pose-y")
+    enter(studio, "pose-y", before + 2.0)
+    place = "model.live.agents.find((a) => a.object_id === 'post').position[1]"
+    wait_until(lambda: shown(studio, place) == pytest.approx(before + 2.0), "the post to move")
+    assert field(studio, "pose-y") == pytest.approx(before + 2.0)
+    studio.click("[data-action=duplicate]")
+    studio.wait_for_selector("#selected-name:has-text('post_copy1')")
+    studio.keyboard.press("Escape")
+    assert studio.locator("#properties button:has-text('post_copy1')").count() == 1
+    studio.keyboard.press("Control+z")
+    studio.wait_for_selector("text=cannot be undone")
+    kept(studio, 0)
+    studio.click("[data-tab=drive]")
+    studio.click("#drive-end")
+    studio.wait_for_selector("#drive-over")
+    assert shown(studio, "model.scenario.objects.map((o) => o.object_id)") == RECORDED
+
+
+def test_what_a_storyboard_brings_is_in_the_list_and_on_the_map(studio):
+    studio.click("[data-tab=drive]")
+    studio.select_option("#corner-case", "cut_in")
+    studio.click("#take-case")
+    kept(studio, 1)
+    held_drive(studio)
+    brought = shown(studio, "model.live.agents.map((a) => a.object_id)")
+    (entity,) = set(brought) - set(RECORDED)
+    studio.click("[data-tab=properties]")
+    studio.click(f"#properties button:has-text('{entity}')")
+    studio.wait_for_selector(f"#selected-name:has-text('{entity}')")
+    on_map = studio.evaluate("async () => (await import('/ui/map_view.js')).shown()")
+    assert {o["object_id"] for o in on_map} == set(brought)
