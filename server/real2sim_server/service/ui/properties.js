@@ -295,7 +295,7 @@ function refreshFields() {
   const { position, quaternion } = poseOf(o);
   ["x", "y", "z"].forEach((axis, k) => put(`pose-${axis}`, position[k], 2));
   put("heading", (yawOf(quaternion) * 180) / Math.PI, 2);
-  if (!document.getElementById("begins")) {
+  if (!document.getElementById("material")) {
     return;
   }
   const physics = o.physics ?? {};
