@@ -26,7 +26,7 @@ GROUND_ELEVATION = -0.03
 
 
 class SkySamples:
-    """Collects, for each direction, the pixels that no Gaussian covers."""
+    """Collects, for each direction, pixels of the sky, or else those that no Gaussian covers."""
 
     def __init__(self, resolution: int) -> None:
         self._resolution = resolution
@@ -34,12 +34,25 @@ class SkySamples:
         n = len(self._directions)
         self._slots: list[NDArray[np.uint8]] = []
         self._counts = np.zeros(n, dtype=np.uint8)
+        self._is_sky = np.zeros(n, dtype=np.bool_)
 
-    def add(self, view: ProjectedView) -> None:
-        """Take the pixels of ``view`` that show neither a Gaussian nor a tracked object."""
+    def add(self, view: ProjectedView, sky: NDArray[np.bool_]) -> None:
+        """Take pixels of ``view`` that show neither a Gaussian nor a tracked object.
+
+        Args:
+            sky: [H, W] pixels that show the sky. Directions in which any view shows it take these
+                alone: a tree or a bridge beyond the Gaussians is in other directions later on.
+        """
         texels, u, v = self._texels_in(view)
         row, column = (v / DEPTH_DOWNSCALE).astype(np.int64), (u / DEPTH_DOWNSCALE).astype(np.int64)
-        free = uncovered_pixels(view)[row, column] & (self._counts[texels] < SLOTS)
+        shows_sky = sky[v.astype(np.int64), u.astype(np.int64)]
+        found = texels[shows_sky & ~self._is_sky[texels]]
+        self._is_sky[found] = True
+        self._counts[found] = 0
+        for values in self._slots:
+            values[found] = 255
+        free = np.where(self._is_sky[texels], shows_sky, uncovered_pixels(view)[row, column])
+        free &= self._counts[texels] < SLOTS
         texels, u, v = texels[free], u[free], v[free]
         colours = _bilinear(view.image, u, v)
         slot = self._counts[texels]

@@ -17,6 +17,7 @@ from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
 from ...scene.spherical_harmonics import SH_C0
 from ..options import InitialiseOptions, ReconstructError
+from ..sky_mask import sky_mask
 from ..stages import OnProgress, Stages
 from .accumulate import Accumulation, accumulate, drive_path
 from .ground import spread_ground
@@ -315,7 +316,7 @@ def _sample_colours(
         nonlocal done
         done += 1
         if view.frame in sky_frames:
-            sky.add(view)
+            sky.add(view, sky_mask(log, view.camera, view.frame, view.image))
         report_step(done, len(frames) * len(log.rig))
 
     samples = gather_views(

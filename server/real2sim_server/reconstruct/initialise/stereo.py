@@ -17,7 +17,8 @@ from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
-from .triangulate import free_of_objects, spread_frames
+from ..sky_mask import still_surfaces
+from .triangulate import spread_frames
 
 WIDTH = 320
 """Images are compared at this width [px]; depths are some percent right then."""
@@ -50,7 +51,7 @@ class _View:
 
     Attributes:
         grey: [H, W] float32, 0 to 255.
-        free: [H, W] bool, outside of the boxes of objects.
+        free: [H, W] bool, outside of the sky and of the boxes of objects.
         K: [3, 3] at this size.
         pose: [4, 4] ``T_world_camera``.
         rows: those from the top that are compared.
@@ -95,7 +96,7 @@ def _read(log: DrivingLog, camera: Camera, frame: int) -> _View:
     image = cv2.resize(log.image(camera.name, frame), size, interpolation=cv2.INTER_AREA)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     pose = camera.pose(log.ego.transform(t_us))
-    free = free_of_objects(log, t_us, small.K, invert_transform(pose), grey.shape) > 0
+    free = still_surfaces(log, small, frame, np.asarray(image, np.uint8))
     return _View(grey, free, small.K, pose, _rows(log, small, frame))
 
 

@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.box import box_corners
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
+from ..sky_mask import still_surfaces
 
 WIDEST = 1280
 """Images are made smaller to this width [px]."""
@@ -32,8 +32,6 @@ SIGHTINGS = 3
 """Images that a point must be seen in."""
 RELATIVE_ERROR = 0.2
 """Largest standard deviation of a point, as part of its distance."""
-BOX_MARGIN = 0.3
-"""Around the boxes of objects nothing is taken: they move [m]."""
 
 _Progress = Callable[[int, int], None]
 
@@ -80,10 +78,11 @@ class _Features:
 def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> TriangulatedPoints:
     """Points of what stands still, from features that three images or more have in common.
 
-    SIFT features (Lowe 2004) outside of all boxes are matched along epipolar lines, since poses are
-    known, between images of one camera that lie some decimetres to some metres apart. Matches are
-    joined to tracks, and a track becomes a point where it lies within a pixel and a half of all
-    its images and is known to a tenth of its distance. The same log gives the same bits.
+    SIFT features (Lowe 2004) outside of all boxes and of the sky are matched along epipolar lines,
+    since poses are known, between images of one camera that lie some decimetres to some metres
+    apart. Matches are joined to tracks, and a track becomes a point where it lies within a pixel
+    and a half of all its images and is known to a tenth of its distance. The same log gives the
+    same bits.
 
     Args:
         log: with calibrated cameras and poses.
@@ -130,47 +129,20 @@ def _pose(log: DrivingLog, camera: Camera, frame: int) -> Float:
 def _features(log: DrivingLog, camera: Camera, frame: int) -> _Features:
     import cv2
 
-    image = log.image(camera.name, frame)
-    scale = min(1.0, WIDEST / camera.width)
+    small = camera.resized(min(WIDEST, camera.width))
+    size = (small.width, small.height)
+    image = cv2.resize(log.image(camera.name, frame), size, interpolation=cv2.INTER_AREA)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    if scale < 1:
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    height, width = grey.shape
-    shrink = np.diag([width / camera.width, height / camera.height, 1.0])
-    K: Float = shrink @ camera.K
+    free = still_surfaces(log, small, frame, np.asarray(image, np.uint8))
     pose = _pose(log, camera, frame)
     viewmat = invert_transform(pose)
-    free = free_of_objects(log, log.image_time_us(camera.name, frame), K, viewmat, grey.shape)
     detector = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.005, edgeThreshold=20)
-    keypoints, found = detector.detectAndCompute(grey, free)
+    keypoints, found = detector.detectAndCompute(grey, free.astype(np.uint8))
     pixels = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     descriptors = np.zeros((0, 128), np.float32) if found is None else found.astype(np.float32)
     # Of roots of histograms the product is Hellinger's kernel (Arandjelovic, Zisserman 2012).
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
-    return _Features(K @ viewmat[:3], pose[:3, 3].copy(), pixels, descriptors)
-
-
-def free_of_objects(
-    log: DrivingLog, t_us: int, K: Float, viewmat: Float, shape: tuple[int, ...]
-) -> NDArray[np.uint8]:
-    """[H, W] 1 outside of the outlines of all boxes."""
-    import cv2
-
-    free = np.ones(shape, np.uint8)
-    for track in log.tracks:
-        pose = track.transform_near(t_us)
-        if pose is None:
-            continue
-        corners = box_corners(pose, np.array(track.size) + 2 * BOX_MARGIN)
-        fraction = np.linspace(0, 1, 9)[:, None, None, None]
-        edges = (corners[:, None] * fraction + corners[None] * (1 - fraction)).reshape(-1, 3)
-        ahead = edges @ viewmat[:3, :3].T + viewmat[:3, 3]
-        ahead = ahead[ahead[:, 2] > 0.2]
-        if len(ahead) >= 3:
-            pixels = ahead @ K.T
-            outline = np.clip(pixels[:, :2] / pixels[:, 2:], -1e4, 1e4).astype(np.int32)
-            cv2.fillConvexPoly(free, cv2.convexHull(outline), 0)
-    return free
+    return _Features(small.K @ viewmat[:3], pose[:3, 3].copy(), pixels, descriptors)
 
 
 def _tracks(images: list[_Features]) -> list[NDArray[np.int64]]:

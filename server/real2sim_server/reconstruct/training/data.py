@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,13 +13,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...geometry.transform import apply_transform
-from ...logs import DrivingLog, log_of_frames
+from ...logs import DrivingLog, LidarSweep, log_of_frames
 from ...scene import Camera
 from ..options import ReconstructError
+from ..sky_mask import sky_mask
 from .schedule import TrainOptions
 
 NEAR, FAR = 0.5, 80.0
 """LiDAR depths outside are not compared [m]."""
+SKY_BORDER = 3.0
+"""Width of the border of the sky in which it counts less [px]."""
 PREFETCH = 4
 """Images that are decoded ahead of the step that takes them."""
 
@@ -51,7 +55,8 @@ class TrainingView:
         image: [H, W, 3] float32 in [0, 1].
         pixels: [M] int64, row-major pixels that LiDAR hit.
         depths: [M] float32 along the camera's z [m].
-        sky: [H, W] bool, where the sky is seen; None where that is not known.
+        sky: [H, W] float32, 1 where the sky is seen, less near its border, where a pixel shows
+            something else as well, and 0 elsewhere; None where no loss asks for it.
     """
 
     camera: Camera
@@ -67,10 +72,12 @@ class TrainingView:
 class _CachedImage:
     image: NDArray[np.uint8]
     points: NDArray[np.float32]
+    sky: NDArray[np.bool_] | None
 
     @property
     def nbytes(self) -> int:
-        return self.image.nbytes + self.points.nbytes
+        sky = 0 if self.sky is None else self.sky.nbytes
+        return self.image.nbytes + self.points.nbytes + sky
 
 
 class TrainingViews:
@@ -165,8 +172,8 @@ class TrainingViews:
         kept = self._resident.pop(key, None)
         if kept is None:
             held = self._bytes(index, divisor)
-            parts = {name: getattr(held, name) for name in ("image", "pixels", "depths")}
-            kept = replace(held, **{k: part.to(self._device) for k, part in parts.items()})
+            parts: dict[str, Any] = {k: p.to(self._device) for k, p in _parts(held).items()}
+            kept = replace(held, **parts)
             self._resident_bytes += _nbytes(kept)
         self._resident[key] = kept
         while self._resident_bytes > self._options.image_bytes and len(self._resident) > 1:
@@ -184,6 +191,7 @@ class TrainingViews:
         camera = self._log.rig[name].resized(max(16, width // divisor))
         pixels, depths = _pixels(stored.points, camera)
         image = np.ascontiguousarray(resized(stored.image, camera))
+        sky = None if stored.sky is None else torch.from_numpy(_weights(stored.sky, camera))
         return TrainingView(
             camera=camera,
             frame=frame,
@@ -191,6 +199,7 @@ class TrainingViews:
             image=torch.from_numpy(image),
             pixels=torch.from_numpy(pixels),
             depths=torch.from_numpy(depths),
+            sky=sky,
         )
 
     def _width(self, camera: Camera) -> int:
@@ -211,11 +220,13 @@ class TrainingViews:
 
     def _read(self, index: int) -> _CachedImage:
         name, frame = self._keys[index]
-        full = self._log.rig[name]
-        image = resized(self._log.image(name, frame), full.resized(self._width(full)))
-        return _CachedImage(image, self._points(full, frame))
+        log, losses, full = self._log, self._options.losses, self._log.rig[name]
+        small = full.resized(self._width(full))
+        image, sweep = resized(log.image(name, frame), small), log.lidar(frame)
+        sky = sky_mask(log, small, frame, image, sweep=sweep) if losses.sky > 0 else None
+        return _CachedImage(image, self._points(full, frame, sweep), sky)
 
-    def _points(self, camera: Camera, frame: int) -> NDArray[np.float32]:
+    def _points(self, camera: Camera, frame: int, sweep: LidarSweep) -> NDArray[np.float32]:
         """LiDAR points [M, 3] in the camera frame, those the image may show."""
         if self._options.losses.depth <= 0:
             return np.zeros((0, 3), np.float32)
@@ -223,7 +234,7 @@ class TrainingViews:
         t_us, seen_us = int(log.frame_times_us[frame]), image_time(log, camera.name, frame)
         T_world_vehicle = log.ego.transform(t_us)
         T_camera = camera.viewmat(log.ego.transform(seen_us)) @ T_world_vehicle
-        points = apply_transform(T_camera, log.lidar(frame).points)
+        points = apply_transform(T_camera, sweep.points)
         x, y, z = points.T
         safe = np.where(z > NEAR, z, 1.0)
         u = camera.K[0, 0] * x / safe + camera.K[0, 2]
@@ -236,9 +247,13 @@ class TrainingViews:
         return points[chosen[::step]].astype(np.float32)
 
 
+def _parts(view: TrainingView) -> dict[str, Tensor]:
+    parts = {name: getattr(view, name) for name in ("image", "pixels", "depths", "sky")}
+    return {name: part for name, part in parts.items() if part is not None}
+
+
 def _nbytes(view: TrainingView) -> int:
-    parts = (view.image, view.pixels, view.depths)
-    return sum(part.numel() * part.element_size() for part in parts)
+    return sum(part.numel() * part.element_size() for part in _parts(view).values())
 
 
 def image_time(log: DrivingLog, camera: str, frame: int) -> int:
@@ -255,6 +270,15 @@ def resized(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
         return image
     size = (camera.width, camera.height)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _weights(sky: NDArray[np.bool_], camera: Camera) -> NDArray[np.float32]:
+    """[H, W] of ``sky`` at the size of ``camera``: how far within its border, at most 1."""
+    import cv2
+
+    whole = (resized(sky.astype(np.uint8) * 255, camera) == 255).astype(np.uint8)
+    within = cv2.distanceTransform(whole, cv2.DIST_L2, 5) / SKY_BORDER
+    return np.asarray(np.minimum(within, 1), np.float32)
 
 
 def _pixels(

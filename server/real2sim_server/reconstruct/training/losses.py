@@ -39,7 +39,7 @@ class LossWeights:
 
     ssim: float = 0.2
     depth: float = 0.01
-    sky: float = 0.05
+    sky: float = 0.2
     object_entropy: float = 0.0
     box: float = 0.1
     needle: float = 0.01
@@ -161,9 +161,10 @@ def lidar_depth(depth: Tensor, pixels: Tensor, measured: Tensor) -> Tensor:
 
 
 def sky_opacity(alpha: Tensor, sky: Tensor) -> Tensor:
-    """``-log(1 - alpha)`` averaged over all pixels, where ``sky`` [H, W] bool; alpha [H, W]."""
-    bounded = alpha.clamp(1e-6, 1 - 1e-3)
-    return torch.where(sky, -torch.log(1 - bounded), 0.0).mean()
+    """``-log(1 - alpha)``, weighted by ``sky`` and averaged over all pixels; both [H, W]."""
+    # Rendering stops where 1e-4 is left: less is never seen, and up to there walls can dissolve.
+    bounded = alpha.clamp(max=1 - 1e-5)
+    return (sky * -torch.log1p(-bounded)).mean()
 
 
 def object_accumulation(alpha: Tensor, inside: Tensor) -> Tensor:

@@ -32,6 +32,15 @@ def test_ssim_of_equal_pictures_is_one(pictures):
     assert losses.ssim(pictures[1], pictures[1]) == pytest.approx(1, abs=1e-6)
 
 
+def test_a_wall_before_the_sky_has_a_gradient_as_dense_as_it_can_be_drawn():
+    alpha = torch.tensor([[0.0, 0.5], [1 - 1e-4, 0.9]], requires_grad=True)
+    loss = losses.sky_opacity(alpha, torch.tensor([[1.0, 1.0], [1.0, 0.0]]))
+    assert float(loss.detach()) == pytest.approx((np.log(2) + np.log(1e4)) / 4, rel=1e-3)
+    loss.backward()
+    expected = np.array([[1, 2], [1e4, 0]]) / 4
+    np.testing.assert_allclose(alpha.grad.numpy(), expected, rtol=1e-3)
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.2, 1.0])
 def test_photometric_loss_and_gradient_equal_torch(pictures, fraction):
     image, truth = pictures

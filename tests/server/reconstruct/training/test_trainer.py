@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from real2sim_server.reconstruct.training.data import TrainingViews
 from real2sim_server.reconstruct.training.direction_options import DirectionOptions
 from real2sim_server.reconstruct.training.gaussians import mirror
 from real2sim_server.reconstruct.training.losses import psnr_of
+from real2sim_server.reconstruct.training.schedule import PRESETS
 from real2sim_server.reconstruct.training.threads import one_torch_thread
 from real2sim_server.render import RasterOptions, rasterize
 from real2sim_server.render.effects import to_display, to_light
@@ -119,6 +120,32 @@ def test_images_of_half_a_stop_more_light_are_told_from_the_scene(tiny_log, tiny
         less = model.exposed(grey, log.rig["front"], int(times[3])).mean()
     # Half a stop is a factor of 1.17 of what is stored, about the middle.
     assert 1.05 < float(more / less) < 1.3
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_loss_of_a_preset_has_what_it_needs(tiny_log, tiny_scene, name):
+    options = replace(TINY, iterations=100, losses=PRESETS[name].losses)
+    options = replace(options, learning_rates=PRESETS[name].learning_rates)
+    wanted = {k for k, weight in asdict(options.losses).items() if weight > 0} - {"needle_ratio"}
+    if options.learning_rates.exposure == 0:
+        wanted.remove("exposure")
+    trainer = Trainer(tiny_log, tiny_scene, options)
+    trainer.iteration = 90
+    terms = trainer.step()
+    trainer.views.close()
+    # The similarity is a part of the picture's term.
+    assert set(terms) == (wanted - {"ssim"}) | {"picture"}
+
+
+def test_views_know_their_sky_at_every_size_and_only_for_a_loss_that_asks(tiny_log):
+    views = TrainingViews(tiny_log, [0, 3], TINY)
+    for index in range(2):
+        sky, half = (views.view(index, divisor).sky for divisor in (1, 2))
+        assert sky.shape == (64, 96)
+        assert half.shape == (32, 48)
+        assert 0.02 < float(half.float().mean()) <= float(sky.float().mean()) < 0.4
+    without = replace(TINY, losses=replace(TINY.losses, sky=0.0))
+    assert TrainingViews(tiny_log, [0], without).view(0).sky is None
 
 
 def test_held_out_views_are_scored_whole_and_over_moving_objects(trained, tiny_log):
