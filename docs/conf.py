@@ -7,7 +7,9 @@ links turned to where the pages are.
 
 from __future__ import annotations
 
+import functools
 import inspect
+import operator
 import os
 import posixpath
 import re
@@ -144,7 +146,7 @@ def bare(annotation: Any) -> Any:
     if origin in (None, Literal, Callable):
         return annotation
     parts = tuple(bare(part) for part in inner)
-    return Union[parts] if origin in (Union, UnionType) else origin[parts]
+    return functools.reduce(operator.or_, parts) if origin in (Union, UnionType) else origin[parts]
 
 
 def inherited_fields(model: type[BaseModel]) -> set[str]:
@@ -162,7 +164,7 @@ def short(value: Any) -> str:
 def skip_constrained(  # noqa: PLR0917 - as Sphinx calls it
     app: Sphinx, what: str, name: str, value: Any, skip: bool, options: Any
 ) -> bool | None:
-    """A type with limits is told where a field has it; by itself it would show pydantic's objects."""
+    """Leave out types with limits: fields tell them, and alone they show pydantic's objects."""
     return True if get_origin(value) is Annotated else None
 
 
