@@ -15,11 +15,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.box import box_corners
 from ..geometry.rotation import Float
-from ..geometry.transform import apply_transform, invert_transform
 from ..logs import DrivingLog, LidarSweep
 from ..scene import Camera
+from .logged_view import image_time, points_in_camera, resized, tracks_mask
 
 WIDTH = 640
 """Larger images are masked at this width [px]."""
@@ -76,22 +75,15 @@ def sky_mask(
     import cv2
 
     small = camera.resized(min(WIDTH, camera.width))
-    if small is not camera:
-        size = (small.width, small.height)
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     sweep = log.lidar(frame) if sweep is None else sweep
-    t_us = log.image_time_us(camera.name, frame)
-    pose = small.pose(log.ego.transform(t_us))
-    T_camera_vehicle = invert_transform(pose) @ log.ego.transform(int(log.frame_times_us[frame]))
-    points = apply_transform(T_camera_vehicle, sweep.points.astype(np.float64))
-    pixels, inside = _pixels(small, points)
-    blocked = _hit(small, pixels) | ~_above_horizon(small, pose)
+    t_us = image_time(log, camera.name, frame)
+    pixels, inside = _pixels(small, points_in_camera(log, small, frame, t_us, sweep=sweep))
+    blocked = _hit(small, pixels) | ~_above_horizon(small, small.pose(log.ego.transform(t_us)))
     blocked |= ~_outside_of_boxes(log, small, frame)
-    mask = sky_of_image(image, blocked, _open_columns(small, pixels, _is_high(sweep)[inside]))
-    if small is not camera:
-        size = (camera.width, camera.height)
-        mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    return np.asarray(mask, np.bool_)
+    is_open = _open_columns(small, pixels, _is_high(sweep)[inside])
+    mask = sky_of_image(resized(image, small), blocked, is_open).astype(np.uint8)
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def still_surfaces(
@@ -137,25 +129,9 @@ def sky_of_image(
 
 def _outside_of_boxes(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]:
     """[H, W] pixels outside of the outlines of all boxes."""
-    import cv2
-
-    t_us = log.image_time_us(camera.name, frame)
-    viewmat = camera.viewmat(log.ego.transform(t_us))
-    free = np.ones((camera.height, camera.width), np.uint8)
-    for track in log.tracks:
-        pose = track.transform_near(t_us)
-        if pose is None:
-            continue
-        corners = box_corners(pose, np.array(track.size) + 2 * BOX_MARGIN)
-        fraction = np.linspace(0, 1, 9)[:, None, None, None]
-        edges = (corners[:, None] * fraction + corners[None] * (1 - fraction)).reshape(-1, 3)
-        ahead = edges @ viewmat[:3, :3].T + viewmat[:3, 3]
-        ahead = ahead[ahead[:, 2] > 0.2]
-        if len(ahead) >= 3:
-            pixels = ahead @ camera.K.T
-            outline = np.clip(pixels[:, :2] / pixels[:, 2:], -1e4, 1e4).astype(np.int32)
-            cv2.fillConvexPoly(free, cv2.convexHull(outline), 0)
-    return np.asarray(free > 0)
+    t_us = image_time(log, camera.name, frame)
+    pose = camera.pose(log.ego.transform(t_us))
+    return ~tracks_mask(log.tracks, camera, pose, t_us, margin=BOX_MARGIN)
 
 
 def _above_horizon(camera: Camera, pose: Float) -> NDArray[np.bool_]:

@@ -23,8 +23,8 @@ from ..scene import UNSEEN, Camera, Scene, Sky
 from ..scene.spherical_harmonics import SH_C0
 from .evaluation.rendering import scene_instances
 from .evaluation.selection import listed_held_out, select_cameras
+from .logged_view import image_time, resized
 from .options import ReconstructError
-from .training.data import image_time, resized
 from .training.threads import one_torch_thread
 
 VIEWS = 48

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...logs import DrivingLog
 from ...scene import Scene
-from .object_regions import moving_tracks
+from ..logged_view import moving_tracks
 
 
 def box_error(scene: Scene, log: DrivingLog) -> float:

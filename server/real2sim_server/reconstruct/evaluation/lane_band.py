@@ -16,10 +16,9 @@ from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera, Ground, Scene
-from ..training.data import image_time, resized
+from ..logged_view import image_time, points_in_camera, resized, tracks_mask
 from .image_metrics import mean_psnr
-from .lidar_depth import points_in_camera, seen_points
-from .object_regions import moving_mask
+from .lidar_depth import seen_points
 from .rendering import render_view, shifted_pose
 from .shifted import within_an_object
 
@@ -139,7 +138,7 @@ def road_colours(log: DrivingLog, camera: Camera, ground: Ground) -> RoadColours
         t_us = image_time(log, camera.name, frame)
         row, column, depth = seen_points(points_in_camera(log, camera, frame, t_us), camera)
         pose = camera.pose(log.ego.transform(t_us))
-        boxed = moving_mask(log.tracks, camera, pose, t_us)
+        boxed = tracks_mask(log.tracks, camera, pose, t_us)
         chosen = (depth > near) & (depth < far) & ~boxed[row, column]
         row, column, depth = row[chosen], column[chosen], depth[chosen]
         # Colours are those of whole pixels: their middles are put onto the ground.
@@ -167,7 +166,7 @@ def projected_road(
     ahead = (z > near) & (z < far)
     column, row = (np.floor(v / np.where(ahead, z, 1)).astype(np.int64) for v in (x, y))
     inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    boxed = moving_mask(log.tracks, camera, pose, t_us)
+    boxed = tracks_mask(log.tracks, camera, pose, t_us)
     inside[inside] = ~boxed[row[inside], column[inside]]
     flat = row[inside] * camera.width + column[inside]
     count = np.bincount(flat, minlength=camera.width * camera.height)

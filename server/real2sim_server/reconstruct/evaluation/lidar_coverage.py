@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera, Scene
+from ..logged_view import resized
 from ..options import ReconstructError
-from ..training.data import resized
 from .image_metrics import psnr
 from .rendering import render_logged_view
 

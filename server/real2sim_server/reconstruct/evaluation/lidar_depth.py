@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform
-from ...logs import DrivingLog
 from ...scene import Camera
 
 NEAR, FAR = 0.5, 80.0
@@ -18,17 +16,6 @@ REACH = 0.006
 """Radius on the image within which an occluder is searched [rad]; about two beams apart."""
 ROAD_BELOW = 1.2
 """The road is at least so far below the cameras [m]."""
-
-
-def points_in_camera(log: DrivingLog, camera: Camera, frame: int, t_us: int) -> Float:
-    """The sweep of ``frame`` [N, 3] [m] in the frame of ``camera`` as it stood at ``t_us``.
-
-    The motion of the recording vehicle between sweep and image is taken out. That of other
-    vehicles is not: it is a few decimetres at most, on few points.
-    """
-    T_world_vehicle = log.ego.transform(int(log.frame_times_us[frame]))
-    T_camera_vehicle = camera.viewmat(log.ego.transform(t_us)) @ T_world_vehicle
-    return apply_transform(T_camera_vehicle, log.lidar(frame).points)
 
 
 def seen_points(

@@ -9,8 +9,7 @@ from ...geometry.box import box_corners
 from ...logs import DrivingLog
 from ...render import encode_rgb
 from ...scene import Camera
-from ..training.data import image_time
-from .object_regions import box_outline, moving_tracks
+from ..logged_view import box_outline, image_time, moving_tracks
 
 ERROR_FULL = 64.0
 """Error at which the colours of error images end, of 255."""

@@ -16,7 +16,7 @@ from ...logs import DrivingLog, same_part
 from ...render import Frame
 from ...render.uncertainty import uncertainty_picture
 from ...scene import Camera, Scene
-from ..training.data import image_time
+from ..logged_view import image_time
 from .pictures import (
     DEPTH_FAR,
     DEPTH_NEAR,

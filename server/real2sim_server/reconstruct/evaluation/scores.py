@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from ...logs import DrivingLog, same_part
 from ...render import Frame
 from ...scene import Camera, Scene
+from ..logged_view import image_time, moving_tracks, points_in_camera, resized, tracks_mask
 from ..options import ReconstructError
 from ..stages import OnProgress, ReportStep, Stages
-from ..training.data import image_time, resized
 from .around import AroundScore, evaluate_around
 from .box_error import box_error
 from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
 from .lane_band import LaneBandScore, evaluate_lane_band
-from .lidar_depth import depth_errors, error_p90, mean_error, median_error, points_in_camera
-from .object_regions import moving_mask, moving_tracks
+from .lidar_depth import depth_errors, error_p90, mean_error, median_error
 from .rendering import measure_rate, render_view
 from .selection import select_cameras, select_frames
 from .shifted import MIN_OBJECT_PIXELS, ShiftScore, evaluate_shifts
@@ -263,7 +262,7 @@ def logged_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_
     """[H, W] bool, pixels within the boxes of moving objects."""
     t_us = image_time(log, camera.name, frame)
     pose = camera.pose(log.ego.transform(t_us))
-    return moving_mask(moving_tracks(log), camera, pose, t_us)
+    return tracks_mask(moving_tracks(log), camera, pose, t_us)
 
 
 def _score(

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from ...logs import DrivingLog
 from ...scene import Camera, Scene
+from ..logged_view import image_time
 from ..options import ReconstructError
-from ..training.data import held_out_frames, image_time
+from ..training.data import held_out_frames
 
 DEFAULT_HOLD_OUT = 4
 """One of so many frames is held out where a scene does not say otherwise."""

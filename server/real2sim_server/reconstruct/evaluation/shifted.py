@@ -13,9 +13,9 @@ from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera, Scene
 from ...synthetic import SyntheticLog
+from ..logged_view import moving_tracks, tracks_mask
 from .image_metrics import mean_psnr, psnr, ssim
 from .lidar_depth import FAR, NEAR, median_error
-from .object_regions import moving_mask, moving_tracks
 from .rendering import render_view, shifted_pose
 
 MIN_OBJECT_PIXELS = 50
@@ -113,7 +113,7 @@ def _compare(
     image, depth, pose = true_view(truth, camera, t_us, left)
     frame = render_view(scene, camera, t_us, left=left, backend=backend)
     assert frame.depth is not None
-    mask = moving_mask(moving_tracks(truth), camera, pose, t_us)
+    mask = tracks_mask(moving_tracks(truth), camera, pose, t_us)
     enough = int(mask.sum()) >= MIN_OBJECT_PIXELS
     return _Compared(
         psnr(frame.rgb, image),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...geometry.rotation import Float
 from ...logs import DrivingLog
 from ...scene import Camera, Scene
-from ..training.data import image_time, resized
+from ..logged_view import image_time, resized
 from .rendering import render_logged_view, render_uncertainty
 
 Values = NDArray[np.float32]

@@ -37,11 +37,11 @@ class SkySamples:
         self._is_sky = np.zeros(n, dtype=np.bool_)
 
     def add(self, view: ProjectedView, sky: NDArray[np.bool_]) -> None:
-        """Take pixels of ``view`` that show neither a Gaussian nor a tracked object.
+        """Take pixels of the sky, and those that show neither a Gaussian nor a tracked object.
 
         Args:
-            sky: [H, W] pixels that show the sky. Directions in which any view shows it take these
-                alone: a tree or a bridge beyond the Gaussians is in other directions later on.
+            sky: [H, W] bool, pixels of ``view`` that show the sky. A direction in which any view
+                shows it keeps pixels of the sky alone.
         """
         texels, u, v = self._texels_in(view)
         row, column = (v / DEPTH_DOWNSCALE).astype(np.int64), (u / DEPTH_DOWNSCALE).astype(np.int64)

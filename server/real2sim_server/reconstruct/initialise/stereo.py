@@ -17,6 +17,7 @@ from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
+from ..logged_view import resized
 from ..sky_mask import still_surfaces
 from .triangulate import spread_frames
 
@@ -90,13 +91,11 @@ def sweep_planes(log: DrivingLog, *, max_images: int, on_image: _Progress) -> ND
 def _read(log: DrivingLog, camera: Camera, frame: int) -> _View:
     import cv2
 
-    t_us = log.image_time_us(camera.name, frame)
     small = camera.resized(min(WIDTH, camera.width))
-    size = (small.width, small.height)
-    image = cv2.resize(log.image(camera.name, frame), size, interpolation=cv2.INTER_AREA)
+    image = resized(log.image(camera.name, frame), small)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    pose = camera.pose(log.ego.transform(t_us))
-    free = still_surfaces(log, small, frame, np.asarray(image, np.uint8))
+    pose = camera.pose(log.ego.transform(log.image_time_us(camera.name, frame)))
+    free = still_surfaces(log, small, frame, image)
     return _View(grey, free, small.K, pose, _rows(log, small, frame))
 
 

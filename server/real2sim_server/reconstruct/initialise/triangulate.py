@@ -13,6 +13,7 @@ from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
+from ..logged_view import resized
 from ..sky_mask import still_surfaces
 
 WIDEST = 1280
@@ -130,10 +131,9 @@ def _features(log: DrivingLog, camera: Camera, frame: int) -> _Features:
     import cv2
 
     small = camera.resized(min(WIDEST, camera.width))
-    size = (small.width, small.height)
-    image = cv2.resize(log.image(camera.name, frame), size, interpolation=cv2.INTER_AREA)
+    image = resized(log.image(camera.name, frame), small)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    free = still_surfaces(log, small, frame, np.asarray(image, np.uint8))
+    free = still_surfaces(log, small, frame, image)
     pose = _pose(log, camera, frame)
     viewmat = invert_transform(pose)
     detector = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.005, edgeThreshold=20)

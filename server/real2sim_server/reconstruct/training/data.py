@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry.transform import apply_transform
 from ...logs import DrivingLog, LidarSweep, log_of_frames
 from ...scene import Camera
+from ..logged_view import image_time, points_in_camera, resized
 from ..options import ReconstructError
 from ..sky_mask import sky_mask
 from .schedule import TrainOptions
@@ -22,7 +22,7 @@ from .schedule import TrainOptions
 NEAR, FAR = 0.5, 80.0
 """LiDAR depths outside are not compared [m]."""
 SKY_BORDER = 3.0
-"""Width of the border of the sky in which it counts less [px]."""
+"""Width of the edge of the sky in which it counts less [px]."""
 PREFETCH = 4
 """Images that are decoded ahead of the step that takes them."""
 
@@ -55,8 +55,8 @@ class TrainingView:
         image: [H, W, 3] float32 in [0, 1].
         pixels: [M] int64, row-major pixels that LiDAR hit.
         depths: [M] float32 along the camera's z [m].
-        sky: [H, W] float32, 1 where the sky is seen, less near its border, where a pixel shows
-            something else as well, and 0 elsewhere; None where no loss asks for it.
+        sky: [H, W] float32, 1 where the sky is seen, less near its edge and 0 elsewhere; None
+            without a loss that uses it.
     """
 
     camera: Camera
@@ -230,11 +230,8 @@ class TrainingViews:
         """LiDAR points [M, 3] in the camera frame, those the image may show."""
         if self._options.losses.depth <= 0:
             return np.zeros((0, 3), np.float32)
-        log = self._log
-        t_us, seen_us = int(log.frame_times_us[frame]), image_time(log, camera.name, frame)
-        T_world_vehicle = log.ego.transform(t_us)
-        T_camera = camera.viewmat(log.ego.transform(seen_us)) @ T_world_vehicle
-        points = apply_transform(T_camera, sweep.points)
+        t_us = image_time(self._log, camera.name, frame)
+        points = points_in_camera(self._log, camera, frame, t_us, sweep=sweep)
         x, y, z = points.T
         safe = np.where(z > NEAR, z, 1.0)
         u = camera.K[0, 0] * x / safe + camera.K[0, 2]
@@ -256,24 +253,8 @@ def _nbytes(view: TrainingView) -> int:
     return sum(part.numel() * part.element_size() for part in _parts(view).values())
 
 
-def image_time(log: DrivingLog, camera: str, frame: int) -> int:
-    """When the image was taken [us], held to the span of the ego path."""
-    t_us = log.image_time_us(camera, frame)
-    return int(min(max(t_us, log.ego.start_us), log.ego.end_us))
-
-
-def resized(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """``image`` at the size of ``camera``."""
-    import cv2
-
-    if image.shape[:2] == (camera.height, camera.width):
-        return image
-    size = (camera.width, camera.height)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
 def _weights(sky: NDArray[np.bool_], camera: Camera) -> NDArray[np.float32]:
-    """[H, W] of ``sky`` at the size of ``camera``: how far within its border, at most 1."""
+    """[H, W] of ``sky`` at the size of ``camera``: 1 inside, less within SKY_BORDER of its edge."""
     import cv2
 
     whole = (resized(sky.astype(np.uint8) * 255, camera) == 255).astype(np.uint8)
@@ -301,7 +282,5 @@ __all__ = [
     "TrainingView",
     "TrainingViews",
     "held_out_frames",
-    "image_time",
-    "resized",
     "training_log",
 ]

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from ...logs import DrivingLog
+from ..logged_view import objects_mask
 from . import losses
 from .data import TrainingViews, held_out_frames
 from .model import SceneModel
-from .object_masks import box_mask
 from .schedule import TrainOptions
 
 MIN_PIXELS = 50
@@ -59,7 +59,7 @@ def score_held_out(
     for index in range(len(views)):
         view = views.view(index)
         image = model.render(view.camera, view.t_us).rgb.clamp(0, 1)
-        inside = box_mask(model.scene, view.camera, view.t_us, only=moving)
+        inside = objects_mask(model.scene, view.camera, view.t_us, only=moving)
         mask = torch.from_numpy(inside).to(image.device)
         scores.append(_score(image, view.image, mask))
     views.close()

@@ -162,7 +162,7 @@ def lidar_depth(depth: Tensor, pixels: Tensor, measured: Tensor) -> Tensor:
 
 def sky_opacity(alpha: Tensor, sky: Tensor) -> Tensor:
     """``-log(1 - alpha)``, weighted by ``sky`` and averaged over all pixels; both [H, W]."""
-    # Rendering stops where 1e-4 is left: less is never seen, and up to there walls can dissolve.
+    # Rendering stops at a transmittance of 1e-4, so that even an opaque wall keeps its gradient.
     bounded = alpha.clamp(max=1 - 1e-5)
     return (sky * -torch.log1p(-bounded)).mean()
 

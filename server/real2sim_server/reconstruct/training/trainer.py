@@ -17,11 +17,12 @@ from ...render.backends import Backend
 from ...scene import Scene
 from ...scene.spherical_harmonics import SH_C0
 from ..initialise.vehicle_body import scene_bodies
+from ..logged_view import image_time, objects_mask
 from ..options import ReconstructError
 from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from .closed_vehicles import close_followed, offer_bodies
-from .data import TrainingView, TrainingViews, held_out_frames, image_time
+from .data import TrainingView, TrainingViews, held_out_frames
 from .densify import STRATEGIES, ScreenSums, TrainingStep
 from .directions import (
     paint_unseen_sides,
@@ -32,7 +33,6 @@ from .directions import (
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 from .metrics import MetricsFile
 from .model import RenderedView, SceneModel
-from .object_masks import box_mask
 from .operations import step_generator
 from .optimizer import SelectiveAdam
 from .progress import OnTraining, RateMeter, RunningMeans, StepTimer, TrainingProgress
@@ -206,7 +206,7 @@ class Trainer:
             terms["image_exposure"] = weights.exposure * model.gains.squares()
         late = self.iteration >= self.options.densify.stop * self.options.iterations
         if weights.object_entropy > 0 and objects and late:
-            inside = torch.from_numpy(box_mask(model.scene, view.camera, view.t_us))
+            inside = torch.from_numpy(objects_mask(model.scene, view.camera, view.t_us))
             alpha = model.objects_alpha(view.camera, view.t_us)
             inside = inside.to(alpha.device)
             entropy = losses.object_accumulation(alpha, inside)

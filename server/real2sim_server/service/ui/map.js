@@ -63,7 +63,7 @@ function draw() {
   line(model.scene.ego.positions, ink().way, 2);
   drawSweepAbove(pen, toScreen, egoPoseAt(model.t));
   for (const o of shown()) {
-    if (o.trajectory.positions.length > 1) {
+    if (o.trajectory?.positions.length > 1) {
       line(
         o.trajectory.positions,
         o.object_id === model.selected ? `${ink().selected}99` : ink().other,

@@ -86,16 +86,10 @@ export async function refresh() {
 // storyboard brought and what was put there while driving.
 export function objects() {
   const { objects: all } = model.scenario;
-  return model.live ? model.live.agents.map((a) => ({ ...inDrive(a), ...find(all, a) })) : all;
+  return model.live ? model.live.agents.map((a) => ({ ...find(all, a.object_id), ...a })) : all;
 }
-const find = (list, { object_id: id }) => list.find((o) => o.object_id === id);
-const inDrive = ({ position, quaternion, ...agent }) => ({
-  ...agent,
-  start_us: model.t,
-  end_us: model.t,
-  trajectory: { times_us: [model.t], positions: [position], quaternions: [quaternion] },
-});
-export const object = (id) => find(objects(), { object_id: id });
+const find = (list, id) => list.find((o) => o.object_id === id);
+export const object = (id) => find(objects(), id);
 export const isHere = (subject) => !!model.live || present(subject, model.t);
 
 // Pose as shown: of a physics run while one is played, else with what is being dragged.
@@ -122,7 +116,7 @@ export const egoPoseAt = (t) =>
 
 // The pose that an edit starts from: in the drive that is watched, else in the scenario.
 export const editedPoseOf = (subject) =>
-  find(model.live?.agents ?? [], subject) ?? poseAt(subject.trajectory, model.t);
+  find(model.live?.agents ?? [], subject.object_id) ?? poseAt(subject.trajectory, model.t);
 
 export function draftOperations() {
   const draft = model.draft;
@@ -198,7 +192,7 @@ export const undo = () => inTurn(() => stepBack("/undo"));
 export const redo = () => inTurn(() => stepBack("/redo"));
 function stepBack(rest) {
   if (model.live) {
-    return notify("A drive goes on: what changed in it cannot be undone.", "warm");
+    return notify("Edits of a running drive cannot be undone.", "warm");
   }
   return !isRecorded() && change(rest);
 }

@@ -97,7 +97,7 @@ function panel(id) {
       row("holds", [when()]),
     ),
     ...(model.live
-      ? [el("p", { textContent: "Edits change the drive that goes on; the scenario stays." })]
+      ? [el("p", { textContent: "Edits change this drive only. The scenario stays as it is." })]
       : ofScenario(id)),
   ];
 }

@@ -7,9 +7,9 @@ from real2sim_server.reconstruct.evaluation.lidar_depth import (
     depth_errors,
     error_p90,
     median_error,
-    points_in_camera,
     seen_points,
 )
+from real2sim_server.reconstruct.logged_view import points_in_camera
 from real2sim_server.scene import Camera
 
 from ..conftest import WALL_X, painted_log

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.reconstruct.evaluation.object_regions import moving_mask, moving_tracks
 from real2sim_server.reconstruct.evaluation.pictures import depth_image, error_image, object_crops
+from real2sim_server.reconstruct.logged_view import moving_tracks, tracks_mask
 
 from ..conftest import painted_log
 
@@ -36,7 +36,7 @@ def test_a_crop_shows_the_box_of_a_moving_object():
     [(object_id, window)] = object_crops(log, camera, FRAME, 3)
     t_us = int(log.frame_times_us[FRAME])
     pose = log.ego.transform(t_us) @ camera.T_vehicle_camera
-    mask = moving_mask(moving_tracks(log), camera, pose, t_us)
+    mask = tracks_mask(moving_tracks(log), camera, pose, t_us)
     assert object_id == "other_1"
     assert mask[window].sum() == mask.sum() > 0
     assert mask[window].mean() > 0.5

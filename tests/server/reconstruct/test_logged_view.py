@@ -5,14 +5,14 @@ import pytest
 
 from real2sim_server.geometry.box import box_corners
 from real2sim_server.logs import ObjectTrack
-from real2sim_server.reconstruct.evaluation.object_regions import (
+from real2sim_server.reconstruct.logged_view import (
     box_outline,
-    moving_mask,
     moving_tracks,
+    tracks_mask,
 )
 from real2sim_server.scene import Camera, Trajectory
 
-from ..conftest import painted_log
+from .conftest import painted_log
 
 K = np.array([[100.0, 0, 60], [0, 100, 40], [0, 0, 1]])
 CAMERA = Camera("front", 120, 80, K, np.eye(4))
@@ -27,7 +27,7 @@ def box(centre, size) -> ObjectTrack:
 
 def test_a_box_seen_frontally_covers_its_nearer_face():
     # Camera and box axes agree: 2 m wide, 1 m high, front face at 9.5 m; 1 m is 100 / 9.5 px.
-    mask = moving_mask((box((0, 0, 10), (2.0, 1.0, 1.0)),), CAMERA, np.eye(4), 0)
+    mask = tracks_mask((box((0, 0, 10), (2.0, 1.0, 1.0)),), CAMERA, np.eye(4), 0)
     rows, columns = np.nonzero(mask)
     half = 100 / 9.5
     assert (columns.min(), columns.max() + 1) == (round(60 - half), round(60 + half))
@@ -36,12 +36,12 @@ def test_a_box_seen_frontally_covers_its_nearer_face():
 
 
 def test_a_box_behind_the_camera_covers_nothing():
-    assert not moving_mask((box((0, 0, -10), (2.0, 1.0, 1.0)),), CAMERA, np.eye(4), 0).any()
+    assert not tracks_mask((box((0, 0, -10), (2.0, 1.0, 1.0)),), CAMERA, np.eye(4), 0).any()
 
 
 def test_a_box_around_the_image_plane_is_cut_not_mirrored():
     # Beside the camera from 5 m behind it to 5 m before it: only the right half can show it.
-    mask = moving_mask((box((2, 0, 0), (2.0, 1.0, 10.0)),), CAMERA, np.eye(4), 0)
+    mask = tracks_mask((box((2, 0, 0), (2.0, 1.0, 10.0)),), CAMERA, np.eye(4), 0)
     assert mask.any()
     assert not mask[:, :60].any()
     # Its far inner edge, 1 m to the right at 5 m, is where it begins.
@@ -50,8 +50,8 @@ def test_a_box_around_the_image_plane_is_cut_not_mirrored():
 
 def test_a_track_counts_only_when_it_is_there():
     track = box((0, 0, 10), (2.0, 1.0, 1.0))
-    assert moving_mask((track,), CAMERA, np.eye(4), 30_000).any()
-    assert not moving_mask((track,), CAMERA, np.eye(4), 300_000).any()
+    assert tracks_mask((track,), CAMERA, np.eye(4), 30_000).any()
+    assert not tracks_mask((track,), CAMERA, np.eye(4), 300_000).any()
 
 
 def test_every_pixel_with_its_centre_in_the_hull_of_a_turned_box_is_set():
@@ -66,7 +66,7 @@ def test_every_pixel_with_its_centre_in_the_hull_of_a_turned_box_is_set():
     track = ObjectTrack(
         "b", "box", (3.0, 1.0, 1.5), Trajectory.from_transforms(np.array([0]), pose[None])
     )
-    mask = moving_mask((track,), CAMERA, np.eye(4), 0)
+    mask = tracks_mask((track,), CAMERA, np.eye(4), 0)
     outline = box_outline(box_corners(pose, track.size), K)
     area = 0.5 * abs(
         np.dot(outline[:, 0], np.roll(outline[:, 1], 1))
