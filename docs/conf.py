@@ -28,14 +28,21 @@ sys.path[:0] = [str(REPOSITORY / folder) for folder in ("proto", "client", "serv
 # What autodoc imports must not look for a device.
 os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 
-from real2sim.version import VERSION  # noqa: E402 - of this checkout
+import real2sim  # noqa: E402 - of this checkout
+from real2sim.version import VERSION  # noqa: E402
 
 project = "Real2Sim"
 author = "the Real2Sim authors"
 version = release = VERSION
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["Thumbs.db", ".DS_Store"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+]
+templates_path = ["_templates"]
+exclude_patterns = ["_templates", "Thumbs.db", ".DS_Store"]
 default_role = "code"
 smartquotes = False
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
@@ -49,7 +56,7 @@ suppress_warnings = ["ref.python"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
-autodoc_default_options = {"show-inheritance": False, "exclude-members": "model_config"}
+autodoc_default_options = {"exclude-members": "model_config"}
 autodoc_type_aliases = {name: name for name in ("Operation", "Plan")}
 python_maximum_signature_line_length = 88
 napoleon_use_ivar = True
@@ -76,6 +83,7 @@ SHOWN_AS = {file: f"docs/{page}.md" for page, file in ROOT_PAGES.items()} | {
     "proto/schema": "docs/api/messages.rst"
 }
 
+ALIAS = re.compile(r"TypeAliasForwardRef\('(\w+)'\)")
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -83,8 +91,12 @@ def setup(app: Sphinx) -> None:
     """Hooks of the build."""
     app.connect("source-read", show_root_page)
     app.connect("autodoc-process-docstring", list_fields)
-    app.connect("autodoc-process-signature", hide_model_signature)
+    app.connect("autodoc-process-signature", show_signature)
     app.connect("autodoc-skip-member", skip_constrained)
+    for name in real2sim.__all__:
+        # Links tell where a class is defined, which is in private modules.
+        if inspect.isclass(value := getattr(real2sim, name)):
+            value.__module__ = "real2sim"
 
 
 def show_root_page(app: Sphinx, page: str, text: list[str]) -> None:
@@ -168,10 +180,15 @@ def skip_constrained(  # noqa: PLR0917 - as Sphinx calls it
     return True if get_origin(value) is Annotated else None
 
 
-def hide_model_signature(  # noqa: PLR0917 - as Sphinx calls it
+def show_signature(  # noqa: PLR0917 - as Sphinx calls it
     app: Sphinx, what: str, name: str, value: Any, options: Any, signature: Any, returns: Any
-) -> tuple[str, None] | None:
-    """A message is made of its fields, which are listed below its name."""
-    if inspect.isclass(value) and issubclass(value, BaseModel):
-        return "", None
-    return None
+) -> tuple[str, str | None] | None:
+    """A signature without Sphinx's own names; none of a class that users do not make.
+
+    A message is made of its fields, which are listed below its name, and a handle by a client.
+    """
+    if inspect.isclass(value):
+        by_client = re.match(r"\((transport|scenario): ", signature or "")
+        if by_client or issubclass(value, BaseModel):
+            return "", None
+    return None if signature is None else (ALIAS.sub(r"\1", signature), returns)

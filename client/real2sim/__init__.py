@@ -30,9 +30,15 @@ if TYPE_CHECKING:
     from ._async.client import AsyncClient, connect_async
     from ._async.drive_batch import AsyncDriveBatch
     from ._async.drive_session import AsyncDriveSession
+    from ._sync.assets import Assets
     from ._sync.client import Client, connect
     from ._sync.drive_batch import DriveBatch
     from ._sync.drive_session import DriveSession
+    from ._sync.jobs import Job, Jobs
+    from ._sync.scenarios import Scenario, SceneObject, Scenarios
+    from ._sync.scenes import Scenes
+    from ._sync.sessions import Sessions
+    from ._sync.sweeps import Sweeps
     from .batch_observation import BatchImages, BatchObservation
     from .clouds import LidarCloud, PointCloud, RadarCloud
     from .env import DriveEnv
@@ -70,6 +76,7 @@ if TYPE_CHECKING:
     from .version import VERSION as __version__
 
 __all__ = [
+    "Assets",
     "AsyncClient",
     "AsyncDriveBatch",
     "AsyncDriveSession",
@@ -92,6 +99,8 @@ __all__ = [
     "InvalidActionError",
     "InvalidOperationError",
     "InvalidRequestError",
+    "Job",
+    "Jobs",
     "LidarCloud",
     "LidarSpec",
     "MalformedReplyError",
@@ -106,13 +115,19 @@ __all__ = [
     "RadarSpec",
     "Real2SimError",
     "ReplyTimeoutError",
+    "Scenario",
+    "Scenarios",
+    "SceneObject",
+    "Scenes",
     "SensorSpec",
     "SessionClosedError",
     "SessionElsewhereError",
+    "Sessions",
     "StaleRevisionError",
     "StaleStepError",
     "StatusError",
     "StepConflictError",
+    "Sweeps",
     "TrajectoryPlan",
     "UnauthorizedError",
     "UnreachableError",
@@ -125,6 +140,7 @@ __all__ = [
 ]
 
 _ELSEWHERE = {
+    "Assets": "real2sim._sync.assets",
     "AsyncClient": "real2sim._async.client",
     "AsyncDriveBatch": "real2sim._async.drive_batch",
     "AsyncDriveSession": "real2sim._async.drive_session",
@@ -136,6 +152,8 @@ _ELSEWHERE = {
     "DriveSession": "real2sim._sync.drive_session",
     "Frame": "real2sim.images",
     "Image": "real2sim.images",
+    "Job": "real2sim._sync.jobs",
+    "Jobs": "real2sim._sync.jobs",
     "LidarCloud": "real2sim.clouds",
     "LidarSpec": "real2sim_proto.ranging",
     "Observation": "real2sim.observation",
@@ -143,11 +161,28 @@ _ELSEWHERE = {
     "PoseCommand": "real2sim_proto.plans",
     "RadarCloud": "real2sim.clouds",
     "RadarSpec": "real2sim_proto.ranging",
+    "Scenario": "real2sim._sync.scenarios",
+    "Scenarios": "real2sim._sync.scenarios",
+    "SceneObject": "real2sim._sync.scenarios",
+    "Scenes": "real2sim._sync.scenes",
     "SensorSpec": "real2sim_proto.episode",
+    "Sessions": "real2sim._sync.sessions",
+    "Sweeps": "real2sim._sync.sweeps",
     "TrajectoryPlan": "real2sim_proto.plans",
     "View": "real2sim.observation",
     "connect": "real2sim._sync.client",
     "connect_async": "real2sim._async.client",
+}
+
+_INSTEAD = {
+    "Env": "real2sim.make_env(scene='street')",
+    "Scene": "real2sim.connect().scenes.get('street')",
+    "Session": "real2sim.connect().session(scene='street'), which is a DriveSession",
+    "Simulator": "real2sim.connect()",
+    "World": "real2sim.connect().session(scene='street')",
+    "make": "real2sim.make_env(scene='street')",
+    "planners": "import real2sim.planners",
+    "render": "real2sim.connect().scenes.render('street', camera='front')",
 }
 
 
@@ -173,7 +208,12 @@ def make_env(**options: Any) -> DriveEnv:
 def __getattr__(name: str) -> Any:
     # Names are fetched when they are used, so that importing the package costs nothing.
     if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        said = ""
+        if not name.startswith("_"):
+            from real2sim_proto.guidance import advice
+
+            said = f"; {advice(name, __all__, _INSTEAD)}"
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{said}")
     if name == "__version__":
         value: Any = importlib.import_module("real2sim.version").VERSION
     else:

@@ -69,7 +69,22 @@ def checked(model: type[M], /, **fields: Any) -> M:
     try:
         return model(**fields)
     except ValidationError as error:
-        raise ValueError(f"{model.__name__}: {describe(error)}") from error
+        raise ValueError(f"{model.__name__}: {describe(error, model)}") from error
+
+
+def instant_us(t: float | None, t_us: float | None) -> int | None:
+    """An instant given in seconds or in microseconds; None: neither.
+
+    Raises:
+        ValueError: given both ways, or no whole number of microseconds.
+    """
+    if t is not None and t_us is not None:
+        raise ValueError(f"t={t!r} (seconds) and t_us={t_us!r} (microseconds); give one of them")
+    if t is not None:
+        return round(t * 1e6)
+    if t_us is None or t_us == int(t_us):
+        return None if t_us is None else int(t_us)
+    raise ValueError(f"t_us is {t_us!r}; give whole microseconds, or seconds as t={t_us!r}")
 
 
 def new_key() -> str:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 from real2sim_proto.jobs import JobInfo, JobState
 
+from ._guidance import Handle
 from .errors import ErrorDetails, Real2SimError, ReplyTimeoutError, error_for
 
 OnProgress = Callable[[JobInfo], object]
@@ -16,8 +17,17 @@ FIRST_POLL = 0.05
 SLOWEST_POLL = 1.0
 
 
-class JobBase:
+class JobBase(Handle):
     """State of a job that this client has seen last, shared by the sync and the async variant."""
+
+    _instead: ClassVar = {
+        "done": "job.info.over",
+        "id": "job.job_id",
+        "progress": "job.info.progress",
+        "save": "job.download(name, path)",
+        "state": "job.info.state",
+        "status": "job.info.state",
+    }
 
     def __init__(self, info: JobInfo) -> None:
         self.info = info

@@ -5,8 +5,13 @@
 
 from __future__ import annotations
 
+import bisect
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from real2sim_proto.base import Pose, Track
 from real2sim_proto.operations import (
@@ -41,7 +46,10 @@ from real2sim_proto.operations import (
 from real2sim_proto.scenes import ObjectInfo
 from real2sim_proto.storyboard import Storyboard
 
-from ._call import checked
+from ._call import checked, instant_us
+from ._guidance import Handle
+from ._poses import pose_between, pose_matrix, quaternion_of
+from ._scenario_state import ScenarioState
 
 R = TypeVar("R")
 Vector = tuple[float, float, float]
@@ -50,16 +58,48 @@ UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 UP: Vector = (0.0, 0.0, 1.0)
 
 
-class ObjectEdits(Generic[R]):
+class ObjectEdits(Handle, Generic[R]):
     """An object of a scenario; each method is one edit. Metres, radians, microseconds, wxyz."""
 
-    def __init__(self, info: ObjectInfo) -> None:
-        self.info = info
+    _instead: ClassVar = {
+        "box": "object.corners(t), or object.pose(t) and object.size",
+        "bounding_box": "object.corners(t), or object.pose(t) and object.size",
+        "center": "object.position",
+        "category_name": "object.category",
+        "destroy": "object.delete()",
+        "get_transform": "object.pose(t)",
+        "id": "object.object_id",
+        "instance_token": "object.object_id",
+        "lwh": "object.size (length, width, height)",
+        "move": "object.translate(x=1.0)",
+        "name": "object.object_id",
+        "orientation": "object.pose(t).quaternion",
+        "quaternion": "object.pose(t).quaternion",
+        "remove": "object.delete()",
+        "rotation": "object.pose(t).quaternion",
+        "set_position": "object.set_pose((x, y, z))",
+        "set_transform": "object.set_pose((x, y, z))",
+        "trajectory": "object.info.trajectory",
+        "velocity": "object.info.velocity, object.set_velocity(linear=(x, y, z))",
+        "wlh": "object.size (length, width, height)",
+    }
+
+    def __init__(self, scenario: ScenarioState, info: ObjectInfo) -> None:
+        self._scenario = scenario
+        self._info = info
+
+    @property
+    def info(self) -> ObjectInfo:
+        """The object after the newest edit; once it is deleted, as it was last."""
+        for known in self._scenario.info.objects:
+            if known.object_id == self._info.object_id:
+                self._info = known
+        return self._info
 
     @property
     def object_id(self) -> str:
         """Id of the object in its scenario."""
-        return self.info.object_id
+        return self._info.object_id
 
     @property
     def category(self) -> str:
@@ -71,15 +111,82 @@ class ObjectEdits(Generic[R]):
         """Length, width and height of its box [m]."""
         return self.info.size
 
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """[3] float64 centre of its box in the world when it appears [m]."""
+        return np.array(self._track.positions[0])
+
+    @property
+    def yaw(self) -> float:
+        """Its heading in the world when it appears [rad]."""
+        w, x, y, z = self._track.quaternions[0]
+        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    @property
+    def _track(self) -> Track:
+        track = self.info.trajectory
+        if track is None:
+            raise ValueError(f"the worker has told no trajectory of {self.object_id!r}; refresh()")
+        return track
+
+    def pose(self, t: float | None = None, *, t_us: int | None = None) -> Pose:
+        """Where its box is: between two poses positions linear, rotations on the shortest arc.
+
+        Args:
+            t, t_us: instant in seconds or in microseconds; default: when it appears.
+
+        Returns:
+            ``position`` of the centre of its box in the world [m] and ``quaternion`` (wxyz).
+
+        Raises:
+            ValueError: the object is not there at that instant.
+
+        Examples:
+            >>> scenario.objects["car_blue"].pose(1.0).position
+            (18.0, 0.0, 0.75)
+        """
+        info, track = self.info, self._track
+        times = track.times_us
+        instant = instant_us(t, t_us)
+        instant = times[0] if instant is None else instant
+        if not min(info.start_us, times[0]) <= instant <= max(info.end_us, times[-1]):
+            raise ValueError(
+                f"{self.object_id!r} is there from {info.start_us / 1e6:g} to "
+                f"{info.end_us / 1e6:g} s, not at {instant / 1e6:g} s; give seconds as t=1.5 or "
+                "microseconds as t_us=1_500_000"
+            )
+        after = min(bisect.bisect_right(times, instant), len(times) - 1)
+        before = max(after - 1, 0)
+        fraction = (instant - times[before]) / max(times[after] - times[before], 1)
+        first, last = (
+            pose_matrix(track.positions[k], track.quaternions[k]) for k in (before, after)
+        )
+        mixed = pose_between(first, last, min(max(fraction, 0.0), 1.0))
+        return Pose(position=tuple(mixed[:3, 3].tolist()), quaternion=quaternion_of(mixed[:3, :3]))
+
+    def corners(self, t: float | None = None, *, t_us: int | None = None) -> NDArray[np.float64]:
+        """[8, 3] float64 corners of its box in the world [m]: four in front, four behind, each
+        from the upper left one clockwise as seen from behind. Times as of :meth:`pose`.
+
+        Examples:
+            >>> scenario.objects["post"].corners().shape
+            (8, 3)
+        """
+        pose = self.pose(t, t_us=t_us)
+        signs = [(x, y, z) for x in (1, -1) for y, z in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+        T_world_object = pose_matrix(pose.position, pose.quaternion)
+        placed: NDArray[np.float64] = (np.array(signs) * self.size / 2) @ T_world_object[:3, :3].T
+        return placed + T_world_object[:3, 3]
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.object_id!r}, category={self.category!r})"
 
     def translate(
         self,
-        *,
         x: float = 0.0,
         y: float = 0.0,
         z: float = 0.0,
+        *,
         frame: str = "world",
         start_us: int | None = None,
         end_us: int | None = None,
@@ -106,8 +213,8 @@ class ObjectEdits(Generic[R]):
 
     def rotate(
         self,
-        *,
         angle: float,
+        *,
         axis: Vector = UP,
         frame: str = "world",
         start_us: int | None = None,
@@ -146,7 +253,7 @@ class ObjectEdits(Generic[R]):
         return self._make(Scale, x=x, y=y, z=z, anchor=anchor)
 
     def set_pose(
-        self, *, position: Vector, quaternion: Quaternion = UPRIGHT, snap: bool = False
+        self, position: Vector, quaternion: Quaternion = UPRIGHT, *, snap: bool = False
     ) -> R:
         """Place the object in the world [m], for the whole time range.
 

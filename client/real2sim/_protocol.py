@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from real2sim_proto import (
     HTTP_STATUS,
@@ -53,7 +53,7 @@ from real2sim_proto.drive import (
 from real2sim_proto.drive_batch import WorldError
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
-from real2sim_proto.plans import PLAN, Plan
+from real2sim_proto.plans import PLAN, Control, Plan, PoseCommand, TrajectoryPlan
 
 from ._call import checked
 from ._models import read_fields, sent_fields
@@ -298,10 +298,30 @@ def valid_plan(plan: Plan | Mapping[str, Any]) -> Plan:
     Raises:
         ValueError: one sentence about what is not allowed in it.
     """
+    if isinstance(plan, Mapping) and "kind" not in plan:
+        # Members tell the kind, since no two kinds share one that must be there.
+        models: tuple[type[BaseModel], ...] = (TrajectoryPlan, Control, PoseCommand)
+        kinds = [m for m in models if _required(m) <= set(plan)]
+        if not kinds:
+            raise ValueError(
+                f"plan: {dict(plan)!r} has no kind; give 'trajectory' (times_us, poses), 'control' "
+                "(acceleration, steering) or 'pose' (x, y, yaw)"
+            )
+        plan = {"kind": kinds[0].model_fields["kind"].default, **plan}
+    elif not isinstance(plan, Mapping | BaseModel):
+        raise ValueError(
+            f"plan: {plan!r} is a {type(plan).__name__}; write real2sim.Control(acceleration=1.0, "
+            "steering=0.0) [m/s^2, rad], a TrajectoryPlan or a PoseCommand, or its fields with "
+            "its kind"
+        )
     try:
         return PLAN.validate_python(plan)
     except ValidationError as error:
         raise ValueError(f"plan: {describe(error)}") from error
+
+
+def _required(model: type[BaseModel]) -> set[str]:
+    return {name for name, field in model.model_fields.items() if field.is_required()}
 
 
 def server_message(data: bytes | str, messages: TypeAdapter[M]) -> M:

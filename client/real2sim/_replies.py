@@ -14,11 +14,12 @@ from real2sim_proto.drive import Frame as WireFrame
 from real2sim_proto.drive import PointCloud as WireCloud
 from real2sim_proto.scenarios import HistoryEntry
 
+from ._guidance import argument_advice
 from ._models import read_json
 from ._retry import parse_retry_after
 from .clouds import LidarCloud, cloud_from_wire
 from .errors import ErrorDetails, InvalidValue, MalformedReplyError, Real2SimError, error_for
-from .images import Image, frame_from_wire
+from .images import Image, encoded_shape, frame_from_wire
 from .observation import View, view_from_frames
 
 M = TypeVar("M", bound=BaseModel)
@@ -121,7 +122,8 @@ def parse_image(reply: Reply, modality: str) -> Image:
     if codec is None:
         raise MalformedReplyError(f"the worker sent {reply.media_type!r} where an image was asked")
     dtype = "uint8" if modality in ("rgb", "semantic") else "uint16"
-    return Image(data=reply.content, codec=codec, modality=modality, dtype=dtype)
+    shape = encoded_shape(reply.content, codec)
+    return Image(data=reply.content, codec=codec, modality=modality, dtype=dtype, shape=shape)
 
 
 def parse_sweep(reply: Reply) -> LidarCloud:
@@ -168,13 +170,20 @@ def _wire_cloud(value: Any) -> WireCloud:
         raise MalformedReplyError(f"the worker sent a broken cloud: {describe(error)}") from error
 
 
-def describe(error: ValidationError) -> str:
-    """What is wrong, in one line: ``sensors/0/width: input should be ...``."""
+def describe(error: ValidationError, model: type[BaseModel] | None = None) -> str:
+    """What is wrong, in one line: ``sensors/0/width: input should be ...``.
+
+    Of the model's own members that are not there it says which are meant.
+    """
+    members = list(model.model_fields) if model else []
     problems = []
     for problem in error.errors(include_url=False, include_context=False)[:4]:
         place = "/".join(str(part) for part in problem["loc"])
         given = repr(problem["input"])
         given = given if len(given) <= 60 else f"{given[:57]}..."
-        problems.append(f"{place}: {problem['msg']}, not {given}")
+        if members and problem["type"] == "extra_forbidden" and len(problem["loc"]) == 1:
+            problems.append(f"there is no {place!r}; {argument_advice(place, members)}")
+        else:
+            problems.append(f"{place}: {problem['msg']}, not {given}")
     more = error.error_count() - len(problems)
     return "; ".join(problems) + (f"; and {more} more" if more > 0 else "")

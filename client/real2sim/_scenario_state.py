@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Mapping
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
+from real2sim_proto.guidance import advice
 from real2sim_proto.scenarios import OperationResult, ScenarioInfo
 from real2sim_proto.storyboard import Storyboard
+
+from ._guidance import Handle
 
 H = TypeVar("H")
 
 
-class ScenarioState:
+class ScenarioState(Handle):
     """The newest state of a scenario that this client has seen."""
+
+    _instead: ClassVar = {
+        "add": "scenario.insert(asset, position=(x, y, z))",
+        "close": "nothing: a scenario stays on its worker until client.scenarios.delete(scenario)",
+        "delete": "client.scenarios.delete(scenario)",
+        "drive": "client.session(scenario=scenario)",
+        "export_video": "client.jobs.export_video(scenario=scenario, camera='front')",
+        "get_object": "scenario.objects['car_6']",
+        "id": "scenario.scenario_id",
+        "name": "scenario.info.name",
+        "render": "scenario.preview(camera='front')",
+        "save": "scenario.export(), for a file; every edit is stored by the worker already",
+        "session": "client.session(scenario=scenario)",
+        "video": "client.jobs.export_video(scenario=scenario, camera='front')",
+    }
 
     def __init__(self, info: ScenarioInfo) -> None:
         self._info = info
@@ -69,12 +86,24 @@ class Objects(Mapping[str, H], Generic[H]):
         try:
             return self._handles[object_id]
         except KeyError:
-            close = difflib.get_close_matches(object_id, self._handles, n=3)
-            instead = f"; did you mean {', '.join(close)}?" if close else ";"
+            if not isinstance(object_id, str):
+                raise KeyError(
+                    f"{object_id!r} is no id; write list(scenario.objects.values())[{object_id!r}]"
+                ) from None
             raise KeyError(
-                f"the scenario has no object {object_id!r} among {len(self)}{instead}"
-                " refresh() shows what other clients have added"
+                f"the scenario has no object {object_id!r} among {len(self)}; "
+                f"{advice(object_id, self._handles)} refresh() shows what other clients have added"
             ) from None
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            if name.startswith("_"):
+                raise AttributeError(f"'Objects' object has no attribute {name!r}")
+            raise AttributeError(f"Objects has no {name!r}; write scenario.objects[{name!r}]")
+
+    def __delitem__(self, object_id: str) -> None:
+        raise TypeError(f"write scenario.objects[{object_id!r}].delete()")
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._handles)

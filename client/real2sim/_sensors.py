@@ -22,7 +22,6 @@ from ._call import checked
 Sensor: TypeAlias = str | SensorSpec | Mapping[str, Any]
 """A camera: its name, or a spec, or a spec's fields: ``{"camera": "front", "width": 640}``."""
 
-S = TypeVar("S")
 R = TypeVar("R", LidarSpec, RadarSpec)
 
 LidarSensor: TypeAlias = str | LidarSpec | Mapping[str, Any]
@@ -65,9 +64,7 @@ def sensor_specs(sensors: Sequence[Sensor], codec: str) -> list[SensorSpec]:
     Raises:
         ValueError: a field that is not allowed.
     """
-    if isinstance(sensors, str):
-        raise ValueError(f"sensors is the string {sensors!r}; give a list, as [{sensors!r}]")
-    return [_sensor_spec(sensor, codec) for sensor in sensors]
+    return [_sensor_spec(sensor, codec) for sensor in _several(sensors)]
 
 
 def reset_spec(sensors: Sequence[Sensor], codec: str, options: ResetOptions) -> ResetSpec:
@@ -97,10 +94,9 @@ def ranging_specs(
     return found
 
 
-def _several(sensors: Sequence[S]) -> Sequence[S]:
-    if isinstance(sensors, str):
-        raise ValueError(f"{sensors!r} is a string; give a list, as [{sensors!r}]")
-    return sensors
+def _several(sensors: Any) -> Sequence[Any]:
+    """Sensors as a sequence, also where one alone is given."""
+    return sensors if isinstance(sensors, Sequence) and not isinstance(sensors, str) else [sensors]
 
 
 def _ranging_spec(kind: type[R], name: str, sensor: object) -> R:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Frame, Result, Welcome
 from real2sim_proto.sessions import SessionInfo
 
+from ._guidance import Handle
 from ._protocol import PendingRequest, ProtocolState
 from ._retry import RETRYABLE_CODES, RETRYABLE_STATUS
 from ._shared_frames import SharedFrames
@@ -89,8 +90,24 @@ class SessionPlan:
     shared_memory: bool | None = None
 
 
-class SessionBase:
+class SessionBase(Handle):
     """State of a drive session, shared by the sync and the async variant."""
+
+    _instead: ClassVar = {
+        "action_space": "real2sim.make_env(scene='street'), which has spaces",
+        "apply_control": "session.step(real2sim.Control(acceleration=1.0, steering=0.0))",
+        "get_observation": "what session.reset() and session.step(plan) return",
+        "info": "session.welcome",
+        "metrics": "obs.metrics, of what session.step(plan) returns",
+        "objects": "session.welcome.objects, or obs.agents after session.reset(privileged=True)",
+        "obs": "what session.reset() and session.step(plan) return",
+        "observation_space": "real2sim.make_env(scene='street'), which has spaces",
+        "observe": "what session.reset() and session.step(plan) return",
+        "run": "real2sim.planners.run_episode(session, planner)",
+        "seed": "session.reset(seed=0)",
+        "start": "session.open(), or `with client.session(...) as session:`",
+        "tick": "session.step(plan)",
+    }
 
     def __init__(self, target: Target, plan: SessionPlan) -> None:
         self._target = target
@@ -226,7 +243,8 @@ def not_open() -> NotOpenError:
     """The error of a session that is used before it is opened, or after it was closed."""
     return NotOpenError(
         "the session is not open",
-        hint="use it as `with client.session(...) as session:`, or `async with` of the async one",
+        hint="write `with client.session(...) as session:`, or call open() first and close() last; "
+        "the async client has `async with`",
     )
 
 

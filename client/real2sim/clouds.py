@@ -9,11 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
+from ._guidance import Handle
 from .errors import MalformedReplyError
 from .images import matrix_from_wire, write_atomically
 
@@ -26,7 +27,7 @@ MAX_CLOUD_BYTES = 256 * 1024 * 1024
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PointCloud:
+class PointCloud(Handle):
     """Points of one sensor at one instant.
 
     Attributes:
@@ -48,6 +49,17 @@ class PointCloud:
         >>> cloud.points.shape == (cloud.count, 3), cloud.modality
         (True, 'lidar')
     """
+
+    _instead: ClassVar = {
+        "colors": "cloud['intensity']",
+        "data": "cloud.points, or cloud.columns",
+        "nbr_points": "len(cloud)",
+        "numpy": "cloud.points",
+        "pose": "cloud.T_world_sensor",
+        "shape": "cloud.points.shape",
+        "timestamp": "cloud.t_us",
+        "xyz": "cloud.points",
+    }
 
     sensor: str
     modality: str
@@ -82,6 +94,17 @@ class PointCloud:
     def instance(self) -> NDArray[np.uint16]:
         """[N] uint16 id of the object that was met; 0 is background."""
         return self._column("instance")
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """For NumPy: ``np.asarray(cloud)`` is :attr:`points`."""
+        return np.array(self.points, dtype=dtype, copy=copy)
+
+    def __getitem__(self, key: Any) -> NDArray[Any]:
+        """A column by its name, such as ``intensity``; else rows of :attr:`points`."""
+        return self._column(key) if isinstance(key, str) else self.points[key]
+
+    def __len__(self) -> int:
+        return self.count
 
     def in_world(self) -> NDArray[np.float64]:
         """Points [N, 3] float64 in the world, as of a compensated cloud [m].

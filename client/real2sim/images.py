@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import io
@@ -11,11 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ._guidance import Handle
 from ._preview import preview_jpeg
 from .errors import ImageDecodeError, MalformedReplyError
 
@@ -37,7 +39,7 @@ AS_SENT = {"jpeg": (".jpg", ".jpeg"), "png": (".png",), "raw": ()}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Image:
+class Image(Handle):
     """One image.
 
     Attributes:
@@ -50,7 +52,7 @@ class Image:
             of the colour, of 1, that training lets expect).
         dtype: of the pixels sent; ``uint16`` depth is in steps of ``DEPTH_PNG_UNIT``, ``uint16``
             uncertainty in steps of ``UNCERTAINTY_PNG_UNIT``.
-        shape: of the array; empty where only the image itself tells.
+        shape: of the array: [H, W, 3] or [H, W].
 
     Examples:
         >>> client = real2sim.connect()
@@ -58,6 +60,26 @@ class Image:
         >>> np.asarray(image).shape, image.modality
         ((64, 96, 3), 'rgb')
     """
+
+    _instead: ClassVar = {
+        "camera": "frame.sensor",
+        "extrinsics": "frame.T_world_sensor",
+        "height": "image.array.shape[0]",
+        "intrinsics": "frame.K",
+        "mean": "image.array.mean()",
+        "numpy": "image.array",
+        "pose": "frame.T_world_sensor",
+        "pixels": "image.array",
+        "rgb": "image.array",
+        "show": "image.save('front.jpg'); a notebook shows an image by itself",
+        "size": "image.array.shape",
+        "time": "frame.t_us",
+        "timestamp": "frame.t_us",
+        "to_numpy": "image.array",
+        "to_pil": "PIL.Image.fromarray(image.array)",
+        "tobytes": "image.array.tobytes(), or image.data as the worker sent it",
+        "width": "image.array.shape[1]",
+    }
 
     data: bytes = field(repr=False)
     codec: str
@@ -89,6 +111,13 @@ class Image:
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """For NumPy: ``np.asarray(image)`` is :attr:`array`."""
         return np.array(self.array, dtype=dtype, copy=copy)
+
+    def __getitem__(self, key: Any) -> Any:
+        """Pixels, as of :attr:`array`."""
+        return self.array[key]
+
+    def __len__(self) -> int:
+        return len(self.array)
 
     def _repr_jpeg_(self) -> bytes:
         """For notebooks: the image itself, depth and numbers in grey and colours."""
@@ -251,6 +280,20 @@ def matrix_from_wire(value: Any, shape: tuple[int, int], name: str) -> NDArray[n
     if matrix.shape != shape:
         raise MalformedReplyError(f"{name} of a frame has shape {matrix.shape}, not {shape}")
     return matrix
+
+
+def encoded_shape(data: bytes, codec: str) -> tuple[int, ...]:
+    """Shape of the array in a jpeg or png; empty where its head is broken."""
+    if codec == "png" and data[12:16] == b"IHDR" and len(data) > 25:
+        width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
+        return (height, width, 3) if data[25] == 2 else (height, width)
+    if codec == "jpeg":
+        import simplejpeg
+
+        with contextlib.suppress(ValueError):
+            height, width, *_ = simplejpeg.decode_jpeg_header(data)
+            return (height, width, 3)
+    return ()
 
 
 def _decode_raw(image: Image) -> NDArray[Any]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from real2sim_proto.base import Named
+
+from ._guidance import Handle
 from .clouds import LidarCloud, PointCloud, RadarCloud, clouds_by_sensor
 from .errors import MalformedReplyError
 from .images import Frame, frames_by_camera
@@ -25,7 +28,7 @@ Frames = Mapping[str, Mapping[str, Frame]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class View:
+class View(Handle):
     """Images of one committed instant.
 
     Attributes:
@@ -44,14 +47,32 @@ class View:
         (['left'], 0)
     """
 
+    _instead: ClassVar = {
+        "cameras": "obs.frames",
+        "depth": 'obs.image("front", "depth"), with modalities=["depth"] of the sensor',
+        "images": 'obs.frames, or obs.image("front")',
+        "instance": 'obs.image("front", "instance"), with modalities=["instance"] of the sensor',
+        "points": 'obs.lidar("vlp-16").points',
+        "rgb": 'obs.image("front")',
+        "semantic": 'obs.image("front", "semantic"), with modalities=["semantic"] of the sensor',
+        "sensors": "obs.frames and obs.clouds",
+        "t": "obs.t_us / 1e6 (seconds)",
+        "time": "obs.t_us (microseconds)",
+        "timestamp": "obs.t_us (microseconds)",
+    }
+
     t_us: int
     revision: int
     frames: Frames = field(repr=False)
     clouds: Mapping[str, PointCloud] = field(default_factory=dict, repr=False)
     timing: Mapping[str, float] = field(default_factory=dict, repr=False)
 
-    def image(self, camera: str, modality: str = "rgb") -> NDArray[Any]:
-        """The decoded image of a camera, e.g. rgb: uint8 [H, W, 3].
+    def image(self, camera: str | None = None, modality: str = "rgb") -> NDArray[Any]:
+        """The decoded image of a camera, e.g. rgb: uint8 [H, W, 3]; ``obs["front"]`` is its rgb.
+
+        Args:
+            camera: its name; default: the only one.
+            modality: as the sensor asked for it.
 
         Raises:
             KeyError: this instant has no such frame; the sentence names those it has.
@@ -60,8 +81,10 @@ class View:
             >>> view.image("left").shape
             (64, 96, 3)
         """
+        if camera is None and len(self.frames) == 1:
+            (camera,) = self.frames
         try:
-            return self.frames[camera][modality].array
+            return self.frames[str(camera)][modality].array
         except KeyError:
             there = ", ".join(f"{c}/{m}" for c, ms in self.frames.items() for m in ms) or "none"
             raise KeyError(
@@ -70,8 +93,22 @@ class View:
                 f"`needs = Needs(modalities=({modality!r},))` (from real2sim.planners)"
             ) from None
 
-    def lidar(self, name: str) -> LidarCloud:
-        """The sweep of a LiDAR.
+    def __getitem__(self, sensor: str) -> Any:
+        """The rgb image of a camera, or the points of a LiDAR or radar: [N, 3] in its frame."""
+        cloud = self.clouds.get(sensor)
+        return self.image(sensor) if cloud is None else cloud.points
+
+    def __contains__(self, sensor: object) -> bool:
+        return sensor in self.frames or sensor in self.clouds
+
+    def __iter__(self) -> Iterator[str]:
+        raise TypeError(
+            f"a step gives one {type(self).__name__}; real2sim.make_env(...) makes an environment "
+            "whose step gives Gymnasium's obs, reward, terminated, truncated, info"
+        )
+
+    def lidar(self, name: str | None = None) -> LidarCloud:
+        """The sweep of a LiDAR; default: of the only one.
 
         Raises:
             KeyError: this instant has none of that name; the sentence names those it has.
@@ -84,8 +121,8 @@ class View:
         """
         return self._cloud(name, LidarCloud)
 
-    def radar(self, name: str) -> RadarCloud:
-        """The scan of a radar. Raises KeyError as :meth:`lidar`.
+    def radar(self, name: str | None = None) -> RadarCloud:
+        """The scan of a radar. Name and KeyError as of :meth:`lidar`.
 
         Examples:
             >>> with real2sim.connect() as other, other.session(scene="street") as driven:
@@ -95,8 +132,11 @@ class View:
         """
         return self._cloud(name, RadarCloud)
 
-    def _cloud(self, name: str, kind: type[C]) -> C:
-        found = self.clouds.get(name)
+    def _cloud(self, name: str | None, kind: type[C]) -> C:
+        of_kind = [cloud for cloud in self.clouds.values() if isinstance(cloud, kind)]
+        if name is None and len(of_kind) == 1:
+            return of_kind[0]
+        found = self.clouds.get(str(name))
         if not isinstance(found, kind):
             there = ", ".join(f"{n} ({c.modality})" for n, c in self.clouds.items()) or "none"
             raise KeyError(f"no such cloud {name!r} at {self.t_us} us; there: {there}")
@@ -112,7 +152,8 @@ class Observation(View):
         ego: state of the controlled vehicle; ``position`` is the rear axle's centre on the ground.
         route: [R, 2] float64, x and y of the route ahead in the vehicle frame [m].
         command: ``straight``, ``left`` or ``right``.
-        agents: other road users in the world frame; filled when reset with ``privileged=True``.
+        agents: other road users in the world frame, by number or ``object_id``; filled when reset
+            with ``privileged=True``.
         lanes: pieces of the map's lanes near the vehicle, the nearest first; filled when reset with
             ``privileged=True`` on a scene with a map.
         signals: traffic signals of the storyboard.
@@ -135,11 +176,28 @@ class Observation(View):
         (0, 'straight', 3, 5.0)
     """
 
+    _instead: ClassVar = {
+        "actors": "obs.agents, which session.reset(privileged=True) fills",
+        "boxes": "obs.agents, which session.reset(privileged=True) fills",
+        "collision": "[e for e in obs.events if e.type == 'collision'], or obs.metrics",
+        "done": "obs.over",
+        "info": "obs.metrics and obs.events",
+        "map": "obs.lanes, which session.reset(privileged=True) fills",
+        "objects": "obs.agents, which session.reset(privileged=True) fills",
+        "position": "obs.ego.position",
+        "reward": "obs.metrics; real2sim.make_env(...) has rewards",
+        "scores": "obs.metrics",
+        "speed": "obs.ego.speed",
+        "state": "obs.ego",
+        "vehicles": "obs.agents, which session.reset(privileged=True) fills",
+        "waypoints": "obs.route",
+    }
+
     step: int
     ego: EgoState
     route: NDArray[np.float64] = field(repr=False)
     command: str
-    agents: Sequence[AgentState] = field(default=(), repr=False)
+    agents: Named[AgentState] = field(default_factory=Named, repr=False)
     lanes: Sequence[LaneShown] = field(default=(), repr=False)
     signals: Sequence[SignalShown] = ()
     events: Sequence[Event] = ()
@@ -187,7 +245,7 @@ def observation_from_wire(obs: Obs, pixels: Sequence[memoryview | None] = ()) ->
         command=obs.command,
         frames=frames_by_camera(obs.frames, pixels),
         clouds=clouds_by_sensor(obs.clouds),
-        agents=tuple(obs.agents),
+        agents=Named(obs.agents, filled_by="session.reset(privileged=True) fills agents;"),
         lanes=tuple(obs.lanes),
         signals=tuple(obs.signals),
         events=tuple(obs.events),

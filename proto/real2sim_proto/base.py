@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, get_args
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, SupportsIndex, TypeVar, get_args, overload
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+from .guidance import Guided, advice
 
 ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}$"
 
@@ -60,12 +64,49 @@ def one_of(values: Any) -> Any:
     return Field(json_schema_extra={"enum": list(get_args(values))})
 
 
-class Model(BaseModel):
+class Model(Guided, BaseModel):
     """Immutable, closed to unknown fields, finite numbers only."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, ser_json_inf_nan="constants"
     )
+
+
+N = TypeVar("N")
+
+
+class Named(list[N]):
+    """A list whose items are found by their ``object_id`` or ``name`` too: ``cameras["front"]``.
+
+    Attributes:
+        filled_by: what to do so that there are some; shown where one is asked for and none is.
+    """
+
+    def __init__(self, items: Iterable[N] = (), *, filled_by: str = "") -> None:
+        super().__init__(items)
+        self.filled_by = filled_by
+
+    @overload
+    def __getitem__(self, key: str | SupportsIndex) -> N: ...
+    @overload
+    def __getitem__(self, key: slice) -> list[N]: ...
+    def __getitem__(self, key: Any) -> Any:
+        if not isinstance(key, str):
+            return super().__getitem__(key)
+        found = {_name_of(item): item for item in self}
+        if key in found:
+            return found[key]
+        raise KeyError(f"no {key!r}; {'' if self else self.filled_by} {advice(key, found)}")
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        inner = handler.generate_schema(list[get_args(kind)[0]])  # type: ignore[misc]
+        return core_schema.no_info_after_validator_function(cls, inner)
+
+
+def _name_of(item: Any) -> str:
+    name: str = getattr(item, "object_id", None) or item.name
+    return name
 
 
 class Pose(Model):

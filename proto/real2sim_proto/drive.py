@@ -7,7 +7,7 @@ messages with ``id``; the answer carries the same ``id``. The clock moves only o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     ConfigDict,
@@ -17,7 +17,17 @@ from pydantic import (
     model_validator,
 )
 
-from .base import Codec, Identifier, Microseconds, Modality, Model, Quaternion, Vector3, one_of
+from .base import (
+    Codec,
+    Identifier,
+    Microseconds,
+    Modality,
+    Model,
+    Named,
+    Quaternion,
+    Vector3,
+    one_of,
+)
 from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .lanes import LaneKind
 from .operations import Operation
@@ -84,6 +94,18 @@ class ServerEnvelope(Envelope, ServerModel):
 class EgoState(ServerModel):
     """The controlled vehicle at one instant; frames as in `conventions`."""
 
+    _instead: ClassVar = {
+        "heading": "ego.yaw",
+        "orientation": "ego.quaternion",
+        "pose": "ego.position and ego.quaternion",
+        "rotation": "ego.quaternion",
+        "v": "ego.speed",
+        "velocity": "ego.speed (along the vehicle) and ego.lateral_speed",
+        "x": "ego.position[0]",
+        "y": "ego.position[1]",
+        "z": "ego.position[2]",
+    }
+
     position: Vector3
     quaternion: Quaternion
     yaw: float = Field(description="heading in the world [rad]")
@@ -98,6 +120,17 @@ class EgoState(ServerModel):
 
 class AgentState(ServerModel):
     """Another road user at one instant."""
+
+    _instead: ClassVar = {
+        "heading": "2 * math.atan2(agent.quaternion[3], agent.quaternion[0])",
+        "id": "agent.object_id",
+        "rotation": "agent.quaternion",
+        "speed": "math.hypot(*agent.velocity)",
+        "type": "agent.category",
+        "x": "agent.position[0]",
+        "y": "agent.position[1]",
+        "yaw": "2 * math.atan2(agent.quaternion[3], agent.quaternion[0])",
+    }
 
     object_id: str
     category: str
@@ -377,8 +410,8 @@ class Welcome(ServerEnvelope):
     role: Literal["controller", "observer", "agent"]
     versions: dict[str, str] = Field(description="server, scene_hash, metrics")
     limits: dict[str, int]
-    cameras: list[CameraInfo]
-    objects: list[ObjectInfo]
+    cameras: Named[CameraInfo]
+    objects: Named[ObjectInfo]
     route: Array | None = Field(
         default=None,
         description="[R, 4] float64 x, y, z [m], heading [rad] along the recorded drive, world, a "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Discriminator, Field, Tag, TypeAdapter, model_validator
 
@@ -44,6 +44,8 @@ class JobFile(Reply):
 
 class JobInfo(Reply):
     """A job as it is now; also the data of each of its events."""
+
+    _instead: ClassVar = {"done": "job.over", "id": "job.job_id", "status": "job.state"}
 
     job_id: str
     kind: str = one_of(JobKind)

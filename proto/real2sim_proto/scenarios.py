@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from .base import Identifier, Model, one_of
+from .base import Identifier, Model, Named, one_of
 from .operations import AddCollider, EraseRegion, Operation, stored_operations
 from .scenes import ObjectInfo, Reply
 from .storyboard import Storyboard
@@ -42,7 +42,7 @@ class ScenarioInfo(Reply):
     can_redo: bool
     start_us: int | None = Field(default=None, description="when it begins; single views only")
     end_us: int | None = Field(default=None, description="when it ends; single views only")
-    objects: list[ObjectInfo] = Field(default_factory=list)
+    objects: Named[ObjectInfo] = Field(default_factory=Named)
     erased: list[EraseRegion] = Field(default_factory=list, description="of the background")
     colliders: list[AddCollider] = Field(default_factory=list)
     storyboard: Storyboard | None = Field(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from .base import Track
+from .base import Named, Track
 from .cameras import OpticsSpec
+from .guidance import Guided
 from .operations import SetGait, SetPhysics, SetVelocity
 
 
-class Reply(BaseModel):
+class Reply(Guided, BaseModel):
     """Base of answers. Readers ignore unknown members, so that newer workers can add some."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -30,6 +31,14 @@ class SceneState(StrEnum):
 class CameraInfo(Reply):
     """A camera of the recording vehicle."""
 
+    _instead: ClassVar = {
+        "extrinsics": "camera.T_vehicle_camera",
+        "intrinsics": "camera.K",
+        "matrix": "camera.K",
+        "pose": "camera.T_vehicle_camera",
+        "resolution": "camera.width and camera.height",
+    }
+
     name: str
     width: int
     height: int
@@ -44,6 +53,14 @@ class CameraInfo(Reply):
 
 class ObjectInfo(Reply):
     """A movable object of a scene or a scenario."""
+
+    _instead: ClassVar = {
+        "corners": "client.scenarios.create(scene).objects[...].corners(t)",
+        "id": "object.object_id",
+        "name": "object.object_id",
+        "pose": "client.scenarios.create(scene).objects[...].pose(t)",
+        "position": "object.trajectory.positions[0]",
+    }
 
     object_id: str
     category: str
@@ -63,6 +80,19 @@ class ObjectInfo(Reply):
 class SceneInfo(Reply):
     """One available scene, resident or not."""
 
+    _instead: ClassVar = {
+        "duration": "(scene.end_us - scene.start_us) / 1e6 (seconds)",
+        "ego_pose": "scene.ego.positions and scene.ego.quaternions",
+        "edit": "client.scenarios.create(scene)",
+        "id": "scene.scene",
+        "lanes": "client.scenes.lanes(scene)",
+        "name": "scene.scene",
+        "render": "client.scenes.render(scene, camera='front')",
+        "sensors": "scene.cameras",
+        "session": "client.session(scene=scene)",
+        "timestamps": "scene.frame_times_us",
+    }
+
     scene: str = Field(description="name to use in paths")
     state: SceneState
     reason: str | None = Field(default=None, description="why it is broken")
@@ -72,8 +102,8 @@ class SceneInfo(Reply):
     start_us: int = 0
     end_us: int = 0
     frame_times_us: list[int] = Field(default_factory=list)
-    cameras: list[CameraInfo] = Field(default_factory=list)
-    objects: list[ObjectInfo] = Field(default_factory=list)
+    cameras: Named[CameraInfo] = Field(default_factory=Named)
+    objects: Named[ObjectInfo] = Field(default_factory=Named)
     extent_min: tuple[float, float, float] | None = Field(default=None, description="[m], world")
     extent_max: tuple[float, float, float] | None = None
     ego: Track | None = Field(default=None, description="T_world_vehicle of the recording")

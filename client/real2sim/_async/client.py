@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 from real2sim_proto import PROTOCOL_VERSION
 from real2sim_proto.drive_batch import MAX_WORLDS
 from real2sim_proto.scenes import Fleet, Readiness, ServerInfo
 
 from .. import _requests
+from .._guidance import Handle
 from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
 from .._session_state import SessionPlan
 from .._target import Target, resolve_target
@@ -32,19 +33,11 @@ if TYPE_CHECKING:
 POLL_SECONDS = 0.25
 
 
-def connect_async(
-    url: str | None = None,
-    *,
-    token: str | None = None,
-    name: str | None = None,
-    timeout: float = 30.0,
-    retries: int = 2,
-    shared_memory: bool | None = None,
-    transport: httpx2.AsyncBaseTransport | None = None,
-) -> AsyncClient:
-    """A client of the worker at ``url``. Nothing is sent yet.
+class AsyncClient(Handle):
+    """A worker's scenes, scenarios and sessions; :func:`connect_async` is the same.
 
-    An argument goes before the environment, and the environment before the default.
+    Nothing is sent yet. An argument goes before the environment, and the environment before the
+    default.
 
     Args:
         url: ``http://host:port`` or ``https://...``; default: ``$REAL2SIM_URL``, else
@@ -58,24 +51,6 @@ def connect_async(
         shared_memory: of sessions that do not say so themselves, see :meth:`AsyncClient.session`.
         transport: replaces the network, for tests of programs that use the SDK.
 
-    Raises:
-        ValueError: not such an address.
-
-    Examples:
-        >>> client = real2sim.connect_async(timeout=10.0, name="anna")
-        >>> [scene.scene for scene in await client.scenes.list()]
-        ['street']
-        >>> await client.close()
-    """
-    target = resolve_target(
-        url, token, timeout=timeout, name=name, retries=retries, shared_memory=shared_memory
-    )
-    return AsyncClient(AsyncTransport(target, transport=transport))
-
-
-class AsyncClient:
-    """A worker's scenes, scenarios and sessions; made by :func:`connect_async`.
-
     Attributes:
         scenes: :class:`AsyncScenes`.
         scenarios: :class:`AsyncScenarios`.
@@ -84,20 +59,59 @@ class AsyncClient:
         sessions: :class:`AsyncSessions`.
         sweeps: :class:`AsyncSweeps`.
 
+    Raises:
+        ValueError: not such an address.
+
     Examples:
-        >>> client = real2sim.connect_async()
+        >>> client = real2sim.connect_async(timeout=10.0, name="anna")
+        >>> [scene.scene for scene in await client.scenes.list()]
+        ['street']
 
         Used as ``async with real2sim.connect_async() as client:`` it closes by itself.
     """
 
-    def __init__(self, transport: AsyncTransport) -> None:
-        self._transport = transport
-        self.scenes = AsyncScenes(transport)
-        self.scenarios = AsyncScenarios(transport)
-        self.assets = AsyncAssets(transport)
-        self.jobs = AsyncJobs(transport)
-        self.sessions = AsyncSessions(transport)
-        self.sweeps = AsyncSweeps(transport)
+    _instead: ClassVar = {
+        "cameras": "client.scenes.get('street').cameras",
+        "create_session": "client.session(scene='street')",
+        "drive": "client.session(scene='street')",
+        "get_scenes": "client.scenes.list()",
+        "get_server_version": "client.server().version",
+        "get_world": "client.session(scene='street')",
+        "list_scenes": "client.scenes.list()",
+        "load": "client.scenes.load('street')",
+        "load_scene": "client.scenes.load('street')",
+        "load_world": "client.scenes.load('street')",
+        "ping": "client.readiness()",
+        "render": "client.scenes.render('street', camera='front')",
+        "reset": "client.session(scene='street').open().reset()",
+        "scenario": "client.scenarios.create(scene='street')",
+        "scene": "client.scenes.get('street')",
+        "status": "client.readiness()",
+        "step": "client.session(scene='street'), which has reset() and step(plan)",
+        "version": "client.server().version",
+    }
+
+    def __init__(
+        self,
+        url: str | None = None,
+        *,
+        token: str | None = None,
+        name: str | None = None,
+        timeout: float = 30.0,
+        retries: int = 2,
+        shared_memory: bool | None = None,
+        transport: httpx2.AsyncBaseTransport | None = None,
+    ) -> None:
+        target = resolve_target(
+            url, token, timeout=timeout, name=name, retries=retries, shared_memory=shared_memory
+        )
+        self._transport = link = AsyncTransport(target, transport=transport)
+        self.scenes = AsyncScenes(link)
+        self.scenarios = AsyncScenarios(link)
+        self.assets = AsyncAssets(link)
+        self.jobs = AsyncJobs(link)
+        self.sessions = AsyncSessions(link)
+        self.sweeps = AsyncSweeps(link)
 
     async def server(self) -> ServerInfo:
         """Versions, device, limits, conventions.
@@ -149,8 +163,8 @@ class AsyncClient:
 
     def session(
         self,
-        *,
         scene: SceneRef | None = None,
+        *,
         scenario: ScenarioRef | None = None,
         codec: str = "auto",
         reconnect: float = 60.0,
@@ -286,6 +300,9 @@ class AsyncClient:
             return _obstacle_in(await self.readiness())
         except (UnreachableError, ReplyTimeoutError, CapacityError) as error:
             return str(error)
+
+
+connect_async = AsyncClient
 
 
 def _same_protocol(info: ServerInfo) -> ServerInfo:

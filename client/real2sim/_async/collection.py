@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Sequence
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from .concurrency import Lookup
 from .transport import AsyncTransport
 
 T = TypeVar("T")
 
 
-class AsyncCollection(Generic[T]):
+class AsyncCollection(Lookup, Generic[T]):
     """Lists what the worker has; iterating over it asks the worker once.
 
     Examples:

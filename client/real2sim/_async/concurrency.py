@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from websockets.asyncio.client import ClientConnection as AsyncSocket
 from websockets.asyncio.client import connect as connect_socket
 
+from .._guidance import Handle
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
-__all__ = ["AsyncSocket", "connect_socket", "receive", "run_blocking", "sleep"]
+__all__ = ["AsyncSocket", "Lookup", "connect_socket", "receive", "run_blocking", "sleep"]
+
+
+class Lookup(Handle):
+    """What the sync client's collections have and an async one cannot have."""
+
+    def __getitem__(self, key: Any) -> Any:
+        raise TypeError(f"{key!r} is fetched from the worker; write await ....get({key!r})")
 
 
 async def sleep(seconds: float) -> None:

@@ -8,7 +8,7 @@ missed; ``refresh()`` and decide again.
 from __future__ import annotations
 
 import os
-from collections.abc import Awaitable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from real2sim_proto.scenarios import (
 from real2sim_proto.scenes import ObjectInfo
 
 from .. import _requests
-from .._call import ViewRequest, checked
+from .._call import Call, ViewRequest, checked, instant_us
 from .._object_edits import (
     UPRIGHT,
     ObjectEdits,
@@ -52,7 +52,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         >>> scenario = await client.scenarios.create(scene="street", name="an example")
     """
 
-    async def create(self, *, scene: SceneRef, name: str = "") -> AsyncScenario:
+    async def create(self, scene: SceneRef, name: str = "") -> AsyncScenario:
         """A new scenario without edits on a scene.
 
         Raises:
@@ -439,13 +439,18 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return await self._transport.send(_requests.export_scenario(self.scenario_id))
 
     async def points(
-        self, path: str | os.PathLike[str], *, t_us: int | None = None, part: str = "all"
+        self,
+        path: str | os.PathLike[str],
+        *,
+        t: float | None = None,
+        t_us: int | None = None,
+        part: str = "all",
     ) -> Path:
         """Write a point cloud with colour, normal, class and instance: the centres of Gaussians.
 
         Args:
             path: of the ply file.
-            t_us: instant; default: the start.
+            t, t_us: instant in seconds or in microseconds; default: the start.
             part: ``all``, ``background`` or ``objects``.
 
         Examples:
@@ -453,18 +458,21 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             >>> path.read_bytes()[:3]
             b'ply'
         """
-        call = _requests.scenario_points(self.scenario_id, t_us, part)
+        call = _requests.scenario_points(self.scenario_id, instant_us(t, t_us), part)
         content = await self._transport.send(call)
         await run_blocking(write_atomically, Path(path), content)
         return Path(path)
 
-    async def splats(self, object_id: str, *, t_us: int | None = None) -> bytes:
+    async def splats(
+        self, object_id: str, *, t: float | None = None, t_us: int | None = None
+    ) -> bytes:
         """The Gaussians of an object as it is now, as an spz file (version 3, axes kept: z up) in
         the frame of its box, those that cover most first.
 
         Args:
             object_id: of the scenario.
-            t_us: how far a person is in walking; default: the start.
+            t, t_us: how far a person is in walking, in seconds or in microseconds; default: the
+                start.
 
         Raises:
             NotFoundError: no such object.
@@ -474,11 +482,11 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             >>> gzip.decompress(await scenario.splats("post"))[:4]
             b'NGSP'
         """
-        call = _requests.object_splats(self.scenario_id, object_id, t_us)
+        call = _requests.object_splats(self.scenario_id, object_id, instant_us(t, t_us))
         return await self._transport.send(call)
 
-    async def undo(self) -> OperationResult:
-        """Take the newest edit back.
+    async def undo(self, count: int = 1) -> OperationResult:
+        """Take the newest edit back, or the newest ``count``, one after the other.
 
         Raises:
             ConflictError: there is nothing to take back.
@@ -489,11 +497,10 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             >>> "post" in scenario.objects, scenario.info.can_redo
             (True, True)
         """
-        result = await self._transport.send(_requests.undo(self.scenario_id, self._etag))
-        return await self._applied(result)
+        return await self._repeated(_requests.undo, count)
 
-    async def redo(self) -> OperationResult:
-        """Make the edit again that was taken back last.
+    async def redo(self, count: int = 1) -> OperationResult:
+        """Make the edit again that was taken back last, or the last ``count``.
 
         Raises:
             ConflictError: nothing was taken back.
@@ -505,8 +512,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             >>> "post" in scenario.objects
             False
         """
-        result = await self._transport.send(_requests.redo(self.scenario_id, self._etag))
-        return await self._applied(result)
+        return await self._repeated(_requests.redo, count)
 
     async def history(self, *, after: int | None = None) -> History:
         """Edits, undos and redos after a revision, oldest first; default: all.
@@ -533,8 +539,9 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
 
     async def preview(
         self,
-        *,
         camera: str,
+        *,
+        t: float | None = None,
         t_us: int | None = None,
         width: int | None = None,
         modality: str = "rgb",
@@ -548,16 +555,18 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             'after.jpg'
         """
         codec = self._transport.target.image_codec(codec, modality)
-        view = ViewRequest(camera, t_us, width, modality, codec)
+        view = ViewRequest(camera, instant_us(t, t_us), width, modality, codec)
         return await self._transport.send(_requests.preview(self.scenario_id, view))
 
-    async def sweep(self, *, lidar: str, t_us: int | None = None) -> LidarCloud:
-        """What a LiDAR on the recording vehicle would measure now; its last ray is fired at
-        ``t_us``.
+    async def sweep(
+        self, lidar: str, *, t: float | None = None, t_us: int | None = None
+    ) -> LidarCloud:
+        """What a LiDAR on the recording vehicle would measure now.
 
         Args:
             lidar: name in the worker's catalogue.
-            t_us: default: start of the scenario.
+            t, t_us: when its last ray is fired, in seconds or in microseconds; default: start of
+                the scenario.
 
         Raises:
             InvalidRequestError: no such LiDAR, or a time outside the recording.
@@ -567,10 +576,21 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             >>> cloud.modality, cloud.t_us
             ('lidar', 0)
         """
-        return await self._transport.send(_requests.sweep(self.scenario_id, lidar, t_us))
+        call = _requests.sweep(self.scenario_id, lidar, instant_us(t, t_us))
+        return await self._transport.send(call)
 
     def _edit(self, operation: Operation) -> Awaitable[OperationResult]:
         return self.apply([operation])
+
+    async def _repeated(
+        self, request: Callable[[str, str], Call[OperationResult]], count: int
+    ) -> OperationResult:
+        if count < 1:
+            raise ValueError(f"count is {count!r}; give how many edits, 1 or more")
+        for _ in range(count):
+            call = request(self.scenario_id, self._etag)
+            result = await self._applied(await self._transport.send(call))
+        return result
 
     async def _applied(self, result: OperationResult) -> OperationResult:
         self._record(result)
@@ -589,8 +609,8 @@ class AsyncSceneObject(ObjectEdits[Awaitable[OperationResult]]):
     """
 
     def __init__(self, scenario: AsyncScenario, info: ObjectInfo) -> None:
-        super().__init__(info)
-        self._scenario = scenario
+        super().__init__(scenario, info)
+        self._scenario: AsyncScenario = scenario
 
     async def duplicate(
         self,

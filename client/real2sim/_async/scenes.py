@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from real2sim_proto.base import Pose
 from real2sim_proto.lanes import SceneLanes
@@ -14,7 +14,7 @@ from real2sim_proto.scenes import SceneInfo, SceneState
 from real2sim_proto.views import FreeCamera, SceneView
 
 from .. import _requests
-from .._call import ViewRequest, checked
+from .._call import ViewRequest, checked, instant_us
 from .._references import SceneRef, scene_name
 from ..errors import Real2SimError, ReplyTimeoutError
 from ..images import Image
@@ -31,6 +31,13 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
     Examples:
         >>> client = real2sim.connect_async()
     """
+
+    _instead: ClassVar = {
+        "create": "`real2sim reconstruct LOG --out scenes/street`, or client.scenes.upload(path)",
+        "keys": "[s.scene for s in client.scenes]",
+        "names": "[s.scene for s in client.scenes]",
+        "preview": "client.scenes.render('street', camera='front')",
+    }
 
     async def list(self) -> Sequence[SceneInfo]:
         """Every available scene, in memory or not.
@@ -165,8 +172,9 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
     async def render(
         self,
         scene: SceneRef,
-        *,
         camera: str,
+        *,
+        t: float | None = None,
         t_us: int | None = None,
         width: int | None = None,
         modality: str = "rgb",
@@ -177,7 +185,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         Args:
             scene: a scene or its name.
             camera: name of one of its cameras.
-            t_us: instant; default: the start of the recording.
+            t, t_us: instant in seconds or in microseconds; default: the start of the recording.
             width: pixels; default: as recorded.
             modality: ``rgb``, ``depth``, ``instance``, ``median_depth``, ``semantic`` or
                 ``uncertainty``.
@@ -193,7 +201,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
             ((64, 96, 3), dtype('uint8'))
         """
         codec = self._transport.target.image_codec(codec, modality)
-        view = ViewRequest(camera, t_us, width, modality, codec)
+        view = ViewRequest(camera, instant_us(t, t_us), width, modality, codec)
         return await self._transport.send(_requests.render_scene(scene_name(scene), view))
 
     async def view(
@@ -201,6 +209,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         scene: SceneRef,
         cameras: Sequence[FreeCamera | Mapping[str, Any]],
         *,
+        t: float | None = None,
         t_us: int | None = None,
         objects: Mapping[str, Pose | Mapping[str, Any]] | None = None,
         others: Literal["recorded", "parked", "none"] = "recorded",
@@ -210,7 +219,8 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         Args:
             scene: a scene or its name.
             cameras: models of ``real2sim_proto.views.FreeCamera``, or their fields.
-            t_us: instant for the objects that are not posed; default: the start of the recording.
+            t, t_us: instant for the objects that are not posed, in seconds or in microseconds;
+                default: the start of the recording.
             objects: poses of box centres in the world by object id.
             others: objects that are not posed: ``recorded`` as at ``t_us``, only those that are
                 ``parked``, or ``none``.
@@ -231,7 +241,8 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
             (64, 96, 3)
         """
         posed = [{"object_id": name, "pose": pose} for name, pose in (objects or {}).items()]
-        body = checked(SceneView, cameras=list(cameras), t_us=t_us, objects=posed, others=others)
+        when = instant_us(t, t_us)
+        body = checked(SceneView, cameras=list(cameras), t_us=when, objects=posed, others=others)
         return await self._transport.send(_requests.view_scene(scene_name(scene), body))
 
 

@@ -153,13 +153,7 @@ def drive(
                 driver,
                 steps=steps,
                 on_observation=on_observation,
-                **{
-                    "sensors": sensors,
-                    "action": needs.action,
-                    # A planner that does not say what it needs is shown everything.
-                    "privileged": needs.privileged or not hasattr(driver, "needs"),
-                }
-                | options,
+                **{"sensors": sensors} | options,
             )
     _report(summary, out=out, json_file=json_file)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import time
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 from real2sim_proto import PROTOCOL_VERSION
 from real2sim_proto.drive_batch import MAX_WORLDS
 from real2sim_proto.scenes import Fleet, Readiness, ServerInfo
 
 from .. import _requests
+from .._guidance import Handle
 from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
 from .._session_state import SessionPlan
 from .._target import Target, resolve_target
@@ -33,19 +34,11 @@ if TYPE_CHECKING:
 POLL_SECONDS = 0.25
 
 
-def connect(
-    url: str | None = None,
-    *,
-    token: str | None = None,
-    name: str | None = None,
-    timeout: float = 30.0,
-    retries: int = 2,
-    shared_memory: bool | None = None,
-    transport: httpx2.BaseTransport | None = None,
-) -> Client:
-    """A client of the worker at ``url``. Nothing is sent yet.
+class Client(Handle):
+    """A worker's scenes, scenarios and sessions; :func:`connect` is the same.
 
-    An argument goes before the environment, and the environment before the default.
+    Nothing is sent yet. An argument goes before the environment, and the environment before the
+    default.
 
     Args:
         url: ``http://host:port`` or ``https://...``; default: ``$REAL2SIM_URL``, else
@@ -59,24 +52,6 @@ def connect(
         shared_memory: of sessions that do not say so themselves, see :meth:`Client.session`.
         transport: replaces the network, for tests of programs that use the SDK.
 
-    Raises:
-        ValueError: not such an address.
-
-    Examples:
-        >>> client = real2sim.connect(timeout=10.0, name="anna")
-        >>> [scene.scene for scene in client.scenes.list()]
-        ['street']
-        >>> client.close()
-    """
-    target = resolve_target(
-        url, token, timeout=timeout, name=name, retries=retries, shared_memory=shared_memory
-    )
-    return Client(Transport(target, transport=transport))
-
-
-class Client:
-    """A worker's scenes, scenarios and sessions; made by :func:`connect`.
-
     Attributes:
         scenes: :class:`Scenes`.
         scenarios: :class:`Scenarios`.
@@ -85,20 +60,59 @@ class Client:
         sessions: :class:`Sessions`.
         sweeps: :class:`Sweeps`.
 
+    Raises:
+        ValueError: not such an address.
+
     Examples:
-        >>> client = real2sim.connect()
+        >>> client = real2sim.connect(timeout=10.0, name="anna")
+        >>> [scene.scene for scene in client.scenes.list()]
+        ['street']
 
         Used as ``with real2sim.connect() as client:`` it closes by itself.
     """
 
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
-        self.scenes = Scenes(transport)
-        self.scenarios = Scenarios(transport)
-        self.assets = Assets(transport)
-        self.jobs = Jobs(transport)
-        self.sessions = Sessions(transport)
-        self.sweeps = Sweeps(transport)
+    _instead: ClassVar = {
+        "cameras": "client.scenes.get('street').cameras",
+        "create_session": "client.session(scene='street')",
+        "drive": "client.session(scene='street')",
+        "get_scenes": "client.scenes.list()",
+        "get_server_version": "client.server().version",
+        "get_world": "client.session(scene='street')",
+        "list_scenes": "client.scenes.list()",
+        "load": "client.scenes.load('street')",
+        "load_scene": "client.scenes.load('street')",
+        "load_world": "client.scenes.load('street')",
+        "ping": "client.readiness()",
+        "render": "client.scenes.render('street', camera='front')",
+        "reset": "client.session(scene='street').open().reset()",
+        "scenario": "client.scenarios.create(scene='street')",
+        "scene": "client.scenes.get('street')",
+        "status": "client.readiness()",
+        "step": "client.session(scene='street'), which has reset() and step(plan)",
+        "version": "client.server().version",
+    }
+
+    def __init__(
+        self,
+        url: str | None = None,
+        *,
+        token: str | None = None,
+        name: str | None = None,
+        timeout: float = 30.0,
+        retries: int = 2,
+        shared_memory: bool | None = None,
+        transport: httpx2.BaseTransport | None = None,
+    ) -> None:
+        target = resolve_target(
+            url, token, timeout=timeout, name=name, retries=retries, shared_memory=shared_memory
+        )
+        self._transport = link = Transport(target, transport=transport)
+        self.scenes = Scenes(link)
+        self.scenarios = Scenarios(link)
+        self.assets = Assets(link)
+        self.jobs = Jobs(link)
+        self.sessions = Sessions(link)
+        self.sweeps = Sweeps(link)
 
     def server(self) -> ServerInfo:
         """Versions, device, limits, conventions.
@@ -150,8 +164,8 @@ class Client:
 
     def session(
         self,
-        *,
         scene: SceneRef | None = None,
+        *,
         scenario: ScenarioRef | None = None,
         codec: str = "auto",
         reconnect: float = 60.0,
@@ -287,6 +301,9 @@ class Client:
             return _obstacle_in(self.readiness())
         except (UnreachableError, ReplyTimeoutError, CapacityError) as error:
             return str(error)
+
+
+connect = Client
 
 
 def _same_protocol(info: ServerInfo) -> ServerInfo:

@@ -6,12 +6,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from .concurrency import Lookup
 from .transport import Transport
 
 T = TypeVar("T")
 
 
-class Collection(Generic[T]):
+class Collection(Lookup, Generic[T]):
     """Lists what the worker has; iterating over it asks the worker once.
 
     Examples:

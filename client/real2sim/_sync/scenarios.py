@@ -9,7 +9,7 @@ missed; ``refresh()`` and decide again.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from real2sim_proto.scenarios import (
 from real2sim_proto.scenes import ObjectInfo
 
 from .. import _requests
-from .._call import ViewRequest, checked
+from .._call import Call, ViewRequest, checked, instant_us
 from .._object_edits import (
     UPRIGHT,
     ObjectEdits,
@@ -53,7 +53,7 @@ class Scenarios(Collection[ScenarioInfo]):
         >>> scenario = client.scenarios.create(scene="street", name="an example")
     """
 
-    def create(self, *, scene: SceneRef, name: str = "") -> Scenario:
+    def create(self, scene: SceneRef, name: str = "") -> Scenario:
         """A new scenario without edits on a scene.
 
         Raises:
@@ -438,13 +438,18 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
         return self._transport.send(_requests.export_scenario(self.scenario_id))
 
     def points(
-        self, path: str | os.PathLike[str], *, t_us: int | None = None, part: str = "all"
+        self,
+        path: str | os.PathLike[str],
+        *,
+        t: float | None = None,
+        t_us: int | None = None,
+        part: str = "all",
     ) -> Path:
         """Write a point cloud with colour, normal, class and instance: the centres of Gaussians.
 
         Args:
             path: of the ply file.
-            t_us: instant; default: the start.
+            t, t_us: instant in seconds or in microseconds; default: the start.
             part: ``all``, ``background`` or ``objects``.
 
         Examples:
@@ -452,18 +457,19 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             >>> path.read_bytes()[:3]
             b'ply'
         """
-        call = _requests.scenario_points(self.scenario_id, t_us, part)
+        call = _requests.scenario_points(self.scenario_id, instant_us(t, t_us), part)
         content = self._transport.send(call)
         run_blocking(write_atomically, Path(path), content)
         return Path(path)
 
-    def splats(self, object_id: str, *, t_us: int | None = None) -> bytes:
+    def splats(self, object_id: str, *, t: float | None = None, t_us: int | None = None) -> bytes:
         """The Gaussians of an object as it is now, as an spz file (version 3, axes kept: z up) in
         the frame of its box, those that cover most first.
 
         Args:
             object_id: of the scenario.
-            t_us: how far a person is in walking; default: the start.
+            t, t_us: how far a person is in walking, in seconds or in microseconds; default: the
+                start.
 
         Raises:
             NotFoundError: no such object.
@@ -473,11 +479,11 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             >>> gzip.decompress(scenario.splats("post"))[:4]
             b'NGSP'
         """
-        call = _requests.object_splats(self.scenario_id, object_id, t_us)
+        call = _requests.object_splats(self.scenario_id, object_id, instant_us(t, t_us))
         return self._transport.send(call)
 
-    def undo(self) -> OperationResult:
-        """Take the newest edit back.
+    def undo(self, count: int = 1) -> OperationResult:
+        """Take the newest edit back, or the newest ``count``, one after the other.
 
         Raises:
             ConflictError: there is nothing to take back.
@@ -488,11 +494,10 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             >>> "post" in scenario.objects, scenario.info.can_redo
             (True, True)
         """
-        result = self._transport.send(_requests.undo(self.scenario_id, self._etag))
-        return self._applied(result)
+        return self._repeated(_requests.undo, count)
 
-    def redo(self) -> OperationResult:
-        """Make the edit again that was taken back last.
+    def redo(self, count: int = 1) -> OperationResult:
+        """Make the edit again that was taken back last, or the last ``count``.
 
         Raises:
             ConflictError: nothing was taken back.
@@ -504,8 +509,7 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             >>> "post" in scenario.objects
             False
         """
-        result = self._transport.send(_requests.redo(self.scenario_id, self._etag))
-        return self._applied(result)
+        return self._repeated(_requests.redo, count)
 
     def history(self, *, after: int | None = None) -> History:
         """Edits, undos and redos after a revision, oldest first; default: all.
@@ -532,8 +536,9 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
 
     def preview(
         self,
-        *,
         camera: str,
+        *,
+        t: float | None = None,
         t_us: int | None = None,
         width: int | None = None,
         modality: str = "rgb",
@@ -547,16 +552,16 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             'after.jpg'
         """
         codec = self._transport.target.image_codec(codec, modality)
-        view = ViewRequest(camera, t_us, width, modality, codec)
+        view = ViewRequest(camera, instant_us(t, t_us), width, modality, codec)
         return self._transport.send(_requests.preview(self.scenario_id, view))
 
-    def sweep(self, *, lidar: str, t_us: int | None = None) -> LidarCloud:
-        """What a LiDAR on the recording vehicle would measure now; its last ray is fired at
-        ``t_us``.
+    def sweep(self, lidar: str, *, t: float | None = None, t_us: int | None = None) -> LidarCloud:
+        """What a LiDAR on the recording vehicle would measure now.
 
         Args:
             lidar: name in the worker's catalogue.
-            t_us: default: start of the scenario.
+            t, t_us: when its last ray is fired, in seconds or in microseconds; default: start of
+                the scenario.
 
         Raises:
             InvalidRequestError: no such LiDAR, or a time outside the recording.
@@ -566,10 +571,21 @@ class Scenario(ScenarioState, ScenarioEdits[OperationResult]):
             >>> cloud.modality, cloud.t_us
             ('lidar', 0)
         """
-        return self._transport.send(_requests.sweep(self.scenario_id, lidar, t_us))
+        call = _requests.sweep(self.scenario_id, lidar, instant_us(t, t_us))
+        return self._transport.send(call)
 
     def _edit(self, operation: Operation) -> OperationResult:
         return self.apply([operation])
+
+    def _repeated(
+        self, request: Callable[[str, str], Call[OperationResult]], count: int
+    ) -> OperationResult:
+        if count < 1:
+            raise ValueError(f"count is {count!r}; give how many edits, 1 or more")
+        for _ in range(count):
+            call = request(self.scenario_id, self._etag)
+            result = self._applied(self._transport.send(call))
+        return result
 
     def _applied(self, result: OperationResult) -> OperationResult:
         self._record(result)
@@ -588,8 +604,8 @@ class SceneObject(ObjectEdits[OperationResult]):
     """
 
     def __init__(self, scenario: Scenario, info: ObjectInfo) -> None:
-        super().__init__(info)
-        self._scenario = scenario
+        super().__init__(scenario, info)
+        self._scenario: Scenario = scenario
 
     def duplicate(
         self,

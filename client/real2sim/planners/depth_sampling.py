@@ -86,8 +86,8 @@ class DepthSampling:
 
     def __init__(
         self,
-        *,
         speed: float = 8.0,
+        *,
         horizon: float = 3.0,
         lattice: Lattice | None = None,
         comfort: Comfort | None = None,

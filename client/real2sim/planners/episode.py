@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
+from .planner import Planner, load_planner, needs_of
+
 if TYPE_CHECKING:
     from real2sim_proto.drive import Event
 
     from .._sensors import ResetOptions, Sensor
     from .._sync.drive_session import DriveSession
     from ..observation import Observation
-    from .planner import Planner
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,10 @@ class EpisodeSummary:
 
 def run_episode(
     session: DriveSession,
-    planner: Planner,
-    *,
+    planner: Planner | str,
     steps: int | None = None,
-    sensors: Sequence[Sensor] = (),
+    *,
+    sensors: Sequence[Sensor] | None = None,
     on_observation: Callable[[Observation], None] | None = None,
     **options: Unpack[ResetOptions],
 ) -> EpisodeSummary:
@@ -97,24 +98,38 @@ def run_episode(
 
     Args:
         session: open.
-        planner: who drives.
+        planner: who drives, or its name as of :func:`load_planner`.
         steps: stop after so many; default: when the episode is over.
-        sensors: what every observation shows.
+        sensors: what every observation shows; default: what the planner needs.
         on_observation: called with every observation, the first included; its time is not counted.
-        options: of reset.
+        options: of reset; ``action`` and ``privileged`` are those of the planner's ``needs``, and a
+            planner that has none is shown everything.
+
+    Raises:
+        TypeError: a class, or something else that does not plan.
 
     Examples:
         >>> planner = real2sim.planners.FollowRoute(speed=5.0)
         >>> with real2sim.connect() as client, client.session(scene="street") as session:
-        ...     summary = run_episode(session, planner, steps=5, privileged=True)
+        ...     summary = run_episode(session, planner, steps=5)
         >>> summary.steps, round(summary.distance, 1)
         (5, 2.5)
         >>> sorted(summary.stages)[:3]
         ['loop', 'plan', 'step']
     """
+    if isinstance(planner, str):
+        planner = load_planner(planner)
+    if isinstance(planner, type) or not isinstance(planner, Planner):
+        made = f"{planner.__name__}()" if isinstance(planner, type) else "an object"
+        raise TypeError(f"planner is {planner!r}; give {made} with reset(obs) and plan(obs)")
     begin = getattr(planner, "begin", None)
     if begin is not None:
         begin(session.welcome)
+    needs = needs_of(planner)
+    options.setdefault("action", needs.action)
+    options.setdefault("privileged", needs.privileged or not hasattr(planner, "needs"))
+    if sensors is None:
+        sensors = needs.sensors(session.welcome.cameras) if needs.modalities else ()
     obs = session.reset(sensors=sensors, **options)
     planner.reset(obs)
     log = _EpisodeLog(obs)

@@ -67,8 +67,8 @@ class FollowRoute:
 
     def __init__(
         self,
-        *,
         speed: float = 8.0,
+        *,
         horizon: float = 3.0,
         spacing: float = 0.25,
         comfort: Comfort | None = None,

@@ -83,8 +83,8 @@ class Idm:
 
     def __init__(
         self,
-        *,
         speed: float = 8.0,
+        *,
         horizon: float = 3.0,
         spacing: float = 0.25,
         follower: Follower | None = None,

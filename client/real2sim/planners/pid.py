@@ -66,8 +66,8 @@ class PidFollowRoute:
 
     def __init__(
         self,
-        *,
         speed: float = 8.0,
+        *,
         longitudinal: Gains = Gains(1.2, 0.1, 0.0),
         lateral: Gains = Gains(1.0, 0.05, 0.1),
         preview: float = 0.8,
