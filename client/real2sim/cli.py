@@ -9,13 +9,26 @@ from __future__ import annotations
 import os
 import sys
 from importlib.metadata import entry_points
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from ._commands import adapter, drive, edit, ros2, scenario, scenes, status
 
 COMMAND_GROUP = "real2sim.commands"
 DEBUG_VARIABLE = "REAL2SIM_DEBUG"
+
+PANELS = {
+    "Try": "demo synth doctor",
+    "Logs and scenes": "log-info track reconstruct evaluate render scenes frame import export map "
+    "ground fit-lidar fit-uncertainty",
+    "Edit and physics": "edit scenario simulate film calibrate validate",
+    "Drive": "drive run replay evaluate-policy sweep search adapter ros2",
+    "Data": "export-dataset train-policy",
+    "Operate": "serve status token store backup restore bench",
+}
+"""Commands by panel of the help, in its order; those of other packages follow."""
 
 
 def main() -> None:
@@ -33,6 +46,7 @@ def build_app() -> typer.Typer:
     """The command with everything that is installed."""
     app = typer.Typer(
         name="real2sim",
+        cls=_Panels,
         help="Drive a policy through a reconstructed street, over the network.",
         no_args_is_help=True,
         add_completion=False,
@@ -43,6 +57,10 @@ def build_app() -> typer.Typer:
     app.callback(invoke_without_command=True)(_options)
     for module in (status, scenes, scenario, edit, drive, ros2, adapter):
         app.add_typer(module.app)
+    own = ", ".join(f"`{name}`" for name in typer.main.get_group(app).commands)
+    app.info.epilog = (
+        f"With the SDK alone you have {own}. The others come with `pip install 'real2sim[server]'`."
+    )
     for entry in sorted(entry_points(group=COMMAND_GROUP), key=lambda e: e.name):
         try:
             app.add_typer(entry.load())
@@ -50,6 +68,22 @@ def build_app() -> typer.Typer:
             # A broken extension must not take the client's own commands away.
             typer.echo(f"warning: the commands of {entry.value!r} are missing: {error}", err=True)
     return app
+
+
+class _Panels(TyperGroup):
+    """Lists its commands panel by panel."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        known = " ".join(PANELS.values()).split()
+        there = super().list_commands(ctx)
+        return sorted(there, key=lambda name: known.index(name) if name in known else len(known))
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        found: Any = super().get_command(ctx, cmd_name)
+        for panel, names in PANELS.items():
+            if found is not None and cmd_name in names.split():
+                found.rich_help_panel = panel
+        return found
 
 
 def print_error(error: Exception) -> None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ..policies.suite import Case, EpisodeGrid
 
 RECORDINGS, PAGE, FIGURES = "recordings", "report.html", "report.json"
+DEFAULT_SEEDS = 3
 
 
 @command("evaluate-policy")
@@ -48,14 +49,14 @@ def evaluate_policy(
         ),
     ] = None,
     seeds: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=1,
             max=1000,
             help="How many, from 0 on, of each case in which something is random: jitter, or "
-            "randomization or agents.spawn of its reset. Others are driven once.",
+            "randomization or agents.spawn of its reset; default 3. Others are driven once.",
         ),
-    ] = 3,
+    ] = None,
     reset: Annotated[
         str | None,
         typer.Option(
@@ -88,7 +89,7 @@ def evaluate_policy(
 
     own_worker = url is None and scenes_dir is None
     cases = _cases(scenes or (), scenarios or (), suite, demo=own_worker, reset=reset)
-    grid = EpisodeGrid(cases, policies, range(seeds))
+    grid = EpisodeGrid(cases, policies, range(seeds or DEFAULT_SEEDS))
     with contextlib.ExitStack() as stack:
         if url is None:
             url, token = stack.enter_context(_own_worker(scenes_dir, out)), None
@@ -109,7 +110,8 @@ def evaluate_policy(
     with atomic_file(out / PAGE) as file:
         file.write(render_page(results, title="Planners compared").encode())
     _print_scores(results)
-    _print_what_ran_once(grid)
+    if seeds is not None:
+        _print_what_ran_once(grid)
     console.print(f"in {out}: {PAGE}, {FIGURES}, {RECORDINGS}/", highlight=False)
     _tell_failures(results)
 

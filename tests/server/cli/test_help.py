@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from real2sim.cli import build_app
+from real2sim.cli import PANELS, build_app
 
 APP = build_app()
 
@@ -55,3 +55,31 @@ def test_every_word_of_the_help_is_shown(path):
 )
 def test_units_are_shown(path, unit):
     assert unit in shown(path)
+
+
+def test_every_command_stands_in_one_panel():
+    listed = " ".join(PANELS.values()).split()
+    assert sorted(listed) == sorted(path[0] for path in COMMANDS if len(path) == 1)
+
+
+def test_panels_and_their_commands_are_shown_in_order():
+    lines = shown(()).splitlines()
+    titles = [line.strip("╭╮─ ") for line in lines if line.startswith("╭")]
+    assert titles == ["Options", *PANELS]
+    first = [line.split()[1] for line in lines if line.startswith("│")]
+    assert [word for word in first if not word.startswith("-")] == " ".join(PANELS.values()).split()
+
+
+def test_the_help_says_which_commands_the_sdk_has(monkeypatch):
+    monkeypatch.setattr("real2sim.cli.entry_points", lambda group: ())
+    own = typer.main.get_command(build_app()).commands
+    _, told = shown(()).split("With the SDK alone you have ")
+    assert set(told.partition(".")[0].split(", ")) == set(own)
+
+
+@pytest.mark.parametrize("words", ["serve", "render scene -o out.png", "token list"])
+def test_a_command_of_the_worker_says_what_to_install(words, monkeypatch):
+    monkeypatch.setattr("real2sim_server.console.SERVER_MODULES", ("a_library_of_the_worker",))
+    done = CliRunner().invoke(APP, words.split(), env={"COLUMNS": "400"})
+    assert done.exit_code == 1
+    assert "pip install 'real2sim[server]'" in done.output

@@ -187,6 +187,15 @@ def test_a_scene_is_driven_once_whatever_the_seeds_and_the_command_says_so(evalu
     assert "driven once, not with 3 seeds: tiny" in output
 
 
+def test_who_asks_for_no_seeds_is_not_told_of_them(site, tmp_path, monkeypatch):
+    (tmp_path / "bad_again.py").write_text(BAD)
+    monkeypatch.chdir(tmp_path)
+    command = ["evaluate-policy", "--policy", "bad_again:Early", "--scene", "tiny"]
+    done = CliRunner().invoke(build_app(), [*command, "--url", site.url, "--out", "out"])
+    assert "mean over cases" in done.output
+    assert "seeds:" not in done.output
+
+
 def test_one_episode_has_no_deviation(evaluated):
     out, _ = evaluated
     groups = json.loads((out / "report.json").read_text())["groups"]
