@@ -15,15 +15,45 @@ IMAGES = ["Dockerfile.cpu", "Dockerfile.gpu"]
 
 
 @pytest.fixture(scope="module")
-def worker():
-    return yaml.safe_load((DOCKER / "compose.yml").read_text())["services"]["worker0"]
+def compose():
+    return yaml.safe_load((DOCKER / "compose.yml").read_text())
 
 
-def test_the_folder_of_scenes_is_that_beside_the_readme_and_scenes_can_be_imported_into_it(worker):
-    (scenes,) = (v for v in worker["volumes"] if v.split(":")[-1] == "/scenes")
-    default = re.match(r"\$\{REAL2SIM_SCENES:-(.*?)\}", scenes)
-    assert default is not None
-    assert (DOCKER / default[1]).resolve().parent == DOCKER.parent
+@pytest.fixture(scope="module")
+def worker(compose):
+    return compose["services"]["worker0"]
+
+
+def filled_in(text: str, **variables: str) -> str:
+    """What compose makes of ``${NAME:-default}`` and ``${NAME:?message}``."""
+
+    def value(found: re.Match[str]) -> str:
+        name, kind, otherwise = found.groups()
+        if not variables.get(name):
+            assert kind == ":-", otherwise
+        return variables.get(name) or otherwise
+
+    return re.sub(r"\$\{(\w+)(:[-?])(.*?)\}", value, text)
+
+
+def mounts(worker, **variables: str) -> dict[str, str]:
+    """Volume or folder of each place in the container."""
+    pairs = [filled_in(volume, **variables).split(":") for volume in worker["volumes"]]
+    return {place: source for source, place in pairs}
+
+
+def test_a_fresh_clone_needs_no_folder_and_its_worker_can_write_to_all_it_mounts(compose, worker):
+    """Docker gives a new volume the owner that its place has in the image; a folder is root's."""
+    volumes = mounts(worker)
+    assert set(volumes.values()) <= compose["volumes"].keys()
+    owned = re.findall(
+        r"(?m)^chown -R real2sim:real2sim (.*)$", (DOCKER / "entry-layer.sh").read_text()
+    )
+    assert volumes.keys() <= set(owned[0].split())
+
+
+def test_scenes_can_be_a_folder_of_ones_own(worker):
+    assert mounts(worker, REAL2SIM_SCENES="/data/scenes")["/scenes"] == "/data/scenes"
 
 
 def test_a_worker_writes_nowhere_but_to_its_volumes(worker):
