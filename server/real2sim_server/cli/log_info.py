@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ..console import console, write_json
+from ..console import console, progress, write_json
 from .command import command
 from .options import JsonFile, LogFolder, LogFormat, Sequence
 
@@ -20,23 +20,45 @@ def log_info(
         Path | None, typer.Option("--out", help="Folder for pictures with boxes and LiDAR.")
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Look at every file, as training does first.")
+        bool,
+        typer.Option("--check", help="Check the header of every file, and name all bad ones."),
+    ] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Check by reading all contents of every file.")
     ] = False,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Say what a log holds, and draw its boxes and LiDAR on its images."""
-    from ..logs import check_log, inspect_log
+    """Say what a log holds, draw its boxes and LiDAR on its images, and check its files; exit
+    code 1 when a file cannot be used."""
+    from ..logs import check_log, inspect_log, inspected_frames
     from ..logs.open import open_log
 
     opened = open_log(log, format=log_format, sequence=sequence)
     report = inspect_log(opened, out)
-    for line in report.lines():
+    lines, checked, problems, shown = report.lines(), None, report.problems, report.problems
+    if check or everything:
+        with progress("checking files") as on_progress:
+            checked = check_log(
+                opened,
+                sweeps=None if everything else inspected_frames(opened),
+                decode_images=everything,
+                on_progress=on_progress,
+            )
+        drawn = tuple(text for text in report.problems if text not in checked.problems)
+        problems, shown = drawn + checked.problems, drawn + checked.summary()
+        if checked.empty_sweeps:
+            frames = ", ".join(map(str, checked.empty_sweeps))
+            lines.append(f"question  no points in the sweeps of frames {frames}: are they lost?")
+        more = "" if everything else "; --all reads all contents"
+        lines.append(f"checked   {checked.done()}{more}")
+        if not problems:
+            lines.append("no problems found")
+    lines += [f"problem   {text}" for text in shown]
+    for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    if check:
-        empty = check_log(opened)
-        console.print("every image's header and every sweep was read: none is missing or cut off")
-        if empty:
-            console.print(f"but the sweeps of {len(empty)} frames hold no points: {empty}")
-    write_json(json, report.as_json())
+    check_figures = checked and checked.as_json()
+    write_json(json, {**report.as_json(), "problems": problems, "check": check_figures})
+    if problems:
+        raise typer.Exit(1)

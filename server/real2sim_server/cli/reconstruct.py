@@ -95,8 +95,8 @@ def reconstruct(
     if width is not None:
         logged = max((camera.width for camera in opened.rig), default=width)
         training = at_width(training, min(width, logged))
-    for question in inspect_log(opened).problems:
-        console.print(f"problem   {question}", highlight=False, markup=False, soft_wrap=True)
+    for question in inspect_log(opened).questions:
+        console.print(f"question  {question}", highlight=False, markup=False, soft_wrap=True)
     with staged_progress() as report:
         result = reconstruct(
             opened,

@@ -3,8 +3,9 @@
 The generator lives in :mod:`.synthetic` and is not imported here: it compiles kernels.
 """
 
-from .check import check_log
+from .check import LogCheck, check_log
 from .driving_log import (
+    ChecksFiles,
     DrivingLog,
     FrameSource,
     LidarSweep,
@@ -12,16 +13,18 @@ from .driving_log import (
     LoggedMap,
     ObjectTrack,
 )
-from .inspect import CameraReport, LogReport, inspect_log
+from .inspect import CameraReport, LogReport, inspect_log, inspected_frames
 from .native_writer import write_native_log
 from .open import open_log
 from .selection import LogSelection, log_of_frames, same_part, select_from_log
 
 __all__ = [
     "CameraReport",
+    "ChecksFiles",
     "DrivingLog",
     "FrameSource",
     "LidarSweep",
+    "LogCheck",
     "LogError",
     "LogReport",
     "LogSelection",
@@ -29,6 +32,7 @@ __all__ = [
     "ObjectTrack",
     "check_log",
     "inspect_log",
+    "inspected_frames",
     "log_of_frames",
     "open_log",
     "same_part",

@@ -1,115 +1,200 @@
-"""Checks a whole log before hours of work are spent on it."""
+"""Checks the files of a log before hours of work are spent on it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from .driving_log import DrivingLog, LogError
+from .driving_log import ChecksFiles, DrivingLog, LogError, damage_named
 
 FARTHEST_M = 100_000.0
 """Of the world's zero; single precision is 8 mm there."""
+NAMED_FILES = 5
+"""How many bad images, and how many bad sweeps, are named in a summary."""
 
 
-@runtime_checkable
-class ChecksImages(Protocol):
-    """A source that can check an image without decoding it."""
+@dataclass(frozen=True)
+class LogCheck:
+    """What :func:`check_log` looked at, and what is wrong.
 
-    def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is missing, cut off or of another size."""
-        ...
+    Attributes:
+        image_headers, sweep_headers: how many files had their header checked.
+        images, sweeps: how many had all of their contents read.
+        table_problems: what is wrong with times, poses, boxes and cameras, a sentence each.
+        image_problems: one sentence for each bad image; it names the file.
+        sweep_problems: one sentence for each bad sweep; it names the file.
+        empty_sweeps: frames whose sweep holds no points, where those of other frames do.
+    """
+
+    image_headers: int
+    sweep_headers: int
+    images: int
+    sweeps: int
+    table_problems: tuple[str, ...]
+    image_problems: tuple[str, ...]
+    sweep_problems: tuple[str, ...]
+    empty_sweeps: tuple[int, ...]
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """All of them, one sentence each; empty for a good log."""
+        return (*self.table_problems, *self.image_problems, *self.sweep_problems)
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values only."""
+        return asdict(self)
+
+    def summary(self) -> tuple[str, ...]:
+        """The problems for people: how many files are bad, the first of them, what to do."""
+        lines = list(self.table_problems)
+        for kind, bad, looked_at in (
+            ("image", self.image_problems, max(self.image_headers, self.images)),
+            ("sweep", self.sweep_problems, max(self.sweep_headers, self.sweeps)),
+        ):
+            if bad:
+                lines.append(f"{len(bad)} of {_count(looked_at, kind)} cannot be used:")
+                lines += [f"  {problem}" for problem in bad[:NAMED_FILES]]
+            if len(bad) > NAMED_FILES:
+                lines.append(f"  and {len(bad) - NAMED_FILES} more")
+        if self.image_problems or self.sweep_problems:
+            lines.append("write these files again, or write the log without their frames")
+        return tuple(lines)
+
+    def done(self) -> str:
+        """What was looked at, such as "headers of 120 images and 60 sweeps checked, contents of 3
+        sweeps read"."""
+        headers = _listed((self.image_headers, "image"), (self.sweep_headers, "sweep"))
+        contents = _listed((self.images, "image"), (self.sweeps, "sweep"))
+        told = ([f"headers of {headers} checked"] if headers else []) + (
+            [f"contents of {contents} read"] if contents else []
+        )
+        return ", ".join(told) or "there are no files to check"
+
+    def raise_for_problems(self) -> None:
+        """Raise LogError with the :meth:`summary` where there are problems."""
+        if self.problems:
+            raise LogError("\n".join(self.summary()))
+
+
+def _count(number: int, kind: str) -> str:
+    return f"{number} {kind}{'' if number == 1 else 's'}"
+
+
+def _listed(*counts: tuple[int, str]) -> str:
+    return " and ".join(_count(number, kind) for number, kind in counts if number)
 
 
 def check_log(
     log: DrivingLog,
     *,
+    sweeps: Collection[int] | None = None,
     decode_images: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
-) -> list[int]:
-    """Touch everything that training will read, and stop at the first thing that is wrong.
+) -> LogCheck:
+    """Look at every file of a log; a bad one does not keep the others from being looked at.
 
-    Opening a log has checked its tables already; this reads every sweep, and the header, the size
-    and the end marker of every image.
+    The header of each image says its size and its end mark whether it is whole; the header of each
+    sweep says which arrays it holds. A source without headers (:class:`ChecksFiles`) has all its
+    sweeps read, and its images only where ``decode_images`` asks for it.
 
     Args:
         log: any log.
-        decode_images: decode every image, which finds damage inside files too.
+        sweeps: frames whose sweeps are read, which finds values that are not finite; None for all.
+        decode_images: decode every image, which finds damage inside files.
         on_progress: called with (done, total) after each frame.
-
-    Returns:
-        Frames whose sweep holds no points, where those of other frames do.
-
-    Raises:
-        LogError: names the file (or camera, frame, object), what is wrong and what is expected.
     """
-    _check_cameras(log)
-    _check_times(log)
-    _check_place(log)
-    _check_tracks(log)
-    empty = []
+    source = log.source if isinstance(log.source, ChecksFiles) else None
+    image_problems: list[str] = []
+    sweep_problems: list[str] = []
+    points: dict[int, int | None] = {}
+    headers = decoded = read = 0
     for frame in range(log.frame_count):
         for camera in log.rig.names:
-            if decode_images:
-                log.image(camera, frame)
-            elif isinstance(log.source, ChecksImages):
-                log.source.check_image(camera, frame)
-        if not len(log.lidar(frame).points):
-            empty.append(frame)
+            try:
+                if decode_images:
+                    decoded += 1
+                    log.image(camera, frame)
+                elif source is not None:
+                    headers += 1
+                    with damage_named(f"image of camera {camera!r} at frame {frame}"):
+                        source.check_image(camera, frame)
+            except LogError as error:
+                image_problems.append(str(error))
+        try:
+            if source is None or sweeps is None or frame in sweeps:
+                read += 1
+                points[frame] = len(log.lidar(frame).points)
+            else:
+                with damage_named(f"sweep of frame {frame}"):
+                    points[frame] = source.check_sweep(frame)
+        except LogError as error:
+            sweep_problems.append(str(error))
         if on_progress is not None:
             on_progress(frame + 1, log.frame_count)
-    return empty if len(empty) < log.frame_count else []
+    empty = tuple(frame for frame, count in points.items() if count == 0)
+    return LogCheck(
+        image_headers=headers,
+        # Reading a sweep checks its header too, but says more.
+        sweep_headers=log.frame_count if read < log.frame_count else 0,
+        images=decoded,
+        sweeps=read,
+        table_problems=(*_cameras(log), *_times(log), *_place(log), *_tracks(log)),
+        image_problems=tuple(image_problems),
+        sweep_problems=tuple(sweep_problems),
+        empty_sweeps=empty if len(empty) < len(points) else (),
+    )
 
 
-def _check_cameras(log: DrivingLog) -> None:
+def _cameras(log: DrivingLog) -> Iterator[str]:
     if len(log.rig):
         return
     known = list(log.provenance.get("cameras_without_images", []))
     named = f"its cameras {known} have no images" if known else "it has no cameras"
-    raise LogError(
+    yield (
         f"log {log.name!r} cannot be trained on: {named}; put the images where the data set has "
         "them (LiDAR and boxes can be used as they are)"
     )
 
 
-def _check_times(log: DrivingLog) -> None:
+def _times(log: DrivingLog) -> Iterator[str]:
     times = log.frame_times_us
     if len(times) == 0 or (np.diff(times) <= 0).any():
-        raise LogError(f"log {log.name!r}: frame times must increase strictly, at least one")
+        yield f"log {log.name!r}: frame times must increase strictly, at least one"
     for camera in log.rig.names:
         given = log.image_times_us.get(camera, times)
         if given.shape != times.shape:
-            raise LogError(
+            yield (
                 f"log {log.name!r}: camera {camera!r} has {len(given)} image times for "
                 f"{len(times)} frames"
             )
-        for t_us in (given.min(), given.max()):
-            if not log.ego.covers(int(t_us)):
-                raise LogError(
-                    f"log {log.name!r}: ego poses cover [{log.ego.start_us}, {log.ego.end_us}] us, "
-                    f"but camera {camera!r} takes an image at {t_us} us"
-                )
+        for t_us in given[~np.array([log.ego.covers(int(t)) for t in given], bool)][:1]:
+            yield (
+                f"log {log.name!r}: ego poses cover [{log.ego.start_us}, {log.ego.end_us}] us, "
+                f"but camera {camera!r} takes an image at {t_us} us"
+            )
 
 
-def _check_place(log: DrivingLog) -> None:
+def _place(log: DrivingLog) -> Iterator[str]:
     far = float(np.abs(log.ego.positions).max())
     if far > FARTHEST_M:
-        raise LogError(
+        yield (
             f"log {log.name!r}: its drive lies {far / 1e3:,.0f} km from the world's zero, where "
             f"Gaussians could only move by {float(np.spacing(np.float32(far))):.2g} m; subtract "
             "the first pose's position from all poses and boxes"
         )
 
 
-def _check_tracks(log: DrivingLog) -> None:
+def _tracks(log: DrivingLog) -> Iterator[str]:
     names: set[str] = set()
     for track in log.tracks:
         if track.object_id in names:
-            raise LogError(f"log {log.name!r}: object {track.object_id!r} is there twice")
+            yield f"log {log.name!r}: object {track.object_id!r} is there twice"
         names.add(track.object_id)
         if not (np.isfinite(track.size).all() and min(track.size) > 0):
-            raise LogError(
+            yield (
                 f"log {log.name!r}: object {track.object_id!r} needs a positive length, width and "
                 f"height, not {track.size}"
             )

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +91,22 @@ class FrameSource(Protocol):
 
     def lidar(self, frame: int) -> LidarSweep:
         """The sweep of a frame. Raises LogError naming a file it cannot read."""
+        ...
+
+
+@runtime_checkable
+class ChecksFiles(Protocol):
+    """A source that checks its files by their headers, without reading all of their contents."""
+
+    def check_image(self, camera: str, frame: int) -> None:
+        """Raise LogError when the image is missing, cut off or of another size."""
+        ...
+
+    def check_sweep(self, frame: int) -> int | None:
+        """How many points the sweep promises, None where its header does not say.
+
+        Raises LogError when the sweep is missing, cut off or lacks arrays of the right shape.
+        """
         ...
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .driving_log import DrivingLog, LidarSweep
+from .driving_log import DrivingLog, LidarSweep, LogError
 from .images import write_image
 from .overlay import draw_frame
 from .plausibility import ego_steps, gaps_between, questions_to
@@ -43,13 +43,14 @@ class LogReport:
         duration: from the first to the last frame [s].
         rate: frames per second, 0 for a single frame.
         gaps: (frame before the gap, its length [s]).
-        lidar_points: of the inspected sweeps, least, median and most.
+        lidar_points: of the inspected sweeps, least, median and most; zeros if none can be read.
         lidar_range: 99th percentile of distances [m].
         tracks: number of objects by category.
         moving: number of moving objects by category.
         ego_distance: way that was driven [m].
         ego_speed: fastest [m/s].
-        problems: what looks wrong, in plain words; empty for a good log.
+        questions: what looks wrong, in plain words; empty for a good log.
+        problems: what cannot be read of the inspected frames, a sentence each.
         drawings: files that were written.
     """
 
@@ -69,6 +70,7 @@ class LogReport:
     moving: dict[str, int]
     ego_distance: float
     ego_speed: float
+    questions: tuple[str, ...]
     problems: tuple[str, ...]
     drawings: tuple[str, ...] = field(default=())
 
@@ -77,7 +79,7 @@ class LogReport:
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """For people, one fact a line."""
+        """For people, one fact a line; without the problems."""
         rate = f", {self.rate:.4g} a second" if self.rate else ""
         least, median, most = self.lidar_points
         lines = [
@@ -96,29 +98,35 @@ class LogReport:
             f"objects   {count} {category} ({self.moving.get(category, 0)} moving)"
             for category, count in self.tracks.items()
         ] or ["objects   none"]
-        lines += [f"problem   {text}" for text in self.problems]
+        lines += [f"question  {text}" for text in self.questions]
         lines += [f"drawing   {file}" for file in self.drawings]
         return lines
 
 
+def inspected_frames(log: DrivingLog) -> tuple[int, ...]:
+    """The frames that :func:`inspect_log` reads: first, middle and last."""
+    chosen = np.linspace(0, log.frame_count - 1, INSPECTED_FRAMES).tolist()
+    return tuple(sorted({round(i) for i in chosen}))
+
+
 def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
-    """Inspect a log; a few of its frames are read.
+    """Inspect a log; a few of its frames are read. What cannot be read is in ``problems``.
 
     Args:
         log: any log.
         out: folder for drawings, created where it is missing: ``frame_%06d.jpg``, all cameras of
             a frame with boxes and points coloured by depth, and ``top.png``, the middle frame from
             above. None draws nothing.
-
-    Raises:
-        LogError: an inspected frame cannot be read.
     """
-    chosen = sorted(
-        {round(i) for i in np.linspace(0, log.frame_count - 1, INSPECTED_FRAMES).tolist()}
-    )
-    sweeps = {frame: log.lidar(frame) for frame in chosen}
+    sweeps: dict[int, LidarSweep] = {}
+    problems: list[str] = []
+    for frame in inspected_frames(log):
+        try:
+            sweeps[frame] = log.lidar(frame)
+        except LogError as error:
+            problems.append(str(error))
     moving = [t for t in log.tracks if t.trajectory.moves]
-    counts = [len(s.points) for s in sweeps.values()]
+    counts = [len(s.points) for s in sweeps.values()] or [0]
     far = [np.linalg.norm(s.points - s.origin, axis=1) for s in sweeps.values() if len(s.points)]
     steps = np.diff(log.frame_times_us) * 1e-6
     return LogReport(
@@ -138,8 +146,9 @@ def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
         moving=dict(sorted(Counter(t.category for t in moving).items())),
         ego_distance=float(ego_steps(log).sum()),
         ego_speed=float((ego_steps(log) / steps).max()) if len(steps) else 0.0,
-        problems=tuple(questions_to(log, sweeps)),
-        drawings=() if out is None else tuple(_draw(log, sweeps, Path(out))),
+        questions=tuple(questions_to(log, sweeps)),
+        drawings=() if out is None else tuple(_draw(log, sweeps, Path(out), problems)),
+        problems=tuple(problems),
     )
 
 
@@ -161,13 +170,25 @@ def _delay(log: DrivingLog, camera: str) -> float:
     return float(np.median(times - log.frame_times_us)) * 1e-6
 
 
-def _draw(log: DrivingLog, sweeps: dict[int, LidarSweep], out: Path) -> list[str]:
+def _draw(
+    log: DrivingLog, sweeps: dict[int, LidarSweep], out: Path, problems: list[str]
+) -> list[str]:
+    """Files of the drawings; images that cannot be read are left out and added to ``problems``."""
     out.mkdir(parents=True, exist_ok=True)
-    files = []
-    for frame in sweeps if len(log.rig) else ():
-        path = out / f"frame_{frame:06d}.jpg"
-        write_image(path, _montage([draw_frame(log, name, frame) for name in log.rig.names]))
-        files.append(str(path))
+    files: list[str] = []
+    for frame in sweeps:
+        pictures = []
+        for name in log.rig.names:
+            try:
+                pictures.append(draw_frame(log, name, frame))
+            except LogError as error:
+                problems.append(str(error))
+        if pictures:
+            path = out / f"frame_{frame:06d}.jpg"
+            write_image(path, _montage(pictures))
+            files.append(str(path))
+    if not sweeps:
+        return files
     path = out / "top.png"
     middle = sorted(sweeps)[len(sweeps) // 2]
     write_image(path, draw_top_view(log, middle, sweeps[middle]))

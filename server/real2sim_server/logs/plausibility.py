@@ -66,15 +66,15 @@ def questions_to(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]
 
     Args:
         log: any log.
-        sweeps: some of its sweeps, by frame. One or two more are read.
-
-    Raises:
-        LogError: a sweep cannot be read.
+        sweeps: some of its sweeps, by frame; empty where none of these could be read. One or two
+            more are read.
     """
     found = [*_times(log), *_world(log), *_ego(log)]
     for camera in log.rig:
         found += _camera(camera)
     found += [*_categories(log.tracks), *_headings(log.tracks), *_sizes(log.tracks)]
+    if not sweeps:
+        return found
     if not any(len(s.points) for s in sweeps.values()):
         return [*found, "there is no LiDAR: nothing to start a reconstruction from"]
     if not log.tracks:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import CameraRig
-from .driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
+from .driving_log import ChecksFiles, DrivingLog, LidarSweep, LogError, ObjectTrack
 
 SELECTION = "selection"
 """Of a log's provenance: what it is a part of, see :func:`select_from_log`."""
@@ -90,10 +90,11 @@ def same_part(log: DrivingLog, provenance: Mapping[str, Any]) -> DrivingLog:
 def log_of_frames(log: DrivingLog, frames: Sequence[int]) -> DrivingLog:
     """``log`` with these frames alone; paths and boxes stay whole."""
     index = np.asarray(frames, np.int64)
+    selected = _SelectedFiles if isinstance(log.source, ChecksFiles) else _SelectedFrames
     return replace(
         log,
         frame_times_us=log.frame_times_us[index],
-        source=_SelectedFrames(log, frames),
+        source=selected(log, frames),
         image_times_us={name: taken[index] for name, taken in log.image_times_us.items()},
     )
 
@@ -109,6 +110,21 @@ class _SelectedFrames:
 
     def lidar(self, frame: int) -> LidarSweep:
         return self._log.lidar(self._frames[frame])
+
+
+class _SelectedFiles(_SelectedFrames):
+    """The same of a source that checks its files."""
+
+    def check_image(self, camera: str, frame: int) -> None:
+        self._files.check_image(camera, self._frames[frame])
+
+    def check_sweep(self, frame: int) -> int | None:
+        return self._files.check_sweep(self._frames[frame])
+
+    @property
+    def _files(self) -> ChecksFiles:
+        assert isinstance(self._log.source, ChecksFiles)
+        return self._log.source
 
 
 def _frames(log: DrivingLog, selection: LogSelection) -> range:

@@ -11,7 +11,7 @@ from pyarrow import feather
 
 from real2sim_server.datasets.labels import points_in_boxes
 from real2sim_server.geometry.transform import apply_transform
-from real2sim_server.logs import DrivingLog, LogError, open_log
+from real2sim_server.logs import DrivingLog, LogError, check_log, open_log
 from real2sim_server.synthetic import SyntheticLog
 
 
@@ -170,7 +170,7 @@ BAD_LOGS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "image of another size": (
         lambda f: _set(f / "calibration/intrinsics.feather", "width_px", 0, 99),
-        r"\.jpg: is 120x80, but camera 'ring_front_center' is 99x80",
+        r"\.jpg: is 120x80, but the calibration says 99x80",
     ),
 }  # fmt: skip
 
@@ -180,7 +180,7 @@ def test_bad_log_is_refused_with_its_place(folder: Path, case: str) -> None:
     change, message = BAD_LOGS[case]
     change(folder)
     with pytest.raises(LogError, match=message):
-        open_log(folder)
+        check_log(open_log(folder)).raise_for_problems()
 
 
 def test_broken_sweep_is_named(folder: Path) -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -8,12 +10,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from click.testing import Result
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
-from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, check_log, open_log
+from real2sim_server.logs import (
+    DrivingLog,
+    LogError,
+    ObjectTrack,
+    check_log,
+    log_of_frames,
+    open_log,
+    write_native_log,
+)
 from real2sim_server.logs.images import encode_image
-from real2sim_server.scene import CameraRig
+from real2sim_server.scene import CameraRig, Trajectory
 from real2sim_server.synthetic import SyntheticLog
 
 LAYOUTS = ("native", "kitti", "kitti_raw", "waymo_v2", "waymo_v1", "argoverse2", "nuscenes",
@@ -30,8 +41,12 @@ def drivestudio(written_drivestudio: Path, tmp_path: Path) -> Path:
 def test_good_logs_pass(layout: str, decode: bool, request: pytest.FixtureRequest) -> None:
     log = open_log(request.getfixturevalue(f"written_{layout}"))
     seen = []
-    check_log(log, decode_images=decode, on_progress=lambda done, total: seen.append((done, total)))
+    check = check_log(
+        log, decode_images=decode, on_progress=lambda done, total: seen.append((done, total))
+    )
     assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert check.problems == check.empty_sweeps == ()
+    assert check_log(log, sweeps=()).problems == ()
 
 
 @pytest.mark.parametrize("name", ["000000.png", "000001.png"])
@@ -39,14 +54,14 @@ def test_cut_image_is_named(kitti_folder: Path, name: str) -> None:
     path = kitti_folder / "training/image_02/0007" / name
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(LogError, match=f"image_02/0007/{name}: the image is cut off"):
-        check_log(open_log(kitti_folder))
+        check_log(open_log(kitti_folder)).raise_for_problems()
 
 
 def test_cut_jpeg_is_named(drivestudio: Path) -> None:
     path = drivestudio / "images/001_0.jpg"
     path.write_bytes(path.read_bytes()[:-300])
     with pytest.raises(LogError, match=r"images/001_0\.jpg: the image is cut off"):
-        check_log(open_log(drivestudio))
+        check_log(open_log(drivestudio)).raise_for_problems()
 
 
 def test_damage_inside_a_jpeg_is_found_by_decoding(drivestudio: Path) -> None:
@@ -56,9 +71,9 @@ def test_damage_inside_a_jpeg_is_found_by_decoding(drivestudio: Path) -> None:
     data[middle : middle + 40] = b"\xff\xd0" * 20
     path.write_bytes(data)
     log = open_log(drivestudio)
-    check_log(log)
-    with pytest.raises(LogError, match=r"images/001_0\.jpg: is a damaged JPEG"):
-        check_log(log, decode_images=True)
+    assert not check_log(log).problems
+    (problem,) = check_log(log, decode_images=True).image_problems
+    assert "images/001_0.jpg: is a damaged JPEG" in problem
 
 
 def test_jpegs_decode_as_opencv_decodes_them(tiny_log: SyntheticLog) -> None:
@@ -69,23 +84,152 @@ def test_jpegs_decode_as_opencv_decodes_them(tiny_log: SyntheticLog) -> None:
     assert np.abs(decode_image(data, "here").astype(int) - expected).max() <= 2
 
 
-def test_broken_sweep_is_named(native_folder: Path) -> None:
-    (native_folder / "lidar/000002.npz").write_bytes(b"PK\x03\x04 no archive")
-    with pytest.raises(LogError, match=r"lidar/000002\.npz"):
-        check_log(open_log(native_folder))
+def told(folder: Path, *options: str) -> Result:
+    return CliRunner().invoke(build_app(), ["log-info", str(folder), *options])
 
 
-def test_every_sweep_is_read(native_folder: Path) -> None:
-    first, empty, broken = (native_folder / f"lidar/00000{i}.npz" for i in range(3))
-    with np.load(first) as parts:
+@pytest.fixture(scope="session")
+def written_long(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight frames of the same street; frames 0, 4 and 7 are those that a report reads."""
+    times = np.arange(8) * 100_000
+    still = Trajectory(times[[0, 7]], np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    frames = log_of_frames(tiny_log, [0, 1, 2, 0, 1, 2, 0, 1])
+    long = dataclasses.replace(frames, frame_times_us=times, ego=still)
+    return write_native_log(long, tmp_path_factory.mktemp("long") / "drive")
+
+
+@pytest.fixture
+def long_folder(written_long: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(written_long, tmp_path / "long"))
+
+
+def change_sweep(path: Path, change: Callable[[dict[str, np.ndarray]], object]) -> None:
+    with np.load(path) as parts:
+        arrays = dict(parts)
+    change(arrays)
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+
+
+def not_a_number(name: str) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        change_sweep(path, lambda arrays: arrays[name].flat.__setitem__(1, np.nan))
+
+    return damage
+
+
+def four_columns(path: Path) -> None:
+    change_sweep(path, lambda a: a.update(points=np.c_[a["points"], a["intensity"]]))
+
+
+def without_origin(path: Path) -> None:
+    change_sweep(path, lambda a: a.pop("origin"))
+
+
+def as_text(path: Path) -> None:
+    change_sweep(path, lambda a: a.update(intensity=a["intensity"].astype(str)))
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def absolute_times(path: Path) -> None:
+    change_sweep(
+        path, lambda a: a.update(offset_us=a["offset_us"] + np.int64(1_700_000_000_000_000))
+    )
+
+
+HEADERS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "no origin": (without_origin, "has no array 'origin'"),
+    "four columns": (four_columns, r"points must be \(\d+, 3\), not \(\d+, 4\)"),
+    "text": (as_text, "intensity must hold real numbers"),
+    "cut off": (cut_off, "is the file cut off"),
+    "missing": (Path.unlink, "no such file"),
+}
+CONTENTS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "NaN point": (not_a_number("points"), "points must be finite, but 1 of its values are NaN"),
+    "NaN intensity": (not_a_number("intensity"), "intensity must be finite"),
+    "NaN origin": (not_a_number("origin"), "origin must be finite"),
+    "absolute times": (
+        absolute_times,
+        "offset_us goes from .* must be relative",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", HEADERS)
+def test_a_sweep_with_a_bad_header_is_found(long_folder: Path, damage: str) -> None:
+    how, message = HEADERS[damage]
+    how(long_folder / "lidar/000002.npz")
+    done = told(long_folder, "--check")
+    assert done.exit_code == 1
+    assert "1 of 8 sweeps cannot be used" in done.output
+    assert re.search(rf"lidar/000002\.npz: .*{message}", done.output)
+
+
+@pytest.mark.parametrize("damage", CONTENTS)
+def test_a_sweep_with_bad_contents_is_found_by_reading_all(long_folder: Path, damage: str) -> None:
+    how, message = CONTENTS[damage]
+    how(long_folder / "lidar/000002.npz")
+    done = told(long_folder, "--check")
+    assert done.exit_code == 0
+    assert "contents of 3 sweeps read; --all reads all contents" in done.output
+    done = told(long_folder, "--check", "--all")
+    assert done.exit_code == 1
+    assert re.search(rf"lidar/000002\.npz: {message}", done.output)
+
+
+def test_all_bad_files_are_reported_together(long_folder: Path, tmp_path: Path) -> None:
+    """Those that the report itself reads among them; the rest of the report is there."""
+    for frame, (damage, _) in zip((0, 1, 4, 5, 6), HEADERS.values(), strict=True):
+        damage(long_folder / f"lidar/{frame:06d}.npz")
+    not_a_number("points")(long_folder / "lidar/000002.npz")
+    cut_off(long_folder / "images/front/000003.png")
+    (long_folder / "images/front_left/000004.png").unlink()
+    figures, pictures = tmp_path / "figures.json", tmp_path / "pictures"
+    given = ("--check", "--all", "--json", str(figures), "--out", str(pictures))
+    done = told(long_folder, *given)
+    assert done.exit_code == 1
+    for line in (
+        "frames    8 in 0.7 s",
+        "contents of 24 images and 8 sweeps read\n",
+        "2 of 24 images cannot be used",
+        "6 of 8 sweeps cannot be used",
+        "  and 1 more",
+        "write these files again",
+    ):
+        assert line in done.output
+    found = json.loads(figures.read_text())
+    assert len(found["problems"]) == 8
+    assert [len(found["check"][f"{kind}_problems"]) for kind in ("image", "sweep")] == [2, 6]
+    assert (pictures / "frame_000007.jpg").is_file()
+
+
+def test_a_good_log_is_said_to_be_checked_as_far_as_it_was(long_folder: Path) -> None:
+    done = told(long_folder, "--check")
+    assert done.exit_code == 0
+    checked = "headers of 24 images and 8 sweeps checked, contents of 3 sweeps read; --all reads"
+    assert checked in done.output
+    assert "no problems found" in done.output
+    done = told(long_folder, "--all")
+    assert done.exit_code == 0
+    assert "contents of 24 images and 8 sweeps read\n" in done.output
+
+
+def test_sweeps_without_points_are_asked_about(native_folder: Path) -> None:
+    empty = native_folder / "lidar/000001.npz"
+    with np.load(empty) as parts:
         np.savez(empty, **{k: v[:0] if k != "origin" else v for k, v in parts.items()})
-    assert check_log(open_log(native_folder)) == [1]
-    told = CliRunner().invoke(build_app(), ["log-info", str(native_folder), "--check"])
-    assert "the sweeps of 1 frames hold no points: [1]" in told.output
-    broken.write_bytes(b"PK no archive")
-    told = CliRunner().invoke(build_app(), ["log-info", str(native_folder), "--check"])
-    assert told.exit_code != 0
-    assert "lidar/000002.npz" in told.output.replace("\n", "")
+    assert check_log(open_log(native_folder)).empty_sweeps == (1,)
+    assert "no points in the sweeps of frames 1" in told(native_folder, "--check").output
+
+
+def test_files_of_selected_frames_are_checked_by_their_headers(native_folder: Path) -> None:
+    (native_folder / "images/front/000002.png").write_bytes(b"no image")
+    without_origin(native_folder / "lidar/000002.npz")
+    selected = log_of_frames(open_log(native_folder), [0, 2])
+    check = check_log(selected, sweeps=())
+    assert len(check.image_problems) == len(check.sweep_problems) == 1
 
 
 def test_log_without_images_says_which_cameras_lack_them(
@@ -96,7 +240,7 @@ def test_log_without_images_says_which_cameras_lack_them(
     log = open_log(folder)
     assert len(log.lidar(0).points) > 1000
     with pytest.raises(LogError, match=r"cannot be trained on: its cameras \['ring_front_center',"):
-        check_log(log)
+        check_log(log).raise_for_problems()
     with pytest.raises(LogError, match="camera 'ring_front_left' has no images"):
         log.image("ring_front_left", 0)
 
@@ -137,4 +281,4 @@ BAD_LOGS: dict[str, tuple[Callable[[DrivingLog], DrivingLog], str]] = {
 def test_bad_log_is_refused(tiny_log: SyntheticLog, case: str) -> None:
     change, message = BAD_LOGS[case]
     with pytest.raises(LogError, match=message):
-        check_log(change(tiny_log))
+        check_log(change(tiny_log)).raise_for_problems()

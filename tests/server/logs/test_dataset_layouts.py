@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
+from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, check_log, open_log
 from real2sim_server.synthetic import SyntheticLog
 
 CAMERAS = {
@@ -300,4 +300,4 @@ def test_bad_folder_is_refused_with_its_place(copied: Callable[[str], Path], cas
     folder = copied(layout)
     change(folder)
     with pytest.raises(LogError, match=message):
-        open_log(folder)
+        check_log(open_log(folder)).raise_for_problems()

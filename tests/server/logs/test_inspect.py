@@ -47,7 +47,7 @@ def test_report_tells_what_the_log_holds(tiny_log: SyntheticLog) -> None:
     assert report.ego_distance == pytest.approx(
         np.linalg.norm(np.diff(tiny_log.ego.positions, axis=0), axis=1).sum()
     )
-    assert report.problems == report.gaps == report.drawings == ()
+    assert report.questions == report.problems == report.gaps == report.drawings == ()
 
 
 def test_report_goes_into_json_and_into_lines(tiny_log: SyntheticLog) -> None:
@@ -66,7 +66,7 @@ def test_gaps_are_found(tiny_log: SyntheticLog) -> None:
         dataclasses.replace(tiny_log, frame_times_us=times, ego=still, source=repeating)
     )
     assert report.gaps == ((2, pytest.approx(0.2)),)
-    assert "0.20 s pass after frame 2: are frames missing?" in report.problems
+    assert "0.20 s pass after frame 2: are frames missing?" in report.questions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,25 +84,25 @@ def test_jumping_ego_is_found(tiny_log: SyntheticLog) -> None:
     positions = tiny_log.ego.positions.copy()
     positions[2, 0] += 20
     ego = dataclasses.replace(tiny_log.ego, positions=positions)
-    problems = inspect_log(dataclasses.replace(tiny_log, ego=ego)).problems
-    assert any("the ego jumps after frame 1" in p for p in problems)
+    questions = inspect_log(dataclasses.replace(tiny_log, ego=ego)).questions
+    assert any("the ego jumps after frame 1" in p for p in questions)
 
 
 def test_lidar_at_the_wrong_height_is_found(tiny_log: SyntheticLog) -> None:
-    problems = inspect_log(_moved(tiny_log, 0, 0, 1.2)).problems
-    assert any(p.startswith("the road near the vehicle lies +1.2 m") for p in problems)
+    questions = inspect_log(_moved(tiny_log, 0, 0, 1.2)).questions
+    assert any(p.startswith("the road near the vehicle lies +1.2 m") for p in questions)
 
 
 def test_boxes_in_another_frame_are_found(tiny_log: SyntheticLog) -> None:
-    problems = inspect_log(_moved(tiny_log, 0, 60, 0)).problems
-    assert any("hold LiDAR points" in p for p in problems)
+    questions = inspect_log(_moved(tiny_log, 0, 60, 0)).questions
+    assert any("hold LiDAR points" in p for p in questions)
 
 
 def test_missing_parts_are_named(tiny_log: SyntheticLog, written_argoverse2: Path) -> None:
     log = dataclasses.replace(tiny_log, tracks=())
-    assert any("no boxes" in p for p in inspect_log(log).problems)
-    problems = inspect_log(open_log(written_argoverse2)).problems
-    assert problems == ("cameras without images, left out: ring_rear_left",)
+    assert any("no boxes" in p for p in inspect_log(log).questions)
+    questions = inspect_log(open_log(written_argoverse2)).questions
+    assert questions == ("cameras without images, left out: ring_rear_left",)
 
 
 def test_drawings_are_written(tiny_log: SyntheticLog, tmp_path: Path) -> None:

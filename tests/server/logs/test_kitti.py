@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from real2sim_server.geometry.rotation import matrix_to_quaternion, quaternion_yaw
 from real2sim_server.geometry.transform import apply_transform, invert_transform
-from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
+from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, check_log, open_log
 from real2sim_server.logs.images import write_image
 from real2sim_server.logs.readers.kitti.files import EARTH_RADIUS
 from real2sim_server.synthetic import SyntheticLog
@@ -213,7 +213,7 @@ BAD_LAYOUTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "image missing": (_remove("image_02/0007/000001.png"), r"image_02/0007/000001\.png"),
     "image of another size": (
         lambda t: write_image(t / "image_02/0007/000001.png", np.zeros((9, 9, 3), np.uint8)),
-        r"000001\.png: is 9x9, but camera 'image_02' is 120x80",
+        r"000001\.png: is 9x9, but the calibration says 120x80",
     ),
     "times unsorted": (_write_times, r"times/0007\.txt: frame times must increase"),
 }  # fmt: skip
@@ -224,7 +224,7 @@ def test_bad_layout_is_refused_with_its_place(kitti_folder: Path, case: str) -> 
     change, message = BAD_LAYOUTS[case]
     change(kitti_folder / "training")
     with pytest.raises(LogError, match=message):
-        open_log(kitti_folder)
+        check_log(open_log(kitti_folder)).raise_for_problems()
 
 
 def test_sample_drive_has_its_vehicles(jam: DrivingLog) -> None:

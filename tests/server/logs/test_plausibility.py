@@ -60,7 +60,7 @@ def poses_of(content: Manifest) -> list[Manifest]:
 
 
 def test_a_good_log_raises_no_question(drive: Path) -> None:
-    assert inspect_log(open_log(drive)).problems == ()
+    assert inspect_log(open_log(drive)).questions == ()
 
 
 # --- mistakes ---------------------------------------------------------------------------------
@@ -176,8 +176,8 @@ MISTAKES: dict[str, tuple[Callable[[Manifest], None], str]] = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_asked_about(own: Path, mistake: str) -> None:
     how, question = MISTAKES[mistake]
-    problems = inspect_log(open_log(change(own, how))).problems
-    assert any(re.search(question, p) for p in problems), problems
+    questions = inspect_log(open_log(change(own, how))).questions
+    assert any(re.search(question, p) for p in questions), questions
 
 
 def test_points_in_the_world_frame_are_asked_about(own: Path) -> None:
@@ -185,8 +185,8 @@ def test_points_in_the_world_frame_are_asked_about(own: Path) -> None:
         sweep["points"] = apply_transform(T_world_vehicle, sweep["points"]).astype(np.float32)
 
     change_sweeps(own, moved)
-    problems = inspect_log(open_log(own)).problems
-    assert any("are points in the world's frame?" in p for p in problems), problems
+    questions = inspect_log(open_log(own)).questions
+    assert any("are points in the world's frame?" in p for p in questions), questions
 
 
 def test_intensities_of_a_byte_are_asked_about(own: Path) -> None:
@@ -194,13 +194,13 @@ def test_intensities_of_a_byte_are_asked_about(own: Path) -> None:
         sweep["intensity"] = sweep["intensity"] * 255
 
     change_sweeps(own, scaled)
-    problems = inspect_log(open_log(own)).problems
-    assert any("LiDAR intensity goes up to" in p for p in problems), problems
+    questions = inspect_log(open_log(own)).questions
+    assert any("LiDAR intensity goes up to" in p for p in questions), questions
 
 
 def test_training_far_from_zero_is_refused(own: Path) -> None:
     with pytest.raises(LogError, match=r"5,411 km from the world's zero.* only move by 0\.5 m"):
-        check_log(open_log(change(own, utm)))
+        check_log(open_log(change(own, utm))).raise_for_problems()
 
 
 @pytest.mark.parametrize(
@@ -228,5 +228,5 @@ def test_a_vehicle_that_only_stands_raises_no_question(own: Path) -> None:
             content["ego"][name] = [content["ego"][name][0]] * len(content["ego"][name])
         content["tracks"] = [t for t in content["tracks"] if len(t["times_us"]) <= 2]
 
-    problems = inspect_log(open_log(change(own, parked))).problems
-    assert not any("axis" in p or "inverted" in p for p in problems), problems
+    questions = inspect_log(open_log(change(own, parked))).questions
+    assert not any("axis" in p or "inverted" in p for p in questions), questions

@@ -23,7 +23,7 @@ from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
 from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
-from .formats.parquet_files import read_feather
+from .formats.parquet_files import check_feather, read_feather
 from .formats.tables import check_ego_covers, check_frame_times
 from .image_matching import TimedImages, match_images
 from .lens import Lens
@@ -52,6 +52,7 @@ CATEGORIES = {
     "motorcyclist": "cyclist",
     "wheeled_rider": "cyclist",
 }
+POINT_COLUMNS = ("x", "y", "z", "intensity", "offset_ns")
 QUATERNION = ("qw", "qx", "qy", "qz")
 POSITION = ("tx_m", "ty_m", "tz_m")
 SIZE = ("length_m", "width_m", "height_m")
@@ -95,7 +96,6 @@ class Argoverse2Reader:
             [sweeps[i] for i in frames],
             mounts["up_lidar"][:3, 3],
         )
-        source.images.check_sizes()
         T_world_city = invert_transform(city.transform(int(times_us[frames[0]])))
         ego = city.moved(T_world_city)
         tracks, keys = _read_tracks(folder / "annotations.feather", ego)
@@ -267,9 +267,13 @@ class _Argoverse2Source:
         """Raise LogError when the image is cut off or not of its camera's size."""
         self.images.check(camera, frame)
 
+    def check_sweep(self, frame: int) -> None:
+        """See :class:`ChecksFiles`."""
+        check_feather(self.sweeps[frame], POINT_COLUMNS)
+
     def lidar(self, frame: int) -> LidarSweep:
         path = self.sweeps[frame]
-        table = read_feather(path, ["x", "y", "z", "intensity", "offset_ns"])
+        table = read_feather(path, POINT_COLUMNS)
         points = np.stack([table[n] for n in "xyz"], axis=1).astype(np.float64)
         finite = np.isfinite(points).all(axis=1)
         points[:, 2] += AXLE_HEIGHT

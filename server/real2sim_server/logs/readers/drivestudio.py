@@ -23,12 +23,14 @@ from ..images import image_size
 from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
 from .formats.json_tables import read_json
+from .formats.point_files import count_rows, read_rows
 from .formats.tables import check_rigid, parse_numbers, read_lines
 from .waymo.segment import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
 
 PERIOD_US = 100_000
 COLUMNS = 14
 """origin 3, point 3, flow 3, flow class, ground, intensity, elongation, laser: float32."""
+ONLY_WAYMO = "only folders made of Waymo segments can be read"
 
 CATEGORIES = {"vehicle": "car", "pedestrian": "pedestrian", "cyclist": "cyclist", "sign": "sign"}
 
@@ -115,7 +117,6 @@ def _read_cameras(path: Path, count: int) -> tuple[CameraRig, ImageFiles, list[s
         lenses[camera.name] = camera.lens
         cameras.append(camera)
     images = ImageFiles(files, lenses)
-    images.check_sizes()
     try:
         rig = CameraRig(tuple(c.lens.camera(c.name, c.T_vehicle_camera) for c in cameras))
     except SceneError as error:
@@ -170,17 +171,7 @@ def _boxes(path: Path, key: str, value: Any, times_us: NDArray[np.int64]) -> lis
 def _sweep_files(folder: Path, count: int) -> list[Path] | None:
     if not folder.is_dir():
         return None
-    files = [folder / f"{frame:03d}.bin" for frame in range(count)]
-    for path in files:
-        if not path.is_file():
-            raise LogError(f"{path}: no such file; every frame needs its sweep")
-        size = path.stat().st_size
-        if size == 0 or size % (4 * COLUMNS):
-            raise LogError(
-                f"{path}: {size} bytes is no whole number of points of {COLUMNS} float32; only "
-                "folders made of Waymo segments can be read"
-            )
-    return files
+    return [folder / f"{frame:03d}.bin" for frame in range(count)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,14 +186,14 @@ class _DrivestudioSource:
         """Raise LogError when the image is cut off or not of its camera's size."""
         self.images.check(camera, frame)
 
+    def check_sweep(self, frame: int) -> int:
+        """See :class:`ChecksFiles`."""
+        return 0 if self.sweeps is None else count_rows(self.sweeps[frame], COLUMNS, ONLY_WAYMO)
+
     def lidar(self, frame: int) -> LidarSweep:
         rows = np.zeros((0, COLUMNS), np.float32)
         if self.sweeps is not None:
-            path = self.sweeps[frame]
-            try:
-                rows = np.fromfile(path, dtype=np.float32).reshape(-1, COLUMNS)
-            except (OSError, ValueError) as error:
-                raise LogError(f"{path}: cannot be read ({error})") from error
+            rows = read_rows(self.sweeps[frame], COLUMNS, ONLY_WAYMO)
         rows = rows[np.isfinite(rows[:, :6]).all(axis=1)]
         top = rows[rows[:, 13] == 0]
         origin = np.median((top if len(top) else rows)[:, :3], axis=0) if len(rows) else np.zeros(3)

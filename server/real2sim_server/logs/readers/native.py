@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 import json
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from ..._npy import read_entries, read_npy
+from ..._npy import read_entries, read_headers, read_npy
 from ...scene import Camera, CameraRig, LaneGraph, SceneError, Trajectory
 from ...scene.camera import Optics
 from ...scene.io.document import OpticsPart
 from ...scene.io.lane_document import read_lanes
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, read_image
-from .formats.tables import check_ego_covers, check_frame_times, check_images
+from .formats.tables import check_ego_covers, check_frame_times
 
 FORMAT = "real2sim-log"
 VERSION = 1
@@ -37,7 +38,10 @@ CAMERA_KEYS = ("name", "width", "height", "K", "T_vehicle_camera", "recorded")
 POSE_KEYS = ("times_us", "positions", "quaternions")
 EGO_KEYS = ("size", *POSE_KEYS)
 TRACK_KEYS = ("object_id", "category", "size", *POSE_KEYS)
-LIDAR_SHAPES = {"points": (3,), "intensity": (), "offset_us": ()}
+SWEEP_SHAPES = {"points": (-1, 3), "intensity": (-1,), "offset_us": (-1,), "origin": (3,)}
+"""-1 stands for the number of points."""
+FARTHEST_OFFSET_US = 10_000_000
+"""Points of one sweep are measured nearer to its frame's time than this."""
 
 
 class NativeReader:
@@ -66,14 +70,13 @@ class NativeReader:
         trajectory = _read_trajectory(ego)
         check_ego_covers(trajectory, times_us, str(manifest))
         images = _image_files(path, rig, len(times_us))
-        check_images(images, rig)
         return DrivingLog(
             name=str(content.get("name", str)),
             rig=rig,
             frame_times_us=times_us,
             ego=trajectory,
             tracks=_read_tracks(content),
-            source=_NativeSource(images, _sweep_files(path, content, len(times_us))),
+            source=_NativeSource(rig, images, _sweep_files(path, content, len(times_us))),
             ego_size=ego.size("size"),
             provenance=dict(content.get("provenance", dict)),
             image_times_us=_read_image_times(content, rig, times_us, trajectory),
@@ -263,17 +266,12 @@ def _image_files(path: Path, rig: CameraRig, frame_count: int) -> dict[str, list
 def _sweep_files(path: Path, content: _JsonSection, frame_count: int) -> list[Path] | None:
     if not content.get("lidar", bool):
         return None
-    files = [path / "lidar" / f"{f:06d}.npz" for f in range(frame_count)]
-    for file in files:
-        if not file.is_file():
-            raise LogError(f"{file}: no such file; log.json says that every frame has a sweep")
-        if file.stat().st_size == 0:
-            raise LogError(f"{file}: is empty")
-    return files
+    return [path / "lidar" / f"{f:06d}.npz" for f in range(frame_count)]
 
 
 @dataclass(frozen=True, eq=False)
 class _NativeSource:
+    rig: CameraRig
     images: dict[str, list[Path]]
     sweeps: list[Path] | None
 
@@ -281,8 +279,11 @@ class _NativeSource:
         return read_image(self.images[camera][frame])
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off."""
-        check_image_file(self.images[camera][frame])
+        lens = self.rig[camera]
+        check_image_file(self.images[camera][frame], (lens.width, lens.height))
+
+    def check_sweep(self, frame: int) -> int:
+        return 0 if self.sweeps is None else _check_sweep(self.sweeps[frame])
 
     def lidar(self, frame: int) -> LidarSweep:
         if self.sweeps is None:
@@ -295,28 +296,71 @@ class _NativeSource:
         return _read_sweep(self.sweeps[frame])
 
 
+def _check_sweep(path: Path) -> int:
+    """How many points the headers of a sweep's arrays promise."""
+    with _sweep_archive(path) as archive:
+        headers = read_headers(archive, max_bytes=MAX_SWEEP_BYTES)
+    return _check_arrays(path, headers)
+
+
 def _read_sweep(path: Path) -> LidarSweep:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            parts = read_entries(archive, max_bytes=MAX_SWEEP_BYTES)
-        points, intensity, offset_us, origin = (
-            read_npy(parts[f"{key}.npy"]) for key in ("points", "intensity", "offset_us", "origin")
-        )
-    # Damage shows as almost any error, depending on where it is.
-    except Exception as error:
+    with _sweep_archive(path) as archive:
+        parts = read_entries(archive, max_bytes=MAX_SWEEP_BYTES)
+        arrays = {n: read_npy(data) for n, data in parts.items() if n.endswith(".npy")}
+    _check_arrays(path, {name: (array.shape, array.dtype) for name, array in arrays.items()})
+    points, intensity, offset_us, origin = (arrays[f"{name}.npy"] for name in SWEEP_SHAPES)
+    for name in SWEEP_SHAPES:
+        bad = int((~np.isfinite(arrays[f"{name}.npy"])).sum())
+        if bad:
+            raise LogError(
+                f"{path}: {name} must be finite, but {bad} of its values are NaN or infinite; "
+                "leave such points out"
+            )
+    if len(points) and np.abs(offset_us.astype(np.float64)).max() > FARTHEST_OFFSET_US:
         raise LogError(
-            f"{path}: expected an .npz with points, intensity, offset_us and origin ({error})"
-        ) from error
-    arrays_by_name = {"points": points, "intensity": intensity, "offset_us": offset_us}
-    for name, array in arrays_by_name.items():
-        expected = (len(points), *LIDAR_SHAPES[name])
-        if array.shape != expected:
-            raise LogError(f"{path}: {name} must be {expected}, not {array.shape}")
-    if origin.shape != (3,) or not (np.isfinite(points).all() and np.isfinite(origin).all()):
-        raise LogError(f"{path}: points and origin must be finite, origin (3,)")
+            f"{path}: offset_us goes from {offset_us.min()} to {offset_us.max()}; it must be "
+            "relative to the frame's time, in microseconds (the point's time minus the frame's)"
+        )
     return LidarSweep(
         points=points.astype(np.float32),
         intensity=intensity.astype(np.float32),
         offset_us=offset_us.astype(np.int32),
         origin=origin.astype(np.float32),
     )
+
+
+@contextmanager
+def _sweep_archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except FileNotFoundError as error:
+        raise LogError(
+            f"{path}: no such file; log.json says that every frame has a sweep"
+        ) from error
+    # Damage shows as almost any error, depending on where it is.
+    except Exception as error:
+        cut = "; is the file cut off?" if isinstance(error, zipfile.BadZipFile) else ""
+        raise LogError(
+            f"{path}: expected an .npz with {', '.join(SWEEP_SHAPES)} ({error}){cut}"
+        ) from error
+
+
+def _check_arrays(path: Path, headers: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> int:
+    """How many points a sweep has whose arrays have these shapes and types."""
+    missing = [name for name in SWEEP_SHAPES if f"{name}.npy" not in headers]
+    if missing:
+        raise LogError(
+            f"{path}: has no array {' and no '.join(map(repr, missing))}; a sweep has "
+            f"{', '.join(SWEEP_SHAPES)}"
+        )
+    shape, _ = headers["points.npy"]
+    count = shape[0] if shape else 0
+    for name, expected in SWEEP_SHAPES.items():
+        shape, dtype = headers[f"{name}.npy"]
+        wanted = tuple(count if n < 0 else n for n in expected)
+        if shape != wanted:
+            raise LogError(f"{path}: {name} must be {wanted}, not {shape}")
+        if dtype.kind not in "fiu":
+            raise LogError(f"{path}: {name} must hold real numbers, not {dtype}")
+    return count

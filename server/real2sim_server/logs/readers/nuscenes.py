@@ -24,6 +24,7 @@ from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTra
 from .box_tracks import FrameBox, build_tracks
 from .formats.image_files import ImageFiles
 from .formats.json_tables import Tables
+from .formats.point_files import count_rows, read_rows
 from .formats.tables import check_ego_covers, check_frame_times
 from .image_matching import MatchedImages, TimedImages, match_images
 from .lens import Lens
@@ -32,6 +33,8 @@ from .selection import select_sequence
 LIDAR, FRONT = "LIDAR_TOP", "CAM_FRONT"
 TOLERANCE_US = 60_000
 HALF_SWEEP_US = 25_000
+COLUMNS = 5
+"""Of a sweep's points: x, y, z, intensity, ring."""
 EGO_SIZE = (4.084, 1.73, 1.562)
 """Renault Zoe [m]."""
 
@@ -84,8 +87,6 @@ class NuScenesReader:
         check_ego_covers(ego.in_log, times_us, str(tables.path("ego_pose")))
         lenses = {c.lower(): _lens(tables, r, c) for c, r in cameras.items()}
         images = ImageFiles(matched.files, lenses)
-        images.check_sizes()
-        _check_sweeps(sweeps)
         tracks, keys = _tracks(tables, samples, ego.to_log)
         return DrivingLog(
             name=f"nuscenes_{name}",
@@ -238,15 +239,6 @@ def _ego(tables: Tables, recordings: Iterable[_Recording], start_us: int) -> _Eg
     return _Ego(path.moved(to_log), to_log)
 
 
-def _check_sweeps(sweeps: Sequence[Path]) -> None:
-    for path in sweeps:
-        if not path.is_file():
-            raise LogError(f"{path}: no such file; every frame needs a sweep")
-        size = path.stat().st_size
-        if size == 0 or size % 20:
-            raise LogError(f"{path}: {size} bytes is no whole number of points of 20 bytes")
-
-
 def _tracks(
     tables: Tables, samples: set[str], to_log: Float
 ) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
@@ -294,15 +286,12 @@ class _NuScenesSource:
         """Raise LogError when the image is cut off or not of its camera's size."""
         self.images.check(camera, frame)
 
+    def check_sweep(self, frame: int) -> int:
+        """See :class:`ChecksFiles`."""
+        return count_rows(self.sweeps[frame], COLUMNS)
+
     def lidar(self, frame: int) -> LidarSweep:
-        path = self.sweeps[frame]
-        try:
-            values = np.fromfile(path, dtype=np.float32)
-        except OSError as error:
-            raise LogError(f"{path}: cannot be read ({error.strerror})") from error
-        if values.size % 5:
-            raise LogError(f"{path}: {values.size * 4} bytes is no whole number of points")
-        rows = values.reshape(-1, 5)
+        rows = read_rows(self.sweeps[frame], COLUMNS)
         rows = rows[np.isfinite(rows[:, :4]).all(axis=1)]
         frame_us, sweep_us = int(self.frame_times_us[frame]), int(self.sweep_times_us[frame])
         sweep_us = min(max(sweep_us, self.ego.start_us), self.ego.end_us)

@@ -29,7 +29,7 @@ class LogReader(Protocol):
         ``sequence`` picks one where a folder holds several; the only one is the default.
 
         Raises:
-            LogError: names the file (and line), what is wrong and what is expected. Everything
-                that can be checked without decoding images or sweeps is checked here.
+            LogError: names the file (and line), what is wrong and what is expected. Tables are
+                checked here; images and sweeps when they are read, or by ``check_log``.
         """
         ...

@@ -69,7 +69,6 @@ class StreetGaussiansReader:
         files = {c.name: _image_files(path, c.number - 1, count) for c in cameras}
         files = {name: found for name, found in files.items() if found}
         images = ImageFiles(files, {c.name: c.lens for c in cameras})
-        images.check_sizes()
         boxes = _read_boxes(path / "track" / "track_info.txt")
         used = [c for c in cameras if c.name in files]
         frames = [_read_frame(path, i, times, used, boxes.get(i, ())) for i in range(count)]
@@ -204,6 +203,10 @@ class _StreetSource:
     def check_image(self, camera: str, frame: int) -> None:
         """Raise LogError when the image is cut off or not of its camera's size."""
         self.images.check(camera, frame)
+
+    def check_sweep(self, frame: int) -> int:
+        """All frames are in one file without a header of each, so it is read."""
+        return len(self.lidar(frame).points)
 
     def lidar(self, frame: int) -> LidarSweep:
         points = np.zeros((0, 3)) if self.points is None else self._cloud(frame)

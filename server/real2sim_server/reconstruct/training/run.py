@@ -84,7 +84,7 @@ def train(
     timing_s = {} if timing_s is None else timing_s
     stages = Stages(on_progress, timing_s)
     with stages("check") as report_step:
-        check_log(log, on_progress=report_step)
+        check_log(log, on_progress=report_step).raise_for_problems()
     scene = _first_scene(
         log, options, folder, resume=resume, on_progress=on_progress, timing_s=timing_s
     )

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...driving_log import LogError
-from ...images import check_image_file, image_size, read_image
+from ...images import check_image_file, read_image
 from ..lens import Lens
 
 
@@ -20,18 +19,6 @@ class ImageFiles:
 
     files: Mapping[str, Sequence[Path]]
     lenses: Mapping[str, Lens]
-
-    def check_sizes(self) -> None:
-        """Raise LogError naming the first file that is missing or of another size than its lens."""
-        for camera, files in self.files.items():
-            lens = self.lenses[camera]
-            for path in files:
-                size = image_size(path)
-                if size != (lens.width, lens.height):
-                    raise LogError(
-                        f"{path}: is {size[0]}x{size[1]}, but camera {camera!r} is "
-                        f"{lens.width}x{lens.height}"
-                    )
 
     def read(self, camera: str, frame: int) -> NDArray[np.uint8]:
         """The pinhole image, RGB uint8 [H, W, 3]."""

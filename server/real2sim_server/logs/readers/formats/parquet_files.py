@@ -115,6 +115,26 @@ class ParquetFile:
         return sum(int(column.nbytes) for column in self._groups.values())
 
 
+def check_feather(path: Path, columns: Sequence[str]) -> None:
+    """Raise LogError when a Feather file is cut off or lacks a column; reads no values."""
+    import pyarrow as pa
+    from pyarrow import ipc
+
+    try:
+        with path.open("rb") as file:
+            schema = ipc.open_file(file).schema
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
+    with _broken_named(f"{path}: the list of columns"):
+        _require(path, columns, list(schema.names))
+
+
+def _require(path: Path, columns: Sequence[str], there: Sequence[str]) -> None:
+    for name in columns:
+        if name not in there:
+            raise LogError(f"{path}: has no column {name!r}; it has {list(there)[:12]}")
+
+
 def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Columns of a Feather file (version 2) as arrays, text as arrays of objects.
 
@@ -132,11 +152,9 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     except (OSError, ValueError, pa.ArrowException) as error:  # names that are no text among them
         raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
     with _broken_named(f"{path}: the list of columns"):
-        there = list(table.column_names)
+        _require(path, columns, list(table.column_names))
     found = {}
     for name in columns:
-        if name not in there:
-            raise LogError(f"{path}: has no column {name!r}; it has {there[:12]}")
         column = table.column(name)
         if column.null_count:
             raise LogError(f"{path}: column {name!r} has {column.null_count} empty cells")

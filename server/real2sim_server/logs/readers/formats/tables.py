@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....geometry.rotation import Float, is_rotation
-from ....scene import CameraRig, Trajectory
+from ....scene import Trajectory
 from ...driving_log import LogError
-from ...images import image_size
 
 
 def read_lines(path: Path) -> list[str]:
@@ -99,19 +98,3 @@ def check_ego_covers(ego: Trajectory, times_us: NDArray[np.int64], where: str) -
             f"{where}: ego poses cover [{ego.start_us}, {ego.end_us}] us, but the frames go from "
             f"{times_us[0]} to {times_us[-1]} us"
         )
-
-
-def check_images(paths: dict[str, list[Path]], rig: CameraRig) -> None:
-    """Check by their headers that all images have their camera's size.
-
-    Raises:
-        LogError: names the first file that is missing, no image, or of another size.
-    """
-    for camera in rig:
-        for path in paths[camera.name]:
-            size = image_size(path)
-            if size != (camera.width, camera.height):
-                raise LogError(
-                    f"{path}: is {size[0]}x{size[1]}, but camera {camera.name!r} is "
-                    f"{camera.width}x{camera.height}"
-                )

@@ -18,7 +18,7 @@ from ....geometry.transform import invert_transform
 from ....scene import Trajectory
 from ...driving_log import DrivingLog, LogError, ObjectTrack
 from ..box_tracks import FrameBox, build_tracks, upright_pose
-from ..formats.tables import check_frame_times, check_images, read_lines, read_number_table
+from ..formats.tables import check_frame_times, read_lines, read_number_table
 from ..selection import select_sequence
 from .files import KittiCalibration, calibration_from, oxts_poses, read_entries
 from .tracking import KITTI_EGO_SIZE, MISSING_SCANS, KittiSource, read_rig
@@ -57,7 +57,6 @@ class KittiRawReader:
         images = _image_files(drive)
         count = len(images[MAIN])
         rig = read_rig(calibration_file, calibration, images)
-        check_images(images, rig)
         times_us = _read_times(drive / MAIN / "timestamps.txt", count)
         scans = _scan_files(drive, count)
         poses = _vehicle_poses(drive / "oxts" / "data", count, calibration)
@@ -70,7 +69,7 @@ class KittiRawReader:
             frame_times_us=times_us,
             ego=Trajectory.from_transforms(times_us, poses),
             tracks=tracks,
-            source=KittiSource(images, scans, calibration.T_vehicle_velo, poses),
+            source=KittiSource(rig, images, scans, calibration.T_vehicle_velo, poses),
             ego_size=KITTI_EGO_SIZE,
             provenance={
                 "dataset": "KITTI raw",
@@ -137,15 +136,7 @@ def _scan_files(drive: Path, count: int) -> list[Path | None]:
     scans: list[Path | None] = []
     for frame in range(count):
         path = drive / "velodyne_points" / "data" / f"{frame:010d}.bin"
-        if not path.is_file():
-            if frame not in missing:
-                raise LogError(f"{path}: no such file; every image needs its scan")
-            scans.append(None)
-            continue
-        size = path.stat().st_size
-        if size == 0 or size % 16:
-            raise LogError(f"{path}: {size} bytes is no whole number of points of 16 bytes")
-        scans.append(path)
+        scans.append(None if frame in missing and not path.is_file() else path)
     return scans
 
 

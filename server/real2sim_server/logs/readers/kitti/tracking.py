@@ -19,7 +19,7 @@ from ....geometry.transform import apply_transform, invert_transform
 from ....scene import Camera, CameraRig, Trajectory
 from ...driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ...images import check_image_file, image_size, read_image
-from ..formats.tables import check_images
+from ..formats.point_files import count_rows, read_rows
 from ..selection import select_sequence
 from ..sweep_motion import compensate_sweep
 from .files import (
@@ -33,6 +33,8 @@ from .files import (
 )
 
 SWEEP_US = 100_000
+COLUMNS = 4
+"""Of a scan's points: x, y, z, reflectance."""
 MISSING_SCANS = {"0001": range(177, 181)}
 """Scans that the published data set lacks, by sequence; these frames get an empty sweep."""
 
@@ -72,7 +74,6 @@ class KittiReader:
         images = _image_files(root, sequence)
         frame_count = len(images["image_02"])
         rig = read_rig(root / "calib" / f"{sequence}.txt", calibration, images)
-        check_images(images, rig)
         scans = _scan_files(root / "velodyne" / sequence, sequence, frame_count)
         times_us = read_times(root / "times" / f"{sequence}.txt", frame_count)
         vehicle_poses, pose_source = _vehicle_poses(root, sequence, frame_count, calibration)
@@ -83,7 +84,7 @@ class KittiReader:
             frame_times_us=times_us,
             ego=Trajectory.from_transforms(times_us, vehicle_poses),
             tracks=_tracks(labels, vehicle_poses @ calibration.T_vehicle_cam0, times_us),
-            source=KittiSource(images, scans, calibration.T_vehicle_velo, vehicle_poses),
+            source=KittiSource(rig, images, scans, calibration.T_vehicle_velo, vehicle_poses),
             ego_size=KITTI_EGO_SIZE,
             provenance={
                 "dataset": "KITTI tracking layout",
@@ -156,14 +157,6 @@ def _scan_files(folder: Path, sequence: str, frame_count: int) -> list[Path | No
         if not path.exists() and frame in MISSING_SCANS.get(sequence, ()):
             scans.append(None)
             continue
-        if not path.is_file():
-            raise LogError(f"{path}: no such file; every image needs its scan")
-        size = path.stat().st_size
-        if size == 0 or size % 16:
-            raise LogError(
-                f"{path}: {size} bytes is no whole number of points (x y z reflectance, float32, "
-                "16 bytes each); is the file cut off?"
-            )
         scans.append(path)
     return scans
 
@@ -224,6 +217,7 @@ def _tracks(
 class KittiSource:
     """Files of a KITTI drive, and what it takes to bring scans to image time."""
 
+    rig: CameraRig
     images: dict[str, list[Path]]
     scans: list[Path | None]
     T_vehicle_velo: Float
@@ -234,8 +228,14 @@ class KittiSource:
         return read_image(self.images[camera][frame])
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off."""
-        check_image_file(self.images[camera][frame])
+        """See :class:`ChecksFiles`."""
+        lens = self.rig[camera]
+        check_image_file(self.images[camera][frame], (lens.width, lens.height))
+
+    def check_sweep(self, frame: int) -> int:
+        """See :class:`ChecksFiles`."""
+        path = self.scans[frame]
+        return 0 if path is None else count_rows(path, COLUMNS)
 
     def lidar(self, frame: int) -> LidarSweep:
         """The compensated scan; see :class:`FrameSource`."""
@@ -253,12 +253,6 @@ class KittiSource:
     def _raw_scan(self, frame: int) -> NDArray[np.float32]:
         path = self.scans[frame]
         if path is None:
-            return np.zeros((0, 4), dtype=np.float32)
-        try:
-            values = np.fromfile(path, dtype=np.float32)
-        except OSError as error:
-            raise LogError(f"{path}: cannot be read ({error.strerror})") from error
-        if values.size % 4:
-            raise LogError(f"{path}: {values.size * 4} bytes is no whole number of points")
-        scan = values.reshape(-1, 4)
+            return np.zeros((0, COLUMNS), dtype=np.float32)
+        scan = read_rows(path, COLUMNS)
         return scan[np.isfinite(scan).all(axis=1)]

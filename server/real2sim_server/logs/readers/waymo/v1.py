@@ -168,6 +168,10 @@ class _WaymoV1Source:
         lens = self.cameras[camera].lens
         check_encoded_image(data, where, (lens.width, lens.height))
 
+    def check_sweep(self, frame: int) -> int:
+        """Sweeps have no header of their own, so they are read."""
+        return len(self.lidar(frame).points)
+
     def lidar(self, frame: int) -> LidarSweep:
         images = _range_images(self._message(frame), self.lasers)
         return merge_range_images(images, self.frames[frame].pose, self.timings[frame])

@@ -307,6 +307,10 @@ class _WaymoV2Source:
         lens = self.cameras[camera].lens
         check_encoded_image(data, where, (lens.width, lens.height))
 
+    def check_sweep(self, frame: int) -> int:
+        """Sweeps have no header of their own, so they are read."""
+        return len(self.lidar(frame).points)
+
     def lidar(self, frame: int) -> LidarSweep:
         files, here = self.lidar_files, self.frames[frame]
         images = [] if files is None else _range_images(files, here.start_us)
