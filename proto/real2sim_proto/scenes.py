@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from .base import Named, Track
 from .cameras import OpticsSpec
 from .guidance import Guided
 from .operations import SetGait, SetPhysics, SetVelocity
+
+WITHOUT_SCENES = "`real2sim serve --demo` shows a street at once; your own: `real2sim reconstruct`"
+"""What to do about a worker that has none."""
 
 
 class Reply(Guided, BaseModel):
@@ -121,12 +124,24 @@ class SceneList(Reply):
 
 
 class SceneImport(BaseModel):
-    """Body of `POST /v1/scenes`: a bundle or splat file below the worker's import folder."""
+    """Body of `POST /v1/scenes`: a bundle or splat file below the worker's import folder, or the
+    demo street, which comes with the worker."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    path: str = Field(min_length=1, max_length=4096, description="relative to the import folder")
-    scene: str | None = Field(default=None, description="name to give it; default: the file's name")
+    path: str | None = Field(
+        default=None, min_length=1, max_length=4096, description="relative to the import folder"
+    )
+    demo: bool = Field(default=False, description="add the demo street; without a path")
+    scene: str | None = Field(
+        default=None, description="name to give it; default: the file's name, or `demo_street`"
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.demo == (self.path is not None):
+            raise ValueError('give either a path below the import folder or "demo": true')
+        return self
 
 
 class Limits(Reply):

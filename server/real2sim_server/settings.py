@@ -34,6 +34,8 @@ class Settings(BaseSettings):
         worker_id: first part of session ids, so that a proxy can find the worker again.
         data_dir: what the worker writes; the next five lie below it by default.
         scenes_dir: folder of scene bundles.
+        demo: add the demo street to the scene folder at the start, unless a scene of its name,
+            ``demo_street``, is there.
         import_root: the only folder that ``POST /v1/scenes`` may read from.
         assets_dir: folder of asset bundles.
         jobs_dir: folder of the files that jobs leave.
@@ -106,6 +108,7 @@ class Settings(BaseSettings):
     worker_id: str = Field(default="w0", pattern=r"^w[0-9]{1,6}$")
     data_dir: Path = Field(default_factory=_default_data_dir)
     scenes_dir: Path | None = None
+    demo: bool = False
     import_root: Path | None = None
     assets_dir: Path | None = None
     jobs_dir: Path | None = None

@@ -52,7 +52,9 @@ def scenes(
         write_json(json_file, [scene.model_dump(mode="json") for scene in found])
         return
     if not found:
-        typer.echo("the worker has no scenes; `real2sim import` or `real2sim synth` makes one")
+        from real2sim_proto.scenes import WITHOUT_SCENES
+
+        typer.echo(f"the worker has no scenes; {WITHOUT_SCENES}")
         return
     console().print(_table(found))
 

@@ -171,7 +171,7 @@ def _own_worker(scenes: Path | None, out: Path) -> Iterator[str]:
 
     from ..demo.street import unpack_street
     from ..demo.worker import worker_process
-    from ..policies.suite import DEMO_SCENE
+    from ..scene.io import DEMO_SCENE
 
     with contextlib.ExitStack() as stack:
         if scenes is None:

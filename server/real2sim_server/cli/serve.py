@@ -22,6 +22,9 @@ def serve(
     ] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 picks a free one.")] = None,
     scenes: Annotated[Path | None, typer.Option(help="Folder of scene bundles.")] = None,
+    demo: Annotated[
+        bool, typer.Option("--demo", help="Add the demo street to the scenes, if it is not there.")
+    ] = False,
     data: Annotated[Path | None, typer.Option(help="Folder for scenarios and sessions.")] = None,
     token_file: Annotated[
         Path | None, typer.Option(help="File with the token; or set REAL2SIM_TOKEN.")
@@ -50,6 +53,7 @@ def serve(
         "host": host,
         "port": port,
         "scenes_dir": scenes,
+        "demo": demo or None,
         "data_dir": data,
         "token": token,
         "backend": backend,

@@ -14,6 +14,7 @@ from real2sim.planners import FollowRoute
 
 from ..console import console, print_figures, write_json
 from ..render.picture_file import write_png
+from ..scene.io import DEMO_SCENE as SCENE
 from .edits import StreetEdits, edit_street
 from .pictures import draw_map
 from .worker import starting_worker
@@ -21,7 +22,6 @@ from .worker import starting_worker
 if TYPE_CHECKING:
     from .drive import FilmedDrive
 
-SCENE = "demo_street"
 CAMERAS = ("front_left", "front", "front_right")
 STEP_US = 100_000
 QUIET_S, WARM_UP_S = 5.0, 600.0

@@ -12,9 +12,9 @@ import tempfile
 from pathlib import Path
 
 from ..console import staged_progress
-from ..scene.io import load_scene, read_packed, save_scene, write_packed
+from ..scene.io import SHIPPED_STREET, load_scene, read_packed, save_scene, write_packed
 
-SHIPPED = Path(__file__).with_name("street.r2s.zip")
+SHIPPED = SHIPPED_STREET
 DURATION_S = 10.4
 """Of the shipped drive: 100 steps of 0.1 s and a little to spare."""
 TRAINING_HZ, UNTRAINED_HZ = 5.0, 2.0
@@ -24,7 +24,7 @@ MAX_BACKGROUND, MAX_OBJECT = 250_000, 12_000
 
 def unpack_street(scenes: Path, name: str) -> None:
     """Write the shipped street as the bundle ``name`` in the folder ``scenes``."""
-    save_scene(read_packed(SHIPPED), scenes / name)
+    save_scene(read_packed(SHIPPED_STREET), scenes / name)
 
 
 def record_street(log: Path, *, duration_s: float, hz: float) -> None:

@@ -24,7 +24,7 @@ from real2sim_proto.operations import Operation
 from ..console import CommandError
 
 SHIPPED_SUITES = Path(__file__).with_name("suites")
-DEMO_SUITE, DEMO_SCENE = "demo", "demo_street"
+DEMO_SUITE = "demo"
 SET_BY_EVALUATION = frozenset({"seed", "sensors", "action", "privileged"})
 """Fields of reset that no case may name: the seed, and what the planner needs."""
 

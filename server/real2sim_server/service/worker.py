@@ -17,11 +17,12 @@ import structlog
 from fastapi import Depends, Response
 from starlette.requests import HTTPConnection
 
-from real2sim_proto.scenes import DeviceInfo, Readiness
+from real2sim_proto import ErrorCode
+from real2sim_proto.scenes import WITHOUT_SCENES, DeviceInfo, Readiness
 
 from ..render import Backend, describe_backends, select_backend
 from ..render.backends import device_of
-from ..scene.io import StagingLimits
+from ..scene.io import DEMO_SCENE, SHIPPED_STREET, StagingLimits
 from ..settings import Settings
 from .accounts import Accounts
 from .agent import Agent, Willingness
@@ -31,12 +32,14 @@ from .engine import Engine
 from .http.connections import ConnectionLimits, Connections, connection_limit
 from .http.idempotency import Idempotency
 from .http.metrics import Metrics
+from .http.problems import ServiceError
 from .jobs.calibrations import Calibrations
 from .jobs.exports import VideoSource
 from .jobs.jobs import Jobs
 from .jobs.simulations import Simulations
 from .library.assets import AssetLibrary
 from .library.import_queue import ImportQueue
+from .library.imports import import_scene
 from .library.memory import MemoryBudget
 from .library.quotas import Quota
 from .library.scene_cache import SceneCache
@@ -233,7 +236,10 @@ class Worker:
             upkeep = Upkeep(self.settings, self.store, self.jobs, self.sessions)
             # Nobody uploads yet: what lies about now was left behind.
             await asyncio.to_thread(partial(upkeep.sweep, at_start=True))
-            await self.scene_cache.refresh()
+            if self.settings.demo:
+                await asyncio.to_thread(self._add_demo)
+            if not await self.scene_cache.refresh():
+                log.warning("no scenes", folder=str(self.settings.scenes_path), hint=WITHOUT_SCENES)
             self.waiting_for = {"warming up kernels"}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
             at_exit.push_async_callback(self.kernels.deformation.close)
@@ -390,6 +396,20 @@ class Worker:
             await self.membership.leave()
         log.info("handed over", to=len(others))
         return True
+
+    def _add_demo(self) -> None:
+        """Put the demo street into the scene folder, unless a scene of its name is there."""
+        try:
+            import_scene(
+                SHIPPED_STREET,
+                scenes=self.settings.scenes_path,
+                name=DEMO_SCENE,
+                limits=self.scene_limits,
+                quota=self.scenes_quota,
+            )
+        except (ServiceError, OSError) as error:
+            if not isinstance(error, ServiceError) or error.code != ErrorCode.ALREADY_EXISTS:
+                log.warning("the demo street cannot be added", reason=str(error))
 
     def _willingness(self) -> Willingness:
         return Willingness(

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from ..console import CommandError
 from ..demo.street import unpack_street
-from ..policies.suite import DEMO_SCENE
 from ..scene import Scene
-from ..scene.io import load_scene
+from ..scene.io import DEMO_SCENE, load_scene
 
 
 def open_scene(name: str, folder: Path | None = None) -> Scene:

@@ -15,7 +15,14 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.base import ID_PATTERN
 
 from ...scene import BundleTooLargeError, SceneError
-from ...scene.io import StagingError, StagingLimits, stage_scene
+from ...scene.io import (
+    SHIPPED_STREET,
+    StagingError,
+    StagingLimits,
+    read_packed,
+    save_scene,
+    stage_scene,
+)
 from ..http.problems import ServiceError
 from ..storage.errors import FULL_ERRNOS, REFUSED_ERRNOS, is_full, is_refused
 from .claims import bears_claim, put_claim
@@ -59,7 +66,7 @@ def import_scene(
     """Read ``source`` whole, check it, and make it bundle ``name`` below ``scenes``.
 
     Args:
-        source: bundle or splat file.
+        source: bundle or splat file, or the shipped street.
         scenes: the scene folder.
         name: of the new scene.
         limits: of the process that reads.
@@ -77,7 +84,10 @@ def import_scene(
     quota.check()
     with import_errors(source, setting="MAX_SCENE_BYTES"), staging_folder(scenes) as staging:
         staged = staging / folder.name
-        stage_scene(source, staged, name=name, limits=limits)
+        if source == SHIPPED_STREET:
+            save_scene(read_packed(source), staged)
+        else:
+            stage_scene(source, staged, name=name, limits=limits)
         quota.check(added_bytes=folder_usage(staged)[1])
         put_claim(staged, claim)
         _check_name(folder, name)

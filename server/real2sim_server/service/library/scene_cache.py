@@ -15,7 +15,7 @@ from typing import TypeVar
 import structlog
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.scenes import SceneState
+from real2sim_proto.scenes import WITHOUT_SCENES, SceneState
 
 from ...render import scene_levels_bytes
 from ...scene import BundleError, Scene
@@ -110,11 +110,13 @@ class SceneCache:
         if known is None and self.fetch is not None and await self.fetch(name):
             known = (await self.refresh()).get(name)
         if known is None:
-            names = ", ".join(list(self._listings)[:20]) or "none"
+            names = ", ".join(list(self._listings)[:20])
             raise ServiceError(
                 ErrorCode.UNKNOWN_SCENE,
-                f"no scene {name!r}; there are: {names}",
-                hint="GET /v1/scenes lists them; POST /v1/scenes imports one",
+                f"no scene {name!r}; there are: {names or 'none'}",
+                hint="GET /v1/scenes lists them; POST /v1/scenes imports one"
+                if names
+                else WITHOUT_SCENES,
             )
         return known
 

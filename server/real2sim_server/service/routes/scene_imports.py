@@ -1,4 +1,4 @@
-"""New scenes: a path below the import folder, or an uploaded splat file."""
+"""New scenes: a path below the import folder, the demo street, or an uploaded splat file."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from starlette.datastructures import FormData, UploadFile
 from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import SceneImport, SceneInfo
 
+from ...scene.io import DEMO_SCENE, SHIPPED_STREET
 from ...scene.io.formats import suffixes
 from ..http.auth import TokenRoute
 from ..http.idempotency import IdempotencyKey, form_digest
@@ -66,7 +67,8 @@ router = APIRouter(prefix="/v1", tags=["scenes"], route_class=TokenRoute)
 async def import_(
     worker: WorkerOf, request: Request, idempotency_key: IdempotencyKey = None
 ) -> Response:
-    """Add a scene: a bundle or ply below the import folder (JSON), or an uploaded ply."""
+    """Add a scene: a bundle or ply below the import folder (JSON), the demo street
+    (`{"demo": true}`), or an uploaded ply."""
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
     with worker.imports.place():
         if kind != "multipart/form-data":
@@ -105,8 +107,11 @@ async def _import_path(worker: Worker, body: bytes, claim: str | None) -> str:
     settings = worker.settings
 
     def work() -> str:
-        source = resolve_import(settings.import_path, request.path)
-        name = scene_name(source, request.scene)
+        if request.path is None:
+            source, name = SHIPPED_STREET, scene_name(SHIPPED_STREET, request.scene or DEMO_SCENE)
+        else:
+            source = resolve_import(settings.import_path, request.path)
+            name = scene_name(source, request.scene)
         _import(worker, source, name, claim)
         return name
 

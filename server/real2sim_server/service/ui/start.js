@@ -1,17 +1,26 @@
 // The first page: scenarios that exist, and scenes to begin one on.
-import { call, get, picture } from "./api.js";
+import { call, get, picture, post } from "./api.js";
 import { isInBin, putInBin } from "./bin.js";
 import { el } from "./dom.js";
 import { attempt } from "./messages.js";
 
 export async function startPage() {
   document.getElementById("start").hidden = false;
-  const [{ scenes }] = await Promise.all([get("/v1/scenes"), listScenarios()]);
+  await Promise.all([listScenes(), listScenarios()]);
+}
+async function listScenes() {
+  const { scenes } = await get("/v1/scenes");
   fill(
     "scene-list",
     scenes.map(sceneCard),
-    "The worker has no scene. Start it with --scenes FOLDER.",
+    "The worker has no scene. real2sim reconstruct makes one of your drive; start the worker with --scenes FOLDER.",
+    el("button", { id: "add-demo", textContent: "Add the demo street", onclick: addDemo }),
   );
+}
+async function addDemo({ target }) {
+  target.disabled = true;
+  await attempt(() => post("/v1/scenes", { demo: true }))();
+  await attempt(listScenes)();
 }
 async function listScenarios() {
   const { scenarios } = await get("/v1/scenarios");
@@ -24,10 +33,10 @@ async function listScenarios() {
     "No scenario yet. The first edit of a scene begins one.",
   );
 }
-function fill(id, cards, otherwise) {
+function fill(id, cards, otherwise, ...more) {
   document
     .getElementById(id)
-    .replaceChildren(...(cards.length ? cards : [el("p", { textContent: otherwise })]));
+    .replaceChildren(...(cards.length ? cards : [el("p", { textContent: otherwise }), ...more]));
 }
 const pathOf = (s) => `/v1/scenarios/${s.scenario_id}`;
 const nameOf = (s) => s.name || s.scenario_id;

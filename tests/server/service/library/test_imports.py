@@ -46,6 +46,49 @@ def test_a_splat_file_can_be_uploaded(client, import_root):
     assert response.json()["gaussians"] == 60
 
 
+def test_the_demo_street_is_imported_and_can_be_drawn(client):
+    response = post(client, demo=True)
+    assert response.status_code == 201
+    assert response.headers["Location"] == "/v1/scenes/demo_street"
+    camera = response.json()["cameras"][0]["name"]
+    drawn = client.get(f"/v1/scenes/demo_street/render?camera={camera}&width=64")
+    assert drawn.status_code == 200
+    assert post(client, demo=True).json()["code"] == ErrorCode.ALREADY_EXISTS
+
+
+@pytest.mark.parametrize("body", [{}, {"demo": True, "path": "street.r2s"}, {"demo": False}])
+def test_an_import_has_one_source(client, import_root, body):
+    problem = post(client, **body).json()
+    assert problem["code"] == ErrorCode.INVALID_REQUEST
+    assert "either a path" in str(problem["errors"])
+
+
+def test_the_demo_street_counts_as_a_scene(start_worker):
+    client = start_worker(scenes_quota=1)
+    assert post(client, demo=True).json()["code"] == ErrorCode.QUOTA_EXCEEDED
+
+
+def test_a_worker_adds_the_demo_street_where_no_scene_has_its_name(run_worker, scenes_dir):
+    mine = scenes_dir / "demo_street.r2s" / "mine"
+    for start in range(2):
+        with run_worker(demo=True) as client:
+            names = [scene["scene"] for scene in client.get("/v1/scenes").json()["scenes"]]
+        assert names == ["demo_street", "tiny"]
+        assert mine.exists() == (start == 1)
+        mine.touch()
+
+
+def test_a_worker_that_cannot_add_the_demo_street_serves_what_it_has(start_worker):
+    client = start_worker(demo=True, scenes_quota=1)
+    assert [scene["scene"] for scene in client.get("/v1/scenes").json()["scenes"]] == ["tiny"]
+
+
+def test_a_worker_without_scenes_says_how_to_get_some(start_worker, tmp_path):
+    (tmp_path / "nothing").mkdir()
+    problem = start_worker(scenes_dir=tmp_path / "nothing").get("/v1/scenes/street").json()
+    assert "serve --demo" in problem["hint"]
+
+
 def test_an_upload_leaves_nothing_but_the_scene(client, import_root, scenes_dir):
     content = (import_root / "car.ply").read_bytes()
     client.post("/v1/scenes", files={"file": ("a.ply", content)}, data={"scene": "b"})

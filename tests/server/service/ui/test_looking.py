@@ -7,6 +7,7 @@ from typing import Any
 import httpx2
 import pytest
 
+from real2sim_server.service.serve import running_worker
 from tests.waiting import wait_until
 
 from .hands import address, enter, field, kept, shown, wait_address
@@ -33,6 +34,15 @@ def test_whoever_looks_leaves_nothing_and_can_share_what_is_seen(looking, visit,
     assert shown(other, "model.selected") == "car_red"
     assert shown(other, "model.t") == shown(looking, "model.t")
     assert scenarios(running) == []
+
+
+def test_a_worker_without_scenes_offers_the_demo_street(visit, make_settings, tmp_path):
+    (tmp_path / "nothing").mkdir()
+    with running_worker(make_settings(scenes_dir=tmp_path / "nothing")) as worker:
+        page = visit(f"{worker.url}/ui")
+        page.click("text=Add the demo street")
+        page.wait_for_selector("[data-scene=demo_street]")
+        assert not page.is_visible("text=Add the demo street")
 
 
 def test_the_first_edit_makes_the_scenario_and_the_picture_follows(looking, running):
