@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, settings
 
 import real2sim_server  # noqa: F401 - says how threads wait, before any library starts some
 from scripts.compile_kernels import compile_drawing, compile_physics
+from tests.pages import Page
 
 # Machines under load are slow now and then, and a failure must come back on the next run.
 settings.register_profile(
@@ -79,3 +80,10 @@ def worker_kernels(compile_alone: Callable[[Callable[[], None]], None]) -> None:
 def solver_kernels(compile_alone: Callable[[Callable[[], None]], None]) -> None:
     """Kernels of the physics on the CPU, in both precisions, on disk."""
     compile_alone(compile_physics)
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Page]:
+    """Opens a page of README and docs, to run its blocks in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return lambda name: Page(REPOSITORY / name, tmp_path)

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
+import typer
 
+from real2sim.cli import build_app
 from real2sim_proto import HTTP_STATUS, RETRYABLE, ErrorCode
+from tests.pages import BLOCK
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDERS = (REPOSITORY, REPOSITORY / "docs", REPOSITORY / "docs/site")
 PAGES = sorted(page for folder in FOLDERS for page in folder.glob("*.md"))
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s#]+)(?:#[^)\s]*)?\)")
+CALL = re.compile(r"(?:[A-Z_0-9]+=\S+ )*(?:\S*/bin/)?real2sim (.*)")
+WITH_BLOCKS = [
+    REPOSITORY / "README.md",
+    *sorted(p for p in (REPOSITORY / "docs").rglob("*.md") if p.stem != "index"),
+]
 INTERNALS = (
     "FieldInfo(",
     "PydanticUndefined",
@@ -65,3 +76,31 @@ def test_the_site_is_built_without_a_warning_and_shows_no_internals(tmp_path: Pa
     assert tmp_path / "site" / "api" / "pages" / "real2sim.Scenario.html" in pages
     shown = {word for text in pages.values() for word in INTERNALS if word in text}
     assert shown == set()
+
+
+def commands() -> Iterator[tuple[str, str]]:
+    """Every call of ``real2sim`` in the blocks of a page."""
+    for path in WITH_BLOCKS:
+        for _, text in BLOCK.findall(path.read_text("utf-8")):
+            for line in text.replace("\\\n", " ").splitlines():
+                if (call := CALL.match(line)) is not None:
+                    yield str(path.relative_to(REPOSITORY)), call.group(1)
+
+
+@pytest.mark.parametrize(("where", "call"), list(commands()))
+def test_every_command_of_the_pages_is_one(where: str, call: str) -> None:
+    """Its name is known, and its options are."""
+    context = click.Context(typer.main.get_command(build_app()), info_name="real2sim")
+    arguments = [word for word in shlex.split(call, comments=True) if word != "&"]
+    while isinstance(context.command, click.Group):
+        name, command, arguments = context.command.resolve_command(context, arguments)
+        context = click.Context(command, info_name=name, parent=context)
+    context.command.make_parser(context).parse_args(arguments)
+
+
+@pytest.mark.parametrize("path", WITH_BLOCKS, ids=lambda p: p.name)
+def test_every_page_with_blocks_has_a_test(path: Path) -> None:
+    opened = f'page("{path.relative_to(REPOSITORY)}")'
+    tests = ("test_guides.py", "test_formats.py")
+    told = any(opened in (REPOSITORY / "tests/server" / t).read_text("utf-8") for t in tests)
+    assert told or not BLOCK.search(path.read_text("utf-8"))

@@ -1,0 +1,76 @@
+"""The code blocks of README and docs, for tests that run them in the order of their page."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
+LIMIT_S = 280
+PACKAGES = ("proto", "client", "server")
+
+
+@dataclass
+class Page:
+    """The blocks of a page, in order; Python shares its names, and shells their variables."""
+
+    path: Path
+    folder: Path
+    names: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._blocks = BLOCK.findall(self.path.read_text("utf-8"))
+        (self.folder / "state").touch()
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            assert self._blocks == [], "blocks that no test runs"
+
+    def block(self, words: str) -> str:
+        """The next block, which must have these words in it."""
+        _, text = self._blocks.pop(0)
+        assert words in text
+        return text
+
+    def json(self, words: str) -> Any:
+        return json.loads(self.block(words))
+
+    def python(self, words: str, **instead: str) -> dict[str, Any]:
+        """Run the next block; the names of the page after it."""
+        exec(replaced(self.block(words), instead), self.names)
+        return self.names
+
+    def shell(self, words: str, instead: dict[str, str] | None = None) -> str:
+        """Run the next block; what it prints. The first command that fails ends it."""
+        text = replaced(self.block(words), instead or {})
+        script = f"set -aeo pipefail\n. ./state\n{text}\n{{ export -p; declare -f; }} > state"
+        environment = os.environ | {
+            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "PYTHONPATH": os.pathsep.join(
+                str(REPOSITORY / n) for n in ("proto", "client", "server")
+            ),
+        }
+        done = subprocess.run(
+            ["bash", "-c", script], cwd=self.folder, env=environment, capture_output=True,
+            text=True, timeout=LIMIT_S, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+
+def replaced(text: str, instead: dict[str, str]) -> str:
+    """The text with addresses and sizes of the test; each of them must be in it."""
+    for old, new in instead.items():
+        assert old in text
+        text = text.replace(old, new)
+    return text
