@@ -74,4 +74,4 @@ def test_the_reconstruction_has_wall_and_car_where_the_arrays_had_them(log: Driv
     x, y, z = car.cloud.means.numpy().T
     rear = x[(np.abs(y) < 0.85) & (np.abs(z) < 0.6) & (x < -1.9)]
     assert len(rear) > 10
-    np.testing.assert_allclose(rear, -2.15, atol=0.03)
+    np.testing.assert_allclose(rear, -2.15, rtol=0, atol=0.015)
