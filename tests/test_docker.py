@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import secrets
 import shlex
+import shutil
+import subprocess
 import tomllib
+import urllib.request
 from importlib.metadata import requires
 from pathlib import Path
 
@@ -173,11 +177,13 @@ def test_a_worker_by_compose_serves_the_demo_street_to_who_has_the_token(
     environment = {n: v for n, v in variables.items() if n.startswith("REAL2SIM_")} | given
     for name, value in environment.items():
         environment[name] = str(folders.get(value, value))
+    assert environment["REAL2SIM_HOST"] == "0.0.0.0"
+    assert worker["ports"] == [f"127.0.0.1:8600:{environment['REAL2SIM_PORT']}"]
     environment |= {"REAL2SIM_HOST": "127.0.0.1", "REAL2SIM_PORT": "0"}
     entry, arguments = json.loads(image["ENTRYPOINT"]), worker["command"]
+    assert entry == ["real2sim"]
     unpack_street(folders["/scenes"], "demo_street")
 
-    assert entry == ["real2sim"]
     log_file = tmp_path / "log"
     process = start_real2sim(arguments, log_file=log_file, environment=environment)
     try:
@@ -194,3 +200,33 @@ def test_a_worker_by_compose_serves_the_demo_street_to_who_has_the_token(
     assert picture.shape[1] == 120
     assert picture.std() > 20  # A street, not one colour.
     assert (folders["/var/lib/real2sim"] / "real2sim.db").exists()
+
+
+def build_options() -> list[str]:
+    """Of ``buildah bud``, from ``BUILDAH_OPTIONS``; skips where no image can be built."""
+    missing = [name for name in ("buildah", "debootstrap") if shutil.which(name) is None]
+    if missing:
+        pytest.skip(f"there is no {' and no '.join(missing)} (make system-packages)")
+    if os.geteuid() != 0:
+        pytest.skip("only root builds images by buildah in a chroot")
+    if subprocess.run(["unshare", "--mount", "true"], check=False, capture_output=True).returncode:
+        pytest.skip("this machine lets root mount nothing")
+    if options := os.environ.get("BUILDAH_OPTIONS"):
+        return shlex.split(options)
+    index = re.search(r"(?m)^ARG TORCH_INDEX=(.*)$", (DOCKER / "Dockerfile.cpu").read_text())
+    try:
+        urllib.request.urlopen(f"{index[1]}/torch/", timeout=20).close()
+    except OSError as error:
+        pytest.skip(f"{index[1]}: {error}; set BUILDAH_OPTIONS, '--build-arg TORCH_INDEX=' say")
+    return []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(5400)
+def test_the_image_for_cpus_is_built_and_is_ready_as_its_user_on_a_read_only_root():
+    """Some ten minutes of processor time, nearly all of it kernels."""
+    command = ["nice", "-n", "10", str(DOCKER / "build.sh"), "cpu", "--", *build_options()]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    *_, last = done.stdout.strip().splitlines()
+    assert last.startswith("real2sim:cpu is ready as user 10001:10001 on a read-only root")
