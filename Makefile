@@ -54,7 +54,7 @@ test-slow: $(STAMP)
 system-packages:
 	apt-get -qq update
 	DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends \
-	  chromium-headless-shell postgresql haproxy
+	  chromium-headless-shell postgresql haproxy buildah debootstrap
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(SOURCES)

@@ -2,8 +2,9 @@
 # Builds an image with buildah, where there is no Docker and no registry, on a base made by
 # debootstrap, and runs it through its health check as its user on a read-only root.
 #   docker/build.sh [cpu|gpu] [-- options of `buildah bud`]
-# As root; needs buildah and debootstrap. MIRROR is a mirror of Debian, SUITE its release; what pip
-# and apt need inside (an index, a proxy, certificates) is given as --volume and --env after `--`.
+# As root; needs buildah and debootstrap. MIRROR is a mirror of Debian, SUITE its release. What pip and
+# apt need inside (an index, certificates) is given after `--` as files, `--volume HOST:PLACE:ro`, of which
+# an empty file stays in the image; what `--env` gives stays there as it is.
 set -eu
 kind=${1:-cpu}
 [ $# -gt 0 ] && shift
@@ -33,8 +34,10 @@ if ! buildah inspect "$base" >/dev/null 2>&1; then
     rm -rf "$work/base"
 fi
 
+before=$(buildah images --quiet "localhost/real2sim:$kind" 2>/dev/null || true)
 buildah bud --format docker --isolation chroot --layers=false --build-arg BASE_IMAGE="$base" \
     -f "docker/Dockerfile.$kind" -t "real2sim:$kind" "$@" .
+[ -z "$before" ] || buildah rmi "$before" >/dev/null || true
 
 # The health check, as the image's user on a root that cannot be written to.
 container=$(buildah from "real2sim:$kind")
@@ -44,13 +47,16 @@ mkdir "$work/root"
 mount --bind "$(buildah mount "$container")" "$work/root"
 mount -o remount,bind,ro "$work/root"
 mount -t proc proc "$work/root/proc"
-mount --rbind /dev "$work/root/dev"
+# As a slave: unmounting it leaves the host's own /dev as it is.
+mount --rbind --make-rslave /dev "$work/root/dev"
 for place in tmp var/lib/real2sim scenes; do
     mount -t tmpfs -o mode=1777 tmpfs "$work/root/$place"
 done
+port=$(chroot "$work/root" /usr/bin/python3 -c \
+    "import socket; s = socket.socket(); s.bind(('127.0.0.1', 0)); print(s.getsockname()[1])")
 setting() { buildah inspect --format '{{range .OCIv1.Config.Env}}{{println .}}{{end}}' "real2sim:$kind"; }
 cat >"$work/check" <<CHECK
-cd / && exec env -i $(setting | tr '\n' ' ') HOME=/tmp REAL2SIM_HOST=127.0.0.1 REAL2SIM_PORT=18600 \
+cd / && exec env -i $(setting | tr '\n' ' ') HOME=/tmp REAL2SIM_HOST=127.0.0.1 REAL2SIM_PORT=$port \
   real2sim serve
 CHECK
 chroot --userspec="$user" "$work/root" /bin/sh -c "$(cat "$work/check")" &
@@ -59,7 +65,7 @@ ready=""
 for _ in $(seq 1 120); do
     kill -0 $worker 2>/dev/null || break
     if chroot --userspec="$user" "$work/root" /usr/bin/python3 -c \
-        "import urllib.request as u; u.urlopen('http://127.0.0.1:18600/readyz')" 2>/dev/null; then
+        "import urllib.request as u; u.urlopen('http://127.0.0.1:$port/readyz')" 2>/dev/null; then
         ready=yes
         break
     fi

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import secrets
+import shlex
+import shutil
+import subprocess
 import tomllib
+import urllib.request
 from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
 import yaml
+
+from real2sim import UnauthorizedError, connect
+from real2sim_server.demo.street import unpack_street
+
+from .server.worker_processes import printed_url, start_real2sim
 
 DOCKER = Path(__file__).parents[1] / "docker"
 IMAGES = ["Dockerfile.cpu", "Dockerfile.gpu"]
@@ -139,3 +151,82 @@ def test_everything_in_an_image_is_among_the_notices():
     rows = (DOCKER.parent / "THIRD_PARTY.md").read_text()
     missing = [n for n, v in pins(IMAGE_PINS).items() if f"| {n} | {v} |" not in rows]
     assert missing == []
+
+
+# --- these files at work ----------------------------------------------------------------
+
+
+def last_stage(name: str) -> dict[str, str]:
+    """Instructions of an image's last stage; of those that come several times, all in one line."""
+    text = (DOCKER / name).read_text().replace("\\\n", " ")
+    found: dict[str, str] = {}
+    for word, rest in re.findall(r"(?m)^([A-Z]+) +(.*)$", text[text.rindex("\nFROM ") :]):
+        found[word] = f"{found.get(word, '')} {rest}".strip()
+    return found
+
+
+def test_a_worker_by_compose_serves_the_demo_street_to_who_has_the_token(
+    compose, worker, tmp_path, worker_kernels
+):
+    """The process that compose starts, in folders for its volumes and on a port of its own."""
+    token = secrets.token_hex(16)
+    folders = {place: tmp_path / source for place, source in mounts(worker).items()}
+    image = last_stage(Path(worker["build"]["dockerfile"]).name)
+    variables = dict(pair.split("=", 1) for pair in shlex.split(image["ENV"]))
+    given = {name: filled_in(v, REAL2SIM_TOKEN=token) for name, v in worker["environment"].items()}
+    environment = {n: v for n, v in variables.items() if n.startswith("REAL2SIM_")} | given
+    for name, value in environment.items():
+        environment[name] = str(folders.get(value, value))
+    assert environment["REAL2SIM_HOST"] == "0.0.0.0"
+    assert worker["ports"] == [f"127.0.0.1:8600:{environment['REAL2SIM_PORT']}"]
+    environment |= {"REAL2SIM_HOST": "127.0.0.1", "REAL2SIM_PORT": "0"}
+    entry, arguments = json.loads(image["ENTRYPOINT"]), worker["command"]
+    assert entry == ["real2sim"]
+    unpack_street(folders["/scenes"], "demo_street")
+
+    log_file = tmp_path / "log"
+    process = start_real2sim(arguments, log_file=log_file, environment=environment)
+    try:
+        url = printed_url(process, log_file)
+        with connect(url, token="") as stranger, pytest.raises(UnauthorizedError):
+            stranger.scenes.list()
+        with connect(url, token=token) as client:
+            client.wait_ready()
+            assert [scene.scene for scene in client.scenes.list()] == ["demo_street"]
+            picture = client.scenes.render("demo_street", camera="front", width=120).array
+    finally:
+        process.kill()
+        process.join()
+    assert picture.shape[1] == 120
+    assert picture.std() > 20  # A street, not one colour.
+    assert (folders["/var/lib/real2sim"] / "real2sim.db").exists()
+
+
+def build_options() -> list[str]:
+    """Of ``buildah bud``, from ``BUILDAH_OPTIONS``; skips where no image can be built."""
+    missing = [name for name in ("buildah", "debootstrap") if shutil.which(name) is None]
+    if missing:
+        pytest.skip(f"there is no {' and no '.join(missing)} (make system-packages)")
+    if os.geteuid() != 0:
+        pytest.skip("only root builds images by buildah in a chroot")
+    if subprocess.run(["unshare", "--mount", "true"], check=False, capture_output=True).returncode:
+        pytest.skip("this machine lets root mount nothing")
+    if options := os.environ.get("BUILDAH_OPTIONS"):
+        return shlex.split(options)
+    index = re.search(r"(?m)^ARG TORCH_INDEX=(.*)$", (DOCKER / "Dockerfile.cpu").read_text())
+    try:
+        urllib.request.urlopen(f"{index[1]}/torch/", timeout=20).close()
+    except OSError as error:
+        pytest.skip(f"{index[1]}: {error}; set BUILDAH_OPTIONS, '--build-arg TORCH_INDEX=' say")
+    return []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(5400)
+def test_the_image_for_cpus_is_built_and_is_ready_as_its_user_on_a_read_only_root():
+    """Some ten minutes of processor time, nearly all of it kernels."""
+    command = ["nice", "-n", "10", str(DOCKER / "build.sh"), "cpu", "--", *build_options()]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    *_, last = done.stdout.strip().splitlines()
+    assert last.startswith("real2sim:cpu is ready as user 10001:10001 on a read-only root")
