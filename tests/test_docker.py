@@ -18,7 +18,6 @@ import pytest
 import yaml
 
 from real2sim import UnauthorizedError, connect
-from real2sim_server.demo.street import unpack_street
 
 from .server.worker_processes import printed_url, start_real2sim
 
@@ -182,7 +181,6 @@ def test_a_worker_by_compose_serves_the_demo_street_to_who_has_the_token(
     environment |= {"REAL2SIM_HOST": "127.0.0.1", "REAL2SIM_PORT": "0"}
     entry, arguments = json.loads(image["ENTRYPOINT"]), worker["command"]
     assert entry == ["real2sim"]
-    unpack_street(folders["/scenes"], "demo_street")
 
     log_file = tmp_path / "log"
     process = start_real2sim(arguments, log_file=log_file, environment=environment)
