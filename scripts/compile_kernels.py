@@ -21,12 +21,12 @@ def main() -> None:
 
 def compile_drawing() -> None:
     """Images, worlds and what plans in them."""
-    from real2sim_server import world
-    from real2sim_server.render.backends import select_backend
+    from real2sim_server import render, world
     from real2sim_server.render.cast.warm_up import warm_up_casting
     from real2sim_server.render.lenses import warm_up_lenses
 
-    select_backend("cpu").warm_up()
+    render.warm_up("cpu")
+    render.warm_up_small_images("cpu")
     world.warm_up()
     world.warm_up_planning()
     warm_up_casting()

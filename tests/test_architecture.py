@@ -22,13 +22,13 @@ ROOTS = {
 }
 
 LAYERS = (
-    "_numba",
     "_files",
+    "console",
+    "_numba",
     "_nvrtc",
     "_confined",
     "_npy",
     "_records",
-    "console",
     "settings",
     "geometry",
     "body",

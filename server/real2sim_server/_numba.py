@@ -48,6 +48,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from types import CellType, CodeType, FunctionType, ModuleType
@@ -66,6 +67,39 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.cpu_options import ParallelOptions
 from numba.core.dispatcher import Dispatcher
 from numba.core.extending import _Intrinsic
+
+from . import console
+
+
+@dataclass
+class Made:
+    """The kernels that this process has made ready; those that they call count as part of them.
+
+    Attributes:
+        done: from disk or by compiling.
+        expected: that warm-ups have said to come; 0 where none has.
+        compiled: of all, those that were compiled or are being compiled.
+    """
+
+    done: int = 0
+    expected: int = 0
+    compiled: int = 0
+
+    def expect(self, count: int) -> None:
+        """Say that a warm-up makes so many kernels ready."""
+        self.expected += count
+
+    def __str__(self) -> str:
+        return f"{self.done} of {self.expected}" if self.done <= self.expected else f"{self.done}"
+
+    def tell(self) -> None:
+        """Tell who wants to know of compiling, see :mod:`.console`; on the thread that compiles."""
+        if self.compiled and console.LISTENERS:
+            console.LISTENERS[-1](f"{COMPILING}: {self}")
+
+
+made = Made()
+COMPILING = "compiling kernels, on the first run only"
 
 LONGEST_WAIT_S = 120.0
 """For another process that compiles the same kernel; the longest take half a minute."""
@@ -179,10 +213,15 @@ class _KernelCache(FunctionCache):
         def load_or_compile(signature: Any) -> Any:
             with global_compiler_lock, contextlib.ExitStack() as until_kept:
                 outer, self._until_kept = self._until_kept, until_kept
+                _COMPILING.append(self)
                 try:
                     return compile_(signature)
                 finally:
                     self._until_kept = outer
+                    _COMPILING.pop()
+                    if not _COMPILING:
+                        made.done += 1
+                        made.tell()
 
         return load_or_compile
 
@@ -192,6 +231,9 @@ class _KernelCache(FunctionCache):
         if kept is None and self._until_kept is not None:
             self._until_kept.enter_context(_locked(f"{self._cache_file._index_path}.lock"))
             kept = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            if kept is None and len(_COMPILING) == 1:
+                made.compiled += 1
+                made.tell()
         return kept
 
     def _index_key(self, sig: tuple[Any, ...], codegen: Any) -> tuple[Any, ...]:
@@ -385,6 +427,9 @@ def _of_library(module: str | None) -> bool:
     root = (module or "builtins").partition(".")[0]
     return root in _LIBRARIES or (root in sys.stdlib_module_names and root != "__main__")
 
+
+_COMPILING: list[_KernelCache] = []
+"""The kernel that is being made ready, and those that it calls; belongs to the compiler's lock."""
 
 _LOCKED: set[str] = set()
 _LIBRARIES = frozenset({"llvmlite", "numba", "numpy"})

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,11 +15,15 @@ from typing import Any
 
 import typer
 from rich.console import Console
+from rich.file_proxy import FileProxy
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 SERVER_MODULES = ("torch", "numba", "fastapi", "uvicorn", "cv2", "sqlalchemy", "safetensors")
+
+LINE_EVERY_S = 10.0
+"""Of a :class:`StatusLine` that is no line of a terminal."""
 
 console = Console()
 errors = Console(stderr=True)
@@ -32,7 +37,8 @@ def run_command(command: Callable[..., None], **arguments: Any) -> None:
     """Run a command; turn the errors a person can mend into one sentence and exit code 1."""
     require_server_extra()
     try:
-        command(**arguments)
+        with telling_of_compiling():
+            command(**arguments)
     except typer.Exit:
         raise
     except KeyboardInterrupt:
@@ -63,6 +69,52 @@ def require_server_extra() -> None:
             highlight=False,
         )
         raise typer.Exit(1)
+
+
+class StatusLine:
+    """One line about what takes long: written over on a terminal, elsewhere a line now and then.
+
+    Args:
+        tell: writes a line where standard error is no terminal.
+    """
+
+    def __init__(self, tell: Callable[[str], object] | None = None) -> None:
+        self._tell = tell or (lambda text: print(text, file=sys.stderr, flush=True))
+        self._width = 0
+        self._next = 0.0
+
+    def show(self, text: str) -> None:
+        """Say how far it is."""
+        # Where a progress bar is shown, it takes whole lines and puts them above itself.
+        if sys.stderr.isatty() and not isinstance(sys.stderr, FileProxy):
+            # What others write goes over it, from the start of the line.
+            print(text.ljust(self._width), end="\r", file=sys.stderr, flush=True)
+            self._width = len(text)
+        elif time.monotonic() >= self._next:
+            self._tell(text)
+            self._next = time.monotonic() + LINE_EVERY_S
+
+    def end(self) -> None:
+        """Take the line away."""
+        if self._width:
+            print(" " * self._width, end="\r", file=sys.stderr, flush=True)
+        self._width = 0
+
+
+LISTENERS: list[Callable[[str], object]] = []
+"""The last of them is told how far it is while kernels are compiled."""
+
+
+@contextmanager
+def telling_of_compiling() -> Iterator[None]:
+    """Tell the person of kernels that the block compiles: how many there are, and are ready."""
+    line = StatusLine()
+    LISTENERS.append(line.show)
+    try:
+        yield
+    finally:
+        LISTENERS.remove(line.show)
+        line.end()
 
 
 @contextmanager

@@ -105,6 +105,12 @@ def never(*arguments):
 n._KernelCache.save_overload = never
 os.nice(n.LOW_PRIORITY)
 """
+LISTENING = """
+import sys
+from real2sim_server import _numba, console
+_numba.made.expect(1)
+console.LISTENERS.append(lambda text: print(text, file=sys.stderr))
+"""
 IMPATIENT = """
 import real2sim_server._numba as n
 def refuse(seconds):
@@ -186,6 +192,21 @@ def test_a_kernel_that_cannot_be_kept_is_compiled_each_time(package):
 
 def test_a_kernel_is_compiled_once(package):
     assert run(package, seed=1) == (BEFORE, "kept")
+
+
+def test_how_many_kernels_are_ready_is_told_while_some_are_compiled(package):
+    assert told(package) == []
+    change(package, "FACTOR = 2.0", "FACTOR = 3.0")
+    said = "compiling kernels, on the first run only"
+    assert told(package) == [f"{said}: 0 of 1", f"{said}: 1 of 1"]
+
+
+def told(package: Path) -> list[str]:
+    """What is told of a run whose warm-up has promised one kernel."""
+    process = started(package, before=LISTENING)
+    _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    return errors.splitlines()
 
 
 def test_processes_that_need_a_kernel_at_once_compile_it_once(package):

@@ -16,7 +16,14 @@ import typer
 from rich.table import Table
 
 from .._files import atomic_file
-from ..console import SERVER_MODULES, CommandError, console, run_command, write_json
+from ..console import (
+    SERVER_MODULES,
+    CommandError,
+    console,
+    run_command,
+    telling_of_compiling,
+    write_json,
+)
 from .command import app
 from .options import JsonFile
 
@@ -319,8 +326,9 @@ def _warm_up() -> tuple[float, list[str]]:
     from .. import render, world
 
     start = time.perf_counter()
-    with event.install_recorder("numba:compile") as recorder:
+    with telling_of_compiling(), event.install_recorder("numba:compile") as recorder:
         render.warm_up()
+        render.warm_up_small_images()
         world.warm_up()
         world.warm_up_planning()
         world.warm_up_deformation()

@@ -54,7 +54,7 @@ def render(
     With --lidar cast a sweep of a LiDAR on the recording vehicle instead, and draw it beside.
     """
     from ..edit.compose import instances_at
-    from ..render import render_cameras
+    from ..render import render_cameras, warm_up
     from ..scene.io import load_scene
 
     if log is not None and (t_us is not None or delete):
@@ -66,6 +66,7 @@ def render(
         return
     _check_output(out, modality)
     backend = chosen_backend(backend, device)
+    warm_up(backend)  # Its time is none of the picture's.
     loaded = load_scene(scene)
     time_us = _frame_time(loaded, frame or 0) if t_us is None else t_us
     chosen = loaded.rig[camera] if camera else loaded.rig.cameras[0]

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from ..console import CommandError, errors
+from ..console import LISTENERS, CommandError, errors
 from .command import command
 
 
@@ -66,6 +66,8 @@ def serve(
     # Before the worker's libraries are loaded, which takes seconds.
     check_start(settings)
     begin_compiling()
+    # The worker itself tells of kernels, also of those that another process compiles.
+    LISTENERS.append(lambda _text: None)
     from ..service import serve as worker
 
     if code := worker.run(settings):

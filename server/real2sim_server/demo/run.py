@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from real2sim import Client, ReplyTimeoutError, connect
 from real2sim.planners import FollowRoute
 
-from ..console import console, print_figures, write_json
+from ..console import StatusLine, console, print_figures, write_json
 from ..render.picture_file import write_png
 from ..scene.io import DEMO_SCENE as SCENE
 from .edits import StreetEdits, edit_street
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 CAMERAS = ("front_left", "front", "front_right")
 STEP_US = 100_000
-QUIET_S, WARM_UP_S = 5.0, 600.0
+QUIET_S, POLL_S, WARM_UP_S = 5.0, 1.0, 600.0
 
 
 def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
@@ -92,17 +92,20 @@ def wait_ready(client: Client) -> None:
     Raises:
         ReplyTimeoutError: it is not ready after ten minutes.
     """
+    deadline = time.monotonic() + WARM_UP_S
+    line, timeout = StatusLine(), QUIET_S
     try:
-        client.wait_ready(timeout=QUIET_S)
-    except ReplyTimeoutError as error:
-        console.print(
-            f"the worker is not ready yet ({error.hint}); its first start on a machine compiles "
-            "kernels for about a minute, later ones read them from disk",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
-        client.wait_ready(timeout=WARM_UP_S)
+        while True:
+            try:
+                client.wait_ready(timeout=timeout)
+                return
+            except ReplyTimeoutError as error:
+                if time.monotonic() > deadline:
+                    raise
+                line.show(f"the worker is not ready yet: {error.hint}")
+            timeout = POLL_S
+    finally:
+        line.end()
 
 
 def _clear(out: Path) -> Path:

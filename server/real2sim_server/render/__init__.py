@@ -4,11 +4,13 @@ from .backends import Backend, BackendStatus, describe_backends, select_backend
 from .encode import EncodedImage, encode_depth, encode_instance, encode_rgb
 from .frame import Frame, RigView, draws_together, render_cameras, render_rigs, warm_up
 from .levels import (
+    kernels_of_small_images_on_disk,
     levels_bytes,
     levels_estimate,
     make_levels,
     scene_levels_bytes,
     uses_levels,
+    warm_up_small_images,
     without_levels,
 )
 from .modalities import encode_image
@@ -41,6 +43,7 @@ __all__ = [
     "encode_image",
     "encode_instance",
     "encode_rgb",
+    "kernels_of_small_images_on_disk",
     "levels_bytes",
     "levels_estimate",
     "make_levels",
@@ -53,5 +56,6 @@ __all__ = [
     "select_backend",
     "uses_levels",
     "warm_up",
+    "warm_up_small_images",
     "without_levels",
 ]

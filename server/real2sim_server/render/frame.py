@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from real2sim_proto.semantics import UNLABELED
 
+from .._numba import made
 from ..scene import Camera, CameraMotion
 from .backends.base import (
     Backend,
@@ -29,6 +30,9 @@ from .modalities import modalities_drawn, modality_of, options_for
 from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
 from .uncertainty import UNCERTAINTY, uncertainty_request
+
+ROUNDING_KERNELS = 2
+"""That :func:`warm_up` makes ready beside those of the backend."""
 
 
 def at_once() -> None:
@@ -176,7 +180,9 @@ def draws_together(backend: Backend, modalities: Iterable[str]) -> bool:
 
 
 def warm_up(backend: str | Backend = "auto") -> None:
-    """Compile or load everything a first frame would wait for; takes seconds the first time."""
+    """Compile or load everything a first frame would wait for, which takes half a minute the first
+    time; for small images there is :func:`~.levels.warm_up_small_images`."""
+    made.expect(ROUNDING_KERNELS)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
     chosen.warm_up()
     camera = Camera("warm-up", 16, 16, np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]]), np.eye(4))

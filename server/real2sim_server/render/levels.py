@@ -8,13 +8,35 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from .._numba import is_on_disk, made
 from ..scene import Scene
 from .backends.base import Backend, BatchBackend
 from .backends.cpu.detail.hierarchy import held_bytes, hierarchy_of, known_hierarchy
+from .backends.select import select_backend
+from .backends.warm_up import warm_up_requests
 from .types import SMALL_IMAGE_PIXELS, Detail, Instance
 
 LEVELS_SHARE = 0.8
 """Memory of levels over that of their cloud, a little more than measured."""
+
+SMALL_IMAGE_KERNELS = 4
+"""That :func:`warm_up_small_images` makes ready."""
+
+
+def kernels_of_small_images_on_disk() -> bool:
+    """Whether an earlier run left what :func:`warm_up_small_images` compiles longest."""
+    from .backends.cpu.detail.draw import draw_images
+
+    return is_on_disk(draw_images)
+
+
+def warm_up_small_images(backend: str | Backend = "auto") -> None:
+    """Compile or load everything that a first small image would wait for; takes a minute the first
+    time."""
+    made.expect(SMALL_IMAGE_KERNELS)
+    chosen = select_backend(backend) if isinstance(backend, str) else backend
+    for request in warm_up_requests("auto"):
+        chosen.rasterize(request)
 
 
 def uses_levels(backend: Backend, width: int, height: int, detail: Detail) -> bool:

@@ -8,6 +8,7 @@ lets it begin first, where nothing of an earlier run lies on disk.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import subprocess
 import sys
@@ -41,11 +42,11 @@ def compile_beside(
     function: str, *arguments: str, package: str = "world", niceness: int = 0
 ) -> subprocess.Popen[bytes]:
     """A process that runs a warm-up of ``package``. Its failure is left to those who load its
-    work."""
+    work. It writes a line of two numbers for each kernel: those that are ready, and all."""
     return subprocess.Popen(
         [sys.executable, "-c", _PROGRAM, str(niceness), package, function, *arguments],
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
     )
 
@@ -60,7 +61,31 @@ async def awaited(process: subprocess.Popen[bytes]) -> AsyncIterator[None]:
     finally:
         if process.poll() is None:
             process.kill()
-            process.wait()
+        process.communicate()
+
+
+class Counter:
+    """How many kernels a process of :func:`compile_beside` has made ready.
+
+    Attributes:
+        done: so far.
+        expected: of all; 0 before it begins.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        assert process.stdout is not None
+        self._output = process.stdout.fileno()
+        os.set_blocking(self._output, False)
+        self._rest = b""
+        self.done = self.expected = 0
+
+    def read(self) -> None:
+        """Take in what it has written."""
+        with contextlib.suppress(BlockingIOError, ValueError):
+            while part := os.read(self._output, 4096):
+                *lines, self._rest = (self._rest + part).split(b"\n")
+                if lines:
+                    self.done, self.expected = map(int, lines[-1].split())
 
 
 def _any_on_disk() -> bool:
@@ -75,5 +100,7 @@ import gc, importlib, os, sys
 gc.disable()
 niceness, package, function, *arguments = sys.argv[1:]
 os.nice(int(niceness))
+from real2sim_server import _numba
+_numba.Made.tell = lambda made: print(made.done, made.expected, flush=True)
 getattr(importlib.import_module("real2sim_server." + package), function)(*arguments)
 """

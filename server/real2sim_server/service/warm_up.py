@@ -12,6 +12,8 @@ import structlog
 
 from real2sim_proto.episode import ResetSpec
 
+from .._numba import COMPILING, made
+from ..console import StatusLine
 from ..world import (
     deformation_on_disk,
     kernels_on_disk,
@@ -22,7 +24,9 @@ from ..world import (
     warm_up_planning,
 )
 from ..world import warm_up as warm_up_world
-from .first_run import LOWEST_PRIORITY, awaited, compile_beside, take_begun
+from .first_run import LOWEST_PRIORITY, Counter, awaited, compile_beside, take_begun
+
+TELL_EVERY_S = 0.5
 
 log = structlog.get_logger(__name__)
 
@@ -35,16 +39,30 @@ class KernelWarmUp:
     """
 
     def __init__(self) -> None:
+        self._beside: Counter | None = None
+        self._compiled = False
         self._planning = asyncio.Event()
         self.deformation = DeformationKernels()
 
     async def run(self, warm_up_renderer: Callable[[], Awaitable[None]]) -> None:
         """What a worker needs before it takes work."""
+        telling = asyncio.create_task(self._tell())
         try:
             await self._run_first(warm_up_renderer)
         except BaseException:
             self._planning.set()
             raise
+        finally:
+            telling.cancel()
+
+    def compiling(self) -> str | None:
+        """How far it is while kernels are compiled; None where they come from disk."""
+        beside = self._beside
+        if beside is None:
+            return f"{COMPILING}: {made}" if made.compiled and not self._compiled else None
+        beside.read()
+        done, expected = made.done + beside.done, made.expected + beside.expected
+        return f"{COMPILING}: {done} of {max(done, expected)}"
 
     async def run_planning(self) -> None:
         """What few sessions need, in the background: those that do wait for it, see :meth:`ready`.
@@ -70,13 +88,27 @@ class KernelWarmUp:
     async def _run_first(self, warm_up_renderer: Callable[[], Awaitable[None]]) -> None:
         begun = take_begun()
         if begun is not None or (not kernels_on_disk() and (os.cpu_count() or 1) > 1):
-            log.info("compiling kernels, on the first run only")
+            process = begun or compile_beside("warm_up")
+            self._beside = Counter(process)
             with _no_collections():
-                async with awaited(begun or compile_beside("warm_up")):
+                async with awaited(process):
                     await warm_up_renderer()
+            # What comes now lies on disk, if the other process has succeeded.
+            self._beside, self._compiled = None, process.returncode == 0
         else:
             await warm_up_renderer()
         await asyncio.to_thread(warm_up_world)
+
+    async def _tell(self) -> None:
+        """Say how far it is: on a terminal in one line, else in the log now and then."""
+        line = StatusLine(log.info)
+        try:
+            while True:
+                if (text := self.compiling()) is not None:
+                    line.show(text)
+                await asyncio.sleep(TELL_EVERY_S)
+        finally:
+            line.end()
 
 
 class DeformationKernels:

@@ -68,6 +68,7 @@ from .upkeep import Upkeep
 from .warm_up import KernelWarmUp
 
 LAG_PERIOD_S = 0.1
+WARMING_UP = "warming up kernels"
 
 log = structlog.get_logger(__name__)
 
@@ -240,7 +241,7 @@ class Worker:
                 await asyncio.to_thread(self._add_demo)
             if not await self.scene_cache.refresh():
                 log.warning("no scenes", folder=str(self.settings.scenes_path), hint=WITHOUT_SCENES)
-            self.waiting_for = {"warming up kernels"}
+            self.waiting_for = {WARMING_UP}
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._warm_up()))
             at_exit.push_async_callback(self.kernels.deformation.close)
             at_exit.push_async_callback(_cancel, asyncio.create_task(self._watch_loop()))
@@ -275,6 +276,8 @@ class Worker:
         A busy worker is ready: it refuses what is too much by request, and metrics tell.
         """
         reasons = sorted(self.waiting_for)
+        if WARMING_UP in reasons and (compiling := self.kernels.compiling()) is not None:
+            reasons.append(compiling)
         if self.draining:
             reasons.append("draining: the worker is stopping")
         if not self.engine.alive:
@@ -472,9 +475,10 @@ class Worker:
             await self.membership.tell()
         log.info("ready", backend=self.backend.name, warm_up_s=seconds)
         try:
+            await self.renderer.small_images.ready()
             await self.kernels.run_planning()
         except Exception:
-            log.exception("warm-up of trackers that plan ahead failed")
+            log.exception("warm-up of what few sessions need failed")
 
     async def _watch_loop(self) -> None:
         while True:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 
 from real2sim import ReplyTimeoutError
+from real2sim_server.demo import run as demo
 from real2sim_server.demo.run import wait_ready
 
 
@@ -20,14 +21,15 @@ class Worker:
 
 def test_a_long_start_is_explained_by_what_the_worker_does(capsys):
     wait_ready(Worker(refusals=1))
-    assert "warming up kernels" in capsys.readouterr().out
+    assert "warming up kernels" in capsys.readouterr().err
 
 
 def test_a_quick_start_needs_no_words(capsys):
     wait_ready(Worker(refusals=0))
-    assert capsys.readouterr().out == ""
+    assert capsys.readouterr().err == ""
 
 
-def test_a_worker_that_is_never_ready_is_an_error():
+def test_a_worker_that_is_never_ready_is_an_error(monkeypatch):
+    monkeypatch.setattr(demo, "WARM_UP_S", 0.0)
     with pytest.raises(ReplyTimeoutError):
         wait_ready(Worker(refusals=2))

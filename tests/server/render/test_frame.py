@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -153,3 +155,18 @@ def test_solid_depth_keeps_exactly_half_covered_pixels() -> None:
 def test_warm_up_leaves_a_backend_ready(backend: str) -> None:
     warm_up(backend)
     assert len(render_cameras([], [camera("a", 4, 4)], np.eye(4), backend=backend)) == 1
+
+
+def test_warm_ups_say_how_many_kernels_they_make_ready(worker_kernels: None) -> None:
+    """In a process of its own, in which no kernel is ready."""
+    program = (
+        "from real2sim_server import render\n"
+        "from real2sim_server._numba import made\n"
+        "for warm_up in (render.warm_up, render.warm_up_small_images):\n"
+        "    warm_up('cpu')\n"
+        "    assert made.done == made.expected, (warm_up.__name__, made)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr

@@ -8,6 +8,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_proto.scenes import Readiness
+from real2sim_server._numba import Made
 from real2sim_server.service.app import create_app
 from real2sim_server.service.storage.store import StoreError
 from tests.waiting import LIMIT_S, wait_until
@@ -48,6 +49,30 @@ def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypa
         warm.set()
         wait_ready(client)
         assert told == [{"warming up kernels"}]
+
+
+def test_while_kernels_are_compiled_it_says_how_many_are_ready(make_settings, monkeypatch):
+    warm = threading.Event()
+    monkeypatch.setattr(
+        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(LIMIT_S)
+    )
+    monkeypatch.setattr("real2sim_server.service.warm_up.made", Made(12, 40, compiled=3))
+    with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
+        assert any(": 12 of 40" in r for r in client.get("/readyz").json()["reasons"])
+        warm.set()
+        wait_ready(client)
+
+
+def test_it_is_ready_before_the_kernels_of_small_images(make_settings, monkeypatch):
+    made = threading.Event()
+    monkeypatch.setattr(
+        "real2sim_server.service.rendering.renderer.warm_up_small_images",
+        lambda _: made.wait(LIMIT_S),
+    )
+    with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
+        wait_ready(client)
+        assert not made.is_set()
+        made.set()
 
 
 def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):

@@ -7,6 +7,7 @@ from fnmatch import fnmatch
 import pytest
 
 from real2sim_proto.episode import ContactSpec, EgoSpec, ResetSpec, SensorSpec
+from real2sim_server._numba import Made
 from real2sim_server.service import first_run, warm_up
 from real2sim_server.service.warm_up import KernelWarmUp
 from real2sim_server.world import plans_ahead
@@ -132,6 +133,29 @@ def test_on_the_first_run_another_process_compiles_beside_the_renderer(monkeypat
     assert left.read_text() == "done"
 
 
+def test_kernels_that_the_other_process_has_made_ready_count(monkeypatch):
+    program = "import sys; print('1 28'); print('2 28', flush=True); sys.stdin.read()"
+    monkeypatch.setattr(first_run, "_PROGRAM", program)
+    monkeypatch.setattr(warm_up, "kernels_on_disk", lambda: False)
+    monkeypatch.setattr(warm_up, "made", Made(3, 12))
+    monkeypatch.setattr(warm_up, "warm_up_world", lambda: None)
+    kernels, told = KernelWarmUp(), []
+
+    async def drawing() -> None:
+        await wait_until_async(lambda: "5 of 40" in (kernels.compiling() or ""), "the count")
+        told.append(kernels.compiling())
+
+    asyncio.run(kernels.run(drawing))
+
+    assert told == ["compiling kernels, on the first run only: 5 of 40"]
+
+
+def test_the_other_process_tells_how_many_it_has_made_ready(worker_kernels):
+    process = first_run.compile_beside("warm_up")
+    written, _ = process.communicate(timeout=LIMIT_S)
+    assert written.split()[-2:] == [b"28", b"28"]
+
+
 @pytest.mark.parametrize("kept", [[], ["world/entries.advance_vehicle-69.py311.nbi"]])
 def test_compiling_begins_before_libraries_are_loaded_where_nothing_is_kept(
     monkeypatch, tmp_path, kept
@@ -146,7 +170,9 @@ def test_compiling_begins_before_libraries_are_loaded_where_nothing_is_kept(
 
     process = first_run.take_begun()
     assert (process is None) == bool(kept)
-    assert process is None or process.wait(timeout=LIMIT_S) == 0
+    if process is not None:
+        process.communicate(timeout=LIMIT_S)
+        assert process.returncode == 0
 
 
 def test_what_names_the_kernel_on_disk_names_it_as_numba_does():

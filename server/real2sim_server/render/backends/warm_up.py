@@ -14,16 +14,16 @@ from .base import RasterRequest
 MANY = 5_000
 """More Gaussians than a backend treats as one block."""
 
-WARM_UPS: tuple[tuple[bool, bool, Detail], ...] = (
-    (False, False, "full"),
-    (True, True, "full"),
-    (True, True, "auto"),
-)
-"""Depth, instance and detail."""
+WARM_UPS: dict[Detail, tuple[bool, ...]] = {"full": (False, True), "auto": (True,)}
+"""Whether with depth and instances, by detail."""
 
 
-def warm_up_requests() -> Iterator[RasterRequest]:
-    """One request for each combination that could be compiled on its own."""
+def warm_up_requests(*details: Detail) -> Iterator[RasterRequest]:
+    """One request for each combination that could be compiled on its own.
+
+    Args:
+        details: ``full``, and ``auto`` for small images; both where none is given.
+    """
     cloud = GaussianCloud(
         means=torch.tensor([[0.0, 0, 2], [0, 0, 3]]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
@@ -34,7 +34,8 @@ def warm_up_requests() -> Iterator[RasterRequest]:
     many = cloud.select(torch.zeros(MANY, dtype=torch.int64))
     covars = (0.01 * torch.eye(3)).repeat(2, 1, 1)
     K = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]], dtype=torch.float64)
-    for depth, instance, detail in WARM_UPS:
+    combinations = [(d, labels) for d in details or WARM_UPS for labels in WARM_UPS[d]]
+    for detail, labels in combinations:
         yield RasterRequest(
             instances=(
                 Instance(cloud),
@@ -46,5 +47,5 @@ def warm_up_requests() -> Iterator[RasterRequest]:
             width=16,
             height=16,
             sky=Sky.uniform((0.5, 0.6, 0.7)),
-            options=RasterOptions(depth=depth, instance=instance, detail=detail),
+            options=RasterOptions(depth=labels, instance=labels, detail=detail),
         )

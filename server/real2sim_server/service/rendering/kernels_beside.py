@@ -51,6 +51,11 @@ class KernelsBeside:
         # Whoever gives up waiting does not end it for others.
         await asyncio.shield(self._made)
 
+    def close(self) -> None:
+        """End the process that compiles them, if there is one."""
+        if self._made is not None:
+            self._made.cancel()
+
     async def _make(self) -> None:
         if not await asyncio.to_thread(self._on_disk):
             log.info("compiling kernels, on the first run only", of=self._what)

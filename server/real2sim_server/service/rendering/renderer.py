@@ -27,9 +27,11 @@ from ...render import (
     RasterOptions,
     RigView,
     draws_together,
+    kernels_of_small_images_on_disk,
     render_rigs,
     uses_levels,
     warm_up,
+    warm_up_small_images,
 )
 from ...render.backends import device_of
 from ...render.effects import with_effects
@@ -40,11 +42,13 @@ from ...render.modalities import modality_names, modality_of, options_for
 from ...render.uncertainty import UNCERTAINTY, WITHOUT
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ..engine import Engine, lower_priority
+from ..first_run import compile_beside
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
 from ..lanes import Lane
 from ..library.memory import MemoryBudget
 from .frames import EncodedFrame, RenderedImage, encode_frame
+from .kernels_beside import NICENESS, KernelsBeside
 from .lens_kernels import LensKernels
 from .levels import DetailLevels
 from .optics import FollowingImage, blurred, camera_with
@@ -111,6 +115,7 @@ class Renderer:
 
     Attributes:
         levels: of detail; small images wait for them before they go to the engine.
+        small_images: the kernels that draw them.
         jpeg: what makes the bytes of jpegs, chosen by :meth:`warm_up`.
     """
 
@@ -133,6 +138,19 @@ class Renderer:
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._lenses = LensKernels(engine, backend)
+        self.small_images = KernelsBeside(
+            engine,
+            "small images",
+            on_disk=lambda: backend.name != "cpu" or kernels_of_small_images_on_disk(),
+            compile=partial(
+                compile_beside,
+                "warm_up_small_images",
+                "cpu",
+                package="render.levels",
+                niceness=NICENESS,
+            ),
+            load=partial(warm_up_small_images, backend),
+        )
         self._encoders = ThreadPoolExecutor(encoder_threads(), thread_name_prefix="encode")
         self._bulk_encoders = ThreadPoolExecutor(
             1,
@@ -144,6 +162,7 @@ class Renderer:
     def close(self) -> None:
         """End its threads."""
         self.levels.close()
+        self.small_images.close()
         self._encoders.shutdown(cancel_futures=True)
         self._bulk_encoders.shutdown(cancel_futures=True)
 
@@ -188,14 +207,19 @@ class Renderer:
         things: Callable[[], Sequence[Instance]],
     ) -> None:
         """Wait until cameras can be drawn without holding up others: for levels of detail, see
-        there, and for kernels of lenses.
+        there, and for kernels of lenses and of small images.
 
         Raises:
             ServiceError: OUT_OF_MEMORY; INVALID_REQUEST where the backend draws no lenses.
         """
         if not all(camera.is_pinhole for camera in cameras):
             await self._lenses.ready(cameras)
-        await self.levels.ready(sensors, cameras, things)
+        if any(
+            self._uses_levels(camera.width, camera.height, sensor.detail)
+            for sensor, camera in zip(sensors, cameras, strict=True)
+        ):
+            await self.small_images.ready()
+            await self.levels.ready(sensors, cameras, things)
 
     async def encode(
         self, images: Iterable[RenderedImage], *, lane: Lane = Lane.DRIVE

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...._numba import made
 from ...types import LabelOutput, RenderError, RenderOutput, Window, WorldViews
 from ..base import RasterRequest, is_reduced, needs_gradients, place_instances, with_colours
 from ..warm_up import warm_up_requests
@@ -29,6 +30,9 @@ from .inputs import Workspace, timed, view_of
 from .label_drawing import draw_labels
 from .ray_drawing import draw_rays
 from .records import Images
+
+PICTURE_KERNELS = 10
+"""That :meth:`CpuBackend.warm_up` makes ready."""
 
 
 class CpuBackend:
@@ -99,8 +103,9 @@ class CpuBackend:
             return draw_labels(request, windows, space, level=level, along_rays=along_rays)
 
     def warm_up(self) -> None:
-        """Compile every kernel, or load it from the disk cache."""
-        for request in warm_up_requests():
+        """Compile every kernel but those of small images, or load it from the disk cache."""
+        made.expect(PICTURE_KERNELS)
+        for request in warm_up_requests("full"):
             self.rasterize(request)
 
     @contextmanager
