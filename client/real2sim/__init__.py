@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ._sync.drive_batch import DriveBatch
     from ._sync.drive_session import DriveSession
     from ._sync.jobs import Job, Jobs
-    from ._sync.scenarios import Scenario, SceneObject, Scenarios
+    from ._sync.scenarios import Scenario, Scenarios, SceneObject
     from ._sync.scenes import Scenes
     from ._sync.sessions import Sessions
     from ._sync.sweeps import Sweeps
