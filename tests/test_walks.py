@@ -114,10 +114,11 @@ def test_a_policy_that_sees_is_compared_with_idm(home: Home, serve: Callable[[st
     home.run(
         f"real2sim evaluate-policy --url {url} --policy mine:Mine --policy idm --seeds 5 --out out"
     )
-    recordings = sorted((home.folder / "out/recordings").rglob("*.r2e"))
-    seeds = {(r.parent.parent.name, r.parent.name) for r in recordings if r.stem == "4"}
-    assert len({case for case, _ in seeds}) == 2
-    assert len({policy for _, policy in seeds}) == 2
+    report = json.loads((home.folder / "out/report.json").read_text())
+    whole = {g["policy"]: g for g in report["groups"] if g["case"] is None}
+    assert set(whole) == {"mine:Mine", "idm"}
+    # Three cases, two of which differ by the seed.
+    assert {(g["episodes"], g["failed"]) for g in whole.values()} == {(11, 0)}
     assert (home.folder / "out/report.html").exists()
 
 
