@@ -13,13 +13,13 @@ from ..scene import Scene
 from .backends.base import Backend, BatchBackend
 from .backends.cpu.detail.hierarchy import held_bytes, hierarchy_of, known_hierarchy
 from .backends.select import select_backend
-from .backends.warm_up import warm_up_requests
+from .backends.warm_up import small_requests
 from .types import SMALL_IMAGE_PIXELS, Detail, Instance
 
 LEVELS_SHARE = 0.8
 """Memory of levels over that of their cloud, a little more than measured."""
 
-SMALL_IMAGE_KERNELS = 4
+SMALL_IMAGE_KERNELS = 5
 """That :func:`warm_up_small_images` makes ready."""
 
 
@@ -31,11 +31,11 @@ def kernels_of_small_images_on_disk() -> bool:
 
 
 def warm_up_small_images(backend: str | Backend = "auto") -> None:
-    """Compile or load everything that a first small image would wait for; takes a minute the first
-    time."""
+    """Compile or load everything that a first small image would wait for, and a first image of a
+    cloud of few Gaussians; takes a minute the first time."""
     made.expect(SMALL_IMAGE_KERNELS)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
-    for request in warm_up_requests("auto"):
+    for request in small_requests():
         chosen.rasterize(request)
 
 

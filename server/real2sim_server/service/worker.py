@@ -474,11 +474,11 @@ class Worker:
         if self.membership is not None:
             await self.membership.tell()
         log.info("ready", backend=self.backend.name, warm_up_s=seconds)
-        try:
-            await self.renderer.small_images.ready()
-            await self.kernels.run_planning()
-        except Exception:
-            log.exception("warm-up of what few sessions need failed")
+        for needed_by_few in (self.kernels.run_planning, self.renderer.small_images.ready):
+            try:
+                await needed_by_few()
+            except Exception:
+                log.exception("warm-up of kernels that few sessions need failed")
 
     async def _watch_loop(self) -> None:
         while True:

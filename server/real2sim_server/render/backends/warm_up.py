@@ -14,38 +14,52 @@ from .base import RasterRequest
 MANY = 5_000
 """More Gaussians than a backend treats as one block."""
 
-WARM_UPS: dict[Detail, tuple[bool, ...]] = {"full": (False, True), "auto": (True,)}
-"""Whether with depth and instances, by detail."""
+
+def warm_up_requests() -> Iterator[RasterRequest]:
+    """One request for each combination that could be compiled on its own."""
+    yield from picture_requests()
+    yield from small_requests()
 
 
-def warm_up_requests(*details: Detail) -> Iterator[RasterRequest]:
-    """One request for each combination that could be compiled on its own.
+def picture_requests() -> Iterator[RasterRequest]:
+    """Those of a scene's first picture, which shows clouds of many Gaussians."""
+    for labels in (False, True):
+        yield _request(_cloud(MANY), labels=labels)
 
-    Args:
-        details: ``full``, and ``auto`` for small images; both where none is given.
-    """
-    cloud = GaussianCloud(
+
+def small_requests() -> Iterator[RasterRequest]:
+    """Those of clouds of few Gaussians, and of small images, for which Gaussians are merged."""
+    details: tuple[Detail, ...] = ("full", "auto")
+    for detail in details:
+        yield _request(_cloud(2), _cloud(MANY), labels=True, detail=detail)
+
+
+def _request(
+    placed: GaussianCloud, *others: GaussianCloud, labels: bool, detail: Detail = "full"
+) -> RasterRequest:
+    covars = (0.01 * torch.eye(3)).repeat(len(placed), 1, 1)
+    K = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]], dtype=torch.float64)
+    return RasterRequest(
+        instances=(
+            *map(Instance, (placed, *others)),
+            Instance(placed, T_world_object=np.eye(4), instance_id=1, covars=covars),
+        ),
+        viewmats=torch.eye(4, dtype=torch.float64)[None],
+        Ks=K,
+        width=16,
+        height=16,
+        sky=Sky.uniform((0.5, 0.6, 0.7)),
+        options=RasterOptions(depth=labels, instance=labels, detail=detail),
+    )
+
+
+def _cloud(count: int) -> GaussianCloud:
+    """So many Gaussians in two places before the camera."""
+    two = GaussianCloud(
         means=torch.tensor([[0.0, 0, 2], [0, 0, 3]]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
         scales=torch.full((2, 3), 0.1),
         opacities=torch.full((2,), 0.5),
         sh=torch.zeros(2, 16, 3),
     )
-    many = cloud.select(torch.zeros(MANY, dtype=torch.int64))
-    covars = (0.01 * torch.eye(3)).repeat(2, 1, 1)
-    K = torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]], dtype=torch.float64)
-    combinations = [(d, labels) for d in details or WARM_UPS for labels in WARM_UPS[d]]
-    for detail, labels in combinations:
-        yield RasterRequest(
-            instances=(
-                Instance(cloud),
-                Instance(many),
-                Instance(cloud, T_world_object=np.eye(4), instance_id=1, covars=covars),
-            ),
-            viewmats=torch.eye(4, dtype=torch.float64)[None],
-            Ks=K,
-            width=16,
-            height=16,
-            sky=Sky.uniform((0.5, 0.6, 0.7)),
-            options=RasterOptions(depth=labels, instance=labels, detail=detail),
-        )
+    return two.select(torch.arange(count) % 2)

@@ -48,6 +48,7 @@ def make_ready(scene, levels: DetailLevels, **sensor: object) -> None:
 @pytest.mark.network
 def test_a_session_with_a_small_camera_waits_for_them_and_the_engine_does_not(client, makers):
     wait_ready(client)
+    client.portal.call(client.app.state.worker.renderer.small_images.ready)
     makers.clear()
     made = client.post("/v1/sessions", params={"scene": "tiny"}, json={"reset": SMALL})
     assert made.status_code == 201, made.text

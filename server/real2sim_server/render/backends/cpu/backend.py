@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ...._numba import made
 from ...types import LabelOutput, RenderError, RenderOutput, Window, WorldViews
 from ..base import RasterRequest, is_reduced, needs_gradients, place_instances, with_colours
-from ..warm_up import warm_up_requests
+from ..warm_up import picture_requests
 from .cull import seen_chunks
 from .detail.images import SmallImages
 from .drawing import Drawing
@@ -31,7 +31,7 @@ from .label_drawing import draw_labels
 from .ray_drawing import draw_rays
 from .records import Images
 
-PICTURE_KERNELS = 10
+PICTURE_KERNELS = 9
 """That :meth:`CpuBackend.warm_up` makes ready."""
 
 
@@ -103,9 +103,10 @@ class CpuBackend:
             return draw_labels(request, windows, space, level=level, along_rays=along_rays)
 
     def warm_up(self) -> None:
-        """Compile every kernel but those of small images, or load it from the disk cache."""
+        """Compile the kernels of a first picture, or load them from the disk cache: all but those
+        of small images and of clouds of few Gaussians."""
         made.expect(PICTURE_KERNELS)
-        for request in warm_up_requests("full"):
+        for request in picture_requests():
             self.rasterize(request)
 
     @contextmanager
