@@ -170,6 +170,8 @@ def test_a_worker_by_compose_serves_the_demo_street_to_who_has_the_token(
     """The process that compose starts, in folders for its volumes and on a port of its own."""
     token = secrets.token_hex(16)
     folders = {place: tmp_path / source for place, source in mounts(worker).items()}
+    for folder in folders.values():
+        folder.mkdir()
     image = last_stage(Path(worker["build"]["dockerfile"]).name)
     variables = dict(pair.split("=", 1) for pair in shlex.split(image["ENV"]))
     given = {name: filled_in(v, REAL2SIM_TOKEN=token) for name, v in worker["environment"].items()}

@@ -112,7 +112,7 @@ def test_policies(page: Callable[[str], Page], demo: real2sim.Client) -> None:
         policies.shell("--seeds 10", {"--seeds 10": "--seeds 2"})
         assert len(list((policies.folder / "report/recordings").rglob("*.r2e"))) == 2
         unpack_street(policies.folder, "street.r2s")
-        policies.shell("--perturb", {"SCENE": "street.r2s --end 0.5"})
+        policies.shell("--perturb", {"SCENE": "street.r2s --end-us 500000"})
         assert (policies.folder / "policy.safetensors").exists()
         env = policies.python("gymnasium.make(")["env"]
         seen, _ = env.reset(seed=0)
@@ -129,8 +129,7 @@ def own_policy(page: Page, words: str, *, scene: str) -> None:
     report = json.loads((page.folder / "out/compared/report.json").read_text())
     whole = {g["policy"]: g for g in report["groups"] if g["case"] is None}
     assert set(whole) == {"mine:Mine", "idm"}
-    # Three cases, two of which differ by the seed.
-    assert {(g["episodes"], g["failed"]) for g in whole.values()} == {(11, 0)}
+    assert {(g["episodes"], g["failed"]) for g in whole.values()} == {(15, 0)}
 
 
 def test_learning(page: Callable[[str], Page], demo: real2sim.Client) -> None:
@@ -207,8 +206,9 @@ def test_sweeps(page: Callable[[str], Page], demo: real2sim.Client) -> None:
         scenario = demo.scenarios.create("demo_street")
         scenario.apply_corner_case("cut_in")
         scenario.write_xosc(sweeps.folder / "drawn.xosc")
-        names = sweeps.python("client.sweeps.start", **{'"count": 64': '"count": 2', "300": "4"})
-        assert names["worst"]["planner"] in {"idm", "follow_route"}
+        names = sweeps.python("client.sweeps.start", **{'"count": 64': '"count": 2', "300": "20"})
+        files = {file.name for file in names["job"].info.files}
+        assert f"{names['worst']}.r2e" in files
         names["search"].cancel()
         names["client"].close()
         sweeps.block("real2sim search")
@@ -235,10 +235,12 @@ def test_rest(page: Callable[[str], Page], demo: real2sim.Client, demo_url: str)
     with page("docs/rest.md") as rest:
         serve = ".venv/bin/real2sim serve --scenes out/demo/scenes --data out/worker &"
         rest.shell("serve --scenes", {serve: ":", "http://127.0.0.1:8600": demo_url})
-        info = demo.scenarios.list()[0]
+        (info,) = [info for info in demo.scenarios if info.name == "cut-in"]
         rest.shell("car_7")
         scenario = demo.scenarios.get(info.scenario_id)
-        assert on_lane_of_the_drive(demo, scenario.objects["car_7"].pose(5.25).position)
+        # From the kerb into the lane beside it, which is the oncoming one.
+        place = scenario.objects["car_7"].pose(5.25).position
+        assert beside_the_drive(demo, place) == pytest.approx(3.5, abs=0.6)
         assert picture(rest.folder / "after.jpg").shape[2] == 3
         rest.shell("video.webm")
         assert frames_of(rest.folder / "cut_in.webm") == 107
@@ -257,7 +259,7 @@ def test_rest(page: Callable[[str], Page], demo: real2sim.Client, demo_url: str)
         rest.shell("above.jpg")
         assert picture(rest.folder / "above.jpg").shape == (360, 640, 3)
         obs = shown(demo, sensors=[rest.json("optics")])
-        assert (obs["front"][0, 0] == 0).all()  # What the fisheye does not see is black.
+        assert obs["front"][0, 0].max() < 10  # Black but for noise: the fisheye does not see it.
         rest.shell("sweep.msgpack")
         assert (rest.folder / "sweep.f32").stat().st_size % 16 == 0
         rest.shell("blue_car")
@@ -272,10 +274,10 @@ def shown(sim: real2sim.Client, **options: Any) -> real2sim.Observation:
         return session.reset(**options)
 
 
-def on_lane_of_the_drive(sim: real2sim.Client, place: Sequence[float]) -> bool:
-    """Whether a place is less than half a lane beside the recorded path."""
+def beside_the_drive(sim: real2sim.Client, place: Sequence[float]) -> float:
+    """How far a place is from the recorded path [m]."""
     path = np.array(sim.scenes["demo_street"].ego.positions)
-    return bool(np.linalg.norm(path[:, :2] - place[:2], axis=1).min() < 1.75)
+    return float(np.linalg.norm(path[:, :2] - place[:2], axis=1).min())
 
 
 def frames_of(video: Path) -> int:
