@@ -107,12 +107,11 @@ def write_log(folder: Path, document: dict[str, Any]) -> None:
 
 def damage(sweeps: Path) -> None:
     """One sweep without its origin, one of points with four columns."""
-    for number, arrays in ((1, ("origin",)), (3, ())):
-        file = sweeps / f"{number:06}.npz"
-        sweep = {k: v for k, v in np.load(file).items() if k not in arrays}
-        if number == 3:
-            sweep["points"] = np.zeros((len(sweep["points"]), 4), np.float32)
-        np.savez(file, **sweep)
+    sweep = dict(np.load(sweeps / "000001.npz"))
+    wide = np.zeros((len(sweep["points"]), 4), np.float32)
+    np.savez(sweeps / "000003.npz", **sweep | {"points": wide})
+    del sweep["origin"]
+    np.savez(sweeps / "000001.npz", **sweep)
 
 
 @pytest.mark.slow
@@ -321,10 +320,8 @@ def drive(url: str, trace: list[tuple[str, dict[str, Any]]]) -> None:
             while answer["type"] == "progress":
                 answer = decode(socket.recv(timeout=LIMIT_S, decode=False))
             assert message.keys() - {"..."} <= answer.keys()
-            shown = {k: v for k, v in message.items() if isinstance(v, (int, str)) and v != "array"}
-            assert {k: answer[k] for k in shown if k != "..."} == {
-                k: v for k, v in shown.items() if k != "..."
-            }
+            said = ("v", "type", "id", "step", "t_us")
+            assert [message.get(k, answer.get(k)) for k in said] == [answer.get(k) for k in said]
 
 
 def messages(trace: str) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -413,9 +410,7 @@ def extras() -> set[str]:
 
 
 @pytest.mark.slow
-def test_storage(
-    page: Callable[[str], Page], monkeypatch: pytest.MonkeyPatch, worker_kernels: None
-) -> None:
+def test_storage(page: Callable[[str], Page], worker_kernels: None) -> None:
     with page("docs/storage.md") as storage:
         state = storage.folder / "state_folder"
         folder = {"/var/lib/real2sim": str(state)}
@@ -491,10 +486,7 @@ DEFAULT = r"`REAL2SIM_(\w+)`(?: \| |\s\()(\d+)( [GM]iB)?(?: \||\))"
 UNITS = {"": 1, " MiB": 1 << 20, " GiB": 1 << 30}
 
 
-def test_operations_name_settings_defaults_and_metrics_that_there_are(
-    page: Callable[[str], Page],
-) -> None:
-    told = page("docs/operations.md").path.read_text("utf-8")
+def test_settings_defaults_and_metrics_of_the_pages_are_those_of_a_worker() -> None:
     known = {f"REAL2SIM_{name.upper()}" for name in Settings.model_fields} | OTHER_VARIABLES
     tests = {"REAL2SIM_TEST_WRITES", "REAL2SIM_TEST_KILLS", "REAL2SIM_TEST_EPISODES"}
     for name in ("operations", "storage", "gpu", "protocol"):
@@ -504,6 +496,7 @@ def test_operations_name_settings_defaults_and_metrics_that_there_are(
             value = int(number) * UNITS[unit]
             assert Settings.model_fields[setting.lower()].default == value, setting
     metrics = {family.name for family in Metrics().registry.collect()}
+    told = (REPOSITORY / "docs/operations.md").read_text("utf-8")
     named = set(re.findall(r"`(real2sim_\w+?)(?:_total)?`", told.split("| metric |")[1]))
     assert {n for n in named if "_token_" not in n} <= metrics
 
