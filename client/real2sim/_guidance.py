@@ -53,7 +53,7 @@ class Handle(Guided):
 
 
 def guided(function: F) -> F:
-    """The function, whose error for arguments that it does not take says which it takes."""
+    """A function that, called with an unknown argument, says which one to write instead."""
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

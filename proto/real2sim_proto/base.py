@@ -76,7 +76,7 @@ N = TypeVar("N")
 
 
 class Named(list[N]):
-    """A list whose items are found by their ``object_id`` or ``name`` too: ``cameras["front"]``.
+    """A list that also finds items by ``object_id`` or ``name``: ``cameras["front"]``.
 
     Attributes:
         filled_by: what to do so that there are some; shown where one is asked for and none is.

@@ -10,7 +10,7 @@ MOST_SHOWN = 24
 
 
 class Guided:
-    """Base of what users hold in their hands: an unknown attribute says what to write instead.
+    """Base of the objects users hold: the error for an unknown attribute says what to write.
 
     Subclasses list in ``_instead`` what people try first, and what does it here.
     """
@@ -22,7 +22,7 @@ class Guided:
 
         def __getattr__(self, name: str) -> Any:
             kind = type(self).__name__
-            # Programs ask for private names to see what an object can do, and show nobody.
+            # Libraries probe private names to see what an object can do; nobody reads the error.
             if name.startswith("_"):
                 raise AttributeError(f"{kind!r} object has no attribute {name!r}")
             said = advice(name, attributes(self), instead_of(type(self)))

@@ -36,8 +36,8 @@ POLL_SECONDS = 0.25
 class AsyncClient(Handle):
     """A worker's scenes, scenarios and sessions; :func:`connect_async` is the same.
 
-    Nothing is sent yet. An argument goes before the environment, and the environment before the
-    default.
+    Nothing is sent yet. Arguments take precedence over the environment, and the environment over
+    the defaults.
 
     Args:
         url: ``http://host:port`` or ``https://...``; default: ``$REAL2SIM_URL``, else

@@ -37,8 +37,8 @@ POLL_SECONDS = 0.25
 class Client(Handle):
     """A worker's scenes, scenarios and sessions; :func:`connect` is the same.
 
-    Nothing is sent yet. An argument goes before the environment, and the environment before the
-    default.
+    Nothing is sent yet. Arguments take precedence over the environment, and the environment over
+    the defaults.
 
     Args:
         url: ``http://host:port`` or ``https://...``; default: ``$REAL2SIM_URL``, else

@@ -66,7 +66,7 @@ def render(
         return
     _check_output(out, modality)
     backend = chosen_backend(backend, device)
-    warm_up(backend)  # Its time is none of the picture's.
+    warm_up(backend)  # Not part of the time that is printed for the picture.
     loaded = load_scene(scene)
     time_us = _frame_time(loaded, frame or 0) if t_us is None else t_us
     chosen = loaded.rig[camera] if camera else loaded.rig.cameras[0]

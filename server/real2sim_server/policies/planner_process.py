@@ -165,16 +165,11 @@ def _serve(pipe: Connection) -> None:
 
 def _driven(episode: PlannedEpisode) -> DrivenEpisode:
     planner = load_planner(episode.policy)
-    needs = needs_of(planner)
     with (
         episode.target.connect() as client,
         client.join(episode.session_id, token=episode.token) as session,
     ):
-        options: Any = episode.case.reset_for(episode.seed) | {
-            "action": needs.action,
-            # A planner that does not say what it needs gets everything, as in `real2sim drive`.
-            "privileged": needs.privileged or not hasattr(planner, "needs"),
-        }
+        options: Any = episode.case.reset_for(episode.seed)
         driver = _IsolatedPlanner(planner, session, episode.case)
         capture = _StillCapture(session, options) if episode.seed == 0 else None
         summary = None
@@ -182,7 +177,6 @@ def _driven(episode: PlannedEpisode) -> DrivenEpisode:
             summary = run_episode(
                 session,
                 driver,
-                sensors=needs.sensors(session.welcome.cameras),
                 on_observation=capture,
                 **options,
             )
@@ -201,6 +195,8 @@ class _IsolatedPlanner:
 
     def __init__(self, planner: Any, session: DriveSession, case: Case) -> None:
         self._planner, self._session, self._case = planner, session, case
+        if hasattr(planner, "needs"):
+            self.needs = planner.needs
         self.error: str | None = None
 
     def begin(self, welcome: Any) -> None:

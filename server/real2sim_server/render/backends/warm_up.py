@@ -54,7 +54,7 @@ def _request(
 
 
 def _cloud(count: int) -> GaussianCloud:
-    """So many Gaussians in two places before the camera."""
+    """A cloud of this many Gaussians, at two places in front of the camera."""
     two = GaussianCloud(
         means=torch.tensor([[0.0, 0, 2], [0, 0, 3]]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),

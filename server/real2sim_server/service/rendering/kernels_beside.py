@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from subprocess import Popen
+from functools import partial
 
 import structlog
 
+from ..._numba import COMPILING
+from ...render import Backend
 from ..engine import Engine
-from ..first_run import awaited
+from ..first_run import awaited, compile_beside
 
 log = structlog.get_logger(__name__)
 
@@ -26,22 +28,23 @@ class KernelsBeside:
     Args:
         engine: loads them.
         what: they are for, for the log.
-        on_disk: whether an earlier run left them, or none are compiled for this device.
-        compile: starts a process of its own that compiles them.
-        load: loads them, on the engine.
+        warm_up: compiles or loads them: a function at the top of its module.
+        on_disk: whether an earlier run left them.
+        backend: that ``warm_up`` takes, where it takes one; only that of CPUs compiles kernels.
     """
 
     def __init__(
         self,
         engine: Engine,
         what: str,
+        warm_up: Callable[..., object],
         *,
         on_disk: Callable[[], bool],
-        compile: Callable[[], Popen[bytes]],
-        load: Callable[[], object],
+        backend: Backend | None = None,
     ) -> None:
-        self._engine, self._what = engine, what
-        self._on_disk, self._compile, self._load = on_disk, compile, load
+        self._engine, self._what, self._warm_up = engine, what, warm_up
+        self._on_disk, self._arguments = on_disk, () if backend is None else (backend,)
+        self._compiles = backend is None or backend.name == "cpu"
         self._made: asyncio.Task[None] | None = None
 
     async def ready(self) -> None:
@@ -57,8 +60,14 @@ class KernelsBeside:
             self._made.cancel()
 
     async def _make(self) -> None:
-        if not await asyncio.to_thread(self._on_disk):
-            log.info("compiling kernels, on the first run only", of=self._what)
-            async with awaited(self._compile()):
+        if self._compiles and not await asyncio.to_thread(self._on_disk):
+            log.info(COMPILING, of=self._what)
+            beside = compile_beside(
+                self._warm_up.__name__,
+                *("cpu" for _ in self._arguments),
+                package=self._warm_up.__module__.removeprefix("real2sim_server."),
+                niceness=NICENESS,
+            )
+            async with awaited(beside):
                 pass
-        await self._engine.call(self._load, label="warm-up")
+        await self._engine.call(partial(self._warm_up, *self._arguments), label="warm-up")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 from real2sim_proto import ErrorCode
 
@@ -11,9 +10,8 @@ from ...render import Backend, RenderError
 from ...render.lenses import kernels_of_lenses_on_disk, refuse_lenses, warm_up_lenses
 from ...scene import Camera
 from ..engine import Engine
-from ..first_run import compile_beside
 from ..http.problems import ServiceError
-from .kernels_beside import NICENESS, KernelsBeside
+from .kernels_beside import KernelsBeside
 
 
 class LensKernels:
@@ -24,15 +22,9 @@ class LensKernels:
         self._kernels = KernelsBeside(
             engine,
             "lenses",
-            on_disk=lambda: backend.name != "cpu" or kernels_of_lenses_on_disk(),
-            compile=partial(
-                compile_beside,
-                "warm_up_lenses",
-                "cpu",
-                package="render.lenses",
-                niceness=NICENESS,
-            ),
-            load=partial(warm_up_lenses, backend),
+            warm_up_lenses,
+            on_disk=kernels_of_lenses_on_disk,
+            backend=backend,
         )
 
     async def ready(self, cameras: Sequence[Camera]) -> None:

@@ -42,13 +42,12 @@ from ...render.modalities import modality_names, modality_of, options_for
 from ...render.uncertainty import UNCERTAINTY, WITHOUT
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ..engine import Engine, lower_priority
-from ..first_run import compile_beside
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
 from ..lanes import Lane
 from ..library.memory import MemoryBudget
 from .frames import EncodedFrame, RenderedImage, encode_frame
-from .kernels_beside import NICENESS, KernelsBeside
+from .kernels_beside import KernelsBeside
 from .lens_kernels import LensKernels
 from .levels import DetailLevels
 from .optics import FollowingImage, blurred, camera_with
@@ -141,15 +140,9 @@ class Renderer:
         self.small_images = KernelsBeside(
             engine,
             "small images",
-            on_disk=lambda: backend.name != "cpu" or kernels_of_small_images_on_disk(),
-            compile=partial(
-                compile_beside,
-                "warm_up_small_images",
-                "cpu",
-                package="render.levels",
-                niceness=NICENESS,
-            ),
-            load=partial(warm_up_small_images, backend),
+            warm_up_small_images,
+            on_disk=kernels_of_small_images_on_disk,
+            backend=backend,
         )
         self._encoders = ThreadPoolExecutor(encoder_threads(), thread_name_prefix="encode")
         self._bulk_encoders = ThreadPoolExecutor(

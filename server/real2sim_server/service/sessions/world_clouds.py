@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from functools import partial
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.ranging import LidarSpec, RadarSpec
@@ -24,9 +23,8 @@ from ...world.ranging import (
 )
 from ...world.sensing import clouds_of, recorded_cloud
 from ..engine import Engine
-from ..first_run import compile_beside
 from ..http.problems import ServiceError
-from ..rendering.kernels_beside import NICENESS, KernelsBeside
+from ..rendering.kernels_beside import KernelsBeside
 from .image_limits import check_message_bytes
 
 POINT_BYTES = 40
@@ -68,14 +66,8 @@ class WorldClouds:
         self._kernels = KernelsBeside(
             engine,
             "LiDAR and radar",
+            warm_up_casting,
             on_disk=kernels_of_casting_on_disk,
-            compile=partial(
-                compile_beside,
-                "warm_up_casting",
-                package="render.cast.warm_up",
-                niceness=NICENESS,
-            ),
-            load=warm_up_casting,
         )
 
     async def ready(self, sensors: RangingSensors, *, image_bytes: int = 0) -> None:
