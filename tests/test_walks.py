@@ -60,7 +60,7 @@ def bin_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([sys.executable, "-m", "venv", root / "venv"], check=True)
     own = [root / "venv/bin/python", "-m", "pip", "--disable-pip-version-check", "-q"]
     pins = ["-c", REPOSITORY / "constraints.txt"]
-    subprocess.run([*own, "install", *pins, f"{wheel}[server]"], check=True, timeout=INSTALL_S)
+    subprocess.run([*own, "install", "--no-compile", *pins, f"{wheel}[server]"], check=True, timeout=INSTALL_S)
     return root / "venv" / "bin"
 
 
@@ -109,10 +109,10 @@ def test_a_policy_that_sees_is_compared_with_idm(home: Home, serve: Callable[[st
         "--json driven.json"
     )
     driven = json.loads((home.folder / "driven.json").read_text())
-    assert driven["steps"] == 50
     assert driven["distance"] > 10
     home.run(
-        f"real2sim evaluate-policy --url {url} --policy mine:Mine --policy idm --seeds 5 --out out"
+        f"real2sim evaluate-policy --url {url} --suite demo --policy mine:Mine --policy idm "
+        "--seeds 5 --out out"
     )
     report = json.loads((home.folder / "out/report.json").read_text())
     whole = {g["policy"]: g for g in report["groups"] if g["case"] is None}

@@ -58,7 +58,9 @@ def test_readme(page: Callable[[str], Page], monkeypatch: pytest.MonkeyPatch) ->
         targets = re.findall(r"^make ([\w-]+)", readme.block("make demo"), re.M)
         made = (REPOSITORY / "Makefile").read_text("utf-8")
         assert all(f"\n{target}:" in made for target in targets)
-        readme.shell("real2sim synth", {". .venv/bin/activate\n": ""})
+        readme.shell(
+            "real2sim synth", {". .venv/bin/activate\n": "", "out/log  ": "out/log --frames 20  "}
+        )
         assert picture(readme.folder / "out/street.png").shape[2] == 3
         readme.shell("--preset cpu-small", {"--iterations 4000": "--iterations 20"})
         assert (readme.folder / "out/report/report.html").exists()
@@ -86,7 +88,7 @@ def test_readme(page: Callable[[str], Page], monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.slow
 def test_first_minutes(page: Callable[[str], Page], demo: real2sim.Client) -> None:
     with page("docs/site/first_minutes.md") as first:
-        new = "python -m venv .venv && . .venv/bin/activate\npip install 'real2sim[server]'\n"
+        new = "python -m venv .venv && . .venv/bin/activate\npip install --no-compile 'real2sim[server]'\n"
         first.shell("real2sim synth", {new: "", "out/log  ": "out/log --frames 10  ", "12 ": "5 "})
         first.block("real2sim serve")  # This worker runs already, with another street.
         names = first.python("nearer", **{'"street"': '"demo_street"'})

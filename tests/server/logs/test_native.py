@@ -89,6 +89,11 @@ def test_log_without_lidar_gives_empty_sweeps(native_folder: Path) -> None:
     assert open_log(native_folder).lidar(0).points.shape == (0, 3)
 
 
+def test_provenance_may_be_left_out(native_folder: Path) -> None:
+    _edit(native_folder, lambda m: m.pop("provenance"))
+    assert open_log(native_folder).provenance == {}
+
+
 def _edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
     content = json.loads((folder / "log.json").read_text())
     change(content)

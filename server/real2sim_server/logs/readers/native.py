@@ -78,7 +78,7 @@ class NativeReader:
             tracks=_read_tracks(content),
             source=_NativeSource(rig, images, _sweep_files(path, content, len(times_us))),
             ego_size=ego.size("size"),
-            provenance=dict(content.get("provenance", dict)),
+            provenance=content.get("provenance", dict) if "provenance" in content.content else {},
             image_times_us=_read_image_times(content, rig, times_us, trajectory),
             lanes=_read_lanes(path / LANES),
         )
