@@ -60,7 +60,8 @@ def bin_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([sys.executable, "-m", "venv", root / "venv"], check=True)
     own = [root / "venv/bin/python", "-m", "pip", "--disable-pip-version-check", "-q"]
     pins = ["-c", REPOSITORY / "constraints.txt"]
-    subprocess.run([*own, "install", "--no-compile", *pins, f"{wheel}[server]"], check=True, timeout=INSTALL_S)
+    install = [*own, "install", "--no-compile", *pins, f"{wheel}[server]"]
+    subprocess.run(install, check=True, timeout=INSTALL_S)
     return root / "venv" / "bin"
 
 
