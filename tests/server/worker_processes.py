@@ -7,6 +7,7 @@ of processor time to get as far. Nothing runs in that process, no kernel and no 
 from __future__ import annotations
 
 import contextlib
+import json
 import multiprocessing
 import os
 import re
@@ -17,6 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 from tests.waiting import LIMIT_S, wait_until
 
@@ -80,6 +82,14 @@ def printed_url(process: BaseProcess, log_file: Path) -> str:
         return url
 
     return wait_until(found, lambda: f"an address in {log_file.read_text()!r}").group()
+
+
+def json_lines(log_file: Path) -> list[dict[str, Any]]:
+    """The JSON objects among the lines that a process has finished writing."""
+    if not log_file.exists():
+        return []
+    lines = log_file.read_text().splitlines(keepends=True)
+    return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]
 
 
 @dataclass(frozen=True)

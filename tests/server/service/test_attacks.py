@@ -16,7 +16,7 @@ import socket
 import threading
 from base64 import b64encode
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from real2sim_server.service.sessions import handshake
 from real2sim_server.settings import Settings
 from tests.waiting import LIMIT_S, wait_until
 
-from ..worker_processes import printed_url, start_real2sim
+from ..worker_processes import json_lines, printed_url, start_real2sim
 from .waiting import wait_ready
 
 TOKEN = "a long enough secret"
@@ -286,11 +286,11 @@ def test_a_thousand_silent_and_half_open_connections_lock_nobody_out(tmp_path, t
                 assert httpx2.get(f"{url}/livez", timeout=LIMIT_S).status_code == 200
 
             def crowded_out() -> int:
-                told = [e for e in log.entries() if e["event"] == "connections dropped"]
+                told = [e for e in json_lines(log) if e["event"] == "connections dropped"]
                 return sum(e["reasons"].get("crowded_out", 0) for e in told)
 
             wait_until(lambda: crowded_out() > 100, "the log to tell of them")
-    assert any(e["event"] == "connections near their limit" for e in log.entries())
+    assert any(e["event"] == "connections near their limit" for e in json_lines(log))
 
 
 def allow_descriptors(count: int) -> None:
@@ -301,20 +301,8 @@ def allow_descriptors(count: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (count, hard))
 
 
-@dataclass(frozen=True)
-class JsonLog:
-    """What a worker has logged up to now."""
-
-    file: Path
-
-    def entries(self) -> list[dict[str, Any]]:
-        # Whole lines: it may be writing one.
-        lines = [line for line in self.file.read_text().splitlines(True) if line.endswith("\n")]
-        return [json.loads(line) for line in lines if line.startswith("{")]
-
-
 @contextlib.contextmanager
-def worker_process(folder: Path, *, descriptors: int) -> Iterator[tuple[str, JsonLog]]:
+def worker_process(folder: Path, *, descriptors: int) -> Iterator[tuple[str, Path]]:
     """A worker of its own: its address and its log."""
     limit = f"({descriptors}, {descriptors})"
     log_file = folder / "worker.log"
@@ -332,7 +320,7 @@ def worker_process(folder: Path, *, descriptors: int) -> Iterator[tuple[str, Jso
         url = printed_url(process, log_file)
         ready = f"{url}/readyz"
         wait_until(lambda: httpx2.get(ready, timeout=LIMIT_S).status_code == 200, "the worker")
-        yield url, JsonLog(log_file)
+        yield url, log_file
     finally:
         os.kill(process.pid, signal.SIGTERM)
         process.join(LIMIT_S)

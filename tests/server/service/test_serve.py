@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import signal
 import socket
@@ -30,7 +29,7 @@ from real2sim_server.service.preflight import (
 from real2sim_server.service.serve import DrainingServer, run, running_worker, server_config
 from tests.waiting import LIMIT_S, wait_until
 
-from ..worker_processes import printed_url, start_real2sim
+from ..worker_processes import json_lines, printed_url, start_real2sim
 
 pytestmark = pytest.mark.network
 
@@ -219,11 +218,11 @@ def test_a_worker_process_tells_its_url_logs_json_and_ends_cleanly_at_sigterm(
     answer = httpx2.get(f"{url}/v1/server", timeout=None)
     os.kill(process.pid, signal.SIGTERM)
     process.join(LIMIT_S)
-    first, second, *lines = log_file.read_text().splitlines()
+    first, second, *_ = log_file.read_text().splitlines()
     assert process.exitcode == 0
     assert url in first
     assert second == f"Studio: {url}/ui/"
-    requests = [entry for line in lines if (entry := json.loads(line))["event"] == "request"]
+    requests = [entry for entry in json_lines(log_file) if entry["event"] == "request"]
     assert [(r["path"], r["status"]) for r in requests] == [("/v1/server", 200)]
     assert requests[0]["client"] == "127.0.0.1"
     assert requests[0]["request_id"] == answer.headers["X-Request-Id"]

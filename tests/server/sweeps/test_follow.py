@@ -9,7 +9,7 @@ import pytest
 
 from tests.waiting import LIMIT_S, wait_until
 
-from ..worker_processes import start_real2sim
+from ..worker_processes import json_lines, start_real2sim
 
 
 @pytest.fixture
@@ -39,11 +39,10 @@ def following(tmp_path, scene_folder):
 
 def test_it_tells_how_far_it_is_and_ends_with_its_standard_input(following):
     process, standard_input, log_file = following
-    wait_until(
-        lambda: log_file.exists() and log_file.read_text().count("\n") >= 2, "two lines of progress"
-    )
-    told = [json.loads(line) for line in log_file.read_text().splitlines()[:2]]
-    assert told == [{"stage": "episodes", "done": done, "total": 1_000} for done in (1, 2)]
+    wait_until(lambda: len(json_lines(log_file)) >= 2, "two lines of progress")
+    assert json_lines(log_file)[:2] == [
+        {"stage": "episodes", "done": done, "total": 1_000} for done in (1, 2)
+    ]
     standard_input.close()
     process.join(LIMIT_S)
     assert process.exitcode == 1
