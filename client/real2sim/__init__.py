@@ -28,18 +28,15 @@ if TYPE_CHECKING:
     from real2sim_proto.ranging import LidarSpec, RadarSpec
 
     from ._async.client import AsyncClient, connect_async
-    from ._async.drive_batch import AsyncDriveBatch
     from ._async.drive_session import AsyncDriveSession
     from ._sync.assets import Assets
     from ._sync.client import Client, connect
-    from ._sync.drive_batch import DriveBatch
     from ._sync.drive_session import DriveSession
     from ._sync.jobs import Job, Jobs
     from ._sync.scenarios import Scenario, Scenarios, SceneObject
     from ._sync.scenes import Scenes
     from ._sync.sessions import Sessions
     from ._sync.sweeps import Sweeps
-    from .batch_observation import BatchImages, BatchObservation
     from .clouds import LidarCloud, PointCloud, RadarCloud
     from .env import DriveEnv
     from .errors import (
@@ -78,18 +75,14 @@ if TYPE_CHECKING:
 __all__ = [
     "Assets",
     "AsyncClient",
-    "AsyncDriveBatch",
     "AsyncDriveSession",
     "BadStepError",
-    "BatchImages",
-    "BatchObservation",
     "CapacityError",
     "Client",
     "ConflictError",
     "ConnectionLostError",
     "Control",
     "ControllerTakenError",
-    "DriveBatch",
     "DriveSession",
     "EpisodeOverError",
     "Frame",
@@ -142,13 +135,9 @@ __all__ = [
 _ELSEWHERE = {
     "Assets": "real2sim._sync.assets",
     "AsyncClient": "real2sim._async.client",
-    "AsyncDriveBatch": "real2sim._async.drive_batch",
     "AsyncDriveSession": "real2sim._async.drive_session",
-    "BatchImages": "real2sim.batch_observation",
-    "BatchObservation": "real2sim.batch_observation",
     "Client": "real2sim._sync.client",
     "Control": "real2sim_proto.plans",
-    "DriveBatch": "real2sim._sync.drive_batch",
     "DriveSession": "real2sim._sync.drive_session",
     "Frame": "real2sim.images",
     "Image": "real2sim.images",

@@ -50,7 +50,6 @@ from real2sim_proto.drive import (
     View,
     Welcome,
 )
-from real2sim_proto.drive_batch import WorldError
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 from real2sim_proto.plans import PLAN, Control, Plan, PoseCommand, TrajectoryPlan
@@ -352,7 +351,7 @@ def server_message(data: bytes | str, messages: TypeAdapter[M]) -> M:
         ) from error
 
 
-def error_of(message: Error | WorldError) -> Exception:
+def error_of(message: Error) -> Exception:
     """What an error of the worker raises."""
     return error_for(
         ErrorDetails(

@@ -17,7 +17,6 @@ from pydantic import BaseModel, TypeAdapter
 from . import (
     assets,
     drive,
-    drive_batch,
     errors,
     jobs,
     lanes,
@@ -55,13 +54,6 @@ MODELS: dict[str, type[BaseModel]] = {
         drive.Progress,
         drive.Error,
         drive.Result,
-        drive_batch.BatchHello,
-        drive_batch.BatchReset,
-        drive_batch.BatchAction,
-        drive_batch.BatchBye,
-        drive_batch.BatchWelcome,
-        drive_batch.BatchObs,
-        drive_batch.BatchResult,
         errors.Problem,
         scenes.ServerInfo,
         scenes.Fleet,
@@ -109,8 +101,6 @@ UNIONS: dict[str, TypeAdapter[Any]] = {
     "Operation": operations.OPERATION,
     "ClientMessage": drive.CLIENT_MESSAGE,
     "ServerMessage": drive.SERVER_MESSAGE,
-    "BatchClientMessage": drive_batch.BATCH_CLIENT_MESSAGE,
-    "BatchServerMessage": drive_batch.BATCH_SERVER_MESSAGE,
 }
 
 SHARED = ("Storyboard",)

@@ -14,18 +14,14 @@ PACKAGE = Path(real2sim.__file__).parent
 PUBLIC = [
     "Assets",
     "AsyncClient",
-    "AsyncDriveBatch",
     "AsyncDriveSession",
     "BadStepError",
-    "BatchImages",
-    "BatchObservation",
     "CapacityError",
     "Client",
     "ConflictError",
     "ConnectionLostError",
     "Control",
     "ControllerTakenError",
-    "DriveBatch",
     "DriveSession",
     "EpisodeOverError",
     "Frame",
@@ -161,5 +157,5 @@ def test_the_client_imports_only_what_the_base_install_has(path):
             names = [str(node.module)]
         else:
             continue
-        extra = {"gymnasium"} if path.stem in {"env", "vector_env"} else set()
+        extra = {"gymnasium"} if path.stem == "env" else set()
         assert {name.partition(".")[0] for name in names} <= ALLOWED | extra

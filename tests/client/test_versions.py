@@ -16,7 +16,6 @@ from real2sim._sensors import reset_spec
 from real2sim.errors import MalformedReplyError
 from real2sim_proto import decode, encode
 from real2sim_proto.drive import CLIENT_MESSAGE, SERVER_MESSAGE, Action, Obs, Reset, Welcome
-from real2sim_proto.drive_batch import BatchReset
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.errors import ErrorCode, Problem
 from real2sim_proto.jobs import JobInfo
@@ -266,14 +265,7 @@ def test_what_is_sent_says_the_same(message):
     assert CLIENT_MESSAGE.validate_python(decode(encode(sent_fields(message)))) == message
 
 
-def test_messages_of_a_batch_and_operations_keep_their_kinds():
-    assert sent_fields(BatchReset(id=1, spec=ResetSpec(seed=2), seeds=[1])) == {
-        "v": 1,
-        "type": "batch_reset",
-        "id": 1,
-        "spec": {"seed": 2},
-        "seeds": [1],
-    }
+def test_operations_keep_their_kinds():
     spawned = Spawn(recorded_id="van_0", place={"ahead": 40.0}, driver={"kind": "idm"})
     assert sent_fields(spawned) == {
         "op": "spawn",

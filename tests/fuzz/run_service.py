@@ -150,11 +150,6 @@ def _drive(site: Site, _folder: Path) -> Attack:
     return lambda _number, rng: drive.attack(rng)
 
 
-def _batch(site: Site, _folder: Path) -> Attack:
-    batch = sockets.Batch(site)
-    return lambda _number, rng: batch.attack(rng)
-
-
 def _view(site: Site, _folder: Path) -> Attack:
     view = sockets.View(site)
     return lambda _number, rng: view.attack(rng)
@@ -169,7 +164,6 @@ ATTACKS: dict[str, Callable[[Site, Path], Attack]] = {
     "requests": _requests,
     "uploads": _uploads,
     "drive": _drive,
-    "batch": _batch,
     "view": _view,
     "frames": _frames,
 }

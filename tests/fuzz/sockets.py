@@ -12,7 +12,6 @@ import time
 from typing import Any
 
 import mutation
-import numpy as np
 from attacked_site import DEAD_S, SENSOR, TOKEN, Site
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
@@ -253,61 +252,11 @@ class Drive:
             said = decode(data)
             if said["type"] == "obs":
                 self._step, self._now = said["step"], said["t_us"]
-            if said["type"] == "batch_obs":
-                for error in said["errors"]:
-                    assert error["code"] not in ("INTERNAL", "OUT_OF_MEMORY"), error
-                if len(said["step"]):
-                    self._step, self._now = int(said["step"][0]), int(said["t_us"][0])
             if said["type"] == "error":
                 assert said["code"] not in ("INTERNAL", "OUT_OF_MEMORY"), said
                 return f"{said['code']} {mutation.shape_of(said['detail'])}"
             if said["type"] != "progress":
                 return str(said["type"])
-
-
-class Batch(Drive):
-    """The same on a batch socket, of one session."""
-
-    KINDS = ("batch_hello", "batch_reset", "batch_action")
-    LAST = ("batch_bye",)
-
-    def _path(self) -> str:
-        return "/v1/sessions/batch/drive"
-
-    def _hello(self) -> dict[str, Any]:
-        return {
-            "v": 1, "type": "batch_hello", "id": 1, "protocols": [DRIVE_SUBPROTOCOL],
-            "sessions": [self._member()], "sdk": "fuzz",
-        }  # fmt: skip
-
-    def _member(self) -> dict[str, Any]:
-        """A session that nobody else attacks; made anew where it is no more."""
-        site, known = self._site, self._site.known
-        there = known.get("batch_session_id")
-        if there is None or site.ask("GET", f"/v1/sessions/{there}") is None:
-            made = site.ask("POST", "/v1/sessions?scene=tiny")
-            known |= {"batch_session_id": made["session_id"], "batch_token": made["token"]}
-        return {"session_id": known["batch_session_id"], "token": known["batch_token"]}
-
-    def _right(self, kind: str, rng: random.Random) -> dict[str, Any]:
-        if kind == "batch_hello":
-            return self._hello() | {"id": rng.randrange(99)}
-        times = self._now + 100_000 * np.arange(1, 4)[None]
-        plans = (
-            {"kind": "trajectory", "times_us": times, "poses": np.ones((1, 3, 3))},
-            {"kind": "control", "values": np.ones((1, 2)), "reverse": np.array([False])},
-            {"kind": "pose", "values": np.zeros((1, 3))},
-        )
-        spec = {
-            "seed": 3, "dt_us": 100_000, "horizon": 8, "privileged": True,
-            "action": rng.choice(("trajectory", "control", "pose")),
-            "agents": {"default": rng.choice(("log", "idm"))}, "on_collision": "continue",
-        }  # fmt: skip
-        content: dict[str, Any] = {
-            "batch_reset": {"spec": spec, "worlds": [0], "seeds": [7]},
-            "batch_action": {"steps": np.array([self._step]), "plans": rng.choice(plans)},
-        }
-        return {"v": 1, **content.get(kind, {}), "type": kind, "id": rng.randrange(99)}
 
 
 def _damaged(data: bytes, rng: random.Random) -> tuple[int, bytes]:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parent
-WAYS = ("routes", "requests", "uploads", "drive", "batch", "view", "frames")
+WAYS = ("routes", "requests", "uploads", "drive", "view", "frames")
 """Damaged calls, damaged bytes of requests, forms with files, messages of the sockets, and bytes
 of handshakes and frames."""
 

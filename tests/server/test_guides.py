@@ -139,8 +139,8 @@ def own_policy(page: Page, words: str, *, scene: str) -> None:
 
 def test_learning(page: Callable[[str], Page], demo: real2sim.Client) -> None:
     with page("docs/learning.md") as learning:
-        names = learning.python("DriveVector")
-        assert names["obs"]["front"].shape == (16, 56, 84, 3)
+        names = learning.python("Drive-v0")
+        assert names["obs"]["front"].shape == (4, 56, 84, 3)
         names["env"].close()
         names = learning.python("DriveBatch", **{"num_envs=64": "num_envs=4"})
         assert names["obs"]["front"].shape == (4, 84, 84, 3)

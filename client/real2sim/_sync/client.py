@@ -8,7 +8,6 @@ from types import TracebackType
 from typing import TYPE_CHECKING, ClassVar, Self
 
 from real2sim_proto import PROTOCOL_VERSION
-from real2sim_proto.drive_batch import MAX_WORLDS
 from real2sim_proto.scenes import Fleet, Readiness, ServerInfo
 
 from .. import _requests
@@ -19,7 +18,6 @@ from .._target import Target, resolve_target
 from ..errors import CapacityError, ProtocolMismatchError, ReplyTimeoutError, UnreachableError
 from .assets import Assets
 from .concurrency import sleep
-from .drive_batch import DriveBatch
 from .drive_session import DriveSession
 from .jobs import Jobs
 from .scenarios import Scenarios
@@ -205,45 +203,6 @@ class Client(Handle):
             shared_memory=shared_memory,
         )
         return DriveSession(self._transport, plan)
-
-    def batch(
-        self,
-        *,
-        scene: SceneRef | None = None,
-        scenario: ScenarioRef | None = None,
-        worlds: int,
-        codec: str = "auto",
-        reconnect: float = 60.0,
-    ) -> DriveBatch:
-        """New sessions on a scene or a scenario that are stepped together, by one message a step.
-
-        Args:
-            scene: a scene or its name; or
-            scenario: a scenario or its id.
-            worlds: how many sessions, 1 to 256; the worker has to have as many free.
-            codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
-            reconnect: as of :meth:`session`.
-
-        Raises:
-            TypeError: something else than a scene or a scenario.
-            ValueError: no such number of worlds.
-
-        Examples:
-            >>> with client.batch(scene="street", worlds=2) as batch:
-            ...     obs = batch.reset(action="control")
-            ...     obs = batch.step({"kind": "control", "values": [[0.5, 0.0], [1.0, 0.0]]})
-            >>> obs.step.tolist()
-            [1, 1]
-        """
-        if not 1 <= worlds <= MAX_WORLDS:
-            raise ValueError(f"worlds is {worlds!r}; give 1 to {MAX_WORLDS}")
-        plan = SessionPlan(
-            scene=optional_scene_name(scene),
-            scenario=optional_scenario_id(scenario),
-            codec=codec,
-            reconnect=reconnect,
-        )
-        return DriveBatch(self._transport, plan, worlds)
 
     def join(
         self,

@@ -25,7 +25,6 @@ from real2sim_proto.sessions import SessionInfo
 
 from ..demo.street import unpack_street
 from ..demo.worker import worker_process
-from .batch_probe import BatchProbe
 from .drive_probe import ANSWER_S, DriveProbe, action
 from .echo_server import ECHOED, echo_servers, echo_session
 
@@ -42,7 +41,7 @@ START_S, DRIVE_S = 120.0, 600.0
 
 
 def of_one_worker(sessions: int, steps: int, *, echo: bool = True) -> Figures:
-    """One session alone, many on a socket each, and the same stepped by one message.
+    """One session alone, and many on a socket each.
 
     Args:
         sessions: driven at once.
@@ -52,15 +51,12 @@ def of_one_worker(sessions: int, steps: int, *, echo: bool = True) -> Figures:
     with _workers(1) as (url,):
         one = _rate(_sessions, url, 1, steps)
         many = _rate(_sessions, url, sessions, steps)
-        batch = _rate_by_one_message(url, sessions, steps)
         observation = _observation(url)
     figures: Figures = {
         "sessions": sessions,
         "steps_per_s": many,
         "one_session_steps_per_s": one,
         "ratio": many / one,
-        "by_one_message_steps_per_s": batch,
-        "by_one_message_ratio": batch / many,
     }
     if echo:
         figures |= _beside_echoes(
@@ -208,24 +204,6 @@ def _planners(infos: Sequence[SessionInfo]) -> Iterator[Drive]:
                     done += 1
 
         yield drive
-
-
-def _rate_by_one_message(url: str, count: int, steps: int) -> float:
-    with real2sim.connect(url) as client:
-        client.wait_ready()
-        infos = [client.sessions.create(scene=SCENE) for _ in range(count)]
-        with BatchProbe(infos) as probe:
-            obs = probe.act(probe.reset(dt_us=SHORT_STEP_US))
-
-            def drive() -> None:
-                nonlocal obs
-                for _ in range(steps):
-                    obs = probe.act(obs)
-
-            rate = count * steps / _seconds(drive)
-        for info in infos:
-            client.sessions.delete(info.session_id)
-    return rate
 
 
 def _seconds(call: Callable[[], None]) -> float:

@@ -33,7 +33,6 @@ from .routes import (
     assets,
     docs,
     drive,
-    drive_batch,
     exports,
     health,
     jobs,
@@ -77,7 +76,6 @@ PROTECTED: tuple[APIRouter, ...] = (
 OPEN: tuple[APIRouter, ...] = (
     health.router,
     sessions.router,
-    drive_batch.router,  # before that of drive, whose path has any id
     drive.router,
     view.router,
     ui.router,

@@ -28,7 +28,6 @@ import pytest
 import real2sim
 import real2sim.env
 import real2sim.planners
-import real2sim.vector_env
 import real2sim_proto
 from real2sim._async import assets as async_assets
 from real2sim._async import jobs as async_jobs
@@ -57,7 +56,6 @@ SDK_CLASSES: tuple[type, ...] = (
     sessions.Sessions,
     sweeps.Sweeps,
     real2sim.DriveSession,
-    real2sim.DriveBatch,
     real2sim.AsyncClient,
     async_scenes.AsyncScenes,
     async_scenarios.AsyncScenarios,
@@ -69,14 +67,11 @@ SDK_CLASSES: tuple[type, ...] = (
     async_sessions.AsyncSessions,
     async_sweeps.AsyncSweeps,
     real2sim.AsyncDriveSession,
-    real2sim.AsyncDriveBatch,
     real2sim.Image,
     real2sim.Frame,
     real2sim.View,
     real2sim.Observation,
-    real2sim.BatchObservation,
     real2sim.env.DriveEnv,
-    real2sim.vector_env.DriveVectorEnv,
 )
 TWINS = {
     sync: source
@@ -215,7 +210,7 @@ async def run_examples(texts: list[str], names: dict[str, Any]) -> None:
         for example in itertools.chain.from_iterable(map(parser.get_examples, texts)):
             await run_example(example, names)
     finally:
-        for value in [v for k, v in names.items() if k in {"session", "batch", "env", "client"}]:
+        for value in [v for k, v in names.items() if k in {"session", "env", "client"}]:
             if inspect.isawaitable(closing := value.close()):
                 await closing
 

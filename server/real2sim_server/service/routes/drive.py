@@ -7,7 +7,6 @@ import contextlib
 import time
 from collections.abc import Iterator
 from functools import partial
-from typing import Protocol
 
 import structlog
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
@@ -18,7 +17,7 @@ from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode
 from ..accounts import Account, RevokedError
 from ..http.accounting import begin_paying
 from ..http.auth import bearer_token, unauthorized
-from ..http.problems import REQUEST_ID_KEY, ServiceError, problem_response, service_error
+from ..http.problems import REQUEST_ID_KEY, problem_response, service_error
 from ..sessions.connection import Connection
 from ..sessions.handshake import FatalError, close_with_error, receive_hello, with_progress
 from ..sessions.messages import unsupported_protocol
@@ -133,15 +132,8 @@ def account_of_token(worker: Worker, token: str | None) -> Account | None:
     return worker.accounts.of_token(token) if worker.accounts.wants_token else None
 
 
-class Endable(Protocol):
-    """A connection that can be told to end."""
-
-    async def end(self, error: ServiceError) -> None:
-        """Tell the client why, and leave it."""
-
-
 @contextlib.contextmanager
-def ended_when_revoked(connection: Endable, account: Account) -> Iterator[None]:
+def ended_when_revoked(connection: Connection, account: Account) -> Iterator[None]:
     """The connection ends when the token of its account is no more."""
     revoked = partial(_end, connection, account)
     account.on_revoked.add(revoked)
@@ -151,7 +143,7 @@ def ended_when_revoked(connection: Endable, account: Account) -> Iterator[None]:
         account.on_revoked.discard(revoked)
 
 
-def _end(connection: Endable, account: Account) -> None:
+def _end(connection: Connection, account: Account) -> None:
     """Leave a client whose token is no more; not awaited, for it may be slow to read."""
     ending = asyncio.ensure_future(connection.end(service_error(RevokedError(account.name))))
     _ending.add(ending)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from ...world import World
 from ..accounts import counted_world_time
 from .gathered_calls import attempt
-from .observation import EncodedObservation, RenderedObservation, Seen, see
+from .observation import EncodedObservation, RenderedObservation
 from .phases import StepPhases
 from .transition import Transition, record_together
 from .wire import pack_members
@@ -35,13 +35,6 @@ class BlindSteps:
         pairs = zip(transitions, worlds, strict=True)
         encoded = iter(_counted(self._encode, [p for p in pairs if isinstance(p[1], World)]))
         return [next(encoded) if isinstance(world, World) else world for world in worlds]
-
-    def see(self, transitions: Sequence[Transition]) -> list[Seen | Exception]:
-        """The new worlds on record and what is seen of them, or what each has failed by."""
-        return [
-            world if isinstance(world, Exception) else attempt(see, world)
-            for world in self._worlds_of(transitions)
-        ]
 
     def _worlds_of(self, transitions: Sequence[Transition]) -> list[World | Exception]:
         worlds = _counted(self._advance_and_evaluate, [(transition,) for transition in transitions])

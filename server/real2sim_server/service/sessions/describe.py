@@ -9,7 +9,6 @@ from typing import Any
 
 from real2sim_proto import DRIVE_SUBPROTOCOL
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
-from real2sim_proto.drive_batch import MAX_WORLDS
 from real2sim_proto.episode import MAX_SENSORS
 from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.sessions import SessionEdited, SessionInfo, SessionState
@@ -120,7 +119,6 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
             "max_operations_per_request": MAX_OPERATIONS_PER_REQUEST,
             "max_cameras_per_step": MAX_SENSORS,
             "max_image_bytes": MAX_IMAGE_BYTES,
-            "max_sessions_per_socket": MAX_WORLDS,
         },
         "cameras": [c.model_dump(mode="json") for c in camera_infos(tuple(start.scene.rig))],
         "objects": [o.model_dump(mode="json", exclude_none=True) for o in infos],

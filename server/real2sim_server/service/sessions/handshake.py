@@ -104,11 +104,6 @@ async def receive(socket: WebSocket) -> ReceivedMessage:
         WebSocketDisconnect: the client has left.
         BadMessageError: what came is no message.
     """
-    return await receive_as(read_message, socket)
-
-
-async def receive_as(read: Callable[[bytes], T], socket: WebSocket) -> T:
-    """The next message, as ``read`` understands it. Raises as :func:`receive` does."""
     event = await socket.receive()
     if event["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(event.get("code", 1005))
@@ -116,8 +111,8 @@ async def receive_as(read: Callable[[bytes], T], socket: WebSocket) -> T:
     if data is None:
         raise BadMessageError(bad_message("text was sent where messages are binary"))
     if len(data) <= SMALL_BYTES:
-        return read(data)
-    return await asyncio.to_thread(read, data)
+        return read_message(data)
+    return await asyncio.to_thread(read_message, data)
 
 
 async def with_progress(
@@ -148,16 +143,13 @@ def error_message(
     error: ServiceError, *, fatal: bool = False, step: int | None = None
 ) -> EncodedMessage:
     """An error as a message; ``step``: the one that is due."""
-    return pack_message("error", error_fields(error, step=step) | {"fatal": fatal})
-
-
-def error_fields(error: ServiceError, *, step: int | None) -> dict[str, Any]:
-    """What an error says; ``step``: the one that is due."""
-    return {
+    fields = {
         "code": error.code.value,
         "detail": error.detail,
         "hint": error.hint,
         "retryable": error.code in RETRYABLE,
         "step": step,
         "retry_after_s": int(error.headers.get("Retry-After", 0)) or None,
+        "fatal": fatal,
     }
+    return pack_message("error", fields)

@@ -15,8 +15,6 @@ TOGETHER_PIXELS = 16_000_000
 """Of images that are drawn in one go: the first session waits for the last, some milliseconds."""
 MOST_TOGETHER = 8
 """Steps with images that are made in one go."""
-MOST_OF_ONE_CLIENT = 64
-"""The same of one client's message: nobody else gets the engine meanwhile."""
 
 
 class JointDrawing:
@@ -86,20 +84,6 @@ class JointDrawing:
         assert not isinstance(images, Exception)
         assert not isinstance(described, Exception)
         return attempt(self._phases.observation, moved.transition, moved.world, images, described)
-
-
-def pieces_of(transitions: Sequence[Transition]) -> list[list[Transition]]:
-    """What is drawn in one go of many."""
-    pieces: list[list[Transition]] = []
-    room = 0
-    for transition in transitions:
-        pixels = sum(camera.width * camera.height for camera in transition.cameras.values())
-        room -= pixels
-        if room < 0 or not pieces or len(pieces[-1]) == MOST_OF_ONE_CLIENT:
-            pieces.append([])
-            room = TOGETHER_PIXELS - pixels
-        pieces[-1].append(transition)
-    return pieces
 
 
 def share_of(cameras: Iterable[Camera]) -> float:

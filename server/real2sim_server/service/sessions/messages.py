@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from real2sim_proto import (
     PROTOCOL_VERSION,
@@ -21,13 +21,8 @@ from ..._records import made_quickly
 from ...world.recording.replay import plan_payload
 from ..http.problems import ServiceError
 
-M = TypeVar("M")
-
 MAX_PROBLEMS = 4
-TYPES = (
-    "hello, attach, reset, action, edit, render, agent, snapshot, restore, fork, bye; on a batch "
-    "socket batch_hello, batch_reset, batch_action, batch_bye"
-)
+TYPES = "hello, attach, reset, action, edit, render, agent, snapshot, restore, fork, bye"
 
 
 @made_quickly
@@ -76,7 +71,7 @@ def read_message(data: bytes) -> ReceivedMessage:
     """
     if (action := action_in(data)) is not None:
         return action
-    message = read_as(CLIENT_MESSAGE, data)
+    message = _read(data)
     content = plan_payload(message.plan) if isinstance(message, Action) else b""
     return ReceivedMessage(message, content)
 
@@ -97,8 +92,8 @@ def action_in(data: bytes) -> ReceivedAction | None:
     return None
 
 
-def read_as(messages: TypeAdapter[M], data: bytes) -> M:
-    """The message in ``data``, one of ``messages``. Raises as :func:`read_message` does."""
+def _read(data: bytes) -> ClientMessage:
+    """The message in ``data``. Raises as :func:`read_message` does."""
     try:
         fields = decode(data, max_bytes=MAX_CLIENT_MESSAGE_BYTES)
     except CodecError as error:
@@ -114,7 +109,7 @@ def read_as(messages: TypeAdapter[M], data: bytes) -> M:
         mismatch = ServiceError(ErrorCode.UNSUPPORTED_PROTOCOL, detail)
         raise BadMessageError(mismatch, message_id=message_id, fatal=True)
     try:
-        return messages.validate_python(fields)
+        return CLIENT_MESSAGE.validate_python(fields)
     except ValidationError as error:
         raise BadMessageError(
             bad_message(validation_summary(error)), message_id=message_id

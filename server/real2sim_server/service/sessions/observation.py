@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from real2sim_proto.episode import SensorSpec
 
 from ..._records import made_quickly
 from ...scene import Camera
-from ...world import Observation, World
+from ...world import World
 from ...world.ranging import Cloud
 from ..rendering.clouds import cloud_parts
 from ..rendering.frames import EncodedFrame, FrameHeader, RenderedImage, raw_headers
@@ -19,13 +18,6 @@ from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack
 
 Described = tuple[EncodedMembers, list[FrameHeader] | None]
 """An observation without its images, and the headers of these where all are raw."""
-
-
-class Seen(NamedTuple):
-    """A world, and what the policy gets of it."""
-
-    world: World
-    observation: Observation
 
 
 @made_quickly
@@ -76,17 +68,6 @@ class EncodedObservation:
     def answer(self) -> EncodedMessage:
         """For the client that is answered."""
         return self.placed or self.message
-
-
-def see(world: World) -> Seen:
-    """An evaluated world with what is seen of it."""
-    return Seen(world, world.observe())
-
-
-def message_of(world: World) -> EncodedMessage:
-    """The observation of an instant without images, as a message."""
-    members = pack_members(world.observe().obs_fields())
-    return pack_with_frames("obs", members, (), PhaseTimer())
 
 
 def describe(world: World, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]) -> Described:

@@ -58,8 +58,8 @@ from ..warm_up import DeformationKernels
 from .blind_steps import BlindSteps
 from .gathered_calls import GatheredCalls
 from .image_limits import cameras_of, raw_image_bytes
-from .joint_drawing import JointDrawing, pieces_of, share_of
-from .observation import EncodedObservation, RenderedObservation, Seen, with_frames
+from .joint_drawing import JointDrawing, share_of
+from .observation import EncodedObservation, RenderedObservation, with_frames
 from .phases import KernelsMissingError, StepPhases
 from .segment import FrameSlot
 from .transition import Transition
@@ -238,48 +238,6 @@ class StepPipeline:
             lane=Lane.DRIVE,
             on_result=told,
         )
-
-    async def run_seeing(
-        self, transitions: Sequence[Transition]
-    ) -> list[EncodedObservation | Exception]:
-        """Advance, render, evaluate and encode worlds with sensors, drawn in one go as far as
-        TOGETHER_PIXELS and MOST_OF_ONE_CLIENT: the observation of each, or what it has failed by.
-        """
-        found: list[EncodedObservation | Exception] = []
-        for piece in pieces_of(transitions):
-            try:
-                drawn = await self._engine.call(
-                    self._joint.draw, piece, label="drive", lane=Lane.DRIVE
-                )
-            except Exception as error:
-                found += [error] * len(piece)
-                continue
-            encoded = (self._encoded(t, o) for t, o in zip(piece, drawn, strict=True))
-            found += await asyncio.gather(*encoded)
-        return found
-
-    async def _encoded(
-        self,
-        transition: Transition,
-        drawn: RenderedObservation | EncodedObservation | Exception,
-    ) -> EncodedObservation | Exception:
-        try:
-            if isinstance(drawn, KernelsMissingError):
-                return await self.run(transition)
-            return drawn if isinstance(drawn, Exception) else await self._finish(drawn)
-        except Exception as error:
-            return error
-
-    async def run_together(self, transitions: Sequence[Transition]) -> list[Seen | Exception]:
-        """Advance, evaluate and record, in one go: the new worlds and what is seen of them, or what
-        each has failed by.
-
-        For worlds without sensors, whose observations somebody else encodes.
-
-        Raises:
-            OverLimitError: the account of the running task has had its time on the engine.
-        """
-        return await self.on_world_thread(self._blind.see, transitions)
 
     def send(
         self, transition: Transition, observation: RenderedObservation | EncodedObservation

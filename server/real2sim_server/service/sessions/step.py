@@ -36,12 +36,12 @@ from ..storage.errors import FencedError, StoreTroubleError, StoreUnavailableErr
 from ..storage.store import SessionEntry, Store, StoredReply
 from ..warm_up import KernelWarmUp
 from .log_write import LogWrite
-from .observation import EncodedObservation, Seen, message_of
+from .observation import EncodedObservation
 from .pipeline import StepPipeline
 from .segment import FrameSlot
 from .session import NewestPlan, Session
 from .transition import Transition
-from .wire import DeferredMessage, EncodedMessage
+from .wire import EncodedMessage
 from .world_clouds import mounted_beside
 
 LogRecord = tuple[str, int, bytes]
@@ -197,36 +197,6 @@ class Stepper:
         # Given once more, its images come with it: the slot may hold others by then.
         session.lockstep.advance(payload, observation.message, over=observation.world.over)
         return None if written else observation.answer
-
-    async def act_together(self, actions: Sequence[DueAction]) -> list[Seen | Exception]:
-        """Take the due actions of sessions without sensors, in one go; what fails in one leaves the
-        others alone. The caller holds the lock of each.
-
-        Raises:
-            OverLimitError: the account of the running task has had its time on the engine.
-        """
-        transitions = [self._transition(action, {}) for action in actions]
-        found = await self._pipeline.run_together(transitions)
-        for action, transition, outcome in zip(actions, transitions, found, strict=True):
-            if isinstance(outcome, Seen):
-                message = DeferredMessage(partial(message_of, outcome.world))
-                _commit(action, outcome.world, message)
-            else:
-                await self._failed(action, transition, outcome)
-        return found
-
-    async def act_seeing(
-        self, actions: Sequence[DueAction]
-    ) -> list[EncodedObservation | Exception]:
-        """As :meth:`act_together`, of sessions with sensors, whose images are drawn in one go."""
-        transitions = [self._transition(action, action.session.cameras) for action in actions]
-        found = await self._pipeline.run_seeing(transitions)
-        for action, transition, outcome in zip(actions, transitions, found, strict=True):
-            if isinstance(outcome, EncodedObservation):
-                _commit(action, outcome.world, outcome.message)
-            else:
-                await self._failed(action, transition, outcome)
-        return found
 
     def begin_step(
         self,

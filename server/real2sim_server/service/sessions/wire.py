@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +17,6 @@ from ..rendering.frames import EncodedFrame, Part, array_header, map_header, pac
 
 FRAMES: bytes = msgpack.packb("frames")
 CLOUDS: bytes = msgpack.packb("clouds")
-IMAGES: bytes = msgpack.packb("images")
 
 
 @dataclass(eq=False)
@@ -70,27 +69,6 @@ class EncodedMessage:
         return b"".join(self.parts(message_id))
 
 
-class DeferredMessage(EncodedMessage):
-    """A message that is encoded when it is first sent; most of those that are kept for a client
-    that may come back never are.
-
-    Args:
-        encode: makes the message, on any thread, always the same.
-    """
-
-    def __init__(self, encode: Callable[[], EncodedMessage]) -> None:
-        object.__setattr__(self, "_encode", encode)
-
-    def parts(self, message_id: int = 0) -> list[Part]:
-        """The whole message, to be sent one part after the other."""
-        return self._encoded.parts(message_id)
-
-    @functools.cached_property
-    def _encoded(self) -> EncodedMessage:
-        encode: Callable[[], EncodedMessage] = self.__dict__["_encode"]
-        return encode()
-
-
 def pack_members(fields: Mapping[str, Any]) -> EncodedMembers:
     """Members of plain values and arrays."""
     return EncodedMembers(len(fields), pack_pairs(fields))
@@ -125,16 +103,6 @@ def pack_with_frames(
     watch.stage("pack")
     parts.append(pack_pairs({"timing": watch.timing_ms}))
     return EncodedMessage(_head(kind, members.count + 2 + bool(clouds)), tuple(parts))
-
-
-def pack_with_images(
-    kind: str, members: EncodedMembers, images: Sequence[Sequence[Part]]
-) -> EncodedMessage:
-    """A message with the member ``images`` besides ``members``: maps, each in parts."""
-    parts: list[Part] = [members.encoded + IMAGES + array_header(len(images))]
-    for each in images:
-        parts += each
-    return EncodedMessage(_head(kind, members.count + 1), tuple(parts))
 
 
 @functools.cache

@@ -176,6 +176,17 @@ def test_the_registered_environment_passes_check_env(site):
     env.close()
 
 
+def test_a_vector_environment_of_gymnasium_steps_many_sessions(site):
+    options = {"num_envs": 2, "url": site.url, "scene": "tiny", "vectorization_mode": "sync"}
+    env = gymnasium.make_vec("real2sim.env:real2sim/Drive-v0", **options)
+    env.reset(seed=0)
+    seen, reward, *_ = env.step(np.array([[1.0, 0.0], [-1.0, 0.0]], np.float32))
+    speed = seen["state"][:, 0]
+    assert speed[0] > speed[1]
+    assert reward[0] > reward[1]
+    env.close()
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
