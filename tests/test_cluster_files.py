@@ -200,7 +200,7 @@ def test_the_dashboard_and_the_autoscaler_ask_for_metrics_that_there_are():
         for sample in (family.name + suffix,)
     }
     # Those of tokens are there once there are accounts.
-    names |= {"real2sim_token_engine_seconds_total", "real2sim_token_refusals_total"}
+    names |= {"real2sim_token_requests_total", "real2sim_token_refusals_total"}
     dashboard = json.loads((DOCKER / "grafana" / "real2sim.json").read_text())
     asked = {
         name

@@ -45,8 +45,6 @@ class ErrorCode(StrEnum):
     FORBIDDEN = "FORBIDDEN"
     OVER_CAPACITY = "OVER_CAPACITY"
     TOO_MANY_REQUESTS = "TOO_MANY_REQUESTS"
-    TOO_MANY_BYTES = "TOO_MANY_BYTES"
-    TOO_MUCH_ENGINE_TIME = "TOO_MUCH_ENGINE_TIME"
     TOO_MANY_SESSIONS = "TOO_MANY_SESSIONS"
     TOO_MANY_JOBS = "TOO_MANY_JOBS"
     QUEUE_FULL = "QUEUE_FULL"
@@ -105,8 +103,6 @@ HTTP_STATUS: dict[ErrorCode, int] = {
     ErrorCode.FORBIDDEN: 403,
     ErrorCode.OVER_CAPACITY: 429,
     ErrorCode.TOO_MANY_REQUESTS: 429,
-    ErrorCode.TOO_MANY_BYTES: 429,
-    ErrorCode.TOO_MUCH_ENGINE_TIME: 429,
     ErrorCode.TOO_MANY_SESSIONS: 429,
     ErrorCode.TOO_MANY_JOBS: 429,
     ErrorCode.QUEUE_FULL: 503,
@@ -135,8 +131,6 @@ RETRYABLE = frozenset(
     {
         ErrorCode.OVER_CAPACITY,
         ErrorCode.TOO_MANY_REQUESTS,
-        ErrorCode.TOO_MANY_BYTES,
-        ErrorCode.TOO_MUCH_ENGINE_TIME,
         ErrorCode.TOO_MANY_SESSIONS,
         ErrorCode.TOO_MANY_JOBS,
         ErrorCode.QUEUE_FULL,

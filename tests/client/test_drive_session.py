@@ -234,7 +234,7 @@ def test_what_the_worker_refuses_for_now_is_sent_again_after_the_time_it_asks_fo
     monkeypatch.setattr("real2sim._sync.reconnecting.sleep", waited.append)
     with connect(worker) as client, client.session(scene="street", reconnect=240.0) as session:
         session.reset()
-        for code in ("STORAGE_UNAVAILABLE", "TOO_MANY_REQUESTS retry", "TOO_MUCH_ENGINE_TIME"):
+        for code in ("STORAGE_UNAVAILABLE", "TOO_MANY_REQUESTS retry", "TOO_MANY_SESSIONS"):
             worker.mischief = code
             session.step(STRAIGHT)
         actions = [m for m in worker.messages if m["type"] == "action"]

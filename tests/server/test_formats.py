@@ -462,8 +462,7 @@ def test_operations(page: Callable[[str], Page], monkeypatch: pytest.MonkeyPatch
         held = read_token_file(tokens).tokens
         assert [(t.name, t.role) for t in held] == [("watcher", "observe"), ("nightly", "drive")]
         assert held[1].limits == TokenLimits(
-            requests_per_second=200, bytes_per_day=2e11, engine_seconds_per_minute=30,
-            sessions=8, jobs=4,
+            requests_per_second=200, sessions=8, jobs=4,
         )  # fmt: skip
         assert alice not in tokens.read_text()
         proxy = operations.block("proxy_pass")

@@ -29,10 +29,6 @@ def add(
     requests_per_second: Annotated[
         float | None, typer.Option(help="Requests, and messages of sockets.")
     ] = None,
-    bytes_per_day: Annotated[float | None, typer.Option(help="Sent and received.")] = None,
-    engine_seconds_per_minute: Annotated[
-        float | None, typer.Option(help="Of the device's thread, or of steps without images.")
-    ] = None,
     sessions: Annotated[int | None, typer.Option(help="Open at a time.")] = None,
     jobs: Annotated[int | None, typer.Option(help="Not over, at a time.")] = None,
     role: Annotated[
@@ -49,8 +45,6 @@ def add(
     try:
         limits = TokenLimits(
             requests_per_second=requests_per_second,
-            bytes_per_day=bytes_per_day,
-            engine_seconds_per_minute=engine_seconds_per_minute,
             sessions=sessions,
             jobs=jobs,
         )

@@ -1,22 +1,18 @@
 """Who takes how much of a worker: an account for each name of a token.
 
-Figures are counted where they arise: requests and bytes on the event loop, engine time on the
-engine's thread, that of steps without images on the thread of worlds. Each has one writer, so that
-counting is an addition and needs no lock. Limits are
-looked at before something begins; what has begun is finished, and counts.
+Limits are checked before something begins. All of it belongs to the event loop.
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import structlog
 
@@ -24,12 +20,8 @@ from . import clock
 from .storage.tokens import token_hash
 from .token_file import DEFAULT_NAME, Role, TokenFileError, TokenLimits, read_token_file
 
-T = TypeVar("T")
-
 RELOAD_S = 1.0
 """Between looks whether the file of tokens has changed."""
-PATIENCE_S = 1.0
-"""Between looks of a job whether its account may use the engine again."""
 
 log = structlog.get_logger(__name__)
 
@@ -38,8 +30,6 @@ class Limit(StrEnum):
     """What can be used up."""
 
     REQUESTS = "requests"
-    BYTES = "bytes"
-    ENGINE = "engine"
     SESSIONS = "sessions"
     JOBS = "jobs"
 
@@ -67,31 +57,27 @@ class RevokedError(Exception):
 
 
 class Meter:
-    """A growing figure against what it may grow by: a bucket that leaks as fast as is allowed.
+    """A bucket that leaks as fast as is allowed.
 
     Args:
-        allowed: in a period; so much may also come at once.
-        period_s: of time [s].
+        rate: per second; as much may also come at once, and one at least.
     """
 
-    def __init__(self, allowed: float, period_s: float) -> None:
-        self.allowed = allowed
-        self._per_s = allowed / period_s
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
         self._level = 0.0
-        self._seen = 0.0
         self._at = clock.monotonic()
 
-    def wait_s(self, total: float, more: float = 0.0) -> float:
-        """Seconds until ``more`` may be added to what is ``total`` up to now; 0 for at once."""
+    def take(self) -> float:
+        """Take one; 0, or the seconds until there is one to take [s]."""
         now = clock.monotonic()
-        leaked = (now - self._at) * self._per_s
-        self._level = max(0.0, self._level - leaked) + (total - self._seen)
-        self._at, self._seen = now, total
-        # Nothing may be added at the brim, and a single thing may always be added to nothing.
-        room = max(self.allowed, more) - self._level
-        if room >= more > 0 or (more == 0 and room > 0):
+        self._level = max(0.0, self._level - (now - self._at) * self._rate)
+        self._at = now
+        room = max(self._rate, 1.0) - self._level
+        if room >= 1.0:
+            self._level += 1.0
             return 0.0
-        return max((more - room) / self._per_s, 1e-3)
+        return max((1.0 - room) / self._rate, 1e-3)
 
 
 class Held(NamedTuple):
@@ -113,10 +99,6 @@ class Account:
         limits: what its holder may take.
         role: what its holder may do.
         requests: and messages of sockets, those that were let in.
-        received_bytes, sent_bytes: bodies and messages, and images by shared memory.
-        engine_seconds: written by the engine's thread alone.
-        world_seconds: of the processor, for what needs no engine; written by the thread of worlds
-            alone.
         refusals: by limit.
         elsewhere: sessions and unfinished jobs on other workers of the fleet, as they last told.
         revoked: whether the token is no more.
@@ -127,10 +109,6 @@ class Account:
     limits: TokenLimits = field(default_factory=TokenLimits)
     role: Role = "administer"
     requests: int = 0
-    received_bytes: int = 0
-    sent_bytes: int = 0
-    engine_seconds: float = 0.0
-    world_seconds: float = 0.0
     refusals: dict[Limit, int] = field(default_factory=lambda: dict.fromkeys(Limit, 0))
     elsewhere: Held = NOTHING
     revoked: bool = False
@@ -139,47 +117,25 @@ class Account:
     def __post_init__(self) -> None:
         self.limit(self.limits)
 
-    @property
-    def computing_seconds(self) -> float:
-        """What limits of engine time count: on the engine, or instead of it."""
-        return self.engine_seconds + self.world_seconds
-
-    @property
-    def is_limited(self) -> bool:
-        """Whether a message may be refused, or what it asks for."""
-        return not (self._requests is None and self._bytes is None and self._engine is None)
-
     def limit(self, limits: TokenLimits) -> None:
         """Other limits from now on; what was taken up to now does not count against them."""
         self.limits = limits
-        self._requests = _meter(limits.requests_per_second, 1.0, self.requests)
-        self._bytes = _meter(limits.bytes_per_day, 86_400.0, self.received_bytes + self.sent_bytes)
-        self._engine = _meter(limits.engine_seconds_per_minute, 60.0, self.computing_seconds)
+        rate = limits.requests_per_second
+        self._requests = None if rate is None else Meter(rate)
 
     def admit(self) -> None:
         """Let one request or message in, and count it. On the event loop.
 
         Raises:
             RevokedError: the token is no more.
-            OverLimitError: of requests or bytes.
+            OverLimitError: it has had its requests.
         """
         if self.revoked:
             raise RevokedError(self.name)
-        if self._requests is not None and (wait := self._requests.wait_s(self.requests, 1.0)):
+        if self._requests is not None and (wait := self._requests.take()):
             rate = self.limits.requests_per_second
             raise self._over(Limit.REQUESTS, f"more than {rate:g} requests a second", wait)
-        if self._bytes is not None:
-            taken = self.received_bytes + self.sent_bytes
-            if wait := self._bytes.wait_s(taken):
-                allowed = self.limits.bytes_per_day
-                raise self._over(Limit.BYTES, f"more than {allowed:g} bytes a day", wait)
         self.requests += 1
-
-    def check_engine(self) -> None:
-        """Raises OverLimitError while the account has had its time on the engine."""
-        if self._engine is not None and (wait := self._engine.wait_s(self.computing_seconds)):
-            allowed = self.limits.engine_seconds_per_minute
-            raise self._over(Limit.ENGINE, f"more than {allowed:g} s of the engine a minute", wait)
 
     def check_sessions(self, present: int) -> None:
         """Raises OverLimitError where ``present`` sessions of this worker, with those of others,
@@ -203,104 +159,21 @@ class Account:
         return OverLimitError(limit, detail, retry_after_s=wait_s)
 
 
-def _meter(allowed: float | None, period_s: float, taken: float) -> Meter | None:
-    if allowed is None:
-        return None
-    meter = Meter(allowed, period_s)
-    meter._seen = taken
-    return meter
-
-
-@dataclass(eq=False)
-class Payer:
-    """Who pays for what a task does.
-
-    Attributes:
-        account: that everything is counted for.
-        waits: for the engine where others are refused, as jobs do.
-        on_engine: whether the present request or message was let on the engine.
-    """
-
-    account: Account
-    waits: bool = False
-    on_engine: bool = False
-
-    async def let_on_engine(self) -> None:
-        """Return once the account may use the engine; a request is asked once, not half-way.
-
-        Raises:
-            OverLimitError: not now, unless it waits.
-        """
-        while not self.on_engine:
-            try:
-                self.account.check_engine()
-                self.on_engine = not self.waits
-                return
-            except OverLimitError as error:
-                if not self.waits:
-                    raise
-                wait_s = min(error.retry_after_s, PATIENCE_S)
-                await clock.sleep_until(clock.monotonic() + wait_s)
-
-
-PAYER: ContextVar[Payer | None] = ContextVar("payer", default=None)
-"""Of the running task; tasks and threads that it starts have the same one."""
+ACCOUNT: ContextVar[Account | None] = ContextVar("account", default=None)
+"""For whom the running task works; tasks that it starts work for the same one."""
 
 
 def admit_message() -> None:
-    """Let a message of a socket in, and count it; see :meth:`Account.admit`."""
-    payer = PAYER.get()
-    if payer is not None:
-        payer.account.admit()
-        payer.on_engine = False
-
-
-def admitted_at_once() -> Account | None:
-    """Let a message in and count it where no limit has to be asked, neither of messages nor of
-    computing; whose it is, None where it has to go by :func:`admit_message`."""
-    payer = PAYER.get()
-    if payer is None or payer.waits or payer.account.revoked or payer.account.is_limited:
-        return None
-    payer.account.requests += 1
-    return payer.account
-
-
-def count_sent(nbytes: int) -> None:
-    """Count what reaches the client of the running task by another way than its connection."""
-    payer = PAYER.get()
-    if payer is not None:
-        payer.account.sent_bytes += nbytes
-
-
-async def computing_account() -> Account | None:
-    """Whose computing time the running task is about to take; None for nobody's.
-
-    Raises:
-        OverLimitError: of engine time; a job waits instead.
-    """
-    payer = PAYER.get()
-    if payer is None:
-        return None
-    if payer.account.limits.engine_seconds_per_minute is not None:
-        await payer.let_on_engine()
-    return payer.account
-
-
-def counted_world_time(account: Account | None, fn: Callable[..., T], *args: Any) -> T:
-    """``fn(*args)``, its processor time counted for ``account``; on the thread of worlds."""
-    if account is None:
-        return fn(*args)
-    began = time.thread_time()
-    try:
-        return fn(*args)
-    finally:
-        account.world_seconds += time.thread_time() - began
+    """Let a message of a socket in; see :meth:`Account.admit`."""
+    account = ACCOUNT.get()
+    if account is not None:
+        account.admit()
 
 
 def owner_name() -> str:
     """Name of the account that the running task makes things for."""
-    payer = PAYER.get()
-    return payer.account.name if payer is not None else DEFAULT_NAME
+    account = ACCOUNT.get()
+    return account.name if account is not None else DEFAULT_NAME
 
 
 class Accounts:
@@ -412,10 +285,6 @@ class Accounts:
         account = Account(name)
         if before is not None:
             account.requests, account.refusals = before.requests, dict(before.refusals)
-            account.received_bytes, account.sent_bytes = before.received_bytes, before.sent_bytes
-            account.engine_seconds = before.engine_seconds
-            account.world_seconds = before.world_seconds
-            account.limit(account.limits)
         self._by_name[name] = account
         return account
 

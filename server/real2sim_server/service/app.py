@@ -17,17 +17,15 @@ from real2sim_proto import Problem
 from real2sim_proto.jobs import JobInfo
 
 from ..settings import Settings
-from .accounts import PAYER, Payer
+from .accounts import ACCOUNT
 from .clock import now_us
-from .http.accounting import Accounting, usage_of
-from .http.auth import require_token
+from .http.auth import READING, account_of, require_token
 from .http.hosts import LoopbackOnly
 from .http.idempotency import install_replay_handler
 from .http.openapi import published
 from .http.origins import OwnPagesOnly
 from .http.problems import install_problem_handlers
 from .http.requests import BodyLimit, RequestContext
-from .http.roles import READING
 from .jobs.jobs import Work
 from .routes import (
     assets,
@@ -142,7 +140,6 @@ def create_app(settings: Settings) -> FastAPI:
     if not settings.wants_token:
         app.add_middleware(LoopbackOnly)
     app.add_middleware(OwnPagesOnly)
-    app.add_middleware(Accounting)
     if settings.traces_url is not None:
         trace(app, worker, traces_to(settings.traces_url, worker_id=settings.worker_id))
     app.add_middleware(RequestContext, metrics=worker.metrics, on_end=partial(note_request, worker))
@@ -178,7 +175,7 @@ def note_request(worker: Worker, scope: Scope, method: str, status: int, request
     refused = status in (401, 403)
     if not refused and (method in READING or status >= 400 or path.endswith(STEPS)):
         return
-    account = usage_of(scope).account
+    account = account_of(scope)
     worker.audit.note(
         AuditEntry(
             account=account.name if account is not None else "",
@@ -195,7 +192,7 @@ def note_request(worker: Worker, scope: Scope, method: str, status: int, request
 
 async def _work_again(worker: Worker, info: JobInfo) -> Work:
     """The work of a job on record, for the account that it was asked for with."""
-    PAYER.set(Payer(worker.accounts.of_owner(info.owner), waits=True))
+    ACCOUNT.set(worker.accounts.of_owner(info.owner))
     if info.kind == "simulate":
         return await worker.simulations.work_again(info)
     if info.kind == "sweep":

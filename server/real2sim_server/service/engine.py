@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 import structlog
 
 from . import clock
-from .accounts import PAYER, Account, computing_account
 from .lanes import Lane, Lanes
 
 T = TypeVar("T")
@@ -126,7 +125,6 @@ class _EngineJob:
     run: Callable[[], Any]
     label: str
     future: Future[Any] | _LoopFuture
-    account: Account | None
     companions: Companions | None = None
     queued_at: float = field(default_factory=lambda: clock.monotonic())  # noqa: PLW0108
     on_end: Callable[[str, float, float], None] | None = None
@@ -166,7 +164,6 @@ class Engine:
         self._on_job = on_job
         self._jobs: Lanes[_EngineJob] = Lanes(queue_length)
         self._began = 0.0
-        self._payers: Sequence[Account | None] = ()
         self._changed = threading.Condition()
         self._accepting = False
         self._running: str | None = None
@@ -223,12 +220,10 @@ class Engine:
             on_result: called with the result on the event loop, before the awaiting task is woken.
 
         Raises:
-            OverLimitError: the account of the running task has had its time on the engine.
             QueueFullError: ``queue_length`` jobs of the lane wait already.
             EngineStoppedError: the engine does not run, or stopped before the job's turn.
             DeviceLostError: an earlier job lost the device.
         """
-        await computing_account()
         awaited = _LoopFuture(on_result)
         job = self._submit(lambda: fn(*args, **kwargs), label, lane, awaited)
         result: T = await self._outcome(job, awaited)
@@ -248,8 +243,7 @@ class Engine:
         """The result that ``compute`` has for ``argument``, awaited as by :meth:`call`.
 
         What waits with it in its lane, of the same ``compute`` and ``key``, is handed over in the
-        same call; those whose turn it was before wait for it once at most. Time counts for all
-        accounts in equal parts.
+        same call; those whose turn it was before wait for it once at most.
 
         Args:
             compute: makes the results of several arguments, or what was raised instead, in order.
@@ -259,9 +253,8 @@ class Engine:
             label, lane, on_result: as of :meth:`call`.
 
         Raises:
-            OverLimitError, QueueFullError, EngineStoppedError, DeviceLostError: as :meth:`call`.
+            QueueFullError, EngineStoppedError, DeviceLostError: as :meth:`call`.
         """
-        await computing_account()
         awaited = _LoopFuture(on_result)
         companions = Companions(compute, argument, key, share)
         job = self._submit(lambda: compute([argument])[0], label, lane, awaited, companions)
@@ -356,9 +349,7 @@ class Engine:
         future: Future[Any] | _LoopFuture,
         companions: Companions | None = None,
     ) -> _EngineJob:
-        payer = PAYER.get()
-        account = payer.account if payer is not None else None
-        job = _EngineJob(run, label, future, account, companions)
+        job = _EngineJob(run, label, future, companions)
         if self.on_queued is not None:
             job.on_end = self.on_queued()
         with self._changed:
@@ -415,15 +406,12 @@ class Engine:
     def _start(self, job: _EngineJob) -> None:
         """Run a job that is wanted still, with those that join it, and count its time."""
         self._began = clock.monotonic()
-        interrupted = self._payers
         try:
             jobs = [j for j in self._joined(job) if j.future.set_running_or_notify_cancel()]
-            self._payers = [j.account for j in jobs]
             if jobs:
                 self._run(jobs)
         finally:
             self._charge()
-            self._payers = interrupted
             with self._changed:
                 self._jobs.end()
 
@@ -450,9 +438,6 @@ class Engine:
         spent, self._began = now - self._began, now
         with self._changed:
             self._jobs.charge(spent)
-        for account in self._payers:
-            if account is not None:
-                account.engine_seconds += spent / len(self._payers)
 
     def _run(self, jobs: Sequence[_EngineJob]) -> None:
         started = clock.monotonic()
@@ -462,12 +447,9 @@ class Engine:
         except BaseException as error:
             if _loses_device(error):
                 self._lose_device(error)
-            self._charge()
             for job in jobs:
                 job.future.set_exception(error)
         else:
-            # Before anybody is woken: who has an answer finds its time counted.
-            self._charge()
             for job, result in zip(jobs, results, strict=True):
                 self._hand_over(job, result)
         finally:

@@ -43,16 +43,11 @@ class TokenLimits(_Strict):
 
     Attributes:
         requests_per_second: requests and messages of sockets; a second's worth at once.
-        bytes_per_day: sent and received together; a day's worth at once.
-        engine_seconds_per_minute: of the thread that owns the device, and of the processor for
-            steps that need none; a minute's worth at once.
         sessions: open at a time.
         jobs: not over, at a time.
     """
 
     requests_per_second: Rate | None = None
-    bytes_per_day: Rate | None = None
-    engine_seconds_per_minute: Rate | None = None
     sessions: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
     jobs: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
 

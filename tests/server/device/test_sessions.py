@@ -18,7 +18,6 @@ from real2sim_server.render.backends import Backend, RasterRequest
 from real2sim_server.render.backends.cpu.backend import CpuBackend
 from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
 from real2sim_server.scene import Scene
-from real2sim_server.service.accounts import PAYER, Account, Payer
 from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.metrics import Metrics
 from real2sim_server.service.rendering.renderer import Renderer
@@ -199,18 +198,3 @@ def test_an_image_that_cannot_be_drawn_is_the_trouble_of_its_session(
     found = service.run(*map(service.pipeline.run, (sound, broken)))
     assert isinstance(found[0], EncodedObservation)
     assert "rigid" in str(found[1])
-
-
-def test_time_of_a_joint_drawing_counts_for_all_in_equal_parts(
-    service: Service, tiny_scene: Scene
-) -> None:
-    accounts: Sequence[Account] = [Account("alice"), Account("bob")]
-    worlds = [begun(tiny_scene) for _ in accounts]
-
-    async def paid(account: Account, world: World) -> EncodedObservation:
-        PAYER.set(Payer(account))
-        return await service.pipeline.run(service.step(world, 0.0))
-
-    found = service.run(*map(paid, accounts, worlds))
-    assert not [outcome for outcome in found if isinstance(outcome, BaseException)]
-    assert accounts[0].engine_seconds == accounts[1].engine_seconds > 0

@@ -1,8 +1,14 @@
-"""Who may call: one bearer token for the worker, and no open door beyond this machine."""
+"""Who may call, and what: bearer tokens, their roles, and no open door beyond this machine.
+
+Each role may all that the one before it may: ``observe`` reads; ``drive`` has sessions and sweeps;
+``edit`` makes scenarios, assets and jobs; ``administer`` adds scenes and moves them in and out of
+memory.
+"""
 
 from __future__ import annotations
 
 import hmac
+import re
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any
 
@@ -10,11 +16,12 @@ from fastapi import Depends, Request, Response
 from fastapi.routing import APIRoute
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.requests import HTTPConnection
+from starlette.types import Scope
 
 from real2sim_proto import ErrorCode
 
-from ..accounts import Account
-from .accounting import begin_paying, usage_of
+from ..accounts import ACCOUNT, Account
+from ..token_file import ROLES, Role
 from .hosts import is_loopback
 from .problems import ServiceError
 
@@ -71,9 +78,9 @@ def check_token(connection: HTTPConnection) -> None:
 
     Raises:
         ServiceError: UNAUTHORIZED.
-        OverLimitError: the account has had its requests or bytes.
+        OverLimitError: the account has had its requests.
     """
-    if usage_of(connection.scope).account is not None:
+    if account_of(connection.scope) is not None:
         return  # Its route has checked before anything was read.
     worker = connection.app.state.worker
     given = bearer_token(connection)
@@ -83,7 +90,7 @@ def check_token(connection: HTTPConnection) -> None:
         if given is None:
             raise unauthorized("this worker wants a bearer token")
         raise unauthorized("the bearer token is not this worker's")
-    begin_paying(connection, account)
+    act_for(connection, account)
 
 
 def bearer_token(connection: HTTPConnection) -> str | None:
@@ -117,4 +124,76 @@ def unauthorized(detail: str) -> ServiceError:
         detail,
         hint="send 'Authorization: Bearer <token>' with a token of the worker's operator",
         headers={"WWW-Authenticate": "Bearer"},
+    )
+
+
+_ACCOUNT_KEY = "real2sim.account"
+
+
+def account_of(scope: Scope) -> Account | None:
+    """The account that a request or a socket is for; None until its token was checked."""
+    account: Account | None = scope.get(_ACCOUNT_KEY)
+    return account
+
+
+def act_for(connection: HTTPConnection, account: Account) -> None:
+    """From now on the running task works for ``account``.
+
+    Raises:
+        RevokedError: its token is no more.
+        OverLimitError: it has had its requests.
+        ServiceError: FORBIDDEN: its role does not allow it.
+    """
+    connection.scope[_ACCOUNT_KEY] = account
+    check_role(connection, account.role, name=account.name)
+    account.admit()
+    ACCOUNT.set(account)
+
+
+READING = frozenset({"GET", "HEAD", "OPTIONS"})
+
+_NEEDED: tuple[tuple[re.Pattern[str], Role], ...] = (
+    # Its body says what to draw; nothing is changed.
+    (re.compile(r"/v1/scenes/[^/]+/render"), "observe"),
+    (re.compile(r"/v1/scenes(/.*)?"), "administer"),
+    (re.compile(r"/v1/sessions(/.*)?"), "drive"),
+    (re.compile(r"/v1/sweeps"), "drive"),
+)
+"""Of requests that change something, by path; the first that fits counts."""
+
+
+def needed_role(method: str, path: str) -> Role:
+    """What a request needs.
+
+    Args:
+        method: of HTTP; ``WEBSOCKET`` for a socket.
+        path: of the URL.
+    """
+    if method == "WEBSOCKET":
+        return "drive" if path.startswith("/v1/sessions") else "observe"
+    if method in READING:
+        return "observe"
+    return next((role for pattern, role in _NEEDED if pattern.fullmatch(path)), "edit")
+
+
+def check_role(connection: HTTPConnection, role: Role, *, name: str) -> None:
+    """Refuse what a token's role does not allow.
+
+    Args:
+        connection: request or socket.
+        role: of the token.
+        name: of the token.
+
+    Raises:
+        ServiceError: FORBIDDEN.
+    """
+    scope = connection.scope
+    method = str(scope.get("method", "WEBSOCKET"))
+    needed = needed_role(method, str(scope["path"]))
+    if ROLES.index(role) >= ROLES.index(needed):
+        return
+    raise ServiceError(
+        ErrorCode.FORBIDDEN,
+        f"the token {name!r} may {role}; this needs a token that may {needed}",
+        hint=f"ask the operator for one: `real2sim token add NAME --role {needed}`",
     )

@@ -21,7 +21,7 @@ from real2sim_proto import ErrorCode
 from ..storage.store import Store, StoredReply, StoreError
 from ..storage.tokens import sealed, unsealed
 from ..token_file import DEFAULT_NAME
-from .accounting import usage_of
+from .auth import account_of
 from .problems import ServiceError
 
 REPLAY_HEADER = "Idempotent-Replayed"
@@ -119,7 +119,7 @@ class Idempotency:
         if key is None:
             yield IdempotentRequest()
             return
-        account = usage_of(request.scope).account
+        account = account_of(request.scope)
         holder = "" if account is None or account.name == DEFAULT_NAME else f"{account.name} "
         scoped = f"{holder}{request.method} {request.url.path} {key}"
         full_key = hashlib.sha256(scoped.encode()).hexdigest()

@@ -306,7 +306,4 @@ class _AccountCollector:
 
 _FIGURES: tuple[tuple[str, str, Callable[[Account], float]], ...] = (
     ("real2sim_token_requests", "requests and messages let in", lambda a: a.requests),
-    ("real2sim_token_received_bytes", "bodies and messages", lambda a: a.received_bytes),
-    ("real2sim_token_sent_bytes", "bodies and messages", lambda a: a.sent_bytes),
-    ("real2sim_token_engine_seconds", "time of computing", lambda a: a.computing_seconds),
 )

@@ -136,8 +136,6 @@ def _translated(error: Exception) -> ServiceError:
 
 CODE_OF_LIMIT = {
     Limit.REQUESTS: ErrorCode.TOO_MANY_REQUESTS,
-    Limit.BYTES: ErrorCode.TOO_MANY_BYTES,
-    Limit.ENGINE: ErrorCode.TOO_MUCH_ENGINE_TIME,
     Limit.SESSIONS: ErrorCode.TOO_MANY_SESSIONS,
     Limit.JOBS: ErrorCode.TOO_MANY_JOBS,
 }

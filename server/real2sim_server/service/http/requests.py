@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from real2sim_proto import ErrorCode
 
-from .accounting import usage_of
+from .auth import account_of
 from .clients import CLIENT_HEADER
 from .problems import REQUEST_ID_KEY, ServiceError, problem_response, service_error
 from .security import secure
@@ -106,7 +106,7 @@ class RequestContext:
     def _note(self, scope: Scope, method: str, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", None) or "unmatched"
         self._metrics.observe_request(method, route, status, seconds)
-        account = usage_of(scope).account
+        account = account_of(scope)
         write = log.debug if scope["path"] in _QUIET else log.info
         write(
             "request",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import contextvars
 import secrets
 import shutil
 import threading
@@ -20,7 +19,7 @@ import structlog
 from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import JobFile, JobInfo, JobKind, JobState
 
-from ..accounts import PAYER, Payer, owner_name
+from ..accounts import ACCOUNT, owner_name
 from ..clock import now_us
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, problem_of, service_error
@@ -239,9 +238,9 @@ class Jobs:
                 f"{waiting} jobs wait already",
                 hint="send it again after Retry-After seconds, or cancel one: DELETE /v1/jobs/{id}",
             )
-        payer = PAYER.get()
-        if payer is not None:
-            payer.account.check_jobs(self.unfinished()[payer.account.name])
+        account = ACCOUNT.get()
+        if account is not None:
+            account.check_jobs(self.unfinished()[account.name])
         if not new.light:
             stored = await self._log.count()
             await asyncio.to_thread(self._quota.check, entries=stored)
@@ -265,7 +264,7 @@ class Jobs:
         portable = new.portable and self.work_again is not None
         await self._log.add(info, reply=reply, portable=portable)
         job = self._hold(info, work, portable=portable)
-        await self._begin(job, light=new.light, context=_waiting_context())
+        await self._begin(job, light=new.light)
         return info
 
     async def cancel(self, job_id: str) -> JobInfo | None:
@@ -451,11 +450,9 @@ class Jobs:
         job = self._hold(info, work, epoch=epoch, portable=True)
         await self._begin(job, light=False)
 
-    async def _begin(
-        self, job: _Job, *, light: bool, context: contextvars.Context | None = None
-    ) -> None:
+    async def _begin(self, job: _Job, *, light: bool) -> None:
         running = self._run(job, light=light)
-        job.task = asyncio.create_task(running, name=job.info.job_id, context=context)
+        job.task = asyncio.create_task(running, name=job.info.job_id)
         # A task that is cancelled before its first step never runs, and never records its end.
         await asyncio.sleep(0)
 
@@ -584,15 +581,6 @@ async def _next_event(job: _Job, after: int) -> None:
 async def _notify_readers(job: _Job) -> None:
     async with job.changed:
         job.changed.notify_all()
-
-
-def _waiting_context() -> contextvars.Context:
-    """That of the caller, whose account the job waits for: nobody else can send it again."""
-    context = contextvars.copy_context()
-    payer = PAYER.get()
-    if payer is not None:
-        context.run(PAYER.set, Payer(payer.account, waits=True))
-    return context
 
 
 def accepted_headers(info: JobInfo) -> dict[str, str]:

@@ -15,8 +15,7 @@ from structlog.contextvars import bound_contextvars
 from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode
 
 from ..accounts import Account, RevokedError
-from ..http.accounting import begin_paying
-from ..http.auth import bearer_token, unauthorized
+from ..http.auth import act_for, bearer_token, unauthorized
 from ..http.problems import REQUEST_ID_KEY, problem_response, service_error
 from ..sessions.connection import Connection
 from ..sessions.handshake import FatalError, close_with_error, receive_hello, with_progress
@@ -72,7 +71,7 @@ async def _serve(
         # Who has the session's token alone drives for whoever made it.
         account = account or account_of_token(worker, hello.token)
         account = account or worker.accounts.of_owner(row.owner)
-        begin_paying(socket, account)
+        act_for(socket, account)
         session = await with_progress(
             socket, worker.sessions.find(row.session_id), hello, phase="loading the session"
         )

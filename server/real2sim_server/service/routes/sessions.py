@@ -29,10 +29,10 @@ from real2sim_proto.sessions import (
 from ...edit import EditOutcome
 from ...world import Event, World
 from ..drives.drives import Seat
-from ..http.accounting import begin_paying
 from ..http.auth import (
     SESSION_SCHEME,
     TokenRoute,
+    act_for,
     bearer_token,
     check_token,
     require_token,
@@ -81,7 +81,7 @@ async def _check_session_token(request: Request, session_id: str) -> None:
     worker: Worker = request.app.state.worker
     given, accounts = bearer_token(request), worker.accounts
     if accounts.wants_token and (account := accounts.of_token(given)) is not None:
-        begin_paying(request, account)
+        act_for(request, account)
         return
     row = None
     if given is not None or not accounts.wants_token:
@@ -92,7 +92,7 @@ async def _check_session_token(request: Request, session_id: str) -> None:
         error = unauthorized("this call wants the session's token or the worker's")
         error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
         raise error
-    begin_paying(request, accounts.of_owner(row.owner))
+    act_for(request, accounts.of_owner(row.owner))
 
 
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"], route_class=SessionRoute)

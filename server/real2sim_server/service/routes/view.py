@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from real2sim_proto import ErrorCode
 
 from ..accounts import Account
-from ..http.accounting import begin_paying
+from ..http.auth import act_for
 from ..http.problems import ServiceError, service_error
 from ..http.websocket import close_quietly, receive_text
 from ..worker import Worker, WorkerOf
@@ -27,7 +27,6 @@ CLOSED_BY = {
     ErrorCode.UNKNOWN_SCENARIO: CLOSED_NOT_FOUND,
     ErrorCode.UNAUTHORIZED: CLOSED_UNAUTHORIZED,
     ErrorCode.TOO_MANY_REQUESTS: CLOSED_OVER_LIMIT,
-    ErrorCode.TOO_MANY_BYTES: CLOSED_OVER_LIMIT,
 }
 
 # Not json.loads(): it follows nesting until the stack ends, and lets lone surrogates pass.
@@ -90,7 +89,7 @@ async def _check_hello(socket: WebSocket, worker: Worker) -> Account:
 
     Raises:
         NoHelloError: the token is not right.
-        OverLimitError: its holder has had their requests or bytes.
+        OverLimitError: its holder has had their requests.
     """
     try:
         async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
@@ -105,5 +104,5 @@ async def _check_hello(socket: WebSocket, worker: Worker) -> Account:
     if account is None:
         worker.metrics.auth_failures.labels("view").inc()
         raise NoHelloError(CLOSED_UNAUTHORIZED, "the token is not this worker's")
-    begin_paying(socket, account)
+    act_for(socket, account)
     return account

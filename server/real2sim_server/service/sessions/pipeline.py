@@ -49,7 +49,6 @@ from ...render import Instance
 from ...scene import Camera, Scene
 from ...world import World
 from ...world.ranging import NO_SENSORS, Cloud, MountedLidar, RangingSensors
-from ..accounts import computing_account, count_sent, counted_world_time
 from ..engine import Engine
 from ..http.metrics import Metrics
 from ..lanes import Lane
@@ -174,8 +173,7 @@ class StepPipeline:
 
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
         """``fn(*args)`` on the thread that moves worlds without sensors."""
-        counted = partial(counted_world_time, await computing_account(), fn, *args)
-        return await asyncio.get_running_loop().run_in_executor(self._worlds, counted)
+        return await asyncio.get_running_loop().run_in_executor(self._worlds, fn, *args)
 
     # --- a change of the world ----------------------------------------------------------------
 
@@ -196,7 +194,6 @@ class StepPipeline:
                 await self._phases.deformation.wait()
                 observation = await self._on_engine(transition)
         else:
-            transition.account = await computing_account()
             observation = await self._steps.call(transition)
         return await self._finish(observation)
 
@@ -205,7 +202,7 @@ class StepPipeline:
         transition: Transition,
         done: Callable[[EncodedObservation | Exception], object],
     ) -> None:
-        """As :meth:`run`, of a world without sensors whose account may compute: ``done`` is called
+        """As :meth:`run`, of a world without sensors: ``done`` is called
         on the event loop with the observation, written where that could be done at once, or with
         what was raised. It must not raise."""
 
@@ -340,8 +337,6 @@ class StepPipeline:
             (observation,) = await self._renderer.on_encoders(
                 lambda rendered: with_frames(rendered, frames), [observation]
             )
-        if observation.placed is not None:
-            count_sent(sum(len(f.data) for f in observation.frames if f.codec == "raw"))
         asyncio.get_running_loop().call_soon(self._count, observation)
         return observation
 

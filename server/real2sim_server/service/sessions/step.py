@@ -29,7 +29,6 @@ from ...world.recording.replay import (
     reset_payload,
     stop_payload,
 )
-from ..accounts import Account
 from ..clock import now_us
 from ..http.problems import ServiceError
 from ..storage.errors import FencedError, StoreTroubleError, StoreUnavailableError
@@ -201,7 +200,6 @@ class Stepper:
     def begin_step(
         self,
         action: DueAction,
-        account: Account,
         *,
         write: Callable[[EncodedMessage], bool],
         done: Callable[[tuple[EncodedObservation, bool] | BrokenStep], object],
@@ -210,13 +208,12 @@ class Stepper:
 
         Args:
             action: the caller holds the lock of its session until ``done`` is called.
-            account: that pays.
             write: hands the observation to the socket, see :class:`~.transition.Transition`.
             done: called on the event loop once the step has taken effect, with the observation and
                 whether it is written; or with why it has not.
         """
         transition = self._transition(action, {})
-        transition.write, transition.account = write, account
+        transition.write = write
 
         def ended(outcome: EncodedObservation | Exception) -> None:
             if isinstance(outcome, Exception):

@@ -19,7 +19,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from real2sim_proto.drive import Action
 
-from ..accounts import admitted_at_once
+from ..accounts import ACCOUNT
 from ..http.metrics import Metrics
 from ..http.problems import service_error
 from .deadline_timer import DeadlineTimer
@@ -108,16 +108,17 @@ class StepsAtOnce:
         session, timer = self._session, self._timer
         if not session.lockstep.is_due(action.step) or not _acquired_at_once(session.lock):
             return False
-        if (account := admitted_at_once()) is None:
+        account = ACCOUNT.get()
+        if account is None or account.revoked or account.limits.requests_per_second is not None:
             session.lock.release()
             return False
+        account.requests += 1
         session.touch()
         due = DueAction(session, action.plan, content, timer.waited_us)
         timer.cancel()
         self._busy = True
         self._stepper.begin_step(
             due,
-            account,
             write=partial(self._write, action.id),
             done=partial(self._ended, action.id, time.perf_counter()),
         )

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 from ...scene import Camera, Scene
 from ...world import World
-from ..accounts import Account
 from .gathered_calls import attempt
 from .log_write import LogWrite, write_together
 from .segment import FrameSlot
@@ -31,7 +30,6 @@ class Transition:
         timer: of the stages.
         recorded: whether ``record`` is done.
         sent: whether ``write`` is done.
-        account: that pays where no engine counts.
         scene: with the steps of which other sessions this may be drawn; None for none.
         moved: the new world, kept where its images have to wait for kernels.
     """
@@ -45,7 +43,6 @@ class Transition:
     timer: PhaseTimer = field(default_factory=PhaseTimer)
     recorded: bool = False
     sent: bool = False
-    account: Account | None = None
     scene: Scene | None = None
     moved: World | None = None
 

@@ -131,15 +131,12 @@ def test_whoever_has_limits_is_asked_each_time(site, planner, monkeypatch, woken
     assert woken == [0]
 
 
-def test_bytes_and_messages_are_counted(site, planner):
+def test_messages_are_counted(site, planner):
     account: Account = site.worker.accounts.default
     planner.reset(sensors=[])
-    before = account.requests, account.received_bytes, account.sent_bytes, account.world_seconds
+    before = account.requests
     planner.act(0)
-    after = account.requests, account.received_bytes, account.sent_bytes, account.world_seconds
-    grown = [b - a for a, b in zip(before, after, strict=True)]
-    assert grown[0] == 1
-    assert min(grown) > 0
+    assert account.requests == before + 1
 
 
 def test_an_observer_and_the_present_state_see_the_step(site, join):
