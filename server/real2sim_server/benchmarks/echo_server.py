@@ -24,7 +24,7 @@ from real2sim_proto.sessions import SessionInfo
 
 from ..service.http.connections import ConnectionLimits, Connections
 from ..service.http.metrics import Metrics
-from ..service.http.websocket import ScatterGatherProtocol, let_take, try_send_parts
+from ..service.http.websocket import WatchedWebSocketProtocol
 from ..service.preflight import bind, listen, url_of
 from ..service.sessions.messages import action_in
 
@@ -86,7 +86,7 @@ def _serve(told: Connection, observation: bytes) -> None:
         log_config=None,
         access_log=False,
         lifespan="off",
-        ws=partial(ScatterGatherProtocol, connections),  # type: ignore[arg-type]
+        ws=partial(WatchedWebSocketProtocol, connections),  # type: ignore[arg-type]
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
     )
@@ -112,11 +112,10 @@ def echo_app(observation: bytes) -> ASGIApp:
 
 
 async def _echo(socket: WebSocket, answer: Answer) -> None:
-    """Hello, reset, and actions, which are taken in the call that reads them."""
+    """Hello, reset, and actions."""
     await socket.accept(subprotocol=DRIVE_SUBPROTOCOL)
     hello: dict[str, Any] = unpack(await socket.receive_bytes())
     welcome = {"v": 1, "type": "welcome", "id": hello["id"], "resume_token": ""}
     await socket.send_bytes(encode(welcome))
-    let_take(socket, lambda data: try_send_parts(socket, (answer(data),)))
     while True:
         await socket.send_bytes(answer(await socket.receive_bytes()))

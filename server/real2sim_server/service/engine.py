@@ -1,4 +1,4 @@
-"""The one thread that owns the device."""
+"""A thread that runs jobs in turn: the one that owns the device, and the one of worlds."""
 
 from __future__ import annotations
 
@@ -49,60 +49,6 @@ class DeviceLostError(EngineError):
     """The device reported an error after which nothing on it works; only a new process helps."""
 
 
-class _LoopFuture:
-    """Stands for the future of a job that a coroutine awaits.
-
-    :func:`asyncio.wrap_future` would do, but takes three calls more to wake the coroutine, and some
-    of its work just when the engine wants to begin.
-
-    Args:
-        on_result: called on the event loop with the result before the coroutine is woken.
-
-    Attributes:
-        outcome: what is awaited.
-    """
-
-    def __init__(self, on_result: Callable[[Any], object] | None) -> None:
-        self._on_result = on_result
-        self._loop = asyncio.get_running_loop()
-        self.outcome: asyncio.Future[Any] = self._loop.create_future()
-
-    def set_running_or_notify_cancel(self) -> bool:
-        return not self.outcome.cancelled()
-
-    def cancelled(self) -> bool:
-        return self.outcome.cancelled()
-
-    def cancel(self) -> bool:
-        return self.outcome.cancel()
-
-    def set_result(self, result: Any) -> None:
-        self._on_loop(self._succeed, result)
-
-    def set_exception(self, error: BaseException) -> None:
-        self._on_loop(self._fail, error)
-
-    def _on_loop(self, resolve: Callable[[Any], None], value: Any) -> None:
-        # A loop that was closed has no waiters left.
-        with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(resolve, value)
-
-    def _succeed(self, result: Any) -> None:
-        if self.outcome.done():
-            return
-        try:
-            if self._on_result is not None:
-                self._on_result(result)
-        except Exception as error:
-            self.outcome.set_exception(error)
-        else:
-            self.outcome.set_result(result)
-
-    def _fail(self, error: BaseException) -> None:
-        if not self.outcome.done():
-            self.outcome.set_exception(error)
-
-
 @dataclass(frozen=True, eq=False)
 class Companions:
     """With what a job may be done in one go: with those that have the same ``compute`` and ``key``.
@@ -124,7 +70,7 @@ class Companions:
 class _EngineJob:
     run: Callable[[], Any]
     label: str
-    future: Future[Any] | _LoopFuture
+    future: Future[Any]
     companions: Companions | None = None
     queued_at: float = field(default_factory=lambda: clock.monotonic())  # noqa: PLW0108
     on_end: Callable[[str, float, float], None] | None = None
@@ -140,8 +86,10 @@ class Engine:
     done in one go are, where they wait together; none waits for one to come.
 
     Args:
+        name: of the thread.
         queue_length: jobs that may wait in each lane.
-        threads: of torch and numba, 0 for one per core.
+        threads: of torch and numba, 0 for one per core; None for a thread that runs no kernels on
+            every core, and that gives way to nobody.
         on_job: called on the engine thread after each job with its label, the seconds it waited
             and the seconds it ran.
 
@@ -153,8 +101,9 @@ class Engine:
     def __init__(
         self,
         *,
+        name: str = "engine",
         queue_length: int = 64,
-        threads: int = 0,
+        threads: int | None = 0,
         on_job: Callable[[str, float, float], None] | None = None,
     ) -> None:
         self.queue_length = queue_length
@@ -169,7 +118,7 @@ class Engine:
         self._running: str | None = None
         self._last_tick = clock.monotonic()
         self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._work, name="engine", daemon=True)
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
 
     # --- life -------------------------------------------------------------------------------
 
@@ -179,7 +128,8 @@ class Engine:
         self._accepting = True
         self._last_tick = clock.monotonic()
         self._thread.start()
-        self.call_sync(set_thread_counts, self._threads, label="threads")
+        if self._threads is not None:
+            self.call_sync(set_thread_counts, self._threads, label="threads")
 
     def stop(self, *, drain: bool = True, timeout_s: float | None = None) -> None:
         """Take no more jobs and end the thread; without ``drain``, waiting jobs are dropped.
@@ -205,7 +155,6 @@ class Engine:
         *args: Any,
         label: str = "work",
         lane: Lane = Lane.VIEW,
-        on_result: Callable[[T], object] | None = None,
         **kwargs: Any,
     ) -> T:
         """``fn(*args, **kwargs)`` on the engine thread, awaited.
@@ -217,16 +166,14 @@ class Engine:
             fn: with ``args`` and ``kwargs``.
             label: for metrics and messages.
             lane: with what it takes turns.
-            on_result: called with the result on the event loop, before the awaiting task is woken.
 
         Raises:
             QueueFullError: ``queue_length`` jobs of the lane wait already.
             EngineStoppedError: the engine does not run, or stopped before the job's turn.
             DeviceLostError: an earlier job lost the device.
         """
-        awaited = _LoopFuture(on_result)
-        job = self._submit(lambda: fn(*args, **kwargs), label, lane, awaited)
-        result: T = await self._outcome(job, awaited)
+        job = self._submit(lambda: fn(*args, **kwargs), label, lane)
+        result: T = await self._outcome(job)
         return result
 
     async def call_together(
@@ -238,7 +185,6 @@ class Engine:
         share: float,
         label: str,
         lane: Lane,
-        on_result: Callable[[R], object] | None = None,
     ) -> R:
         """The result that ``compute`` has for ``argument``, awaited as by :meth:`call`.
 
@@ -250,15 +196,14 @@ class Engine:
             argument: of this call.
             key: compared by identity.
             share: of what may be done in one go, above 0; at most 1 comes together.
-            label, lane, on_result: as of :meth:`call`.
+            label, lane: as of :meth:`call`.
 
         Raises:
             QueueFullError, EngineStoppedError, DeviceLostError: as :meth:`call`.
         """
-        awaited = _LoopFuture(on_result)
         companions = Companions(compute, argument, key, share)
-        job = self._submit(lambda: compute([argument])[0], label, lane, awaited, companions)
-        result: R = await self._outcome(job, awaited)
+        job = self._submit(lambda: compute([argument])[0], label, lane, companions)
+        result: R = await self._outcome(job)
         return result
 
     def call_sync(
@@ -276,14 +221,14 @@ class Engine:
         """
         if threading.current_thread() is self._thread:
             return fn(*args, **kwargs)
-        future: Future[T] = Future()
-        job = self._submit(lambda: fn(*args, **kwargs), label, Lane.VIEW, future)
+        job = self._submit(lambda: fn(*args, **kwargs), label, Lane.VIEW)
         try:
-            return future.result(timeout_s)
+            result: T = job.future.result(timeout_s)
         except TimeoutError:
-            if not future.done():
+            if not job.future.done():
                 self._drop(job)
             raise
+        return result
 
     def give_way(self) -> None:
         """Run what is more urgent than the running job and whose turn it is.
@@ -334,9 +279,9 @@ class Engine:
 
     # --- inside -----------------------------------------------------------------------------
 
-    async def _outcome(self, job: _EngineJob, awaited: _LoopFuture) -> Any:
+    async def _outcome(self, job: _EngineJob) -> Any:
         try:
-            return await awaited.outcome
+            return await asyncio.wrap_future(job.future)
         except asyncio.CancelledError:
             self._drop(job)
             raise
@@ -346,10 +291,9 @@ class Engine:
         run: Callable[[], Any],
         label: str,
         lane: Lane,
-        future: Future[Any] | _LoopFuture,
         companions: Companions | None = None,
     ) -> _EngineJob:
-        job = _EngineJob(run, label, future, companions)
+        job = _EngineJob(run, label, Future(), companions)
         if self.on_queued is not None:
             job.on_end = self.on_queued()
         with self._changed:
@@ -378,7 +322,8 @@ class Engine:
 
     def _work(self) -> None:
         try:
-            lower_priority(NICENESS)
+            if self._threads is not None:
+                lower_priority(NICENESS)
             while (job := self._next()) is not None:
                 self._start(job)
                 # The job holds arguments and result; an idle engine must not keep them alive.

@@ -26,7 +26,7 @@ from .app import create_app
 from .garbage import search_seldom, spare_what_is_there
 from .http.auth import check_bind
 from .http.protocol import LimitedHttpProtocol
-from .http.websocket import ScatterGatherProtocol
+from .http.websocket import WatchedWebSocketProtocol
 from .logging_setup import configure_logging
 from .preflight import bind, check_scenes, listen, url_of
 from .storage.errors import StoreError
@@ -192,7 +192,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         lifespan="on",
-        ws=partial(ScatterGatherProtocol, connections),  # type: ignore[arg-type]
+        ws=partial(WatchedWebSocketProtocol, connections),  # type: ignore[arg-type]
         # Deflating a frame takes 20 ms and gains nothing: images do not compress.
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,

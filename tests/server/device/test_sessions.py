@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Awaitable, Iterator, Sequence
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, TypeVar, cast
 
 import pytest
@@ -21,9 +22,12 @@ from real2sim_server.scene import Scene
 from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.metrics import Metrics
 from real2sim_server.service.rendering.renderer import Renderer
-from real2sim_server.service.sessions.observation import EncodedObservation
-from real2sim_server.service.sessions.pipeline import StepPipeline
-from real2sim_server.service.sessions.transition import Transition
+from real2sim_server.service.sessions.pipeline import (
+    EncodedObservation,
+    LogWrite,
+    Step,
+    StepPipeline,
+)
 from real2sim_server.world import World
 from tests.waiting import LIMIT_S, wait_until_async
 
@@ -62,10 +66,10 @@ class Service:
         for close in self._closing:
             close()
 
-    def step(self, world: World, steering: float) -> Transition:
+    def step(self, world: World, steering: float) -> Step:
         cameras = self.pipeline.cameras(world.scene, world.spec.sensors)
         scene = self.pipeline.drawn_with(world, cameras)
-        return Transition(partial(moved, world, steering), cameras, scene=scene)
+        return Step(partial(moved, world, steering), cameras, drawn_with=scene)
 
     def run(self, *steps: Awaitable[T]) -> list[T | BaseException]:
         """What comes of steps that wait for the engine at the same time."""
@@ -160,7 +164,7 @@ def test_small_images_of_two_sessions_are_drawn_together_on_the_cpu(
         # One for each size.
         assert batches == [2, 2]
         large = [sensor | {"detail": "full"} for sensor in SENSORS]
-        assert service.step(begun(tiny_scene, sensors=large), 0.1).scene is None
+        assert service.step(begun(tiny_scene, sensors=large), 0.1).drawn_with is None
     finally:
         service.close()
 
@@ -174,7 +178,8 @@ def test_what_fails_in_one_session_leaves_the_others_alone(
     def fail(*_: object) -> World:
         raise ValueError("no")
 
-    refused.change, unrecorded.record = fail, fail
+    store = cast(Any, SimpleNamespace(record=fail))
+    refused.change, unrecorded.log = fail, LogWrite(store, cast(Any, None), (), instead=False)
     ran = (service.pipeline.run(step) for step in (refused, sound, unrecorded))
     found = service.run(*ran)
     assert [isinstance(outcome, ValueError) for outcome in found] == [True, False, True]

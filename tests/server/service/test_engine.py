@@ -76,33 +76,6 @@ def test_an_engine_goes_on_when_the_loop_that_asked_is_gone(make_engine):
     assert engine.call_sync(int, "7") == 7
 
 
-def test_on_result_runs_on_the_loop_before_the_caller_goes_on(make_engine):
-    engine, told = make_engine(), []
-
-    async def ask() -> None:
-        def note(result: int) -> None:
-            told.append((result, threading.get_ident()))
-
-        assert await engine.call(int, "7", on_result=note) == 7
-        assert told == [(7, threading.get_ident())]
-
-    asyncio.run(ask())
-
-
-def test_an_error_of_on_result_reaches_the_caller(make_engine):
-    engine = make_engine()
-    with pytest.raises(ZeroDivisionError):
-        asyncio.run(engine.call(int, "0", on_result=lambda result: 1 // result))
-    assert engine.call_sync(int, "7") == 7
-
-
-def test_on_result_is_not_called_for_a_job_that_failed(make_engine):
-    engine, told = make_engine(), []
-    with pytest.raises(ValueError, match="invalid literal"):
-        asyncio.run(engine.call(int, "seven", on_result=told.append))
-    assert told == []
-
-
 def test_all_jobs_run_on_the_same_thread_and_none_on_the_callers(make_engine):
     engine = make_engine()
 

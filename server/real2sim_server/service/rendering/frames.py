@@ -1,7 +1,6 @@
 """Images as frames of the wire: the one place where an image becomes bytes.
 
-A frame is a msgpack map whose last member is ``data``. All before it is its header, which for a raw
-image is known before the image is drawn; the image itself is never copied.
+A frame is a msgpack map whose last member is ``data``; all before it is its header.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from real2sim_proto import encode
 from real2sim_proto.episode import SensorSpec
 
 from ...render.jpeg import JpegEncoder, turbo_jpeg
-from ...render.modalities import encode_image, modality_of
+from ...render.modalities import encode_image
 from ...scene import Camera
 from .optics import frame_names
 
@@ -98,56 +97,23 @@ class EncodedFrame:
 def encode_frame(image: RenderedImage, *, jpeg: JpegEncoder = turbo_jpeg) -> EncodedFrame:
     """The frame of an image; raw ones are views of its pixels. On any thread."""
     image.ready()
-    fields = _place_fields(image.sensor, image.modality, image.t_us, image.T_world_sensor, image.K)
-    fields |= frame_names(image.sensor, image.camera, image.modality)
+    fields = {
+        "sensor": image.sensor.camera,
+        "modality": image.modality,
+        "t_us": image.t_us,
+        "T_world_sensor": image.T_world_sensor,
+        "K": image.K,
+        **frame_names(image.sensor, image.camera, image.modality),
+    }
     if image.sensor.codec == "raw":
-        return with_pixels(_raw_header(fields, image.pixels.shape[:2]), image.pixels)
+        pixels = np.ascontiguousarray(image.pixels)
+        fields |= {"codec": "raw", "dtype": pixels.dtype.name, "shape": list(pixels.shape)}
+        return EncodedFrame(_frame_header(fields, pixels.nbytes), pixels.data.cast("B"))
     encoded = encode_image(
         image.pixels, image.modality, image.sensor.codec, quality=image.sensor.quality, jpeg=jpeg
     )
     fields |= {"codec": encoded.codec, "dtype": encoded.dtype, "shape": list(encoded.shape)}
     return EncodedFrame(_frame_header(fields, len(encoded.data)), encoded.data)
-
-
-def raw_headers(
-    sensors: Sequence[SensorSpec],
-    cameras: Sequence[Camera],
-    T_world_vehicle: NDArray[np.float64],
-    t_us: int,
-) -> list[FrameHeader]:
-    """Headers of the raw images of ``sensors``, which need not be rendered yet.
-
-    Args:
-        sensors: S of them.
-        cameras: of the sensors, S of them.
-        T_world_vehicle: [4, 4], where the cameras' vehicle stands.
-        t_us: the instant [us].
-    """
-    return [
-        _raw_header(
-            _place_fields(sensor, modality, t_us, camera.pose(T_world_vehicle), camera.K)
-            | frame_names(sensor, camera, modality),
-            (camera.height, camera.width),
-        )
-        for sensor, camera in zip(sensors, cameras, strict=True)
-        for modality in sensor.modalities
-    ]
-
-
-def with_pixels(header: FrameHeader, pixels: NDArray[Any]) -> EncodedFrame:
-    """The frame of a raw image; a view of its pixels.
-
-    Raises:
-        TypeError: the image has another dtype or shape than its header says.
-    """
-    fields = header.fields
-    dtype = modality_of(fields["modality"]).dtype
-    if list(pixels.shape) != fields["shape"] or pixels.dtype != dtype:
-        raise TypeError(
-            f"an image of {pixels.dtype} {pixels.shape} instead of {fields['dtype']} "
-            f"{fields['shape']}"
-        )
-    return EncodedFrame(header, np.ascontiguousarray(pixels).data.cast("B"))
 
 
 def placed_frame(frame: EncodedFrame, offset: int) -> EncodedFrame:
@@ -175,32 +141,6 @@ def array_header(items: int) -> bytes:
 def pack_pairs(fields: Mapping[str, Any]) -> bytes:
     """The members of a map without its header, to be joined with others into one map."""
     return encode(dict(fields))[len(map_header(len(fields))) :]
-
-
-def _place_fields(
-    sensor: SensorSpec,
-    modality: str,
-    t_us: int,
-    T_world_sensor: NDArray[np.float64],
-    K: NDArray[np.float64],
-) -> dict[str, Any]:
-    """What a frame says of when and from where."""
-    return {
-        "sensor": sensor.camera,
-        "modality": modality,
-        "t_us": t_us,
-        "T_world_sensor": T_world_sensor,
-        "K": K,
-    }
-
-
-def _raw_header(place: dict[str, Any], size: tuple[int, ...]) -> FrameHeader:
-    """Of a raw image of ``size`` (height, width)."""
-    modality = modality_of(place["modality"])
-    height, width = size
-    shape = [height, width, *modality.channels]
-    form = {"codec": "raw", "dtype": modality.dtype.name, "shape": shape}
-    return _frame_header(place | form, modality.raw_bytes(width, height))
 
 
 def _frame_header(fields: dict[str, Any], size: int) -> FrameHeader:

@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator
-from functools import partial
 from typing import assert_never
 
 import structlog
@@ -34,7 +33,6 @@ from real2sim_proto.drive import (
 from ..accounts import admit_message
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, service_error
-from ..http.websocket import let_take, send_parts, try_send_parts
 from .deadline_timer import DeadlineTimer
 from .describe import result_fields, welcome_fields
 from .handshake import (
@@ -44,6 +42,7 @@ from .handshake import (
     error_message,
     is_resuming,
     receive,
+    send,
     with_progress,
 )
 from .messages import BadMessageError, ReceivedMessage, bad_message
@@ -51,7 +50,6 @@ from .observers import ObserverQueue
 from .registry import Sessions
 from .segment import FrameSlot, Segment
 from .session import Session, controller_taken
-from .steps_at_once import StepsAtOnce
 from .views import looking
 from .wire import EncodedMessage, pack_message
 
@@ -101,7 +99,7 @@ class Connection:
                 async with self._as_controller(hello):
                     await self._welcome(hello)
                     await self._resend_missed_observation(hello)
-                    await self._serve_messages(hello.role, self._steps_at_once())
+                    await self._serve_messages(hello.role)
             else:
                 await self._welcome(hello)
                 async with self._as_observer():
@@ -195,36 +193,12 @@ class Connection:
 
     # --- messages ---------------------------------------------------------------------------
 
-    def _steps_at_once(self) -> StepsAtOnce:
-        """Those of the controller, which take its actions from now on."""
-        sessions = self._sessions
-        steps = StepsAtOnce(
-            self._session,
-            sessions.stepper,
-            sessions.metrics,
-            timer=self._deadline_timer,
-            is_driving=self._is_driving,
-            write=self._write_at_once,
-            send=self._send,
-        )
-        let_take(self._socket, steps.take)
-        return steps
-
-    def _is_driving(self) -> bool:
-        """Whether this is the controller, and its client has said about shared memory what there
-        was to say."""
-        is_settled = self._segment is None or self._segment.attached
-        return self._session.controller is self and is_settled
-
-    async def _serve_messages(self, role: str, at_once: StepsAtOnce | None = None) -> None:
-        """Answer every message that ``at_once`` does not take with one message, in order, until
-        bye."""
+    async def _serve_messages(self, role: str) -> None:
+        """Answer every message with one message, in order, until bye."""
         while True:
             try:
-                receive = self._receive
-                received = await (at_once.between(receive) if at_once is not None else receive())
-                if (answer := await self._answer(received, role)) is not None:
-                    await self._send(answer, received.message.id)
+                received = await self._receive()
+                await self._send(await self._answer(received, role), received.message.id)
                 if role == "controller" and not self._deadline_timer.waiting:
                     self._deadline_timer.start()
             except BadMessageError as error:
@@ -236,8 +210,7 @@ class Connection:
                     await self._socket.close(NORMAL_CLOSURE)
                     return
 
-    async def _answer(self, received: ReceivedMessage, role: str) -> EncodedMessage | None:
-        """The answer; None where it has been sent already."""
+    async def _answer(self, received: ReceivedMessage, role: str) -> EncodedMessage:
         try:
             _check_role(received.message, role)
             admit_message()
@@ -245,7 +218,7 @@ class Connection:
         except Exception as error:
             return self._error_message(service_error(error, log_unexpected=True))
 
-    async def _dispatch(self, received: ReceivedMessage, role: str) -> EncodedMessage | None:
+    async def _dispatch(self, received: ReceivedMessage, role: str) -> EncodedMessage:
         message, session = received.message, self._session
         if self._segment is not None and not self._segment.attached:
             self._settle_offer(message)
@@ -278,7 +251,7 @@ class Connection:
             case _:
                 assert_never(message)
 
-    async def _act(self, action: Action, content: bytes) -> EncodedMessage | None:
+    async def _act(self, action: Action, content: bytes) -> EncodedMessage:
         """Check an action, and let it pass the rest of the step pipeline."""
         session, waited_us = self._session, self._deadline_timer.waited_us
         arrived, slot = time.perf_counter(), self._slot(action.slot)
@@ -294,8 +267,7 @@ class Connection:
                 session,
                 action.plan,
                 content,
-                latency_us=waited_us,
-                write=partial(self._write_at_once, action.id),
+                waited_us=waited_us,
                 slot=slot,
             )
             self._sessions.metrics.steps.observe(time.perf_counter() - arrived)
@@ -410,16 +382,10 @@ class Connection:
         self._session.touch()
         return received
 
-    def _write_at_once(self, message_id: int, message: EncodedMessage) -> bool:
-        """Write a message if nothing has to be waited for; whether it is written."""
-        if self._sending.locked():
-            return False
-        return try_send_parts(self._socket, message.parts(message_id))
-
     async def _send(self, message: EncodedMessage, message_id: int = 0) -> None:
         # The end of the session is sent from elsewhere.
         async with self._sending:
-            await send_parts(self._socket, message.parts(message_id))
+            await send(self._socket, message, message_id)
 
     async def _close_with_error(self, error: ServiceError, *, message_id: int = 0) -> None:
         """Send the error and close; a client that does not read is left alone."""

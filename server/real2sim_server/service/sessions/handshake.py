@@ -11,14 +11,13 @@ import contextlib
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from real2sim_proto import RETRYABLE, SUPPORTED_SUBPROTOCOLS, ErrorCode
 from real2sim_proto.drive import Envelope, Hello
 
 from ..http.auth import secrets_equal, unauthorized
 from ..http.problems import ServiceError
-from ..http.websocket import send_parts
 from ..storage.store import SessionRow
 from .messages import (
     BadMessageError,
@@ -115,6 +114,13 @@ async def receive(socket: WebSocket) -> ReceivedMessage:
     return await asyncio.to_thread(read_message, data)
 
 
+async def send(socket: WebSocket, message: EncodedMessage, message_id: int = 0) -> None:
+    """Send a message. Raises WebSocketDisconnect: the client has left."""
+    if socket.application_state is WebSocketState.DISCONNECTED:
+        raise WebSocketDisconnect
+    await socket.send_bytes(message.joined(message_id))
+
+
 async def with_progress(
     socket: WebSocket, work: Coroutine[Any, Any, T], hello: Envelope, *, phase: str
 ) -> T:
@@ -124,7 +130,7 @@ async def with_progress(
     task.add_done_callback(lambda done: done.cancelled() or done.exception())
     while not (await asyncio.wait({task}, timeout=PROGRESS_S))[0]:
         fields = {"phase": phase, "eta_s": None}
-        await send_parts(socket, pack_message("progress", fields).parts(hello.id))
+        await send(socket, pack_message("progress", fields), hello.id)
     return task.result()
 
 
@@ -135,7 +141,7 @@ async def close_with_error(
     with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
         async with asyncio.timeout(CLOSE_TIMEOUT_S):
             message = error_message(error, fatal=True, step=step)
-            await send_parts(socket, message.parts(message_id))
+            await send(socket, message, message_id)
             await socket.close(POLICY_VIOLATION, error.code.value)
 
 

@@ -1,44 +1,32 @@
-"""The step pipeline: from the bytes of an action to the bytes of the observation that answers it.
+"""The step pipeline: a change of a session's world becomes an observation of it.
 
-A step passes seven phases. Each is a function of that name, so that a profile shows them too.
+============  ==============  ====================================================================
+phase         runs on         what happens
+============  ==============  ====================================================================
+``receive``   event loop      a message is read and validated (`connection`)
+``check``     event loop      role, session, lock step: is this action due (`connection`)
+``advance``   worlds, engine  a fork of the world moves, as far as images show it
+``render``    engine          deformations, then images and clouds of the sensors that are due
+``evaluate``  worlds, beside  metrics and events; the log entry is written; the observation is
+              the rendering   packed but for its images
+``encode``    encoders        images are encoded, raw ones copied into shared memory; the parts
+                              become one message
+``send``      event loop      the message is written to the socket (`connection`)
+============  ==============  ====================================================================
 
-============  =====================  ==========================================================
-phase         runs on                what happens
-============  =====================  ==========================================================
-``receive``   event loop             a message is read, decoded and validated (`connection`)
-``check``     event loop             role, session, lock step: is this the action due (`connection`)
-``advance``   engine                 a fork of the world moves, as far as images show it
-``render``    engine                 deformations, then the images of all sensors due
-``evaluate``  beside the rendering   metrics and events; the log entry is written; all of the
-                                     observation but its images is packed, headers of raw images
-                                     included
-``encode``    engine, or encoders    raw images are taken as they are on the engine, or copied into
-                                     the memory that the client reads them from; others are
-                                     encoded beside it; the parts become one message
-``send``      event loop             written to the socket in the very call that ends the engine's
-                                     job; what cannot be written at once goes the ordinary way
-============  =====================  ==========================================================
-
-A world without sensors moves on a thread of its own: it needs no device, and its planner should not
-wait while other sessions are rendered. Steps that wait for that thread are made in one go, phase by
-phase: their log entries are one transaction, and they wake the event loop once. The action that is
-due there is received and checked in the call that reads it from the socket, and no task is woken
-for its observation (`steps_at_once`); all else goes as above.
-
-Where the backend draws images of several worlds in one go (the serving kernels all, the CPU's small
-ones), steps of sessions on one scene that wait for the engine together pass the phases together, as
-far as TOGETHER_PIXELS: their images are those that each would get alone, bit for bit. None waits
-for another that is not there yet, and one that came first is left behind once at most.
-
-The phases are in `phases`, those of several steps together in `blind_steps` and `joint_drawing`.
+A world without sensors moves on a thread of its own: it needs no device, and its planner does not
+wait while other sessions are rendered. Steps that wait for a thread together pass the phases
+together: their log entries are one transaction, and where the backend can, their images are drawn
+in one go, each with the bits that it would have alone. No step waits for one that is not there yet.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -48,27 +36,131 @@ from ...edit import ScenarioState, compose, instances_at, things_at_start
 from ...render import Instance
 from ...scene import Camera, Scene
 from ...world import World
-from ...world.ranging import NO_SENSORS, Cloud, MountedLidar, RangingSensors
+from ...world.ranging import NO_SENSORS, Cloud, Mounted, MountedLidar, RangingSensors
 from ..engine import Engine
 from ..http.metrics import Metrics
 from ..lanes import Lane
+from ..rendering.clouds import cloud_parts
+from ..rendering.frames import EncodedFrame, RenderedImage
+from ..rendering.optics import needs_motion
 from ..rendering.renderer import Renderer, RenderRequest
+from ..storage.store import Claim, SessionEntry, Store
 from ..warm_up import DeformationKernels
-from .blind_steps import BlindSteps
-from .gathered_calls import GatheredCalls
 from .image_limits import cameras_of, raw_image_bytes
-from .joint_drawing import JointDrawing, share_of
-from .observation import EncodedObservation, RenderedObservation, with_frames
-from .phases import KernelsMissingError, StepPhases
 from .segment import FrameSlot
-from .transition import Transition
-from .wire import PhaseTimer, pack_members
+from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack_with_frames
 from .world_clouds import WorldClouds
-from .world_images import Images, WorldImages
 
 T = TypeVar("T")
 
 WARM_UP_WIDTH = 320
+MAX_TOGETHER = 16
+"""Steps without sensors made in one go: the first waits for the last, some milliseconds."""
+MAX_TOGETHER_DRAWN = 8
+"""The same of steps with images."""
+MAX_PIXELS_TOGETHER = 16_000_000
+"""Of their images."""
+MAX_WAITING = 1024
+"""Steps that may wait for the thread of worlds."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogWrite:
+    """Entries of a session's log on their way to the store.
+
+    Attributes:
+        store: takes them.
+        claim: on the session.
+        entries: of its log.
+        instead: whether they replace what may be on record from there on.
+    """
+
+    store: Store
+    claim: Claim
+    entries: Sequence[SessionEntry]
+    instead: bool
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedObservation:
+    """An instant as a message.
+
+    Attributes:
+        world: at that instant; it is not committed by being shown.
+        frames: the images of the message.
+        message: for all who get it, whole.
+        timing_ms: by stage.
+        placed: for the client that is answered, where its images lie in shared memory.
+        clouds: of the message.
+    """
+
+    world: World
+    frames: Sequence[EncodedFrame]
+    message: EncodedMessage
+    timing_ms: Mapping[str, float]
+    placed: EncodedMessage | None = None
+    clouds: Sequence[Cloud] = ()
+
+    @property
+    def answer(self) -> EncodedMessage:
+        """For the client that is answered."""
+        return self.placed or self.message
+
+
+@dataclass(eq=False)
+class Step:
+    """A change of a session's world on its way to an observation.
+
+    Attributes:
+        change: makes the new world, complete as far as images show it, and leaves the present one
+            alone; runs off the event loop.
+        cameras: of the world's sensors, by name, at the sizes they name.
+        clouds: whether those of its LiDARs and radars are made.
+        log: is written once the new world is evaluated; None where it is in the log already.
+        slot: that raw images of the answer may be written to.
+        drawn_with: the scene with whose other steps this one may be drawn; None for none.
+        timer: of the stages.
+        world: the new one, once it has moved.
+        sensors, ranging: that are due in it.
+        images, measured: of these, in their order.
+        members: of the message, without images, clouds and timing.
+        recorded: whether ``log`` is written.
+        error: why the step has failed.
+    """
+
+    change: Callable[[], World]
+    cameras: Mapping[str, Camera]
+    clouds: bool = False
+    log: LogWrite | None = None
+    slot: FrameSlot | None = None
+    drawn_with: Scene | None = None
+    timer: PhaseTimer = field(default_factory=PhaseTimer)
+    world: World | None = None
+    sensors: Sequence[SensorSpec] = ()
+    ranging: Sequence[Mounted] = ()
+    images: Sequence[RenderedImage] = ()
+    measured: Sequence[Cloud] = ()
+    members: EncodedMembers | None = None
+    recorded: bool = False
+    error: Exception | None = None
+
+    @property
+    def moved(self) -> World:
+        """The new world of a step that has advanced."""
+        assert self.world is not None
+        return self.world
+
+    @contextlib.contextmanager
+    def catching(self) -> Iterator[None]:
+        """A phase whose failure is this step's alone."""
+        try:
+            yield
+        except Exception as error:
+            self.error = error
+
+
+class KernelsMissingError(Exception):
+    """An image has to wait for kernels of deformation; nothing has happened."""
 
 
 class StepPipeline:
@@ -98,41 +190,24 @@ class StepPipeline:
         self._engine = engine
         self._renderer = renderer
         self._metrics = metrics
+        self._deformation = deformation
         self._max_pixels = max_pixels
-        self._images = WorldImages(renderer)
         self._clouds = WorldClouds(engine, max_rays=max_rays, caster=caster)
-        self._phases = StepPhases(self._images, self._clouds, deformation)
-        self._joint = JointDrawing(self._phases, self._images)
-        self._blind = BlindSteps(self._phases)
-        self._worlds = ThreadPoolExecutor(1, thread_name_prefix="worlds")
-        self._steps: GatheredCalls[Transition, EncodedObservation] = GatheredCalls(
-            self._blind.compute, self._worlds, on_result=self.send
-        )
+        self._worlds = Engine(name="worlds", queue_length=MAX_WAITING, threads=None)
+        self._worlds.start()
+        self._evaluators = ThreadPoolExecutor(1, thread_name_prefix="evaluate")
 
     def close(self) -> None:
         """End its threads."""
-        self._worlds.shutdown(cancel_futures=True)
-        self._phases.close()
+        self._worlds.stop(drain=False)
+        self._evaluators.shutdown(cancel_futures=True)
+
+    # --- what a session waits for before it begins ----------------------------------------------
 
     def cameras(self, scene: Scene, sensors: Sequence[SensorSpec]) -> dict[str, Camera]:
         """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
         cameras = cameras_of(scene, sensors, max_pixels=self._max_pixels)
         return {s.camera: c for s, c in zip(sensors, cameras, strict=True)}
-
-    def drawn_with(self, world: World, cameras: Mapping[str, Camera]) -> Scene | None:
-        """With the sessions of which scene the next step of a world may be drawn; None for none.
-
-        No session waits for the deformations of another.
-        """
-        sensors = world.spec.sensors
-        if (
-            not sensors
-            or world.ranging
-            or (world.deformation is not None and world.deformation.has_impacts)
-        ):
-            return None
-        sizes = [cameras[sensor.camera] for sensor in sensors]
-        return world.scene if self._renderer.draws_together(sensors, sizes) else None
 
     async def ranging_ready(
         self, ranging: RangingSensors, sensors: Sequence[SensorSpec], cameras: Mapping[str, Camera]
@@ -171,77 +246,138 @@ class StepPipeline:
 
         await self._renderer.ready(sensors, [cameras[s.camera] for s in sensors], shown)
 
+    def drawn_with(self, world: World, cameras: Mapping[str, Camera]) -> Scene | None:
+        """With the sessions of which scene the next step of a world may be drawn; None for none.
+
+        No session waits for the deformations of another.
+        """
+        sensors = world.spec.sensors
+        deforms = world.deformation is not None and world.deformation.has_impacts
+        if not sensors or world.ranging or deforms:
+            return None
+        sizes = [cameras[sensor.camera] for sensor in sensors]
+        return world.scene if self._renderer.draws_together(sensors, sizes) else None
+
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
         """``fn(*args)`` on the thread that moves worlds without sensors."""
-        return await asyncio.get_running_loop().run_in_executor(self._worlds, fn, *args)
+        return await self._worlds.call(fn, *args, label="world", lane=Lane.DRIVE)
 
-    # --- a change of the world ----------------------------------------------------------------
+    # --- a change of the world ------------------------------------------------------------------
 
-    async def run(self, transition: Transition) -> EncodedObservation:
-        """Advance, render, evaluate, encode and send; the observation of the new world.
+    async def run(self, step: Step) -> EncodedObservation:
+        """Advance, render, evaluate and encode; the observation of the new world.
 
         Evaluation has ended when this returns or raises. Where it raises, nothing has happened but
         that the change may be on record.
 
         Raises:
-            QueueFullError: too much waits for the engine.
+            QueueFullError: too much waits for the thread.
         """
-        observation: RenderedObservation | EncodedObservation
-        if transition.cameras or transition.clouds:
-            try:
-                observation = await self._on_engine(transition)
-            except KernelsMissingError:
-                await self._phases.deformation.wait()
-                observation = await self._on_engine(transition)
+        try:
+            await self._compute_on_thread(step)
+        except KernelsMissingError:
+            await self._deformation.wait()
+            step.error = None
+            await self._compute_on_thread(step)
+        return await self.encode(step, "obs")
+
+    async def _compute_on_thread(self, step: Step) -> None:
+        key: object
+        if step.cameras or step.clouds:
+            thread, key = self._engine, step.drawn_with or step
+            pixels = sum(camera.width * camera.height for camera in step.cameras.values())
+            share = max(pixels / MAX_PIXELS_TOGETHER, 1 / MAX_TOGETHER_DRAWN)
         else:
-            observation = await self._steps.call(transition)
-        return await self._finish(observation)
-
-    def begin(
-        self,
-        transition: Transition,
-        done: Callable[[EncodedObservation | Exception], object],
-    ) -> None:
-        """As :meth:`run`, of a world without sensors: ``done`` is called
-        on the event loop with the observation, written where that could be done at once, or with
-        what was raised. It must not raise."""
-
-        def ended(outcome: EncodedObservation | Exception) -> None:
-            if isinstance(outcome, Exception):
-                done(outcome)
-                return
-            try:
-                self.send(transition, outcome)
-            except Exception as error:
-                done(error)
-                return
-            done(outcome)
-            self._count(outcome)
-
-        self._steps.begin(transition, ended)
-
-    async def _on_engine(self, transition: Transition) -> RenderedObservation | EncodedObservation:
-        told = partial(self.send, transition)
-        if transition.scene is None:
-            return await self._engine.call(
-                self._phases.compute, transition, label="drive", lane=Lane.DRIVE, on_result=told
-            )
-        return await self._engine.call_together(
-            self._joint.draw,
-            transition,
-            key=transition.scene,
-            share=share_of(transition.cameras.values()),
-            label="drive",
-            lane=Lane.DRIVE,
-            on_result=told,
+            thread, key, share = self._worlds, self, 1 / MAX_TOGETHER
+        await thread.call_together(
+            self.compute, step, key=key, share=share, label="drive", lane=Lane.DRIVE
         )
 
-    def send(
-        self, transition: Transition, observation: RenderedObservation | EncodedObservation
-    ) -> None:
-        """Write the observation to the socket, if it is there already and nothing has to wait."""
-        if transition.write is not None and isinstance(observation, EncodedObservation):
-            transition.sent = transition.write(observation.answer)
+    def compute(self, steps: Sequence[Step]) -> list[Exception | None]:
+        """Advance, render and evaluate steps in one go; why each has failed, None where it has not.
+        Where one fails, the others go on."""
+        for step in steps:
+            step.timer.stage("queue")
+        self.advance(steps)
+        seeing = [step for step in steps if step.error is None and (step.sensors or step.ranging)]
+        if seeing:
+            evaluation = self._evaluators.submit(self.evaluate, steps)
+            try:
+                self.render(seeing)
+            finally:
+                evaluation.result()
+        else:
+            self.evaluate(steps)
+        for step in steps:
+            step.timer.stage("settle")
+        return [step.error for step in steps]
+
+    def advance(self, steps: Sequence[Step]) -> None:
+        """Move the worlds, as far as images show them, and find the sensors that are due."""
+        for step in steps:
+            with step.catching():
+                world = step.world = step.world or step.change()
+                step.sensors = world.due_sensors()
+                step.ranging = world.due_ranging() if step.clouds else ()
+                if step.sensors or step.ranging:
+                    self._require_kernels(world)
+            step.timer.stage("world")
+
+    def render(self, steps: Sequence[Step]) -> None:
+        """Draw the images and make the clouds of worlds, their objects deformed first."""
+        for step in steps:
+            with step.catching():
+                _deform(step.moved, step.timer)
+        drawn = [step for step in steps if step.sensors and step.error is None]
+        try:
+            self._draw(drawn)
+        except Exception:
+            # Each then finds out for itself: the trouble of one is not that of the others.
+            for step in drawn:
+                with step.catching():
+                    self._draw([step])
+        for step in steps:
+            step.timer.stage("render")
+            if step.ranging:
+                with step.catching():
+                    step.measured = self._clouds.of(step.moved, step.ranging)
+                step.timer.stage("cast")
+
+    def evaluate(self, steps: Sequence[Step]) -> None:
+        """Complete the worlds by what images do not show, write the log, and describe them."""
+        moved = [step for step in steps if step.world is not None and step.error is None]
+        for step in moved:
+            with step.catching():
+                step.moved.evaluate()
+        evaluated = [step for step in moved if step.error is None]
+        record(evaluated)
+        for step in evaluated:
+            with step.catching():
+                step.members = pack_members(step.moved.observe().obs_fields())
+
+    async def encode(self, step: Step, kind: str) -> EncodedObservation:
+        """The observation encoded; counted once the answer is on its way."""
+        if step.images or step.measured:
+            frames = await self._renderer.encode(step.images)
+            pack = partial(_packed, step, kind)
+            (observation,) = await self._renderer.on_encoders(pack, [frames])
+        else:
+            observation = _packed(step, kind, ())
+        asyncio.get_running_loop().call_soon(self._count, observation)
+        return observation
+
+    def _draw(self, steps: Sequence[Step]) -> None:
+        """Draw the images of steps in one go, or none where one of them fails."""
+        requests = [(_request(s.moved, s.sensors), _cameras(s)) for s in steps]
+        for step, images in zip(steps, self._renderer.render_together(requests), strict=True):
+            step.images = _estimated(step.moved, images)
+
+    def _require_kernels(self, world: World) -> None:
+        """Raises KernelsMissingError where images of a world would compile on the engine, which
+        belongs to all sessions."""
+        shapes = world.deformation
+        if shapes is not None and shapes.has_impacts and not self._deformation.ready:
+            raise KernelsMissingError
 
     # --- a view of a world that stays as it is --------------------------------------------------
 
@@ -269,32 +405,34 @@ class StepPipeline:
         things = partial(things_at_start, world.scene, world.state)
         await self._renderer.ready(sensors, cameras, things)
         await self._clouds.ready(ranging, image_bytes=raw_image_bytes(sensors, cameras))
-        timer = PhaseTimer()
-        view = partial(self._compute_view, world, sensors, cameras, timer, ranging)
+        step = Step(lambda: world, {}, slot=slot, world=world)
+        step.members = pack_members({"t_us": world.t_us, "revision": world.revision})
+        look = partial(self._look, step, sensors, cameras, ranging)
         try:
-            rendered = await self._engine.call(view, label="view")
+            await self._engine.call(look, label="view")
         except KernelsMissingError:
-            await self._phases.deformation.wait()
-            rendered = await self._engine.call(view, label="view")
-        return await self._finish(replace(rendered, slot=slot))
+            await self._deformation.wait()
+            await self._engine.call(look, label="view")
+        return await self.encode(step, "view")
 
-    def _compute_view(
+    def _look(
         self,
-        world: World,
+        step: Step,
         sensors: Sequence[SensorSpec],
         cameras: Sequence[Camera],
-        timer: PhaseTimer,
         ranging: RangingSensors,
-    ) -> RenderedObservation:
-        timer.stage("queue")
-        self._phases.require_kernels(world)
-        images: Images = ()
+    ) -> None:
+        step.timer.stage("queue")
+        world = step.moved
+        self._require_kernels(world)
         if sensors:
-            images = self._images.of(world, sensors, cameras, between=self._engine.give_way)
-        timer.stage("render")
-        clouds = self._phases.measure(world, ranging.all, timer)
-        members = pack_members({"t_us": world.t_us, "revision": world.revision})
-        return RenderedObservation(world, images, clouds, "view", members, timer)
+            requests = [(_request(world, sensors), cameras)]
+            (images,) = self._renderer.render_together(requests, between=self._engine.give_way)
+            step.images = _estimated(world, images)
+        step.timer.stage("render")
+        if ranging:
+            step.measured = self._clouds.of(world, ranging.all)
+            step.timer.stage("cast")
 
     async def recorded_sweep(
         self, scene: Scene, state: ScenarioState, mounted: MountedLidar, t_us: int
@@ -326,21 +464,76 @@ class StepPipeline:
         draw = partial(self._renderer.render_images, between=self._engine.give_way)
         await self._engine.call(draw, request, [camera], label="warm-up")
 
-    # --- inside ---------------------------------------------------------------------------------
-
-    async def _finish(
-        self, observation: RenderedObservation | EncodedObservation
-    ) -> EncodedObservation:
-        """The observation encoded, and counted once the answer is on its way."""
-        if isinstance(observation, RenderedObservation):
-            frames = await self._renderer.encode(observation.images)
-            (observation,) = await self._renderer.on_encoders(
-                lambda rendered: with_frames(rendered, frames), [observation]
-            )
-        asyncio.get_running_loop().call_soon(self._count, observation)
-        return observation
-
     def _count(self, observation: EncodedObservation) -> None:
         self._metrics.stages.observe_ms(observation.timing_ms)
         for frame in observation.frames:
             self._metrics.frames.labels("drive", frame.codec).inc()
+
+
+def record(steps: Sequence[Step]) -> None:
+    """Write the log entries of steps, in one transaction where that can be; the trouble of one is
+    not that of the others. Off the event loop."""
+    logs = [(step, step.log) for step in steps if step.log is not None]
+    if len(logs) > 1 and not any(log.instead for _, log in logs):
+        with contextlib.suppress(Exception):
+            store = logs[0][1].store
+            store.record_together([(log.claim, log.entries) for _, log in logs])
+            for step, _ in logs:
+                step.recorded = True
+            return
+    for step, log in logs:
+        with step.catching():
+            log.store.record(log.claim, log.entries, instead=log.instead)
+            step.recorded = True
+
+
+def _packed(step: Step, kind: str, frames: Sequence[EncodedFrame]) -> EncodedObservation:
+    """The message of a step, and the one whose images lie in shared memory."""
+    assert step.members is not None
+    placed_frames = step.slot.place(frames) if step.slot is not None else None
+    step.timer.stage("encode")
+    clouds = [cloud_parts(cloud) for cloud in step.measured]
+    pack = partial(pack_with_frames, kind, step.members, watch=step.timer, clouds=clouds)
+    return EncodedObservation(
+        step.moved,
+        frames,
+        pack(frames),
+        step.timer.timing_ms,
+        None if placed_frames is None else pack(placed_frames),
+        step.measured,
+    )
+
+
+def _deform(world: World, timer: PhaseTimer) -> None:
+    """Find the shapes that images of a world show."""
+    if world.deformation is not None:
+        world.deformation.solve(world.t_us)
+        timer.stage("physics")
+
+
+def _request(world: World, sensors: Sequence[SensorSpec]) -> RenderRequest:
+    moving = needs_motion(sensors)
+    return RenderRequest(
+        scene=world.scene,
+        instances=world.moving_instances() if moving else world.instances(),
+        T_world_vehicle=world.T_world_body,
+        t_us=world.t_us,
+        sensors=sensors,
+        twist=world.twist if moving else None,
+    )
+
+
+def _cameras(step: Step) -> list[Camera]:
+    return [step.cameras[sensor.camera] for sensor in step.sensors]
+
+
+def _estimated(world: World, images: Sequence[RenderedImage]) -> Sequence[RenderedImage]:
+    """Images show where the ego is; their poses are those of its own estimate."""
+    if world.T_world_estimate is world.T_world_body:
+        return images
+    believed = []
+    for image in images:
+        assert image.camera is not None
+        pose = image.camera.pose(world.T_world_estimate)
+        believed.append(replace(image, T_world_sensor=pose))
+    return believed

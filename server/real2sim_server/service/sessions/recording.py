@@ -14,8 +14,7 @@ from ...world.recording.recording import Recording, record, to_bytes
 from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
 from ..http.problems import ServiceError
 from ..rendering.frames import EncodedFrame
-from .observation import EncodedObservation
-from .pipeline import StepPipeline
+from .pipeline import EncodedObservation, StepPipeline
 from .registry import Sessions
 from .session import EpisodeStart, Session
 

@@ -16,9 +16,8 @@ from ..http.problems import ServiceError
 from ..scenarios.scenarios import Scenarios
 from ..storage.store import SessionRow, Store
 from .log import entries_of
-from .pipeline import StepPipeline
+from .pipeline import Step, StepPipeline
 from .session import Session
-from .transition import Transition
 
 
 async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> None:
@@ -46,9 +45,7 @@ async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> 
         before_last = _world(replayer)
         cameras = await _cameras_ready(pipeline, session, before_last)
         clouds = bool(before_last.ranging)
-        observation = await pipeline.run(
-            Transition(lambda: replayer.apply(last), cameras, clouds=clouds)
-        )
+        observation = await pipeline.run(Step(lambda: replayer.apply(last), cameras, clouds=clouds))
         session.begin(observation.world, cameras)
         session.lockstep.reset(observation.world.steps, over=observation.world.over)
         if not decode(last.payload).get("missed"):

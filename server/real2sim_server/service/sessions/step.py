@@ -8,9 +8,8 @@ goes wrong before leaves the session as it was, and what is in its log already i
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.drive import Agent
@@ -18,7 +17,7 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Operation
 
 from ...edit import EditOutcome
-from ...scene import Camera, Scene
+from ...scene import Camera
 from ...world import Event, Plan, World
 from ...world.recording.replay import (
     KEPT_PLAN,
@@ -34,12 +33,9 @@ from ..http.problems import ServiceError
 from ..storage.errors import FencedError, StoreTroubleError, StoreUnavailableError
 from ..storage.store import SessionEntry, Store, StoredReply
 from ..warm_up import KernelWarmUp
-from .log_write import LogWrite
-from .observation import EncodedObservation
-from .pipeline import StepPipeline
+from .pipeline import EncodedObservation, LogWrite, Step, StepPipeline
 from .segment import FrameSlot
 from .session import NewestPlan, Session
-from .transition import Transition
 from .wire import EncodedMessage
 from .world_clouds import mounted_beside
 
@@ -56,30 +52,6 @@ MAX_SNAPSHOTS = 32
 
 STEPS_AT_ONCE = 20
 """Steps of a REST request that are computed in one go; other sessions get their turn between."""
-
-
-class DueAction(NamedTuple):
-    """The action that the lock step of a session wants now.
-
-    Attributes:
-        session: whose world moves.
-        plan: what the ego does.
-        payload: canonical bytes of the plan.
-        latency_us: wall-clock time from the observation to this action.
-    """
-
-    session: Session
-    plan: Plan | None
-    payload: bytes
-    latency_us: int = 0
-
-
-class BrokenStep(NamedTuple):
-    """A step that has not taken effect, and why."""
-
-    action: DueAction
-    transition: Transition
-    error: Exception
 
 
 class Stepper:
@@ -113,25 +85,14 @@ class Stepper:
         Raises:
             WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
         """
-        return (await self.reset_seen(session, spec, slot=slot)).answer
-
-    async def reset_seen(
-        self, session: Session, spec: ResetSpec, *, slot: FrameSlot | None = None
-    ) -> EncodedObservation:
-        """As :meth:`reset`; the observation with its parts."""
         cameras = await self._announced(session, spec)
         record = ("reset", 0, reset_payload(spec))
-        observation, _ = await self._observe(
-            session,
-            _beginning(session, spec),
-            cameras,
-            record,
-            clouds=bool(spec.lidars or spec.radars),
-            slot=slot,
-        )
+        clouds = bool(spec.lidars or spec.radars)
+        step = Step(_beginning(session, spec), cameras, clouds=clouds, slot=slot)
+        observation = await self._observe(session, step, record)
         session.begin(observation.world, cameras)
         session.publish(observation.message)
-        return observation
+        return observation.answer
 
     async def restart(self, session: Session, spec: ResetSpec, *, reply: MakeReply) -> None:
         """Begin an episode without rendering its first observation. Raises like reset().
@@ -172,77 +133,34 @@ class Stepper:
         plan: Plan | None,
         payload: bytes,
         *,
-        latency_us: int = 0,
-        write: Callable[[EncodedMessage], bool] | None = None,
+        waited_us: int = 0,
         slot: FrameSlot | None = None,
-    ) -> EncodedMessage | None:
-        """Take the action that is due; the next observation, None where it is written already.
+    ) -> EncodedMessage:
+        """Take the action that is due; the next observation.
 
         Args:
             session: its lock step wants this action now.
             plan: what the ego does.
             payload: canonical bytes of the plan.
-            latency_us: wall-clock time from the observation to this action.
-            write: may hand the observation to the socket before this returns; see
-                :class:`~.transition.Transition`.
+            waited_us: wall-clock time from the observation to this action.
             slot: that raw images of the observation may be written to.
 
         Raises:
             WorldError: the plan is refused.
             QueueFullError: too much waits for the engine; the same action may be sent again.
         """
-        change, entry = _movement(DueAction(session, plan, payload, latency_us))
-        observation, written = await self._step(session, change, entry, write=write, slot=slot)
+        now = session.running_world()
+        if plan is not None:
+            session.newest_plan = NewestPlan(plan, now.motion, waited_us)
+        latency_us = waited_us if session.spec.latency.model == "measured" else 0
+        entry = payload
+        if latency_us or session.late:
+            entry = action_payload(plan, latency_us=latency_us, missed=session.late)
+        change = partial(_moved, now, plan, latency_us, session.late)
+        observation = await self._move(session, change, entry, slot=slot)
         # Given once more, its images come with it: the slot may hold others by then.
         session.lockstep.advance(payload, observation.message, over=observation.world.over)
-        return None if written else observation.answer
-
-    def begin_step(
-        self,
-        action: DueAction,
-        *,
-        write: Callable[[EncodedMessage], bool],
-        done: Callable[[tuple[EncodedObservation, bool] | BrokenStep], object],
-    ) -> None:
-        """Take the due action of a session without sensors; no task waits for it.
-
-        Args:
-            action: the caller holds the lock of its session until ``done`` is called.
-            write: hands the observation to the socket, see :class:`~.transition.Transition`.
-            done: called on the event loop once the step has taken effect, with the observation and
-                whether it is written; or with why it has not.
-        """
-        transition = self._transition(action, {})
-        transition.write = write
-
-        def ended(outcome: EncodedObservation | Exception) -> None:
-            if isinstance(outcome, Exception):
-                done(BrokenStep(action, transition, outcome))
-                return
-            _commit(action, outcome.world, outcome.message)
-            done((outcome, transition.sent))
-
-        self._pipeline.begin(transition, ended)
-
-    async def withdraw(self, broken: BrokenStep) -> None:
-        """Take back what a step that has not taken effect may have left on record."""
-        await self._failed(*broken)
-
-    def _transition(self, action: DueAction, cameras: Mapping[str, Camera]) -> Transition:
-        session = action.session
-        change, entry = _movement(action)
-        entries = _entries(session, [("action", session.running_world().steps, entry)])
-        write = LogWrite(self._store, session.row.claim, entries, session.log_unsure)
-        return Transition(change, cameras, record=write)
-
-    async def _failed(self, action: DueAction, transition: Transition, error: Exception) -> None:
-        """A step that has not taken effect leaves nothing on record."""
-        if isinstance(error, StoreUnavailableError):
-            action.session.log_unsure = True
-        elif isinstance(error, FencedError):
-            self._on_fenced(action.session)
-        elif transition.recorded:
-            await self._withdraw(action.session)
+        return observation.answer
 
     async def step_without_action(self, session: Session) -> EncodedMessage:
         """Go on without the action that is due, by the episode's fallback; the observation.
@@ -251,7 +169,7 @@ class Stepper:
         """
         change = partial(_moved, session.running_world(), None, 0, True)
         entry = action_payload(None, missed=True)
-        observation, _ = await self._step(session, change, entry)
+        observation = await self._move(session, change, entry)
         session.lockstep.skip(1, over=observation.world.over)
         return observation.message
 
@@ -259,41 +177,34 @@ class Stepper:
         """End the episode where it is; the present observation with the reason."""
         now = session.running_world()
         record = ("stop", now.steps, stop_payload(reason))
-        observation, _ = await self._observe(
-            session,
-            partial(_stopped, now, reason),
-            session.cameras,
-            record,
-            clouds=bool(now.ranging),
-        )
+        step = Step(partial(_stopped, now, reason), session.cameras, clouds=bool(now.ranging))
+        observation = await self._observe(session, step, record)
         session.world = observation.world
         session.lockstep.end()
         session.publish(observation.message)
         return observation.message
 
-    async def _step(
+    async def _move(
         self,
         session: Session,
         change: Callable[[], World],
         payload: bytes,
         *,
-        write: Callable[[EncodedMessage], bool] | None = None,
         slot: FrameSlot | None = None,
-    ) -> tuple[EncodedObservation, bool]:
-        record = ("action", session.running_world().steps, payload)
-        observation, written = await self._observe(
-            session,
+    ) -> EncodedObservation:
+        """The clock moves by one step."""
+        now = session.running_world()
+        step = Step(
             change,
             session.cameras,
-            record,
-            clouds=bool(session.running_world().ranging),
-            write=write,
+            clouds=bool(now.ranging),
             slot=slot,
-            scene=self._pipeline.drawn_with(session.running_world(), session.cameras),
+            drawn_with=self._pipeline.drawn_with(now, session.cameras),
         )
+        observation = await self._observe(session, step, ("action", now.steps, payload))
         session.world, session.late = observation.world, False
         session.publish(observation.message)
-        return observation, written
+        return observation
 
     async def step(self, session: Session, n: int, plan: Plan | None, *, reply: MakeReply) -> None:
         """Move the clock ``n`` times under one plan, or to the end; nothing is drawn.
@@ -387,34 +298,19 @@ class Stepper:
             )
         cameras = self._pipeline.cameras(snapshot.scene, snapshot.spec.sensors)
         record = ("restore", snapshot.steps, name_payload(name))
-        observation, _ = await self._observe(
-            session, lambda: snapshot, cameras, record, clouds=bool(snapshot.ranging)
-        )
+        step = Step(lambda: snapshot, cameras, clouds=bool(snapshot.ranging))
+        observation = await self._observe(session, step, record)
         session.begin(snapshot, cameras)
         session.lockstep.reset(snapshot.steps, over=snapshot.over)
         session.publish(observation.message)
         return observation.message
 
-    async def _observe(
-        self,
-        session: Session,
-        change: Callable[[], World],
-        cameras: Mapping[str, Camera],
-        record: LogRecord,
-        *,
-        clouds: bool,
-        write: Callable[[EncodedMessage], bool] | None = None,
-        slot: FrameSlot | None = None,
-        scene: Scene | None = None,
-    ) -> tuple[EncodedObservation, bool]:
-        """The observation of a change, and whether it is written to the socket already."""
-        entries = _entries(session, [record])
-        store = LogWrite(self._store, session.row.claim, entries, session.log_unsure)
-        transition = Transition(
-            change, cameras, clouds=clouds, record=store, write=write, slot=slot, scene=scene
-        )
+    async def _observe(self, session: Session, step: Step, entry: LogRecord) -> EncodedObservation:
+        """The observation of a change, which is on record then."""
+        entries = _entries(session, [entry])
+        step.log = LogWrite(self._store, session.row.claim, entries, session.log_unsure)
         try:
-            observation = await self._pipeline.run(transition)
+            observation = await self._pipeline.run(step)
         except StoreUnavailableError:
             session.log_unsure = True
             raise
@@ -422,11 +318,11 @@ class Stepper:
             self._on_fenced(session)
             raise
         except Exception:
-            if transition.recorded:
+            if step.recorded:
                 await self._withdraw(session)
             raise
-        session.next_seq, session.log_unsure = session.next_seq + len(entries), False
-        return observation, transition.sent
+        session.next_seq, session.log_unsure = session.next_seq + 1, False
+        return observation
 
     async def _withdraw(self, session: Session) -> None:
         """Take back what has been recorded ahead; by the next entry where the store is not well."""
@@ -465,26 +361,6 @@ class Stepper:
             self._on_fenced(session)
             raise
         session.next_seq, session.log_unsure = session.next_seq + len(entries), False
-
-
-def _movement(action: DueAction) -> tuple[Callable[[], World], bytes]:
-    """What makes the next world, and what is recorded of it."""
-    session, plan, payload, waited_us = action
-    if plan is not None:
-        session.newest_plan = NewestPlan(plan, session.running_world().motion, waited_us)
-    latency_us = waited_us if session.spec.latency.model == "measured" else 0
-    if latency_us or session.late:
-        payload = action_payload(plan, latency_us=latency_us, missed=session.late)
-    return partial(_moved, session.running_world(), plan, latency_us, session.late), payload
-
-
-def _commit(action: DueAction, world: World, message: EncodedMessage) -> None:
-    """A step takes effect; it is on record. ``message``: shows it."""
-    session, payload = action.session, action.payload
-    session.next_seq, session.log_unsure = session.next_seq + 1, False
-    session.world, session.late = world, False
-    session.lockstep.advance(payload, message, over=world.over)
-    session.publish(message)
 
 
 def _entries(session: Session, records: Sequence[LogRecord]) -> list[SessionEntry]:

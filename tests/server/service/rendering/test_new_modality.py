@@ -18,7 +18,7 @@ from real2sim_server.render.modalities import SensorModality, register, unregist
 from real2sim_server.scene import Scene
 from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.metrics import Metrics
-from real2sim_server.service.rendering.frames import EncodedFrame, raw_headers
+from real2sim_server.service.rendering.frames import EncodedFrame
 from real2sim_server.service.rendering.renderer import Renderer, RenderRequest
 from real2sim_server.service.sessions.wire import PhaseTimer, pack_members, pack_with_frames
 
@@ -85,11 +85,3 @@ def test_its_frame_is_read_from_the_message_of_an_observation(alpha, tiny_scene)
     levels = np.frombuffer(received["data"], received["dtype"]).reshape(received["shape"])
     assert received["modality"] == "alpha"
     assert 0 < levels.max() <= 255
-
-
-def test_the_header_of_its_raw_image_is_known_before_it_is_rendered(alpha, tiny_scene):
-    _, frame = rendered(tiny_scene, "raw")
-    sensor = SensorSpec.model_construct(camera="front", modalities=["alpha"], codec="raw")
-    (header,) = raw_headers([sensor], tiny_scene.rig.cameras[:1], np.eye(4), 0)
-    assert header.fields["shape"] == list(frame.shape)
-    assert len(header.encoded) > 0

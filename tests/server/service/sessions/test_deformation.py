@@ -22,7 +22,7 @@ def compiler(site, monkeypatch):
     done = threading.Event()
     monkeypatch.setattr(warm_up, "deformation_on_disk", lambda: True)
     monkeypatch.setattr(warm_up, "warm_up_deformation", lambda: done.wait(LIMIT_S))
-    monkeypatch.setattr(site.worker.sessions.pipeline._phases, "deformation", DeformationKernels())
+    monkeypatch.setattr(site.worker.sessions.pipeline, "_deformation", DeformationKernels())
     yield done
     done.set()
 

@@ -12,7 +12,6 @@ import pytest
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode
 from real2sim_proto.drive import SERVER_MESSAGE
 from real2sim_server.service.engine import QueueFullError
-from real2sim_server.service.http.websocket import try_send_parts
 from real2sim_server.service.sessions import handshake
 from tests.waiting import LIMIT_S
 
@@ -76,24 +75,6 @@ def test_whoever_has_an_observation_finds_its_step_by_plain_requests_too(site, j
     for step in range(20):
         assert planner.act(step)["step"] == step + 1
         assert site.call("GET", info, "/state").json()["step"] == step + 1
-
-
-@pytest.mark.parametrize("at_once", [True, False])
-def test_an_observation_arrives_once_also_where_it_cannot_be_written_at_once(
-    planner, monkeypatch, at_once
-):
-    tried = []
-
-    def try_to_write(websocket: object, parts: list[bytes]) -> bool:
-        tried.append(at_once and try_send_parts(websocket, parts))
-        return tried[-1]
-
-    monkeypatch.setattr("real2sim_server.service.sessions.connection.try_send_parts", try_to_write)
-    planner.reset(sensors=[CAMERA])
-    for step in range(3):
-        obs = planner.act(step)
-        assert (obs["step"], obs["id"]) == (step + 1, planner.ids)
-    assert tried == [at_once] * 3
 
 
 def test_a_slower_camera_comes_only_when_it_is_due(planner):

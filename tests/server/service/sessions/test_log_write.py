@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
-from real2sim_server.service.sessions.log_write import LogWrite
-from real2sim_server.service.sessions.transition import Transition, record_together
+from real2sim_server.service.sessions.pipeline import LogWrite, Step, record
 from real2sim_server.service.storage.store import SessionEntry, Store
 
 
@@ -30,16 +29,16 @@ class Shelf:
 def recorded(shelf: Shelf, names: Sequence[str], *, unsure: Sequence[str] = ()) -> dict[str, Any]:
     """What has gone wrong, by session."""
     entries = [SessionEntry(1, "action", 0, b"", 0)]
-    transitions = {
-        name: Transition(
-            cast(Any, None), {}, record=LogWrite(cast(Store, shelf), name, entries, name in unsure)
+    steps = {
+        name: Step(
+            cast(Any, None), {}, log=LogWrite(cast(Store, shelf), name, entries, name in unsure)
         )
         for name in names
     }
-    failed = record_together(list(transitions.values()))
-    for name, transition in transitions.items():
-        assert transition.recorded == (transition not in failed), name
-    return {name: failed[t] for name, t in transitions.items() if t in failed}
+    record(list(steps.values()))
+    for name, step in steps.items():
+        assert step.recorded == (step.error is None), name
+    return {name: step.error for name, step in steps.items() if step.error is not None}
 
 
 def test_entries_of_several_sessions_are_one_transaction() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -15,12 +14,9 @@ from real2sim_proto.base import Modality
 from real2sim_proto.drive import SERVER_MESSAGE
 from real2sim_proto.episode import SensorSpec
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.scene import Camera
 from real2sim_server.service.rendering.frames import (
     RenderedImage,
     encode_frame,
-    raw_headers,
-    with_pixels,
 )
 from real2sim_server.service.sessions.wire import (
     PhaseTimer,
@@ -79,24 +75,6 @@ def test_raw_pixels_arrive_as_they_were(modality):
         frame.header.fields["shape"]
     )
     np.testing.assert_array_equal(pixels, drawn.pixels)
-
-
-@pytest.mark.parametrize("modality", get_args(Modality))
-def test_what_is_said_of_a_raw_image_before_it_is_drawn_is_what_it_says_itself(modality):
-    camera = Camera("front", 30, 20, np.array([[8.0, 0, 15], [0, 8, 10], [0, 0, 1]]), MOUNTED)
-    stands = transform_from(np.array([3.0, 4.0, 0.5]), np.array([0.6, 0.0, 0.0, 0.8]))
-    sensor = SensorSpec(camera="front", modalities=[modality], codec="raw")
-    drawn = replace(image("raw", modality), K=camera.K, T_world_sensor=camera.pose(stands), t_us=50)
-    (header,) = raw_headers([sensor], [camera], stands, 50)
-    assert header.encoded == encode_frame(drawn).header.encoded
-
-
-def test_an_image_that_is_not_as_it_was_announced_is_refused():
-    header = encode_frame(image("raw", "depth")).header
-    with pytest.raises(TypeError, match=r"float64 \(20, 30\) instead of float32 \[20, 30\]"):
-        with_pixels(header, np.zeros((20, 30)))
-    with pytest.raises(TypeError, match="instead of"):
-        with_pixels(header, np.zeros((30, 20), np.float32))
 
 
 def test_raw_pixels_are_not_copied_before_they_are_joined():
