@@ -12,7 +12,7 @@ from ..settings import Settings
 from .clock import now_us
 from .jobs.jobs import Jobs
 from .sessions import Sessions
-from .sessions.segment import sweep_segments
+from .sessions.shared_memory import sweep_segments
 from .storage.backup import RESTORING
 from .storage.errors import StoreError
 from .storage.retention import DAY_US, Retention, RetentionLimits

@@ -53,7 +53,7 @@ from .rendering.renderer import Renderer
 from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
-from .sessions.segment import Segments
+from .sessions.shared_memory import Segments
 from .sharing import Sharing
 from .storage.audit_log import AuditLog
 from .storage.bundle_log import BundleLog

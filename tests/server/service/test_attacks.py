@@ -33,7 +33,7 @@ from real2sim_server.scene.io import save_scene
 from real2sim_server.service.http.metrics import Metrics
 from real2sim_server.service.routes import view as view_route
 from real2sim_server.service.serve import RunningWorker, running_worker
-from real2sim_server.service.sessions import handshake
+from real2sim_server.service.sessions import messages
 from real2sim_server.settings import Settings
 from tests.waiting import LIMIT_S, wait_until
 
@@ -512,7 +512,7 @@ def test_handshakes_that_are_refused_leave_no_error(site, caplog):
 
 @pytest.mark.network
 def test_a_drive_socket_without_a_hello_is_closed_in_time(site, monkeypatch):
-    monkeypatch.setattr(handshake, "HANDSHAKE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(messages, "HANDSHAKE_TIMEOUT_S", 0.1)
     info = create_session(site)
     with connect(
         info["ws_url"], subprotocols=[DRIVE_SUBPROTOCOL], compression=None, proxy=None

@@ -18,8 +18,13 @@ from ..accounts import Account, RevokedError
 from ..http.auth import act_for, bearer_token, unauthorized
 from ..http.problems import REQUEST_ID_KEY, problem_response, service_error
 from ..sessions.connection import Connection
-from ..sessions.handshake import FatalError, close_with_error, receive_hello, with_progress
-from ..sessions.messages import unsupported_protocol
+from ..sessions.messages import (
+    FatalError,
+    close_with_error,
+    receive_hello,
+    unsupported_protocol,
+    with_progress,
+)
 from ..sessions.registry import check_not_closed
 from ..sessions.session import Session
 from ..storage.store import SessionRow

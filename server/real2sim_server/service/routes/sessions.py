@@ -12,7 +12,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier
-from real2sim_proto.episode import ResetSpec
+from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.jobs import DriveRequest, JobInfo
 from real2sim_proto.sessions import (
     SessionClock,
@@ -41,14 +41,16 @@ from ..http.auth import (
 from ..http.clients import ClientName
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
-from ..http.responses import info_response, large_response
+from ..http.responses import choose_among, etag, info_response, large_response
 from ..jobs.jobs import accepted_headers
+from ..rendering.responses import CODEC_OF, choose_media_type
 from ..sessions.describe import session_edited, session_info, session_state, shown_state
+from ..sessions.pipeline import StepPipeline
 from ..sessions.recording import RECORDING, recording_of
 from ..sessions.registry import check_not_closed, created_headers
+from ..sessions.sensors import looking
 from ..sessions.session import Session, opens_session
 from ..sessions.step import MakeReply
-from ..sessions.views import view_response
 from ..storage.store import StoredReply
 from ..worker import Worker, WorkerOf
 
@@ -387,3 +389,41 @@ def _own_url(request: Request) -> str:
 
 def _ws_base(request: Request) -> str:
     return str(request.base_url).rstrip("/").replace("http", "ws", 1)
+
+
+MSGPACK = "application/msgpack"
+
+
+async def view_response(
+    pipeline: StepPipeline, world: World, asked: SessionRender, accept: str | None
+) -> Response:
+    """All frames and clouds as msgpack; a single image also as a file, if ``accept`` likes that
+    best.
+
+    In msgpack each frame has the codec its sensor names.
+
+    Raises:
+        ServiceError: NOT_ACCEPTABLE, or as StepPipeline.view().
+    """
+    sensors: Sequence[SensorSpec] = asked.sensors
+    ranging = await looking(world, asked)
+    single = not ranging and len(sensors) == 1 and len(sensors[0].modalities) == 1
+    if single:
+        media_type = choose_media_type(accept, sensors[0].modalities[0])
+    else:
+        media_type = choose_among([MSGPACK], accept, of="clouds, or more than one image")
+    if media_type != MSGPACK:
+        sensors = [sensors[0].model_copy(update={"codec": CODEC_OF[media_type]})]
+    observation = await pipeline.view(world, sensors, ranging=ranging)
+    timing = ", ".join(f"{stage};dur={ms:.2f}" for stage, ms in observation.timing_ms.items())
+    headers = {
+        "Server-Timing": timing,
+        "Vary": "Accept",
+        "Cache-Control": "no-store",
+        "X-Real2Sim-Revision": etag(world.revision),
+    }
+    if media_type == MSGPACK:
+        content = await pipeline.on_world_thread(observation.message.joined)
+    else:
+        content = bytes(observation.frames[0].data)
+    return Response(content, media_type=media_type, headers=headers)

@@ -27,7 +27,7 @@ from ...world import (
 from ...world.ego.reference import PlannedTrajectory
 from ...world.ego.route import whole_route
 from ..library.views import camera_infos, edited_objects
-from .image_limits import MAX_IMAGE_BYTES
+from .sensors import MAX_IMAGE_BYTES
 from .session import Session
 
 

@@ -46,10 +46,9 @@ from ..rendering.optics import needs_motion
 from ..rendering.renderer import Renderer, RenderRequest
 from ..storage.store import Claim, SessionEntry, Store
 from ..warm_up import DeformationKernels
-from .image_limits import cameras_of, raw_image_bytes
-from .segment import FrameSlot
+from .sensors import WorldClouds, cameras_of, raw_image_bytes
+from .shared_memory import FrameSlot
 from .wire import EncodedMembers, EncodedMessage, PhaseTimer, pack_members, pack_with_frames
-from .world_clouds import WorldClouds
 
 T = TypeVar("T")
 

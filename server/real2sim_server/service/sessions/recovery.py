@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from real2sim_proto import ErrorCode, decode
 from real2sim_proto.plans import PLAN
@@ -14,10 +14,14 @@ from ...world import World
 from ...world.recording.replay import Entry, Replayer, plan_payload
 from ..http.problems import ServiceError
 from ..scenarios.scenarios import Scenarios
-from ..storage.store import SessionRow, Store
-from .log import entries_of
+from ..storage.store import SessionEntry, SessionRow, Store
 from .pipeline import Step, StepPipeline
 from .session import Session
+
+
+def entries_of(rows: Iterable[SessionEntry]) -> list[Entry]:
+    """Entries of a stored log, for the world to live through again."""
+    return [Entry(row.kind, row.step or 0, row.payload) for row in rows]
 
 
 async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> None:

@@ -36,11 +36,10 @@ from ..storage.store import SessionEntry, SessionRow, Store
 from ..storage.tokens import token_hash
 from ..warm_up import KernelWarmUp
 from .describe import session_info
-from .log import entries_of
 from .pipeline import StepPipeline
-from .recovery import check_scene, rebuild, state_at
-from .segment import Segments
+from .recovery import check_scene, entries_of, rebuild, state_at
 from .session import EpisodeStart, Session
+from .shared_memory import Segments
 from .step import Stepper
 
 RETRY_AFTER_S = 5

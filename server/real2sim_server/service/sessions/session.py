@@ -1,11 +1,14 @@
-"""One closed-loop session: what differs from the scene, and who is connected."""
+"""One closed-loop session: its lock step, its clock, what differs from the scene, who looks on."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import math
+from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec
@@ -19,10 +22,200 @@ from ..http.auth import secrets_equal
 from ..http.problems import ServiceError
 from ..storage.store import SessionRow
 from ..storage.tokens import token_hash
-from .clock_hold import ClockHold
-from .lockstep import LockStep, not_reset
-from .observers import ObserverQueue
 from .wire import EncodedMessage
+
+A = TypeVar("A")
+
+
+class LockStep(Generic[A]):
+    """Which action is due, and the answer to the last one.
+
+    Ask :meth:`cached_answer` before the world moves and call :meth:`advance` once it has moved; an
+    action that is refused in between leaves everything as it was. Actions are compared by their
+    canonical bytes.
+
+    Attributes:
+        step: of the newest observation; None before the first reset.
+        over: whether the episode has ended.
+    """
+
+    def __init__(self) -> None:
+        self.step: int | None = None
+        self.over = False
+        self._last: tuple[bytes, A] | None = None
+
+    def reset(self, step: int = 0, *, over: bool = False) -> None:
+        """An episode begins at step 0, or is returned to at another."""
+        self.step, self.over, self._last = step, over, None
+
+    def end(self) -> None:
+        """The episode ends without a step; the last answer can still be had again."""
+        self.over = True
+
+    def restore_answer(self, content: bytes, answer: A) -> None:
+        """Restore the answer to the last step, after a replay."""
+        self._last = (content, answer)
+
+    def cached_answer(self, step: int, content: bytes) -> A | None:
+        """The answer already given to this action; None when it is the one that is due.
+
+        Args:
+            step: of the observation that the action answers.
+            content: canonical bytes of what the action asks for.
+
+        Raises:
+            ServiceError: NOT_RESET; STEP_CONFLICT for another action where one was taken;
+                STALE_STEP for older steps; EPISODE_OVER; BAD_STEP for newer steps.
+        """
+        if self.step is None:
+            raise not_reset()
+        if step == self.step - 1 and self._last is not None:
+            return _repeated(step, content, *self._last)
+        if step < self.step:
+            raise ServiceError(
+                ErrorCode.STALE_STEP,
+                f"an action for step {step}; the session is at step {self.step}",
+                hint="answer the newest observation",
+            )
+        if self.over:
+            raise ServiceError(
+                ErrorCode.EPISODE_OVER,
+                f"the episode ended at step {self.step}",
+                hint="reset the session to start another",
+            )
+        if step > self.step:
+            raise ServiceError(
+                ErrorCode.BAD_STEP,
+                f"an action for step {step}, which nobody has observed yet; the session is at "
+                f"step {self.step}",
+                hint="put the step of the newest observation into the action",
+            )
+        return None
+
+    def is_due(self, step: int) -> bool:
+        """Whether an action for ``step`` is the one that the clock waits for."""
+        return step == self.step and not self.over
+
+    def advance(self, content: bytes, answer: A, *, over: bool) -> None:
+        """The due action was taken; ``answer`` is kept until the next one."""
+        self._move(1, over=over)
+        self._last = (content, answer)
+
+    def skip(self, steps: int, *, over: bool) -> None:
+        """The clock was moved by other means; no answer is kept."""
+        self._move(steps, over=over)
+        self._last = None
+
+    def _move(self, steps: int, *, over: bool) -> None:
+        if self.step is None:
+            raise not_reset()
+        self.step += steps
+        self.over = over
+
+
+def not_reset() -> ServiceError:
+    """NOT_RESET."""
+    return ServiceError(
+        ErrorCode.NOT_RESET,
+        "no episode has begun in this session",
+        hint="send reset first; by REST: POST /v1/sessions/{id}/reset",
+    )
+
+
+def _repeated(step: int, content: bytes, taken: bytes, answer: A) -> A:
+    if content == taken:
+        return answer
+    raise ServiceError(
+        ErrorCode.STEP_CONFLICT,
+        f"step {step} has been answered with another action, which has taken effect",
+        hint=f"repeat that action to get its observation again, or act on step {step + 1}",
+    )
+
+
+class ClockHold:
+    """Lets actions pass, all of them or so many, at once or at a pace; the others wait. Belongs to
+    the event loop."""
+
+    def __init__(self) -> None:
+        self._steps: int | None = None
+        self._pace: float | None = None
+        self._next_s = 0.0
+        self._changed = asyncio.Event()
+
+    @property
+    def held(self) -> bool:
+        """Whether the next action has to wait until somebody lets it go."""
+        return self._steps == 0
+
+    @property
+    def free(self) -> bool:
+        """Whether actions need not ask before they move the clock."""
+        return self._steps is None and self._pace is None
+
+    @property
+    def wait_s(self) -> float:
+        """How long the next action has to wait from now [s]."""
+        if self.held:
+            return math.inf
+        return 0.0 if self._pace is None else max(0.0, self._next_s - clock.monotonic())
+
+    def release(self, *, pace: float | None = None) -> None:
+        """All actions pass; with a pace, so many simulated seconds take a second."""
+        self._steps, self._pace = None, pace
+        self._changed.set()
+
+    def hold(self, *, after: int = 0) -> None:
+        """So many more actions pass; then they wait."""
+        self._steps = after
+        self._changed.set()
+
+    def take_step(self, dt_us: int) -> None:
+        """An action passes, for a step so long."""
+        if self._steps:
+            self._steps -= 1
+        if self._pace is not None:
+            now = clock.monotonic()
+            self._next_s = max(self._next_s, now) + dt_us * 1e-6 / self._pace
+
+    async def wait(self, seconds: float) -> None:
+        """Wait for a change, so long at most."""
+        self._changed.clear()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._changed.wait()
+
+
+KEPT = 4
+"""Observations that wait for a slow observer; older ones are dropped."""
+
+
+class ObserverQueue:
+    """A few observations on their way to one observer. Putting one in never waits.
+
+    Attributes:
+        dropped: observations that the observer was too slow for.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._waiting: deque[EncodedMessage] = deque(maxlen=KEPT)
+        self._filled = asyncio.Event()
+
+    def put(self, message: EncodedMessage) -> None:
+        """Add the newest observation; the oldest makes room."""
+        if len(self._waiting) == KEPT:
+            self.dropped += 1
+        self._waiting.append(message)
+        self._filled.set()
+
+    async def take(self) -> EncodedMessage:
+        """The oldest that waits."""
+        await self._filled.wait()
+        message = self._waiting.popleft()
+        if not self._waiting:
+            self._filled.clear()
+        return message
+
 
 CloseWithError = Callable[[ServiceError], Awaitable[None]]
 """Tells a connection that its session is over, and ends it."""

@@ -34,10 +34,10 @@ from ..storage.errors import FencedError, StoreTroubleError, StoreUnavailableErr
 from ..storage.store import SessionEntry, Store, StoredReply
 from ..warm_up import KernelWarmUp
 from .pipeline import EncodedObservation, LogWrite, Step, StepPipeline
-from .segment import FrameSlot
+from .sensors import mounted_beside
 from .session import NewestPlan, Session
+from .shared_memory import FrameSlot
 from .wire import EncodedMessage
-from .world_clouds import mounted_beside
 
 LogRecord = tuple[str, int, bytes]
 """Kind, step and payload of an entry of a session's log."""

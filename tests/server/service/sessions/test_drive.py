@@ -12,7 +12,7 @@ import pytest
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode
 from real2sim_proto.drive import SERVER_MESSAGE
 from real2sim_server.service.engine import QueueFullError
-from real2sim_server.service.sessions import handshake
+from real2sim_server.service.sessions import messages
 from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.network
@@ -136,7 +136,7 @@ def test_progress_is_told_while_the_scene_warms_up(site, join, monkeypatch):
     async def slowly(_session: object) -> None:
         await asyncio.to_thread(warm.wait, LIMIT_S)
 
-    monkeypatch.setattr(handshake, "PROGRESS_S", 0.05)
+    monkeypatch.setattr(messages, "PROGRESS_S", 0.05)
     monkeypatch.setattr(site.worker.sessions, "warm_up", slowly)
     hello = planner.send("hello", protocols=[DRIVE_SUBPROTOCOL], token=info["token"])
     progress = decode(planner.socket.recv(timeout=LIMIT_S))

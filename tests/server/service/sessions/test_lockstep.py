@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from real2sim_proto import ErrorCode
 from real2sim_server.service.http.problems import ServiceError
-from real2sim_server.service.sessions.lockstep import LockStep
+from real2sim_server.service.sessions.session import LockStep
 
 ACTIONS = st.lists(
     st.tuples(st.integers(min_value=-3, max_value=2), st.sampled_from([b"left", b"right"])),

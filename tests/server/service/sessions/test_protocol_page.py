@@ -13,7 +13,7 @@ from real2sim_proto import HTTP_STATUS, ErrorCode
 from real2sim_proto.drive import EgoState, Event, EventType, Hello, Obs, Resume
 from real2sim_server.service.http.websocket import CLOSED_NO_UTF8
 from real2sim_server.service.sessions.connection import NORMAL_CLOSURE
-from real2sim_server.service.sessions.handshake import POLICY_VIOLATION
+from real2sim_server.service.sessions.messages import POLICY_VIOLATION
 from real2sim_server.world.scoring import METRICS
 
 pytestmark = pytest.mark.network

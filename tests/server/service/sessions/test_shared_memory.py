@@ -18,9 +18,9 @@ from real2sim_proto.episode import SensorSpec
 from real2sim_proto.shared_memory import FOLDER, HEADER_BYTES, MAGIC, SECRET_BYTES
 from real2sim_server.service.library.memory import MemoryBudget
 from real2sim_server.service.rendering.frames import EncodedFrame, RenderedImage, encode_frame
-from real2sim_server.service.sessions import segment as module
-from real2sim_server.service.sessions.image_limits import MAX_IMAGE_BYTES
-from real2sim_server.service.sessions.segment import SLOTS, Segment, Segments, sweep_segments
+from real2sim_server.service.sessions import shared_memory as module
+from real2sim_server.service.sessions.sensors import MAX_IMAGE_BYTES
+from real2sim_server.service.sessions.shared_memory import SLOTS, Segment, Segments, sweep_segments
 from real2sim_server.service.sessions.wire import PhaseTimer, pack_members, pack_with_frames
 from real2sim_server.settings import Settings
 from tests.waiting import wait_until
