@@ -19,11 +19,9 @@ from real2sim_proto.jobs import JobInfo
 from ..settings import Settings
 from .accounts import ACCOUNT
 from .clock import now_us
-from .http.auth import READING, account_of, require_token
-from .http.hosts import LoopbackOnly
+from .http.auth import READING, LoopbackOnly, OwnPagesOnly, account_of, require_token
 from .http.idempotency import install_replay_handler
 from .http.openapi import published
-from .http.origins import OwnPagesOnly
 from .http.problems import install_problem_handlers
 from .http.requests import BodyLimit, RequestContext
 from .jobs.jobs import Work

@@ -8,22 +8,142 @@ memory.
 from __future__ import annotations
 
 import hmac
+import ipaddress
 import re
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any
+from urllib.parse import urlsplit
 
 from fastapi import Depends, Request, Response
 from fastapi.routing import APIRoute
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.datastructures import Headers
 from starlette.requests import HTTPConnection
-from starlette.types import Scope
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from real2sim_proto import ErrorCode
 
 from ..accounts import ACCOUNT, Account
 from ..token_file import ROLES, Role
-from .hosts import is_loopback
 from .problems import ServiceError
+
+FOREIGN_PAGE = 4403
+"""Code with which sockets of other sites' pages are closed."""
+PAGES = ("/", "/ui", "/ui/", "/docs")
+"""What a link on another site may lead to."""
+OWN = ("same-origin", "none")
+"""Requests of our own pages, and of persons who type an address."""
+
+
+class OwnPagesOnly:
+    """ASGI middleware that refuses requests and sockets of other sites' pages."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] in ("http", "websocket"):
+            headers = Headers(scope=scope)
+            refusal = _refusal(scope, headers)
+            if refusal is not None:
+                if scope["type"] == "http":
+                    raise ServiceError(ErrorCode.FOREIGN_PAGE, refusal, hint=_HINT)
+                await receive()
+                closing = {"type": "websocket.close", "code": FOREIGN_PAGE}
+                await send(closing | {"reason": "pages of other sites may not call"})
+                return
+        await self._app(scope, receive, send)
+
+
+def same_origin(origin: str, host: str | None) -> bool:
+    """Whether a page of this worker asks; its scheme may be that of a proxy."""
+    try:
+        return host is not None and urlsplit(origin).netloc.lower() == host.lower()
+    except ValueError:
+        return False
+
+
+_HINT = (
+    "call from a program, or from a page that the worker itself serves; a proxy has to pass on the "
+    "Host that the browser sent"
+)
+
+
+def _refusal(scope: Scope, headers: Headers) -> str | None:
+    """Why a request is refused; None where it is not."""
+    origin, host = headers.get("origin"), headers.get("host")
+    if origin is not None and not same_origin(origin, host):
+        return f"a page of {origin[:200]!r} called a worker at {(host or '')[:200]!r}"
+    site = headers.get("sec-fetch-site")
+    if site is None or site in OWN or _is_link(scope, headers):
+        return None
+    return f"a page of another site called (Sec-Fetch-Site: {site[:40]})"
+
+
+def _is_link(scope: Scope, headers: Headers) -> bool:
+    """Whether a person follows a link to one of our pages, in a window of its own."""
+    return (
+        scope["type"] == "http"
+        and scope["method"] in ("GET", "HEAD")
+        and scope["path"] in PAGES
+        and headers.get("sec-fetch-mode") == "navigate"
+        and headers.get("sec-fetch-dest") == "document"
+    )
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach ``host``."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class LoopbackOnly:
+    """ASGI middleware that refuses requests which name another host.
+
+    Any site may point a name of its own at 127.0.0.1 (DNS rebinding); ``Host`` tells.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] == "http":
+            _check(Headers(scope=scope))
+        elif scope["type"] == "websocket" and not _is_from_here(Headers(scope=scope)):
+            await receive()
+            await send({"type": "websocket.close", "code": FOREIGN_PAGE, "reason": "foreign host"})
+            return
+        await self._app(scope, receive, send)
+
+
+def _check(headers: Headers) -> None:
+    if _is_from_here(headers):
+        return
+    raise ServiceError(
+        ErrorCode.UNAUTHORIZED,
+        f"Host {headers.get('host')!r}: a worker without a token answers requests to localhost or "
+        "a loopback address",
+        hint="set REAL2SIM_TOKEN on the worker to let others in",
+    )
+
+
+def _is_from_here(headers: Headers) -> bool:
+    return _names_loopback(f"//{headers.get('host', 'localhost')}")
+
+
+def _names_loopback(address: str) -> bool:
+    try:
+        host = urlsplit(address).hostname
+    except ValueError:
+        return False
+    return host is not None and is_loopback(host)
+
 
 WORKER_SCHEME, SESSION_SCHEME = "WorkerToken", "SessionToken"
 """Names of the security schemes in the OpenAPI document."""

@@ -20,7 +20,7 @@ import structlog
 from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, ErrorCode
 
 from .problems import ServiceError, problem_of
-from .security import SECURITY_HEADERS
+from .responses import SECURITY_HEADERS
 
 if TYPE_CHECKING:
     from .metrics import Metrics

@@ -1,20 +1,156 @@
-"""The OpenAPI document: what FastAPI makes of the routes, with examples and true error types.
-
-``python -m real2sim_server.service.write_openapi FILE`` writes it; the committed copy is
-``docs/openapi.json``, and a test holds it against the routes.
-"""
+"""The OpenAPI document, the errors that each call may answer with, and the page of calls."""
 
 from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from html import escape
+from itertools import groupby
 from typing import Any
 
 from fastapi import FastAPI
 
+from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, ErrorCode
+from real2sim_proto.errors import title_of
+
 from .auth import SESSION_SCHEME, WORKER_SCHEME
-from .documented_errors import document_errors
+
+C = ErrorCode
+
+OF_EVERY_CALL = (
+    C.BAD_MESSAGE,
+    C.UNAUTHORIZED,
+    C.FOREIGN_PAGE,
+    C.FORBIDDEN,
+    C.REQUEST_TIMEOUT,
+    C.PAYLOAD_TOO_LARGE,
+    C.TOO_MANY_REQUESTS,
+    C.INTERNAL,
+    C.QUEUE_FULL,
+    C.DRAINING,
+    C.TOO_MANY_CONNECTIONS,
+    C.STORAGE_UNAVAILABLE,
+    C.STORAGE_FULL,
+)
+_OF_SCENES = (C.UNKNOWN_SCENE, C.SCENE_BROKEN, C.OUT_OF_MEMORY)
+OF_PARAMETER: dict[str, tuple[ErrorCode, ...]] = {
+    "scene": _OF_SCENES,
+    "scenario_id": (C.UNKNOWN_SCENARIO, *_OF_SCENES),
+    "session_id": (
+        C.UNKNOWN_SESSION,
+        C.SESSION_CLOSED,
+        *_OF_SCENES,
+        C.OVER_CAPACITY,
+        C.TOO_MANY_SESSIONS,
+    ),
+    "job_id": (C.UNKNOWN_JOB,),
+    "asset_id": (C.UNKNOWN_ASSET,),
+    "accept": (C.NOT_ACCEPTABLE,),
+    "If-Match": (C.STALE_REVISION,),
+    "Idempotency-Key": (C.IDEMPOTENCY_CONFLICT,),
+    "camera": (C.UNKNOWN_CAMERA,),
+    "t_us": (C.TIME_OUT_OF_RANGE,),
+}
+"""By the names of path, query and header parameters."""
+
+_OF_EDITS = (C.INVALID_OPERATION, C.UNKNOWN_OBJECT, C.UNKNOWN_ASSET, C.ALREADY_EXISTS)
+_OF_EPISODES = (C.NOT_RESET, C.EPISODE_OVER, C.CONTROLLER_TAKEN, C.INVALID_ACTION)
+OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
+    "assets-add": (
+        C.QUOTA_EXCEEDED,
+        C.UNKNOWN_OBJECT,
+        C.ALREADY_EXISTS,
+        C.IMPORT_FAILED,
+        *_OF_SCENES,
+    ),
+    "assets-delete": (C.ASSET_IN_USE,),
+    "exports-create": (
+        *_OF_SCENES,
+        C.UNKNOWN_SCENARIO,
+        C.UNKNOWN_JOB,
+        C.UNKNOWN_SESSION,
+        C.SESSION_CLOSED,
+        C.NOT_RESET,
+        C.JOB_NOT_DONE,
+        C.UNSUPPORTED,
+        C.TOO_MANY_JOBS,
+        C.QUOTA_EXCEEDED,
+    ),
+    "health-metrics": (C.NOT_FOUND,),
+    "jobs-file": (C.JOB_NOT_DONE, C.NOT_FOUND),
+    "jobs-preview": (C.JOB_NOT_DONE, C.JOB_FAILED, *_OF_SCENES),
+    "scenarios-create": _OF_SCENES,
+    "scenarios-edit": _OF_EDITS,
+    "scenarios-import_": (*_OF_SCENES, *_OF_EDITS),
+    "scenarios-points": (*_OF_SCENES, C.TIME_OUT_OF_RANGE),
+    "scenarios-redo": (C.NOTHING_TO_REDO,),
+    "scenarios-simulate": (C.TOO_MANY_JOBS, C.QUOTA_EXCEEDED, C.UNSUPPORTED, C.UNKNOWN_OBJECT),
+    "scenarios-undo": (C.NOTHING_TO_UNDO,),
+    "scenes-import_": (
+        C.QUOTA_EXCEEDED,
+        C.IMPORT_FAILED,
+        C.ALREADY_EXISTS,
+        C.NOT_FOUND,
+        C.OUT_OF_MEMORY,
+    ),
+    "scenes-load": (C.JOB_FAILED,),
+    "scenes-sky": (C.NOT_FOUND,),
+    "scenes-splats": (C.NOT_FOUND, C.UNKNOWN_OBJECT),
+    "scenes-unload": (C.SCENE_IN_USE,),
+    "sessions-create": (
+        *_OF_SCENES,
+        C.UNKNOWN_SCENARIO,
+        C.UNKNOWN_CAMERA,
+        C.OVER_CAPACITY,
+        C.TOO_MANY_SESSIONS,
+    ),
+    "sessions-edit": (*_OF_EDITS, C.NOT_RESET, C.STALE_REVISION),
+    "sessions-fork": _OF_EPISODES,
+    "sessions-recording": _OF_EPISODES,
+    "sessions-render": (*_OF_EPISODES, C.UNKNOWN_CAMERA, C.NOT_ACCEPTABLE),
+    "sessions-reset": (*_OF_EPISODES, C.UNKNOWN_CAMERA),
+    "sessions-state": _OF_EPISODES,
+    "sessions-step": _OF_EPISODES,
+    "storyboards-apply_corner_case": _OF_EDITS,
+    "storyboards-import_xosc": _OF_EDITS,
+    "storyboards-picture": (C.NOT_FOUND,),
+    "storyboards-remove": _OF_EDITS,
+    "storyboards-replace": _OF_EDITS,
+    "sweeps-create": (*_OF_SCENES, C.TOO_MANY_JOBS, C.QUOTA_EXCEEDED),
+}
+"""What does not follow from parameters, by operation id."""
+
+
+def document_errors(operation: dict[str, Any]) -> None:
+    """Give an operation one answer for each status of its errors, and none for others."""
+    responses = operation["responses"]
+    for undocumented in ("422", "default"):
+        responses.pop(undocumented, None)
+    by_status: dict[str, list[ErrorCode]] = {}
+    for code in dict.fromkeys(_codes(operation)):
+        by_status.setdefault(str(HTTP_STATUS[code]), []).append(code)
+    for status, codes in by_status.items():
+        if status in responses:  # the operation says more about it
+            responses[status].setdefault("content", {})[PROBLEM_MEDIA_TYPE] = _content()
+            continue
+        told = "; ".join(f"`{code.value}`: {title_of(code).lower()}" for code in codes)
+        responses[status] = {"description": told, "content": {PROBLEM_MEDIA_TYPE: _content()}}
+
+
+def _codes(operation: dict[str, Any]) -> Iterable[ErrorCode]:
+    yield from OF_EVERY_CALL
+    parameters = operation.get("parameters", ())
+    if parameters or "requestBody" in operation:
+        yield C.INVALID_REQUEST
+    for parameter in parameters:
+        yield from OF_PARAMETER.get(parameter["name"], ())
+    yield from OF_OPERATION.get(operation["operationId"], ())
+
+
+def _content() -> dict[str, Any]:
+    return {"schema": {"$ref": "#/components/schemas/Problem"}}
+
 
 METHODS = ("get", "put", "post", "delete", "patch")
 
@@ -223,3 +359,103 @@ def _schema_name(schema: dict[str, Any]) -> str:
 def text_of(made: dict[str, Any]) -> str:
     """The committed form of a document."""
     return json.dumps(made, indent=1, sort_keys=True) + "\n"
+
+
+STYLE = "/ui/docs.css"
+POLICY = (
+    "default-src 'none'; style-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+"""Content security policy of the page."""
+
+
+def reference_page(made: dict[str, Any]) -> str:
+    """The page of a document."""
+    info = made["info"]
+    found = sorted(operations(made), key=lambda found: _tag(found[2]))
+    tags = [(tag, list(group)) for tag, group in groupby(found, key=lambda found: _tag(found[2]))]
+    return "\n".join(
+        (
+            "<!doctype html>",
+            '<html lang="en"><head><meta charset="utf-8">',
+            f"<title>{escape(info['title'])}</title>",
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f'<link rel="stylesheet" href="{STYLE}"></head><body>',
+            f"<h1>{escape(info['title'])} <small>{escape(info['version'])}</small></h1>",
+            '<p>The same for programs: <a href="/openapi.json">openapi.json</a>. In the examples '
+            "<code>$WORKER</code> is the address of this worker, <code>$REAL2SIM_TOKEN</code> its "
+            "token, if it has one, and <code>$SESSION_TOKEN</code> the <code>token</code> in the "
+            "answer that made the session.</p>",
+            "<nav>",
+            *(f'<a href="#{escape(tag)}">{escape(tag)}</a>' for tag, _ in tags),
+            "</nav>",
+            *(line for tag, group in tags for line in _section(tag, group)),
+            "<h2>Schemas</h2>",
+            *_schemas(made["components"]["schemas"]),
+            "</body></html>",
+        )
+    )
+
+
+def _section(tag: str, group: list[tuple[str, str, dict[str, Any]]]) -> Iterator[str]:
+    yield f'<h2 id="{escape(tag)}">{escape(tag)}</h2>'
+    for path, method, operation in group:
+        yield f'<details id="{escape(operation["operationId"])}"><summary>'
+        yield f"<b>{method.upper()}</b> <code>{escape(path)}</code> "
+        yield f"{escape(operation.get('summary', ''))}</summary>"
+        yield f"<p>{escape(operation.get('description', ''))}</p>"
+        yield from _parameters(operation.get("parameters", ()))
+        yield from _contents("Body", operation.get("requestBody", {}).get("content", {}))
+        yield "<table><tr><th>status</th><th>answer</th></tr>"
+        for status, response in sorted(operation["responses"].items()):
+            kinds = ", ".join(response.get("content", ()))
+            described = escape(f"{response.get('description', '')}")
+            yield f"<tr><td>{status}</td><td>{described} <i>{escape(kinds)}</i></td></tr>"
+        yield f"</table><pre>{escape(operation['x-codeSamples'][0]['source'])}</pre></details>"
+
+
+def _parameters(parameters: Any) -> Iterator[str]:
+    if not parameters:
+        return
+    yield "<table><tr><th>parameter</th><th>in</th><th>meaning</th></tr>"
+    for parameter in parameters:
+        name = escape(parameter["name"]) + (" *" if parameter.get("required") else "")
+        meaning = escape(parameter.get("description", ""))
+        schema = escape(_kind(parameter.get("schema", {})))
+        yield f"<tr><td><code>{name}</code></td><td>{escape(parameter['in'])}</td>"
+        yield f"<td>{meaning} <i>{schema}</i></td></tr>"
+    yield "</table>"
+
+
+def _contents(title: str, contents: dict[str, Any]) -> Iterator[str]:
+    for kind, content in contents.items():
+        yield f"<p>{title}: <code>{escape(kind)}</code> {_linked(content.get('schema', {}))}</p>"
+        if "example" in content:
+            yield f"<pre>{escape(json.dumps(content['example'], indent=1))}</pre>"
+
+
+def _schemas(schemas: dict[str, Any]) -> Iterator[str]:
+    for name, schema in sorted(schemas.items()):
+        yield f'<details id="schema-{escape(name)}"><summary><code>{escape(name)}</code></summary>'
+        yield f"<p>{escape(schema.get('description', ''))}</p>"
+        yield f"<pre>{escape(json.dumps(schema, indent=1))}</pre></details>"
+
+
+def _linked(schema: dict[str, Any]) -> str:
+    name = _reference(schema)
+    return f'<a href="#schema-{escape(name)}">{escape(name)}</a>' if name else ""
+
+
+def _kind(schema: dict[str, Any]) -> str:
+    choices = schema.get("anyOf", [schema])
+    kinds = [str(c.get("type") or _reference(c) or "") for c in choices]
+    return " or ".join(kind for kind in kinds if kind and kind != "null")
+
+
+def _reference(schema: dict[str, Any]) -> str:
+    choices = [schema, *schema.get("anyOf", ())]
+    return next((c["$ref"].rsplit("/", 1)[1] for c in choices if "$ref" in c), "")
+
+
+def _tag(operation: dict[str, Any]) -> str:
+    return str(operation.get("tags", ["worker"])[0])

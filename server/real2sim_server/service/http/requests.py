@@ -6,9 +6,10 @@ import re
 import time
 import uuid
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import structlog
+from fastapi import Header
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -16,12 +17,26 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from real2sim_proto import ErrorCode
 
 from .auth import account_of
-from .clients import CLIENT_HEADER
 from .problems import REQUEST_ID_KEY, ServiceError, problem_response, service_error
-from .security import secure
+from .responses import secure
 
 if TYPE_CHECKING:
     from .metrics import Metrics
+
+
+CLIENT_HEADER = "X-Real2Sim-Client"
+
+ClientName = Annotated[
+    str,
+    Header(
+        alias=CLIENT_HEADER,
+        max_length=80,
+        pattern=r"^[ -~]*$",
+        description="who is calling; goes into the history of what is changed",
+        examples=["alice"],
+    ),
+]
+
 
 REQUEST_ID_HEADER = "X-Request-Id"
 _REQUEST_ID = re.compile(r"[A-Za-z0-9_.\-]{1,80}")

@@ -1,16 +1,33 @@
-"""Answers: models as JSON, and the media type that a client accepts."""
+"""Answers: models as JSON, the media type a client accepts, event streams, headers of all."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
 from fastapi import Response
 from pydantic import BaseModel
+from starlette.datastructures import MutableHeaders
 
 from real2sim_proto import ErrorCode
 
 from .problems import ServiceError
+
+NOTHING = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+"""Content security policy of answers that are no pages."""
+
+SECURITY_HEADERS = {
+    "Content-Security-Policy": NOTHING,
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+def secure(headers: MutableHeaders) -> None:
+    """Add what is missing; a page brings a policy of its own."""
+    for name, value in SECURITY_HEADERS.items():
+        headers.setdefault(name, value)
 
 
 def choose_among(offered: Sequence[str], accept: str | None, *, of: str) -> str:
@@ -98,3 +115,29 @@ def _q(parameters: list[str]) -> float:
             except ValueError:
                 return 0.0
     return 1.0
+
+
+HEARTBEAT_S = 10.0
+"""Comments this far apart keep proxies from closing a stream on which nothing happens."""
+
+
+async def event_stream(events: AsyncIterator[tuple[int, str, str]]) -> AsyncIterator[bytes]:
+    """The bytes of (id, name, data without line breaks), with heartbeats in between."""
+    source = aiter(events)
+    pending: asyncio.Future[tuple[int, str, str]] | None = None
+    try:
+        while True:
+            pending = pending or asyncio.ensure_future(anext(source))
+            done, _ = await asyncio.wait({pending}, timeout=HEARTBEAT_S)
+            if not done:
+                yield b": still here\n\n"
+                continue
+            try:
+                number, name, data = pending.result()
+            except StopAsyncIteration:
+                return
+            pending = None
+            yield f"id: {number}\nevent: {name}\ndata: {data}\n\n".encode()
+    finally:
+        if pending is not None:
+            pending.cancel()

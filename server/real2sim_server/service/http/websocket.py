@@ -15,8 +15,8 @@ from websockets.protocol import State
 
 from real2sim_proto import ErrorCode
 
+from .auth import is_loopback
 from .connections import Backlog, Connections, DropReason
-from .hosts import is_loopback
 from .problems import ServiceError
 
 MAX_REASON_BYTES = 123

@@ -5,8 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
-from ..http.openapi import published
-from ..http.reference import POLICY, reference_page
+from ..http.openapi import POLICY, published, reference_page
 
 router = APIRouter(include_in_schema=False)
 

@@ -22,8 +22,8 @@ from ...edit import ScenarioState, instances_at
 from ...scene import Scene
 from ...world.recording.recording import Recording, RecordingError, recording_of_bytes
 from ..http.auth import TokenRoute, bearer_token, unauthorized
-from ..http.clients import ClientName
 from ..http.idempotency import IdempotencyKey
+from ..http.requests import ClientName
 from ..http.responses import info_response
 from ..jobs.datasets import DatasetSource, EngineBackend, check_dataset, make_dataset, plan_of
 from ..jobs.exports import VideoSource, check_camera, export_video, frame_times

@@ -14,8 +14,7 @@ from real2sim_proto.jobs import JobInfo, JobList
 
 from ..http.auth import TokenRoute
 from ..http.disconnects import cancel_on_disconnect
-from ..http.events import event_stream
-from ..http.responses import info_response
+from ..http.responses import event_stream, info_response
 from ..jobs.jobs import Jobs
 from ..rendering.renderer import RenderRequest
 from ..rendering.responses import FRAME_RESPONSES, frame_response

@@ -27,10 +27,10 @@ from real2sim_proto.scenarios import (
 
 from ...edit.points import Part, ply_of_points, points_at
 from ..http.auth import TokenRoute
-from ..http.clients import ClientName
 from ..http.disconnects import cancel_on_disconnect
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
+from ..http.requests import ClientName
 from ..http.responses import etag, info_response, large_response
 from ..jobs.jobs import accepted_headers
 from ..rendering.responses import FRAME_RESPONSES, frame_response

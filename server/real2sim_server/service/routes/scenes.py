@@ -18,9 +18,9 @@ from real2sim_proto.views import SceneView
 from ...edit import ScenarioState
 from ...scene.io.lane_document import lane_document
 from ..http.auth import TokenRoute
-from ..http.clients import ClientName
 from ..http.disconnects import cancel_on_disconnect
 from ..http.problems import ServiceError
+from ..http.requests import ClientName
 from ..http.responses import info_response, large_response
 from ..jobs.jobs import JobContext, JobResult, NewJob, accepted_headers
 from ..library.views import scene_info

@@ -38,9 +38,9 @@ from ..http.auth import (
     require_token,
     unauthorized,
 )
-from ..http.clients import ClientName
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
 from ..http.problems import ServiceError
+from ..http.requests import ClientName
 from ..http.responses import choose_among, etag, info_response, large_response
 from ..jobs.jobs import accepted_headers
 from ..rendering.responses import CODEC_OF, choose_media_type

@@ -8,8 +8,8 @@ from real2sim_proto.jobs import JobInfo
 from real2sim_proto.sweeps import SweepRequest
 
 from ..http.auth import TokenRoute
-from ..http.clients import ClientName
 from ..http.idempotency import IdempotencyKey
+from ..http.requests import ClientName
 from ..http.responses import info_response
 from ..jobs.jobs import accepted_headers
 from ..worker import WorkerOf

@@ -19,8 +19,13 @@ from real2sim_proto.scenarios import (
 )
 from real2sim_proto.storyboard import Storyboard
 from real2sim_server.service.app import create_app
-from real2sim_server.service.http.documented_errors import OF_OPERATION
-from real2sim_server.service.http.openapi import BODIES, operations, published, text_of
+from real2sim_server.service.http.openapi import (
+    BODIES,
+    OF_OPERATION,
+    operations,
+    published,
+    text_of,
+)
 from real2sim_server.service.serve import running_worker
 from tests.waiting import LIMIT_S
 
