@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..world import World
-from ..world.scoring.contact_side import STOPPED
+from ..world.scoring.hazard import STOPPED
 from ..world.storyboard.entities import object_ids_of
 from .gap_kernels import least_margin
 from .gaps import signed_gaps

@@ -26,7 +26,7 @@ from .per_object import per_object
 from .scoring import EgoSample, ObjectSamples, ScoringContext
 from .scoring.comfort import comfort_window
 from .scoring.instant import VEHICLES
-from .scoring.road_map import RoadMap
+from .scoring.road import RoadMap
 from .seam import Seam
 
 

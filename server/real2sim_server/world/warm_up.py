@@ -24,7 +24,7 @@ from .driving import KINDS, PLANNING_AHEAD, advance_vehicle, prepare_schedule
 from .ego.motion import Motion
 from .ego.reference import PlannedTrajectory, ReferenceTrajectory
 from .ego.trackers import make_tracker
-from .scoring.comfort_kernels import windowed_sum
+from .scoring.comfort import windowed_sum
 from .scoring.update import NONE_AGAINST
 from .world import World
 

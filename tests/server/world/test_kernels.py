@@ -22,7 +22,7 @@ from real2sim_server.world import broad_phase_kernels, path_kernels, warm_up
 from real2sim_server.world.collision import sweep_kernels
 from real2sim_server.world.driving import entries
 from real2sim_server.world.ego.reference import PlannedTrajectory
-from real2sim_server.world.scoring import comfort_kernels, hazard_kernels, road_kernels
+from real2sim_server.world.scoring import comfort, hazard, road
 from real2sim_server.world.scoring.comfort import ComfortAccumulator, plans_agree
 from real2sim_server.world.warm_up import warm_up_planning
 
@@ -215,7 +215,7 @@ def test_off_road_is_the_distance_to_all_lines_less_their_half_widths(seed, lane
     rng = np.random.default_rng(seed)
     route, others = some_lines(rng, 1), some_lines(rng, lanes)
     x, y, yaw = (rng.normal(scale=far, size=3)).tolist()
-    found, quarters = road_kernels.off_road((x, y, yaw), SIZE, route, others, (3.5, 1.75))
+    found, quarters = road.off_road((x, y, yaw), SIZE, route, others, (3.5, 1.75))
 
     signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
@@ -265,7 +265,7 @@ def test_the_first_meeting_is_that_of_boxes_moved_step_by_step(seed, everywhere)
     ego = (0.3, -0.2, float(rng.uniform(-4, 4)), 6.0, 0.2, -0.8)
 
     nobody = np.zeros(len(sizes), np.bool_)
-    found = hazard_kernels.first_overlap_step(ego, SIZE, 1.35, everywhere, others, nobody)
+    found = hazard.first_overlap_step(ego, SIZE, 1.35, everywhere, others, nobody)
     assert found == first_meeting_by_sampling(ego, everywhere, others)
 
 
@@ -274,7 +274,7 @@ def test_objects_that_are_ignored_are_not_met():
     ego = (0.0, 0.0, 0.0, 5.0, 0.0, -0.5)
 
     found = [
-        hazard_kernels.first_overlap_step(ego, SIZE, 1.35, False, others, np.array([ignored]))
+        hazard.first_overlap_step(ego, SIZE, 1.35, False, others, np.array([ignored]))
         for ignored in (False, True)
     ]
     assert found == [7, -1]
@@ -287,7 +287,7 @@ def test_objects_that_are_ignored_are_not_met():
 @given(seed=seeds, count=st.integers(0, 12), window=st.integers(1, 9))
 def test_windows_keep_the_last_values(seed, count, window):
     values = np.random.default_rng(seed).normal(size=(count, 2))
-    kept, total = comfort_kernels.windowed_sum(values[:, 0].copy(), 3.0, window)
+    kept, total = comfort.windowed_sum(values[:, 0].copy(), 3.0, window)
     np.testing.assert_array_equal(kept, np.append(values[:, 0], 3.0)[-window:])
     assert total == pytest.approx(kept.sum())
 
@@ -297,7 +297,7 @@ def test_derivatives_are_weighted_sums():
     weights, samples = rng.normal(size=(3, 15)), rng.normal(size=(15, 2))
     (speed, _), (acceleration, rate), (jerk, yaw_acceleration) = weights @ samples
 
-    found = comfort_kernels.derivatives(weights, samples)
+    found = comfort.derivatives(weights, samples)
     np.testing.assert_allclose(found, [speed, acceleration, jerk, rate, yaw_acceleration])
 
 
@@ -326,7 +326,7 @@ def test_comfort_looked_at_once_is_that_of_both(history):
 def test_yaws_become_continuous_as_by_unwrapping(yaws):
     poses = np.zeros((len(yaws), 3))
     poses[:, 2] = yaws
-    comfort_kernels.make_continuous(poses)
+    comfort.make_continuous(poses)
 
     np.testing.assert_allclose(poses[:, 2], np.unwrap(yaws), atol=1e-9)
 
@@ -394,9 +394,9 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         track_kernels,
         path_kernels,
         broad_phase_kernels,
-        road_kernels,
-        hazard_kernels,
-        comfort_kernels,
+        road,
+        hazard,
+        comfort,
         sweep_kernels,
     )
     kernels = [v for m in modules for v in vars(m).values() if isinstance(v, Dispatcher)]

@@ -11,7 +11,7 @@ from real2sim_server.scene import Lane, LaneGraph, Signal
 from real2sim_server.world.scoring import (
     ScoringContext,
 )
-from real2sim_server.world.scoring.road_map import RoadMap
+from real2sim_server.world.scoring.road import RoadMap
 
 from .scored_drives import context, drive, scores
 

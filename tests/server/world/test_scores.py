@@ -18,7 +18,7 @@ from real2sim_server.world.scoring import (
     ScoringContext,
 )
 from real2sim_server.world.scoring.comfort import comfort_sample, comfort_window
-from real2sim_server.world.scoring.contact_side import side_of_contact
+from real2sim_server.world.scoring.hazard import side_of_contact
 
 from .scored_drives import DT, NOBODY, car, context, drive, ego, scores
 

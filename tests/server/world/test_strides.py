@@ -13,7 +13,7 @@ from real2sim_server.scenarios.fit import fitted_to_scene
 from real2sim_server.scenarios.flat_scene import flat_scene
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.world import World
-from real2sim_server.world.sensing.met import met_things
+from real2sim_server.world.sensing import met_things
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.world.scoring.window import RowWindow, Window
+from real2sim_server.world.scoring.comfort import RowWindow, Window
 
 
 def test_the_last_entries_are_kept() -> None:

@@ -29,7 +29,7 @@ from ..ego.reference import SinglePose
 from ..ego.route import WAYPOINT_SPACING, WAYPOINTS
 from ..ego.suspension import LEVEL, BodyAttitude, sprung_side_by_side, tilted
 from ..path import Float
-from ..scoring.fault import ego_at_fault
+from ..scoring.hazard import ego_at_fault
 from ..traffic.idm import Idm
 from ..world import World
 from .step_kernels import (

@@ -20,7 +20,7 @@ from ..driving.curve import NO_POSE
 from ..driving.entries import advance_vehicle, plan_curve, world_poses
 from ..ego.box import REAR_OVERHANG
 from ..path_kernels import nearest_point, waypoints
-from ..scoring.road_kernels import off_road
+from ..scoring.road import off_road
 from .traffic_kernels import advance_objects, bodies_of, remainder
 
 STATE = len(PlanarState._fields)

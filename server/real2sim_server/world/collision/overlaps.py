@@ -21,7 +21,7 @@ from ..broad_phase_kernels import within_reach
 from ..ego.box import REAR_OVERHANG, ego_box
 from ..ego.motion import Motion
 from ..path import Float
-from ..scoring.contact_side import side_of_contact
+from ..scoring.hazard import side_of_contact
 from ..scoring.instant import ContactRecord
 from .bodies import ego_body, ego_properties
 from .obstacles import ObstacleGrid

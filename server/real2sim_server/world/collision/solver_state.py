@@ -13,7 +13,7 @@ from ..agents import Agents
 from ..driving import Command
 from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
-from ..scoring.contact_side import side_of_contact
+from ..scoring.hazard import side_of_contact
 from ..scoring.instant import Side
 from .bodies import ImpactedObject
 from .impact import MUTUAL_STIFFNESS, ImpactParticipant

@@ -22,7 +22,7 @@ from ..agents import Agents, rows_in
 from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
 from ..path import Float
-from ..scoring.contact_side import side_of_contact
+from ..scoring.hazard import side_of_contact
 from ..scoring.instant import ContactRecord
 from .manifold import contact_manifold, corners
 from .obstacles import ObstacleGrid

@@ -3,11 +3,11 @@
 :mod:`.metric` is the family, :mod:`.metrics` its members.
 """
 
-from .accumulator import MetricAccumulator
 from .instant import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
 from .metric import (
     METRICS,
     Metric,
+    MetricAccumulator,
     MetricValue,
     Score,
     metric,

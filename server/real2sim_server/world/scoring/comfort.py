@@ -1,19 +1,246 @@
-"""Comfort of what was driven, and of how plans follow one another."""
+"""How a drive feels, how its plans follow one another, and whether a car could have moved so."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from ..._numba import kernel
 from ..._records import made_quickly
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
-from .comfort_kernels import derivatives, plans_alike
-from .window import RowWindow
+from .instant import EgoSample, Instant, ScoringContext
+
+T = TypeVar("T")
+
+ROOM = 8
+"""Rows that a window of rows has room for at least."""
+
+
+class Window(Generic[T]):
+    """The last entries of a growing sequence, newest last.
+
+    A window never changes for who holds it: :meth:`pushed` gives a new one. The two share their
+    entries, as long as it is the first that goes on from this one; a second one, of a world that
+    was forked here, begins with a copy.
+    """
+
+    __slots__ = ("_end", "_entries", "_length", "_unclaimed")
+
+    def __init__(self, *entries: T) -> None:
+        self._own(list(entries), len(entries))
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __iter__(self) -> Iterator[T]:
+        return iter(self._entries[self._end - self._length : self._end])
+
+    def newest(self, back: int = 0) -> T:
+        """The newest entry, or the one ``back`` entries before; ``back`` < the length."""
+        return self._entries[self._end - 1 - back]
+
+    def pushed(self, entry: T, most: int) -> Window[T]:
+        """With one more entry, the last ``most`` of them."""
+        kept = min(self._length, most - 1)
+        entries = self._entries
+        try:
+            # Atomic, so that worlds that go on from here on two threads do not share.
+            self._unclaimed.pop()
+            shared = len(entries) < 2 * most
+        except IndexError:
+            shared = False
+        if not shared:
+            entries = entries[self._end - kept : self._end]
+        entries.append(entry)
+        found: Window[T] = Window.__new__(Window)
+        found._own(entries, kept + 1)
+        return found
+
+    def mapped(self, change: Callable[[T], T]) -> Window[T]:
+        """With every entry changed."""
+        return Window(*(change(entry) for entry in self))
+
+    def _own(self, entries: list[T], length: int) -> None:
+        self._entries, self._length = entries, length
+        self._end = len(entries)
+        self._unclaimed = [True]
+
+
+class RowWindow:
+    """The same of rows of numbers, which kernels take as one array.
+
+    Attributes:
+        rows: [n, C] float64, newest last; nobody writes into it.
+    """
+
+    __slots__ = ("_buffer", "_end", "_unclaimed", "rows")
+
+    def __init__(self, rows: Float) -> None:
+        self._own(rows, 0, len(rows))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def pushed(self, row: Sequence[float], most: int) -> RowWindow:
+        """With one more row, the last ``most`` of them."""
+        kept = min(len(self.rows), most - 1)
+        buffer, end = self._buffer, self._end
+        try:
+            # As in Window.
+            self._unclaimed.pop()
+            shared = end < len(buffer)
+        except IndexError:
+            shared = False
+        if not shared:
+            buffer = np.empty((max(2 * kept, ROOM), self.rows.shape[1]))
+            buffer[:kept] = self.rows[len(self.rows) - kept :]
+            end = kept
+        buffer[end] = row
+        found = RowWindow.__new__(RowWindow)
+        found._own(buffer, end - kept, end + 1)
+        return found
+
+    def _own(self, buffer: Float, begin: int, end: int) -> None:
+        self._buffer, self._end = buffer, end
+        self.rows = buffer[begin:end]
+        self._unclaimed = [True]
+
+
+PLAN_BOUNDS = (0.7, 0.5, 0.1, 0.1)
+"""Greatest RMS difference of successive plans in acceleration, jerk, yaw rate, yaw acceleration
+(NAVSIM v2, extended comfort)."""
+
+PLAN_STEP = 0.1
+SHORTEST_OVERLAP = 6
+"""Fewer common times than these say nothing."""
+
+
+@kernel
+def windowed_sum(values, value, window):
+    """Values [n] with one more at their end, the last ``window`` of them; and their sum."""
+    kept = min(len(values), window - 1)
+    found = np.empty(kept + 1)
+    for k in range(kept):
+        found[k] = values[len(values) - kept + k]
+    found[kept] = value
+    total = 0.0
+    for v in found:
+        total += v
+    return found, total
+
+
+@kernel
+def derivatives(weights, samples):
+    """Weighted sums of speed and yaw.
+
+    Args:
+        weights: [3, W] float64 of the value, the first and the second derivative.
+        samples: [W, 2] float64, speed and yaw.
+
+    Returns:
+        Speed, its first and second derivative; first and second derivative of yaw.
+    """
+    speed = acceleration = jerk = rate = yaw_acceleration = 0.0
+    for k in range(len(samples)):
+        speed += weights[0, k] * samples[k, 0]
+        acceleration += weights[1, k] * samples[k, 0]
+        jerk += weights[2, k] * samples[k, 0]
+        rate += weights[1, k] * samples[k, 1]
+        yaw_acceleration += weights[2, k] * samples[k, 1]
+    return speed, acceleration, jerk, rate, yaw_acceleration
+
+
+@kernel
+def make_continuous(poses):
+    """Add whole turns to the yaws of poses [N, 3] (x, y, yaw [rad]), so that none is more than
+    half a turn from the one before, as ``np.unwrap``."""
+    before, added = poses[0, 2], 0.0
+    for k in range(1, len(poses)):
+        step = poses[k, 2] - before
+        before = poses[k, 2]
+        if abs(step) > math.pi:
+            short = (step + math.pi) % math.tau - math.pi
+            if short == -math.pi and step > 0:
+                short = math.pi
+            added += short - step
+        poses[k, 2] += added
+
+
+@kernel
+def plans_alike(times_a, poses_a, times_b, poses_b):
+    """Whether two plans feel alike where both say something: RMS differences of acceleration,
+    jerk, yaw rate and yaw acceleration, by finite differences in steps of 0.1 s.
+
+    Args:
+        times_a, times_b: [N] int64, increasing [us].
+        poses_a, poses_b: [N, 3] float64, x, y [m], yaw [rad].
+
+    Returns:
+        1 for alike, 0 for not, -1 where they overlap for less than 0.5 s.
+    """
+    first, last = max(times_a[0], times_b[0]), min(times_a[-1], times_b[-1])
+    count = int((last - first) * 1e-6 / PLAN_STEP + 1e-6) + 1
+    if count < SHORTEST_OVERLAP:
+        return -1
+    poses_a, poses_b = poses_a.copy(), poses_b.copy()
+    make_continuous(poses_a)
+    make_continuous(poses_b)
+    speeds, rates = np.empty((2, count - 1)), np.empty((2, count - 1))
+    _differentiate(times_a, poses_a, first, speeds[0], rates[0])
+    _differentiate(times_b, poses_b, first, speeds[1], rates[1])
+    # Differences of derivatives are derivatives of differences.
+    acceleration, rate = _slopes(speeds[0] - speeds[1]), rates[0] - rates[1]
+    alike = (
+        _within(acceleration, PLAN_BOUNDS[0])
+        and _within(_slopes(acceleration), PLAN_BOUNDS[1])
+        and _within(rate, PLAN_BOUNDS[2])
+        and _within(_slopes(rate), PLAN_BOUNDS[3])
+    )
+    return 1 if alike else 0
+
+
+@kernel
+def _differentiate(times, poses, first, speeds, rates):
+    """Write speeds and yaw rates [T] of a plan between times in steps of 0.1 s from ``first``."""
+    k = 1
+    x = y = yaw = 0.0
+    for i in range(len(speeds) + 1):
+        at = first * 1e-6 + PLAN_STEP * i
+        while k < len(times) - 1 and times[k] * 1e-6 < at:
+            k += 1
+        start, end = times[k - 1] * 1e-6, times[k] * 1e-6
+        fraction = (at - start) / (end - start)
+        rest = 1 - fraction
+        before = x, y, yaw
+        x = poses[k - 1, 0] * rest + poses[k, 0] * fraction
+        y = poses[k - 1, 1] * rest + poses[k, 1] * fraction
+        yaw = poses[k - 1, 2] * rest + poses[k, 2] * fraction
+        if i:
+            vx, vy = (x - before[0]) / PLAN_STEP, (y - before[1]) / PLAN_STEP
+            speeds[i - 1] = math.sqrt(vx * vx + vy * vy)
+            rates[i - 1] = (yaw - before[2]) / PLAN_STEP
+
+
+@kernel
+def _slopes(values):
+    """Finite differences [T - 1] of values [T] in steps of 0.1 s."""
+    return (values[1:] - values[:-1]) / PLAN_STEP
+
+
+@kernel
+def _within(values, bound):
+    """Whether the RMS of values [T] is at most ``bound``."""
+    squares = 0.0
+    for value in values:
+        squares += value * value
+    return squares <= len(values) * bound * bound
+
 
 WINDOW_S = 1.5
 ORDER = 3
@@ -174,3 +401,105 @@ def plans_agree(before: PlannedTrajectory, now: PlannedTrajectory) -> bool | Non
     """
     alike: int = plans_alike(before.times_us, before.poses, now.times_us, now.poses)
     return None if alike < 0 else bool(alike)
+
+
+MAX_ACCELERATION, MAX_CURVATURE = 10.4, 0.3
+"""Waymax, kinematic infeasibility, for steps of 0.1 s [m/s^2], [1/m]."""
+
+STEP_S = 0.1
+"""Shorter clock steps are looked at together: noise of places would be acceleration."""
+
+SLOWEST_CURVATURE = 0.5
+"""Below this speed curvature is noise [m/s]."""
+
+PLACE_NOISE = 0.03
+"""Of recorded places [m]."""
+
+SLIP = 0.05
+"""Way sideways per way ahead that nobody minds, beside what the vehicle model says: the rear axle
+is rarely known better."""
+
+SPIN_S, SPIN_NOISE = 1.0, 0.1
+"""Turning on the spot: time over which it is looked at [s], noise of headings in it [rad]."""
+
+FASTEST_BACKWARDS = 8.0
+"""More than the reverse gear of a car gives [m/s]."""
+
+SETTLED = 0.2
+"""Speed across below which a vehicle that was pushed rolls again [m/s]."""
+
+
+Samples = Window[tuple[EgoSample, float]]
+
+
+@made_quickly
+@dataclass(frozen=True, eq=False)
+class Feasibility:
+    """The motion of the ego so far.
+
+    Attributes:
+        samples: of the last second, newest last, each with the way driven until then [m].
+        pushed: whether an impact moved the ego and it slides still; nobody can blame it then.
+        steps: that no car could have made.
+        first: number of the first of them; None without.
+    """
+
+    samples: Samples = field(default_factory=Window)
+    pushed: bool = False
+    steps: int = 0
+    first: int | None = None
+
+    def updated(self, instant: Instant, way: float, context: ScoringContext) -> Feasibility:
+        """After one more clock step; ``way``: driven so far [m]."""
+        ego = instant.ego
+        pushed = bool(instant.contacts) and any(c.impulse != (0.0, 0.0) for c in instant.contacts)
+        if pushed or (self.pushed and not _settled(ego)):
+            return Feasibility(Window((ego, way)), True, self.steps, self.first)
+        kept = max(round(SPIN_S / context.dt), 1) + 1
+        samples = self.samples.pushed((ego, way), kept)
+        if _is_feasible(samples, context.dt):
+            return Feasibility(samples, False, self.steps, self.first)
+        first = instant.step if self.first is None else self.first
+        return Feasibility(samples, False, self.steps + 1, first)
+
+
+def _settled(ego: EgoSample) -> bool:
+    rolling = abs(ego.yaw_rate) <= MAX_CURVATURE * abs(ego.speed) + SPIN_NOISE
+    return abs(ego.lateral_speed) < SETTLED and rolling
+
+
+def _is_feasible(samples: Samples, dt: float) -> bool:
+    stride = max(round(STEP_S / dt), 1)
+    now, way = samples.newest()
+    if len(samples) > stride:
+        before, _ = samples.newest(stride)
+        if not _follows(before, now, stride * dt):
+            return False
+    turns = max(round(SPIN_S / dt), 1)
+    if len(samples) <= turns:
+        return True
+    before, driven = samples.newest(turns)
+    return abs(now.yaw - before.yaw) <= MAX_CURVATURE * (way - driven) + SPIN_NOISE
+
+
+def _follows(before: EgoSample, now: EgoSample, h: float) -> bool:
+    """Whether a car gets from one sample to another ``h`` seconds later."""
+    if abs(now.speed - before.speed) > MAX_ACCELERATION * h * (1 + 1e-9):
+        return False
+    if now.speed < -FASTEST_BACKWARDS and now.speed < before.speed:
+        return False
+    speed = max(
+        math.hypot(before.speed, before.lateral_speed), math.hypot(now.speed, now.lateral_speed)
+    )
+    turn = math.remainder(now.yaw - before.yaw, math.tau)
+    if speed > SLOWEST_CURVATURE and abs(turn) > MAX_CURVATURE * speed * h:
+        return False
+    cos, sin = math.cos(before.yaw + turn / 2), math.sin(before.yaw + turn / 2)
+    dx, dy = now.x - before.x, now.y - before.y
+    ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
+    reach = MAX_ACCELERATION * h * h
+    sideways = (before.lateral_speed + now.lateral_speed) / 2 * h
+    if abs(aside - sideways) > reach / 4 + SLIP * abs(ahead) + PLACE_NOISE:
+        return False
+    # A vehicle that is put to its places has the speed of the step before.
+    return abs(ahead - before.speed * h) <= reach + PLACE_NOISE

@@ -16,8 +16,7 @@ from ..ego.reference import PlannedTrajectory
 from ..path import Float
 from ..seam import Seam
 from ..storyboard.shown_signal import ShownSignal
-from .road_kernels import DENSITY, in_lane, off_road
-from .road_map import RoadMap
+from .road import DENSITY, RoadMap, in_lane, off_road
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]
 """Side of the ego on which a contact began, after nuPlan's collision types."""

@@ -3,13 +3,286 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from .accumulator import MetricAccumulator
-from .blind_spots import Aspect, cannot_see
-from .instant import Instant, ScoringContext
+import numpy as np
+
+from ..ego.reference import PlannedTrajectory
+from ..path import Float
+from .comfort import WINDOW_S, ComfortAccumulator, Feasibility
+from .hazard import NEVER, NO_LIGHTS, TrafficLights
+from .instant import EgoSample, Instant, ScoringContext
+
+
+@dataclass(frozen=True, eq=False)
+class MetricAccumulator:
+    """Counts and extremes of an episode so far; immutable. One way to make them serves both the
+    running episode and a recording.
+
+    Attributes:
+        steps: made; those of the warm-up do not count, here and below.
+        start_s: along the route where the scores begin [m].
+        distance: driven [m].
+        outside: part of it beside all lanes that go the ego's way [m].
+        tail_first: way along the route that was made facing against it, in reverse gear [m].
+        cut: way along the route that was left out by meeting it again elsewhere [m].
+        s, furthest: along the route: now and at most; the latter less what was tail first or left
+            out [m].
+        offset: from the route now [m].
+        at_fault: at-fault contacts of the ego, by kind: vehicle, vru, object.
+        contacts: contacts begun, by category.
+        off_road, far_off_road: whether a corner ever left the corridor; by more than 0.3 m.
+        ttc: time to collision now [s].
+        min_ttc: smallest so far [s].
+        comfort, comfort_with_history: of the drive; with the log before the start prepended.
+        backward: [n] float64, ways made against the route in the steps of the last second [m];
+            empty while there were none.
+        oncoming: longest way against the route within a second [m].
+        lane_run: how long the offset has been too large [s].
+        left_lane: whether it was so for 2 s.
+        plan: the newest one.
+        plans_compared, plans_disagree: successive plans compared; whether any two differ.
+        overspeed: integral of speed above the limit [m].
+        hugsim: sum of HUGSIM's score of the steps.
+        feasibility: whether a car could have moved so.
+        first_impact: ego speed relative to what it hit first, there [m/s]; None without contact.
+        impact_position: of the ego at the first contact.
+        pushes: impulse of the steps of the last 0.2 s [N s], of contacts that go on, by name.
+        impulse: on the ego, lengths summed over objects and steps [N s].
+        delta_v: greatest change of the ego's velocity by one impact [m/s].
+        secondary: contacts begun after the first, of the ego or between objects.
+        hit: objects in contact so far.
+        lights: what traffic lights showed, and which were run.
+        ego: at the newest instant.
+        states: what single metrics accumulate themselves, by name; see :class:`.metric.Metric`.
+    """
+
+    steps: int = 0
+    start_s: float = 0.0
+    distance: float = 0.0
+    outside: float = 0.0
+    tail_first: float = 0.0
+    cut: float = 0.0
+    s: float = 0.0
+    furthest: float = 0.0
+    offset: float = 0.0
+    at_fault: dict[str, int] = field(default_factory=dict)
+    contacts: dict[str, int] = field(default_factory=dict)
+    off_road: bool = False
+    far_off_road: bool = False
+    ttc: float = NEVER
+    min_ttc: float = NEVER
+    comfort: ComfortAccumulator = field(default_factory=ComfortAccumulator)
+    comfort_with_history: ComfortAccumulator = field(default_factory=ComfortAccumulator)
+    backward: Float = field(default_factory=lambda: np.zeros(0))
+    oncoming: float = 0.0
+    lane_run: float = 0.0
+    left_lane: bool = False
+    plan: PlannedTrajectory | None = None
+    plans_compared: int = 0
+    plans_disagree: bool = False
+    overspeed: float = 0.0
+    hugsim: float = 0.0
+    feasibility: Feasibility = field(default_factory=Feasibility)
+    first_impact: float | None = None
+    impact_position: tuple[float, float] | None = None
+    pushes: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+    impulse: float = 0.0
+    delta_v: float = 0.0
+    secondary: int = 0
+    hit: frozenset[str] = frozenset()
+    lights: TrafficLights = NO_LIGHTS
+    ego: EgoSample | None = None
+    states: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def collisions(self) -> int:
+        """Contacts of the ego begun so far."""
+        return sum(self.contacts.values())
+
+
+SHORT_ROUTE = 5.0
+"""Ways up to this are no measure of progress to NAVSIM and AlpaSim [m]."""
+
+LEAST_ROUTE = 1.0
+"""A recorded drive that gets no farther stands still [m]; one that does is measured against here,
+also where it is short: standing still where somebody drove is no progress."""
+
+
+def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """Way of the recorded drive along the route in the same time [m]."""
+    last = len(context.expert_s) - 1
+    begin = min(context.warmup_steps, last)
+    step = min(begin + accumulator.steps, last)
+    return context.expert_s[step] - context.expert_s[begin]
+
+
+def progress_along_route(accumulator: MetricAccumulator) -> float:
+    """Way along the route [m]; not what was driven tail first, which is no way to drive there, nor
+    what was left out by a short cut."""
+    driven = accumulator.s - accumulator.tail_first - accumulator.cut
+    return max(driven - accumulator.start_s, 0.0)
+
+
+def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """Fraction of the recorded way, at most 1; 1 where the recorded drive stands still."""
+    expert = expert_progress(accumulator, context)
+    if expert < LEAST_ROUTE:
+        return 1.0
+    return min(progress_along_route(accumulator) / expert, 1.0)
+
+
+def whole_route(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """Way of the recorded drive along the route up to the horizon [m]."""
+    return context.route_end_s - accumulator.start_s
+
+
+def route_completion(
+    accumulator: MetricAccumulator, context: ScoringContext, fraction: float = 1.0
+) -> float:
+    """How much of a ``fraction`` of the recorded way up to the horizon was reached; 1 where the
+    recorded drive stands still."""
+    whole = whole_route(accumulator, context)
+    if whole < LEAST_ROUTE:
+        return 1.0
+    return min(max(accumulator.furthest - accumulator.start_s, 0.0) / (fraction * whole), 1.0)
+
+
+def assumed_progress(accumulator: MetricAccumulator, context: ScoringContext) -> tuple[str, ...]:
+    """What is taken for granted where the recorded drive is short; nothing where it is not."""
+    expert = expert_progress(accumulator, context)
+    if expert < LEAST_ROUTE:
+        return (f"progress 1: the recorded drive stands still ({expert:.1f} m)",)
+    if expert <= SHORT_ROUTE:
+        return (
+            f"progress is measured though the recorded drive is short ({expert:.1f} m); NAVSIM and "
+            "AlpaSim take it as 1",
+        )
+    return ()
+
+
+def assumed_route(accumulator: MetricAccumulator, context: ScoringContext) -> tuple[str, ...]:
+    """What is taken for granted where the recorded drive up to the horizon stands still."""
+    whole = whole_route(accumulator, context)
+    if whole >= LEAST_ROUTE:
+        return ()
+    return (f"route completed: the recorded drive stands still ({whole:.1f} m)",)
+
+
+Aspect = Literal[
+    "progress",
+    "comfort",
+    "near_misses",
+    "road",
+    "lane",
+    "direction",
+    "speed_limit",
+    "fault",
+    "lights",
+]
+"""What a score may look at, beside contact and whether a car can move so."""
+
+UNSEEN: dict[Aspect, str] = {
+    "progress": "progress",
+    "lane": "lane keeping",
+    "road": "leaving the road",
+    "direction": "driving backwards or against the route",
+    "near_misses": "near misses",
+    "comfort": "comfort",
+    "speed_limit": "speeding",
+    "fault": "whose fault a contact is",
+}
+"""In the order in which a reader misses them."""
+
+LONG_STEP = 0.1
+"""TTC is looked at once a clock step; longer ones leave something out [s]."""
+
+NOT_NOTICED = 2.0
+"""Ways up to this are not mentioned [m]."""
+
+
+def cannot_see(
+    sees: frozenset[Aspect], accumulator: MetricAccumulator, context: ScoringContext
+) -> str:
+    """One sentence: what a score that looks at ``sees`` does not see in an episode like this, and
+    what it left uncounted of what happened."""
+    blind = [phrase for aspect, phrase in UNSEEN.items() if aspect not in sees]
+    blind += _seen_in_part(sees, accumulator, context)
+    seconds, most = accumulator.steps * context.dt, context.horizon * context.dt
+    if not accumulator.contacts and seconds + context.warmup_steps * context.dt < most - 1e-9:
+        blind.append(f"what comes after {seconds:g} s (the episode may last {most:g} s)")
+    seen = "lights" in sees and bool(accumulator.lights.placed)
+    blind.append(f"{'signs' if seen else 'traffic lights, signs'} and right of way (no map)")
+    if not context.background:
+        blind.append("walls and poles (contact.background is off)")
+    if not context.reactive:
+        blind.append("how others would react (they repeat what was recorded)")
+    sentence = f"Cannot see {_listed(blind)}"
+    uncounted = _uncounted(sees, accumulator, context)
+    return f"{sentence}; uncounted here: {_listed(uncounted)}." if uncounted else f"{sentence}."
+
+
+def _seen_in_part(
+    sees: frozenset[Aspect], accumulator: MetricAccumulator, context: ScoringContext
+) -> list[str]:
+    """Of what the score looks at, what this episode does not show."""
+    found = []
+    if "progress" in sees and expert_progress(accumulator, context) < LEAST_ROUTE:
+        found.append("progress (the recorded drive stands still)")
+    if "road" in sees:
+        found.append(
+            f"where the road ends (no map: {context.corridor:g} m to either side of the recorded "
+            "drive count as road)"
+        )
+    if "near_misses" in sees:
+        found.append("following closely at the same speed")
+        if context.dt > LONG_STEP:
+            found.append(f"near misses between instants, {context.dt:g} s apart")
+    if "lane" in sees:
+        found.append("lanes that nobody drove in the recording")
+    if "comfort" in sees:
+        short = accumulator.steps * context.dt < WINDOW_S
+        half = f"{WINDOW_S / 2:g} s"
+        found.append(
+            f"comfort (the drive is shorter than {WINDOW_S:g} s)"
+            if short
+            else f"comfort in the first and last {half}"
+        )
+    return found
+
+
+def _uncounted(
+    sees: frozenset[Aspect], accumulator: MetricAccumulator, context: ScoringContext
+) -> list[str]:
+    """What happened in the episode and does not change the score."""
+    found = []
+    if "progress" not in sees and accumulator.distance < NOT_NOTICED:
+        recorded = expert_progress(accumulator, context)
+        if recorded > NOT_NOTICED:
+            found.append(f"standing still where the recorded drive goes {recorded:.0f} m")
+    if "direction" not in sees and accumulator.oncoming >= NOT_NOTICED:
+        found.append(f"up to {accumulator.oncoming:.0f} m in a second against the route")
+    if "progress" not in sees and accumulator.tail_first >= NOT_NOTICED:
+        found.append(f"{accumulator.tail_first:.0f} m of the route driven tail first")
+    if "progress" not in sees and accumulator.cut >= NOT_NOTICED:
+        found.append(f"{accumulator.cut:.0f} m of the route left out by a short cut")
+    if "lane" not in sees and accumulator.outside >= NOT_NOTICED:
+        found.append(f"{accumulator.outside:.0f} m beside all lanes that were driven")
+    if "lights" not in sees and (ran := len(accumulator.lights.ran)):
+        found.append(f"stop lines crossed on red ({ran})")
+    without_fault = accumulator.collisions - sum(accumulator.at_fault.values())
+    if "fault" in sees and without_fault > 0:
+        found.append(f"contacts without fault of the ego, or again ({without_fault})")
+    return found
+
+
+def _listed(phrases: list[str]) -> str:
+    """``a, b and c``."""
+    *most, last = phrases
+    return f"{', '.join(most)} and {last}" if most else last
+
 
 NO_TERMS: Mapping[str, float] = MappingProxyType({})
 

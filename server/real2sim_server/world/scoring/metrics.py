@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 
-from .accumulator import MetricAccumulator
-from .blind_spots import Aspect
-from .fault import fault_class
+from .hazard import fault_class
 from .instant import ScoringContext
-from .metric import METRICS, MetricValue, metric
-from .progress import (
+from .metric import (
     LEAST_ROUTE,
+    METRICS,
+    Aspect,
+    MetricAccumulator,
+    MetricValue,
     assumed_progress,
     assumed_route,
     expert_progress,
+    metric,
     progress_along_route,
     relative_progress,
     route_completion,

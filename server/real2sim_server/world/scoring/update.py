@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,17 +12,41 @@ import numpy as np
 from ..ego.reference import PlannedTrajectory
 from ..evolve import evolved
 from ..path import Float
-from .accumulator import MetricAccumulator
-from .comfort import ComfortAccumulator, plans_agree
-from .comfort_kernels import windowed_sum
-from .fault import ego_at_fault, fault_class
-from .feasibility import Feasibility
-from .hazard import time_to_collision
+from ..seam import Seam
+from .comfort import ComfortAccumulator, Feasibility, RowWindow, Window, plans_agree, windowed_sum
+from .hazard import NO_LIGHTS, ego_at_fault, fault_class, time_to_collision
 from .instant import ContactRecord, EgoSample, Instant, ScoringContext
-from .metric import METRICS
-from .put_back import put_back
-from .traffic_lights import NO_LIGHTS
-from .window import Window
+from .metric import METRICS, MetricAccumulator
+
+
+def put_back(accumulator: MetricAccumulator, seam: Seam) -> MetricAccumulator:
+    """The accumulator beyond the seam, so that no step is longer or turns more than it was driven.
+
+    Distances along the route go on and need nothing; the plan before the seam is not compared with
+    the next one, for the route bends differently there.
+    """
+    assert accumulator.ego is not None
+    position, found = accumulator.impact_position, accumulator.feasibility
+    samples = found.samples.mapped(lambda sample: (_moved(sample[0], seam), sample[1]))
+    return replace(
+        accumulator,
+        ego=_moved(accumulator.ego, seam),
+        impact_position=None if position is None else seam.place(*position),
+        comfort=_turned(accumulator.comfort, seam),
+        comfort_with_history=_turned(accumulator.comfort_with_history, seam),
+        feasibility=replace(found, samples=samples),
+        plan=None,
+    )
+
+
+def _moved(ego: EgoSample, seam: Seam) -> EgoSample:
+    x, y = seam.place(ego.x, ego.y)
+    return ego._replace(x=x, y=y, yaw=ego.yaw + seam.turn, path_yaw=ego.path_yaw + seam.turn)
+
+
+def _turned(comfort: ComfortAccumulator, seam: Seam) -> ComfortAccumulator:
+    return replace(comfort, window=RowWindow(comfort.samples + np.array([0.0, seam.turn])))
+
 
 NUPLAN_DRIVABLE_TOLERANCE = 0.3
 ONCOMING_WINDOW_S = 1.0
