@@ -20,9 +20,8 @@ from ..scene import Ground, Scene, Trajectory
 from ..world.ego.box import REAR_OVERHANG
 from ..world.ego.motion import Motion
 from ..world.path import LoggedPath
-from ..world.storyboard.entities import own_centre
 from ..world.storyboard.roads import RoadNetwork, RouteNetwork, straight
-from ..world.storyboard.run import StoryboardRun
+from ..world.storyboard.run import StoryboardRun, own_centre
 from ..world.traffic.driver import ObservedEgo, Surroundings
 from .errors import ScenarioError
 

@@ -27,10 +27,8 @@ from ..scene import (
 from ..scene.lane_graph import LaneGraph
 from ..scene.person import person_asset
 from ..world.path import LoggedPath
-from ..world.storyboard.entities import BOXES
-from ..world.storyboard.graph_roads import GraphNetwork
-from ..world.storyboard.roads import Place, Way, straight
-from ..world.storyboard.run import StoryboardRun
+from ..world.storyboard.roads import GraphNetwork, Place, Way, straight
+from ..world.storyboard.run import BOXES, StoryboardRun
 from .errors import ScenarioError
 from .fit import begun_alone
 

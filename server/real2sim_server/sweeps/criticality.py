@@ -11,7 +11,7 @@ import numpy as np
 
 from ..world import World
 from ..world.scoring.hazard import STOPPED
-from ..world.storyboard.entities import object_ids_of
+from ..world.storyboard.run import object_ids_of
 from .gap_kernels import least_margin
 from .gaps import signed_gaps
 

@@ -8,9 +8,284 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from .._numba import kernel
 from ..geometry.rotation import quaternion_to_matrix, quaternion_yaw
 from ..scene import Trajectory
-from .path_kernels import KNOT, nearest_point, point_at, sharpest_turn
+
+KNOT = 11
+
+NEAR_BEHIND, NEAR_AHEAD = 20.0, 60.0
+"""Where along the path a vehicle is looked for first, from where it was last [m]."""
+
+LOST = 10.0
+"""Farther from the path than this, the whole of it is searched [m]."""
+
+PIECE = 4.0
+"""Curvature is taken over pieces of this length [m]."""
+
+REACH = 80
+"""The leading object is searched for in as many metres, at points one metre apart."""
+
+SIDE = 0.3
+"""Clearance beside a box that counts as in the way [m]."""
+
+
+@kernel
+def nearest_point(knots, x, y, near_s):
+    """The nearest point of the path to (x, y) [m].
+
+    Args:
+        knots: see above.
+        x, y: world [m].
+        near_s: distance along the path of the part to look at first [m]; NaN for none.
+
+    Returns:
+        Distance along the path [m], distance from it, positive on its left and beyond its ends
+        from the straight line on [m], position (x, y, z) [m], heading [rad], unit normal of the
+        floor.
+    """
+    segments = len(knots) - 1
+    k, f, offset = 0, 0.0, math.inf
+    if not math.isnan(near_s):
+        first = max(_first_not_before(knots, near_s - NEAR_BEHIND) - 1, 0)
+        last = min(max(_first_not_before(knots, near_s + NEAR_AHEAD), first + 1), segments)
+        k, f, offset = _foot(knots, x, y, first, last)
+    if not abs(offset) <= LOST:
+        k, f, offset = _foot(knots, x, y, 0, segments)
+    a, b, rest = knots[k], knots[k + 1], 1.0 - f
+    if (k == 0 and f == 0.0) or (k == segments - 1 and f == 1.0):
+        offset = ((x - a[1]) * a[9] + (y - a[2]) * a[8]) * math.sqrt(a[10])
+    ux, uy, uz = (
+        rest * a[5] + f * b[5],
+        rest * a[6] + f * b[6],
+        rest * a[7] + f * b[7],
+    )
+    length = math.sqrt(ux * ux + uy * uy + uz * uz)
+    return (
+        rest * a[0] + f * b[0],
+        offset,
+        (
+            rest * a[1] + f * b[1],
+            rest * a[2] + f * b[2],
+            rest * a[3] + f * b[3],
+        ),
+        rest * a[4] + f * b[4],
+        (ux / length, uy / length, uz / length),
+    )
+
+
+@kernel
+def waypoints(knots, s, pose, count, spacing):
+    """Places along the path, seen from a vehicle; beyond its end the path goes straight on.
+
+    Args:
+        knots: see above.
+        s: where along the path they begin [m].
+        pose: x, y [m], yaw [rad] of the vehicle in the world.
+        count: of them.
+        spacing: along the path, also from ``s`` to the first one [m].
+
+    Returns:
+        [count, 2] float64 in the vehicle frame [m].
+    """
+    x, y, yaw = pose
+    end = knots[len(knots) - 1]
+    ahead_x, ahead_y = math.cos(end[4]), math.sin(end[4])
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    found = np.empty((count, 2))
+    for i in range(count):
+        at = s + spacing * (i + 1)
+        beyond = max(at - end[0], 0.0)
+        dx = _along(knots, at, 1) + beyond * ahead_x - x
+        dy = _along(knots, at, 2) + beyond * ahead_y - y
+        found[i, 0], found[i, 1] = cos * dx + sin * dy, cos * dy - sin * dx
+    return found
+
+
+@kernel
+def turn_between(knots, here, there):
+    """Change of heading [rad] between two distances along the path [m]."""
+    return _along(knots, there, 4) - _along(knots, here, 4)
+
+
+@kernel
+def point_at(knots, s):
+    """The point x, y, z [m] and heading [rad] at distance ``s`` [m]; before the start and after the
+    end of the path straight on."""
+    yaw = _along(knots, s, 4)
+    beyond = s - min(max(s, 0.0), knots[len(knots) - 1, 0])
+    return (
+        _along(knots, s, 1) + beyond * math.cos(yaw),
+        _along(knots, s, 2) + beyond * math.sin(yaw),
+        _along(knots, s, 3),
+        yaw,
+    )
+
+
+@kernel
+def sharpest_turn(knots, s, reach):
+    """Largest curvature [1/m] of the path over the next ``reach`` metres, in pieces of 4 m."""
+    most, before = 0.0, _along(knots, s, 4)
+    for k in range(1, math.ceil(max(reach, 8.0) / PIECE) + 1):
+        now = _along(knots, s + PIECE * k, 4)
+        most, before = max(most, abs(now - before)), now
+    return most / PIECE
+
+
+@kernel
+def next_in_strip(knots, s, box, bodies, own):
+    """The body that is next in the strip a box sweeps along the path.
+
+    Bodies whose middle is beside or behind that of the box are not looked at.
+
+    Args:
+        knots: see above.
+        s: where the middle of the box is along the path [m].
+        box: its offset from the path, length and width [m].
+        bodies: [B, 7] float64: middle x, y [m], yaw [rad], length, width [m], velocity x, y [m/s].
+        own: row of the box itself.
+
+    Returns:
+        Gap from bumper to bumper [m], infinite where there is none, and speed along the path
+        [m/s].
+    """
+    offset, length, width = box
+    strip = strip_ahead(knots, s, offset)
+    gap, speed = math.inf, 0.0
+    for k in range(len(bodies)):
+        if k == own:
+            continue
+        body = bodies[k]
+        i = _nearest_row(strip, body[0], body[1])
+        dx, dy, heading = body[0] - strip[i, 0], body[1] - strip[i, 1], strip[i, 2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        along, aside = i + dx * cos + dy * sin, dy * cos - dx * sin
+        if along <= 0.5 or i == REACH - 1:
+            continue
+        c, n = abs(math.cos(body[2] - heading)), abs(math.sin(body[2] - heading))
+        if abs(aside) >= width / 2 + (body[3] * n + body[4] * c) / 2 + SIDE:
+            continue
+        free = along - length / 2 - (body[3] * c + body[4] * n) / 2
+        if free < gap:
+            gap, speed = free, body[5] * cos + body[6] * sin
+    return gap, speed
+
+
+@kernel
+def previous_in_strip(knots, s, box, bodies, own):
+    """The body that comes next behind a box in the strip that it sweeps along the path, or is
+    beside it.
+
+    Args:
+        knots, s, box, bodies, own: see :func:`next_in_strip`.
+
+    Returns:
+        Gap from its front to the rear of the box [m], negative where they overlap along the path,
+        infinite where there is none, and speed along the path [m/s].
+    """
+    offset, length, width = box
+    back = REACH - 1
+    strip = strip_ahead(knots, s - back, offset)
+    gap, speed = math.inf, 0.0
+    for k in range(len(bodies)):
+        if k == own:
+            continue
+        body = bodies[k]
+        i = _nearest_row(strip, body[0], body[1])
+        dx, dy, heading = body[0] - strip[i, 0], body[1] - strip[i, 1], strip[i, 2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        along, aside = i - back + dx * cos + dy * sin, dy * cos - dx * sin
+        if along > 0.5 or i == 0:
+            continue
+        c, n = abs(math.cos(body[2] - heading)), abs(math.sin(body[2] - heading))
+        if abs(aside) >= width / 2 + (body[3] * n + body[4] * c) / 2 + SIDE:
+            continue
+        free = -along - length / 2 - (body[3] * c + body[4] * n) / 2
+        if free < gap:
+            gap, speed = free, body[5] * cos + body[6] * sin
+    return gap, speed
+
+
+@kernel
+def strip_ahead(knots, s, offset):
+    """Places x, y [m] and heading [rad] [REACH, 3] one metre apart from ``s`` on, ``offset`` to the
+    left of the path: what :func:`point_at` gives, whose search each place would begin anew."""
+    found = np.empty((REACH, 3))
+    end, after = knots[len(knots) - 1, 0], _first_not_before(knots, s)
+    for i in range(REACH):
+        at = s + i
+        while after < len(knots) and knots[after, 0] < at:
+            after += 1
+        x, y, yaw = (
+            _between(knots, after, at, 1),
+            _between(knots, after, at, 2),
+            _between(knots, after, at, 4),
+        )
+        beyond = at - min(max(at, 0.0), end)
+        if beyond != 0.0 or offset != 0.0:
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            x, y = x + beyond * cos, y + beyond * sin
+            x, y = x - offset * sin, y + offset * cos
+        found[i, 0], found[i, 1], found[i, 2] = x, y, yaw
+    return found
+
+
+@kernel
+def _nearest_row(strip, x, y):
+    nearest, least = 0, math.inf
+    for i in range(len(strip)):
+        dx, dy = x - strip[i, 0], y - strip[i, 1]
+        if dx * dx + dy * dy < least:
+            nearest, least = i, dx * dx + dy * dy
+    return nearest
+
+
+@kernel
+def _first_not_before(knots, s):
+    """Number of the first pose at distance ``s`` or farther; that of poses where there is none."""
+    low, high = 0, len(knots)
+    while low < high:
+        middle = (low + high) // 2
+        if knots[middle, 0] < s:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel
+def _along(knots, s, column):
+    """A column of the path at distance ``s``, linear between poses, constant beyond both ends."""
+    return _between(knots, _first_not_before(knots, s), s, column)
+
+
+@kernel
+def _between(knots, after, s, column):
+    """The same where ``after`` is the number of the first pose at ``s`` or farther."""
+    if after == 0:
+        return knots[0, column]
+    if after == len(knots):
+        return knots[after - 1, column]
+    a, b = knots[after - 1], knots[after]
+    return a[column] + (b[column] - a[column]) / (b[0] - a[0]) * (s - a[0])
+
+
+@kernel
+def _foot(knots, x, y, first, last):
+    """Nearest segment from ``first`` to before ``last``, fraction of it, and the distance from
+    there, positive on the left [m]."""
+    nearest, least, fraction, left = first, math.inf, 0.0, 0.0
+    for k in range(first, last):
+        dx, dy = x - knots[k, 1], y - knots[k, 2]
+        along = dx * knots[k, 8] - dy * knots[k, 9]
+        across = dx * knots[k, 9] + dy * knots[k, 8]
+        foot = min(max(along, 0.0), 1.0)
+        beyond = along - foot
+        square = (beyond * beyond + across * across) * knots[k, 10]
+        if square < least:
+            nearest, least, fraction, left = k, square, foot, across
+    return nearest, fraction, math.copysign(math.sqrt(least), left)
+
 
 Float = NDArray[np.float64]
 

@@ -33,7 +33,6 @@ from .collision.obstacles import obstacle_grid
 from .collision.overlaps import overlapping_rows
 from .collision.step_contacts import StepContacts, contacts_of_impacts, contacts_of_overlaps
 from .collision.sweep import StepStart
-from .draws import Draws
 from .ego.box import ego_box
 from .ego.controller import EgoController, Plan, emergency_brake
 from .ego.motion import Motion, logged_motion
@@ -46,11 +45,11 @@ from .errors import WorldError
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .events import Event
 from .evolve import evolved
-from .lanes_around import LanePiece, lanes_around
-from .observation import Observation
+from .observation import LanePiece, Observation, lanes_around
 from .path import Float, LoggedPath, PathPoint
 from .placement import placed
 from .randomization import (
+    Draws,
     RandomizedIdm,
     estimate_error,
     latency_jitter_us,
@@ -59,9 +58,8 @@ from .randomization import (
 from .ranging import Mounted, StepWay, Wake, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score
 from .seam import Seam
-from .storyboard.begin import begin_storyboard
-from .storyboard.run import StoryboardRun
-from .storyboard.shown_signal import ShownSignal
+from .storyboard.program import ShownSignal
+from .storyboard.run import StoryboardRun, begin_storyboard
 from .strides import Strides
 from .traffic import ObservedEgo, Surroundings, Traffic
 from .traffic.spawner import begin_spawner

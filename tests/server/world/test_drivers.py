@@ -16,7 +16,7 @@ from real2sim_server.edit import ObjectState
 from real2sim_server.scene import Lane, LaneGraph
 from real2sim_server.world.driving import GRAVITY
 from real2sim_server.world.traffic import DRIVERS, AgentDriver, AgentPose, Surroundings
-from real2sim_server.world.traffic.replay import recorded_pose
+from real2sim_server.world.traffic.driver import recorded_pose
 
 
 class CoastDriver(Model):

@@ -18,7 +18,7 @@ from real2sim_server.geometry import box_kernels
 from real2sim_server.geometry.box import box_penetration
 from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.world import broad_phase_kernels, path_kernels, warm_up
+from real2sim_server.world import broad_phase_kernels, path, warm_up
 from real2sim_server.world.collision import sweep_kernels
 from real2sim_server.world.driving import entries
 from real2sim_server.world.ego.reference import PlannedTrajectory
@@ -51,7 +51,7 @@ def some_path(rng: np.random.Generator) -> np.ndarray:
     yaws = np.cumsum(rng.normal(scale=0.1, size=60))
     steps = rng.uniform(0.1, 3.0, 60) * np.exp(1j * yaws)
     plane = np.concatenate([[0], np.cumsum(steps)[:-1]])
-    knots = np.zeros((60, path_kernels.KNOT))
+    knots = np.zeros((60, path.KNOT))
     lengths = np.abs(np.diff(plane))
     knots[1:, 0] = np.cumsum(lengths)
     knots[:, 1], knots[:, 2], knots[:, 3] = plane.real, plane.imag, rng.normal(size=60)
@@ -65,7 +65,7 @@ def some_path(rng: np.random.Generator) -> np.ndarray:
 @given(seed=seeds, x=st.floats(-50, 100), y=st.floats(-50, 50))
 def test_the_nearest_point_is_nearer_than_all_points_of_a_fine_sampling(seed, x, y):
     knots = some_path(np.random.default_rng(seed))
-    s, offset, (px, py, pz), yaw, up = path_kernels.nearest_point(knots, x, y, math.nan)
+    s, offset, (px, py, pz), yaw, up = path.nearest_point(knots, x, y, math.nan)
     at = np.arange(0.0, knots[-1, 0], 0.01)
     east, north = np.interp(at, knots[:, 0], knots[:, 1]), np.interp(at, knots[:, 0], knots[:, 2])
     distances = np.hypot(east - x, north - y)
@@ -88,7 +88,7 @@ def test_the_sharpest_turn_is_that_of_the_headings_every_four_metres(seed, s, re
     at = s + np.arange(0.0, max(reach, 8.0) + 4.0, 4.0)
     expected = np.abs(np.diff(np.interp(at, knots[:, 0], knots[:, 4]))).max() / 4
 
-    assert path_kernels.sharpest_turn(knots, s, reach) == pytest.approx(expected, abs=1e-12)
+    assert path.sharpest_turn(knots, s, reach) == pytest.approx(expected, abs=1e-12)
 
 
 def leader_by_numpy(knots, s, box, bodies, own) -> tuple[float, float]:
@@ -126,7 +126,7 @@ def test_the_next_in_a_strip_is_the_nearest_of_those_that_block_it(seed, count, 
     bodies[:, 5:] = rng.normal(scale=5.0, size=(count, 2))
     box = (offset, 4.5, 1.8)
 
-    found = path_kernels.next_in_strip(knots, s, box, bodies, 0)
+    found = path.next_in_strip(knots, s, box, bodies, 0)
     assert found == pytest.approx(leader_by_numpy(knots, s, box, bodies, 0), abs=1e-9)
 
 
@@ -135,7 +135,7 @@ def test_the_next_in_a_strip_is_the_nearest_of_those_that_block_it(seed, count, 
 def test_waypoints_are_places_of_the_path_in_the_vehicle_frame(seed, s):
     rng = np.random.default_rng(seed)
     knots, (x, y, yaw) = some_path(rng), rng.normal(scale=5.0, size=3).tolist()
-    found = path_kernels.waypoints(knots, s, (x, y, yaw), 20, 2.0)
+    found = path.waypoints(knots, s, (x, y, yaw), 20, 2.0)
 
     at = s + 2.0 * np.arange(1, 21)
     beyond = np.maximum(at - knots[-1, 0], 0.0) * np.exp(1j * knots[-1, 4])
@@ -392,7 +392,7 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         entries,
         box_kernels,
         track_kernels,
-        path_kernels,
+        path,
         broad_phase_kernels,
         road,
         hazard,

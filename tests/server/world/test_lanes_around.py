@@ -13,7 +13,7 @@ from real2sim_proto.drive import Obs
 from real2sim_proto.episode import ResetSpec
 from real2sim_server.scene import Lane, LaneGraph
 from real2sim_server.world import World
-from real2sim_server.world.lanes_around import MOST_LANES, MOST_PLACES, RADIUS, lanes_around
+from real2sim_server.world.observation import MOST_LANES, MOST_PLACES, RADIUS, lanes_around
 
 
 def lane(name: str, points, **fields) -> Lane:

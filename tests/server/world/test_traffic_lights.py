@@ -15,7 +15,7 @@ from real2sim_server.world.recording.rows import instant_row, read_instant
 from real2sim_server.world.scoring.hazard import shows_red
 from real2sim_server.world.scoring.metrics import light_compliance, lights
 from real2sim_server.world.scoring.road import RoadMap
-from real2sim_server.world.storyboard.shown_signal import ShownSignal
+from real2sim_server.world.storyboard.program import ShownSignal
 
 from .scored_drives import context, drive
 from .test_map_scores import street

@@ -19,7 +19,7 @@ from ..driving import HOLD, PlanarState
 from ..driving.curve import NO_POSE
 from ..driving.entries import advance_vehicle, plan_curve, world_poses
 from ..ego.box import REAR_OVERHANG
-from ..path_kernels import nearest_point, waypoints
+from ..path import nearest_point, waypoints
 from ..scoring.road import off_road
 from .traffic_kernels import advance_objects, bodies_of, remainder
 

@@ -18,7 +18,7 @@ from ..._numba import func
 from ...edit.track_kernels import poses_at
 from ..broad_phase_kernels import heading
 from ..ego.box import REAR_OVERHANG
-from ..path_kernels import nearest_point, next_in_strip, point_at, sharpest_turn
+from ..path import nearest_point, next_in_strip, point_at, sharpest_turn
 from ..traffic.idm import BACK_TO_LANE, HARDEST, STANDSTILL
 
 NONE, DRIVES, LEFT = 0, 1, 2

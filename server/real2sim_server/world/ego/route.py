@@ -6,8 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..path import Float, LoggedPath
-from ..path_kernels import turn_between, waypoints
+from ..path import Float, LoggedPath, turn_between, waypoints
 
 ROUTE_SPACING, ROUTE_POINTS = 1.0, 4096
 """Of a whole route: way from point to point [m], and how many points it has at most."""

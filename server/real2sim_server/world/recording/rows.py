@@ -17,7 +17,7 @@ from ..ego.reference import PlannedTrajectory
 from ..scoring import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
 from ..scoring.instant import Side
 from ..seam import Seam
-from ..storyboard.shown_signal import ShownSignal
+from ..storyboard.program import ShownSignal
 
 MAX_WAY_M = 1e6
 """Length of a route or lane [m]: they are cut into pieces of less than a metre."""

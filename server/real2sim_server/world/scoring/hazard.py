@@ -12,7 +12,7 @@ import numpy as np
 
 from ..._numba import kernel
 from ...scene import LaneGraph, Signal
-from ..storyboard.shown_signal import ShownSignal
+from ..storyboard.program import ShownSignal
 from .instant import VEHICLES, VRU, ContactRecord, EgoSample, Instant, ScoringContext, Side
 
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one

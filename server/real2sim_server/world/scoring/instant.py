@@ -15,7 +15,7 @@ from ..._records import made_quickly
 from ..ego.reference import PlannedTrajectory
 from ..path import Float
 from ..seam import Seam
-from ..storyboard.shown_signal import ShownSignal
+from ..storyboard.program import ShownSignal
 from .road import DENSITY, RoadMap, in_lane, off_road
 
 Side = Literal["front", "rear", "lateral", "stopped_ego", "stopped_track"]

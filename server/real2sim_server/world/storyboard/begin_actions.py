@@ -29,21 +29,24 @@ from real2sim_proto.storyboard_actions import (
 from ..errors import WorldError
 from ..evolve import evolved
 from ..path import LoggedPath
-from .dynamics import duration, gentle_duration
-from .entity_state import ACROSS, EntityState
-from .lateral import FollowOffset, HoldOffset, KeepAside, OffsetChange, lane_offset
-from .longitudinal import (
+from .motion import (
     FollowIdm,
+    FollowOffset,
     FollowSpeed,
+    HoldOffset,
+    KeepAside,
     KeepDistance,
+    OffsetChange,
     SpeedChange,
     SpeedCourse,
     Synchronize,
+    duration,
+    gentle_duration,
+    lane_offset,
 )
-from .positions import Places
 from .roads import Place, RoadPoint, Way, path_through
 from .trajectory import Trajectory, course_of
-from .view import View, across, ahead_on_way
+from .view import ACROSS, EntityState, Places, View, across, ahead_on_way
 
 BESIDE_ROUTE = 10.0
 """An entity teleported within this distance of its assigned route keeps the route [m]."""

@@ -31,9 +31,9 @@ from real2sim_proto.storyboard_conditions import (
     VariableValue,
 )
 
-from .entity_state import EntityState
-from .positions import Places
 from .view import (
+    EntityState,
+    Places,
     View,
     box_corners_of,
     closing_speed,

@@ -1,10 +1,429 @@
-"""An entity a short time later."""
+"""How entities move: transitions, what moves them sideways and along, and a short time of it."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
+
+from real2sim_proto.episode import IdmDriver
+from real2sim_proto.storyboard_actions import (
+    Dynamics,
+    LateralDistanceAction,
+    LongitudinalDistanceAction,
+    Shape,
+    SpeedLimits,
+)
+
 from ..evolve import evolved
-from .entity_state import EntityState, Moved, coasting
-from .view import View
+from ..traffic.idm import acceleration as idm_acceleration
+from ..traffic.idm import advance_along, leading_agent
+from .roads import Place
+from .view import EntityState, Moved, Shifted, View, across, ahead_on_way, coasting
+
+STEEPEST = {"linear": 1.0, "cubic": 1.5, "sinusoidal": math.pi / 2, "quintic": 1.875}
+"""Highest slope of each form f(u), u from 0 to 1."""
+
+CURVIEST = {"cubic": 6.0, "sinusoidal": math.pi**2 / 2, "quintic": 10.0 / math.sqrt(3.0)}
+"""Highest second derivative of each form; a linear one has none that is finite."""
+
+
+def progress(shape: Shape, u: float) -> float:
+    """f(u): 0 to 1 while u goes from 0 to 1, see :class:`Dynamics`."""
+    if shape == "step" or u >= 1.0:
+        return 1.0
+    u = max(u, 0.0)
+    if shape == "linear":
+        return u
+    if shape == "cubic":
+        return u * u * (3.0 - 2.0 * u)
+    if shape == "sinusoidal":
+        return (1.0 - math.cos(math.pi * u)) / 2.0
+    return u * u * u * (10.0 - 15.0 * u + 6.0 * u * u)
+
+
+def integral(shape: Shape, u: float) -> float:
+    """F(u), the integral of f from 0 to u; beyond 1 that of the constant 1."""
+    if shape == "step":
+        return u
+    if u >= 1.0:
+        return 0.5 + (u - 1.0)
+    u = max(u, 0.0)
+    if shape == "linear":
+        return u * u / 2.0
+    if shape == "cubic":
+        return u**3 - u**4 / 2.0
+    if shape == "sinusoidal":
+        return u / 2.0 - math.sin(math.pi * u) / (2.0 * math.pi)
+    return 2.5 * u**4 - 3.0 * u**5 + u**6
+
+
+def duration(dynamics: Dynamics, change: float) -> float:
+    """How long a change takes by time or rate [s]; 0 at once. Not for the dimension 'distance'."""
+    value = float(dynamics.value)
+    if dynamics.shape == "step" or change == 0.0:
+        return 0.0
+    if dynamics.dimension == "time":
+        return value
+    return STEEPEST[dynamics.shape] * abs(change) / value if value > 0 else 0.0
+
+
+def gentle_duration(shape: Shape, change: float, acceleration: float | None) -> float:
+    """How long a change takes whose second derivative is not to be higher [s]; 0 at once."""
+    if shape == "step" or acceleration is None or change == 0.0:
+        return 0.0
+    return math.sqrt(CURVIEST[shape] * abs(change) / max(acceleration, 1e-6))
+
+
+AT_PLACE = 0.01
+"""A distance sideways is reached within this [m]."""
+
+
+@dataclass(frozen=True)
+class OffsetChange:
+    """From one offset to another in a form of time, or of the way."""
+
+    token: int
+    shape: Shape
+    start: float
+    end: float
+    extent: float
+    by_way: bool = False
+    done: float = 0.0
+
+    def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
+        """``h`` seconds and ``way`` metres on."""
+        done = self.done + (abs(way) if self.by_way else h)
+        u = done / self.extent
+        offset = self.start + (self.end - self.start) * progress(self.shape, u)
+        return Shifted(offset, None if u >= 1.0 - DONE else replace(self, done=done))
+
+
+@dataclass(frozen=True)
+class FollowOffset:
+    """Goes on being so far beside where another is in its lane."""
+
+    token: int
+    other: str
+    value: float
+
+    def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
+        """``h`` seconds and ``way`` metres on."""
+        return Shifted(self.value + lane_offset(view.entities[self.other], view), self)
+
+
+@dataclass(frozen=True)
+class HoldOffset:
+    """Goes on being so far beside the middle of its lane."""
+
+    token: int
+    value: float
+
+    def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
+        """``h`` seconds and ``way`` metres on."""
+        return Shifted(self.value, self)
+
+
+@dataclass(frozen=True)
+class KeepAside:
+    """Keeps a distance sideways from another, within limits of speed and acceleration."""
+
+    token: int
+    action: LateralDistanceAction
+    side: float
+
+    def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
+        """``h`` seconds and ``way`` metres on."""
+        other, limits = view.entities[self.action.entity], self.action.limits
+        distance = float(self.action.distance)
+        if self.action.freespace:
+            distance += (actor.size[1] + other.size[1]) / 2
+        yaw = actor.h if actor.way is None else actor.way.path.at(actor.s)[3]
+        now = across(yaw, actor.x - other.x, actor.y - other.y)
+        error = self.side * distance - now
+        speed = math.inf if limits.speed is None else float(limits.speed)
+        if limits.acceleration is not None:
+            # What can still be braked away before it is there, and what can be gained by now.
+            gain = float(limits.acceleration)
+            speed = min(speed, math.sqrt(2.0 * gain * abs(error)), abs(actor.drift) + gain * h)
+        step = min(max(error, -speed * h), speed * h)
+        there = abs(error - step) < AT_PLACE
+        return Shifted(actor.offset + step, None if there and not self.action.continuous else self)
+
+
+def lane_offset(actor: EntityState, view: View) -> float:
+    """How far an entity is to the left of the middle of its lane, as it drives [m]."""
+    if actor.way is not None and actor.way.lane:
+        return actor.offset
+    on_lane = actor.on_lane(view.network)
+    return on_lane.offset
+
+
+DONE = 1e-9
+"""Times and distances below this are none."""
+
+AT_PLACE, AT_SPEED = 0.05, 0.05
+"""A distance is reached within these [m], [m/s]."""
+
+SLOWEST_MASTER = 0.05
+"""Of whom it is not known when they arrive [m/s]."""
+
+
+@dataclass(frozen=True)
+class SpeedChange:
+    """From one speed to another in a form of time."""
+
+    token: int
+    shape: Shape
+    start: float
+    end: float
+    duration: float
+    elapsed: float = 0.0
+
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
+        """``h`` seconds on; the way is the integral of the speed."""
+        before, after = self.elapsed / self.duration, (self.elapsed + h) / self.duration
+        change = self.end - self.start
+        covered = integral(self.shape, after) - integral(self.shape, before)
+        way = self.start * h + change * self.duration * covered
+        speed = self.start + change * progress(self.shape, after)
+        over = after >= 1.0 - DONE
+        return Moved(way, speed, None if over else replace(self, elapsed=self.elapsed + h))
+
+
+@dataclass(frozen=True)
+class SpeedCourse:
+    """Through speeds at times since it began, linearly between them."""
+
+    token: int
+    points: tuple[tuple[float, float], ...]
+    elapsed: float = 0.0
+
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
+        """``h`` seconds on."""
+        t0, t1 = self.elapsed, self.elapsed + h
+        inner = [t for t, _ in self.points if t0 < t < t1]
+        times = [t0, *inner, t1]
+        speeds = [self._speed(t) for t in times]
+        way = sum(
+            (b - a) * (u + v) / 2
+            for a, b, u, v in zip(times, times[1:], speeds, speeds[1:], strict=False)
+        )
+        over = t1 >= self.points[-1][0] - DONE
+        return Moved(way, speeds[-1], None if over else replace(self, elapsed=t1))
+
+    def _speed(self, t: float) -> float:
+        for (a, u), (b, v) in zip(self.points, self.points[1:], strict=False):
+            if t <= b:
+                return v if b <= a else u + (v - u) * (t - a) / (b - a)
+        return self.points[-1][1]
+
+
+@dataclass(frozen=True)
+class FollowSpeed:
+    """Goes on having the speed of another, plus or times something, no faster than by a rate."""
+
+    token: int
+    other: str
+    relation: str
+    value: float
+    rate: float
+
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
+        """``h`` seconds on."""
+        speed = view.entities[self.other].speed
+        wanted = speed + self.value if self.relation == "delta" else speed * self.value
+        change = min(max(wanted - actor.speed, -self.rate * h), self.rate * h)
+        return Moved((actor.speed + change / 2) * h, actor.speed + change, self)
+
+
+@dataclass(frozen=True)
+class KeepDistance:
+    """Keeps a distance, or a gap in time, along the road to another."""
+
+    token: int
+    action: LongitudinalDistanceAction
+    leading: bool
+
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
+        """``h`` seconds on, as fast as the limits let it be there and stay."""
+        other = view.entities[self.action.entity]
+        ahead = ahead_on_way(actor, other.x, other.y, view.network)
+        error = ahead - self._wanted(actor, other)
+        closing = error + other.speed * h
+        limits = self.action.limits
+        if limits.acceleration is None and limits.deceleration is None:
+            # As fast as it takes: there at the end of the step.
+            most = math.inf if limits.speed is None else float(limits.speed)
+            way = min(max(closing, 0.0), most * h)
+            speed = min(other.speed, most) if abs(way - closing) < DONE else way / h
+            return Moved(way, speed, self._then(0.0 if way == closing else error, 0.0))
+        speed = _approach(actor.speed, other.speed, error, h, limits)
+        left = error + (other.speed - (actor.speed + speed) / 2) * h
+        way = (actor.speed + speed) / 2 * h
+        return Moved(way, speed, self._then(left, speed - other.speed))
+
+    def _wanted(self, actor: EntityState, other: EntityState) -> float:
+        """How far ahead of it the other is to be: negative for who leads."""
+        aim = self.action
+        if aim.distance is not None:
+            distance = float(aim.distance)
+        else:
+            distance = float(aim.time_gap or 0.0) * actor.speed
+        if aim.freespace:
+            behind, front = (other, actor) if not self.leading else (actor, other)
+            distance += front.size[0] / 2 + front.centre[0]
+            distance += behind.size[0] / 2 - behind.centre[0]
+        return -distance if self.leading else distance
+
+    def _then(self, error: float, difference: float) -> KeepDistance | None:
+        there = abs(error) < AT_PLACE and abs(difference) < AT_SPEED
+        return None if there and not self.action.continuous else self
+
+
+def _approach(speed: float, other: float, error: float, h: float, limits: SpeedLimits) -> float:
+    """Speed after ``h`` seconds of who is to close ``error`` metres to someone with a speed."""
+    gain = float(limits.acceleration) if limits.acceleration is not None else 10.0
+    loss = float(limits.deceleration) if limits.deceleration is not None else 10.0
+    # The difference that the other limit can still take back in time; linear when nearly there.
+    back = loss if error > 0 else gain
+    excess = min(math.sqrt(2.0 * 0.8 * back * abs(error)), abs(error) * 2.0)
+    wanted = max(other + math.copysign(excess, error), 0.0)
+    if limits.speed is not None:
+        wanted = min(wanted, float(limits.speed))
+    return min(max(wanted, speed - loss * h), speed + gain * h)
+
+
+@dataclass(frozen=True)
+class Synchronize:
+    """Arrives at its place when another arrives at its own, solved anew in every step.
+
+    Without a final speed by a constant acceleration a = 2 (d - v T) / T^2, with one by a linear
+    one: a(0) = 6 d / T^2 - (4 v + 2 v_f) / T, over the way and time that are left before the steady
+    part; who stands waits until a constant one does.
+    """
+
+    token: int
+    master: str
+    master_target: Place
+    target: Place
+    final_speed: float | None
+    relative: bool
+    tolerances: tuple[float, float]
+    steady: tuple[float, float]
+    limits: SpeedLimits
+
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
+        """``h`` seconds on."""
+        master = view.entities[self.master]
+        to_go = _left(master, self.master_target, view)
+        left = _left(actor, self.target, view)
+        v = actor.speed
+        if to_go <= self.tolerances[0] + DONE or left <= self.tolerances[1] + DONE:
+            return Moved(v * h, self._final(master, v), None)
+        if master.speed <= SLOWEST_MASTER:
+            return Moved(v * h, v, self)
+        time = to_go / master.speed
+        rate = self._solved(left, v, time)
+        if self.limits != SpeedLimits():
+            way, speed = advance_along(0.0, v, self._limited(v, rate, h), h)
+            return Moved(way, speed, self if time > h else None)
+        if self.final_speed is not None:
+            return self._towards_final(actor, left, time, self._final(master, v), h)
+        if time <= h:
+            end = max(v + rate * time, 0.0)
+            return Moved(left + end * (h - time), end, None)
+        way, speed = advance_along(0.0, v, rate, h)
+        return Moved(way, speed, self)
+
+    def _towards_final(
+        self, actor: EntityState, left: float, time: float, final: float, h: float
+    ) -> Moved:
+        """With a final speed: a linear acceleration to it, then steadily on."""
+        v, (distance, seconds) = actor.speed, self.steady
+        if seconds > 0.0:
+            distance = seconds * final
+        elif final > DONE:
+            seconds = distance / final
+        d, t = left - distance, time - seconds
+        then = self if time > h else None
+        if t <= DONE or d <= DONE:
+            return Moved(final * h, final, then)
+        if v <= DONE and final > DONE and t > 2.0 * d / final:
+            wait = min(t - 2.0 * d / final, h)
+            if wait >= h:
+                return Moved(0.0, 0.0, self)
+            rate, left_h = final * final / (2.0 * d), h - wait
+            return Moved(rate * left_h * left_h / 2, rate * left_h, self)
+        rate = 6 * d / t**2 - (4 * v + 2 * final) / t
+        jerk = 2 * (final - v - rate * t) / t**2
+        if t <= h:
+            return Moved(d + final * (h - t), final, then)
+        speed = v + rate * h + jerk * h * h / 2
+        if speed < 0.0:
+            way, _ = advance_along(0.0, v, -v / h, h)
+            return Moved(way, 0.0, self)
+        return Moved(v * h + rate * h * h / 2 + jerk * h**3 / 6, speed, self)
+
+    def _solved(self, d: float, v: float, time: float) -> float:
+        """Constant acceleration to arrive in time."""
+        rate = 2 * (d - v * time) / time**2
+        if v + rate * time < 0.0:
+            # It would have to come back: it stops at its place and waits.
+            return -v * v / (2 * max(d, DONE))
+        return rate
+
+    def _limited(self, speed: float, rate: float, h: float) -> float:
+        """An acceleration within the limits."""
+        most, least, fastest = self.limits.acceleration, self.limits.deceleration, self.limits.speed
+        rate = rate if most is None else min(rate, float(most))
+        rate = rate if least is None else max(rate, -float(least))
+        return rate if fastest is None else min(rate, max(float(fastest) - speed, 0.0) / h)
+
+    def _final(self, master: EntityState, speed: float) -> float:
+        if self.final_speed is None:
+            return speed
+        return self.final_speed + (master.speed if self.relative else 0.0)
+
+
+def _left(actor: EntityState, target: Place, view: View) -> float:
+    """Way that is left to a place [m]."""
+    if actor.trajectory is not None:
+        return actor.trajectory.ahead(target.x, target.y)
+    return ahead_on_way(actor, target.x, target.y, view.network)
+
+
+@dataclass(frozen=True)
+class FollowIdm:
+    """The intelligent driver model behind whoever is ahead on its way."""
+
+    token: int
+    spec: IdmDriver
+    desired: float
+    rate: float = 0.0
+
+    def step(self, actor: EntityState, view: View, h: float) -> Moved:
+        """``h`` seconds on; the leader is looked for once in a step of the clock."""
+        rate = self._rate(actor, view) if view.first else self.rate
+        way, speed = advance_along(0.0, actor.speed, rate, h)
+        return Moved(way, speed, replace(self, rate=rate))
+
+    def _rate(self, actor: EntityState, view: View) -> float:
+        if actor.way is None or actor.subject is None:
+            return 0.0
+        length, width, _ = actor.size
+        path, s = actor.way.path, actor.s + actor.centre[0]
+        leader = leading_agent(
+            path,
+            s,
+            offset=actor.offset,
+            length=length,
+            width=width,
+            object_id=actor.subject.object_id,
+            surroundings=view.surroundings,
+        )
+        bend = path.sharpest_turn(s, 2.0 * actor.speed)
+        desired = min(self.desired, math.sqrt(self.spec.lateral / max(bend, 1e-4)))
+        return idm_acceleration(self.spec, actor.speed, desired, leader)
 
 
 def advanced(actor: EntityState, view: View, h: float) -> EntityState:

@@ -19,13 +19,10 @@ from ..evolve import evolved
 from ..traffic.driver import Surroundings
 from .begin_actions import Beginning, begun
 from .conditions import Facts, Memory, fires
-from .entity_state import EntityState
 from .motion import advanced
-from .positions import Places
-from .program import Element, Program, Start
+from .program import Element, Program, Start, phase_start, shown_at
 from .roads import RoadNetwork
-from .signals import phase_start, shown_at
-from .view import View
+from .view import EntityState, Places, View
 
 STANDBY, RUNNING, COMPLETE = 0, 1, 2
 STATES = {"standby": STANDBY, "running": RUNNING, "complete": COMPLETE}

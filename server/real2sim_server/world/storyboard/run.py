@@ -3,30 +3,273 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
+
+import numpy as np
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.storyboard import Entity, RouteLanes, Storyboard, resolved
+from real2sim_proto.episode import ResetSpec
+from real2sim_proto.storyboard import (
+    DRAWN,
+    Choice,
+    Entity,
+    Histogram,
+    MapRoads,
+    Normal,
+    Poisson,
+    RouteLanes,
+    Storyboard,
+    Uniform,
+    resolved,
+)
 
-from ...edit import ObjectState
-from ..draws import Draws
+from ...edit import ObjectState, ScenarioState
+from ...edit.compose import figure_of
+from ...scene import Scene, Trajectory
+from ...scene.lane_graph import LaneGraph
+from ...scene.scene import MAX_OBJECTS
+from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
 from ..errors import WorldError
 from ..evolve import evolved
-from ..traffic.driver import Surroundings
-from ..traffic.replay import recorded_pose
-from ..traffic.scripted import ScriptedEntity
-from .draw import drawn_values
-from .entities import box_of, own_centre
-from .entity_state import EntityState, observed
-from .positions import Places
-from .program import PLACING, Program, program_of
+from ..randomization import Draws
+from ..traffic.driver import ScriptedEntity, Surroundings, recorded_pose
+from .program import PLACING, Program, ShownSignal, program_of, shown_at
 from .progress import COMPLETE, ElementChange, Memories, Progress
-from .roads import Place, RoadNetwork, RouteNetwork
-from .shown_signal import ShownSignal
-from .signals import shown_at
+from .roads import GraphNetwork, Place, RoadNetwork, RouteNetwork
+from .view import EntityState, Places, observed
+
+TRIES = 1000
+"""Of a draw that has to fall within a range."""
+
+
+def drawn_values(board: Storyboard, draws: Draws | None) -> tuple[Storyboard, Mapping[str, float]]:
+    """The storyboard with drawn values of the parameters that have a stochastic distribution, and
+    those that are numbers by name. Without ``draws`` as it is.
+
+    Raises:
+        WorldError: INVALID_REQUEST, a range in which nothing falls.
+    """
+    stochastic = {k: d for k, d in board.distributions.items() if isinstance(d, DRAWN)}
+    if draws is None or not stochastic:
+        return board, {}
+    values = {name: _drawn(d, name, draws) for name, d in stochastic.items()}
+    named = {
+        f"storyboard.parameters.{k}": float(v)
+        for k, v in values.items()
+        if isinstance(v, int | float)
+    }
+    return board.model_copy(update={"parameters": {**board.parameters, **values}}), named
+
+
+def _drawn(distribution: Any, name: str, draws: Draws) -> Any:
+    what = f"storyboard.{name}"
+    if isinstance(distribution, Uniform):
+        u = draws.uniform(what)[0]
+        return distribution.low + (distribution.high - distribution.low) * u
+    if isinstance(distribution, Choice):
+        weights = [v.weight for v in distribution.values]
+        return distribution.values[_picked(weights, draws.uniform(what)[0])].value
+    if isinstance(distribution, Histogram):
+        u, v = draws.uniform(what, count=2)
+        chosen = distribution.bins[_picked([b.weight for b in distribution.bins], u)]
+        return chosen.low + (chosen.high - chosen.low) * v
+    for attempt in range(TRIES):
+        value = _unbounded(distribution, what, draws, attempt)
+        low, high = distribution.low, distribution.high
+        if (low is None or value >= low) and (high is None or value <= high):
+            return value
+    raise WorldError(
+        ErrorCode.INVALID_REQUEST,
+        f"nothing drawn for storyboard parameter {name!r} falls within its range",
+        hint="widen the range of its distribution",
+    )
+
+
+def _unbounded(distribution: Normal | Poisson, what: str, draws: Draws, attempt: int) -> float:
+    if isinstance(distribution, Normal):
+        value = (
+            distribution.mean + math.sqrt(distribution.variance) * (draws.normal(what, attempt)[0])
+        )
+        return math.exp(value) if distribution.log else value
+    # By the sum of waiting times (Knuth 1969), in pieces that do not underflow.
+    left, count, number = distribution.mean, 0, 0
+    while True:
+        u = draws.uniform(what, attempt, number)[0]
+        number += 1
+        left += math.log(max(1.0 - u, 1e-300))
+        if left <= 0.0:
+            return float(count)
+        count += 1
+
+
+def _picked(weights: list[float], u: float) -> int:
+    left = u * sum(weights)
+    for k, weight in enumerate(weights):
+        if left < weight:
+            return k
+        left -= weight
+    return len(weights) - 1
+
+
+BOXES = {
+    "car": ((4.6, 1.85, 1.5), 1.35),
+    "van": ((5.2, 2.0, 2.0), 1.5),
+    "truck": ((8.0, 2.5, 3.2), 2.5),
+    "bus": ((11.0, 2.5, 3.2), 3.0),
+    "motorcycle": ((2.1, 0.8, 1.6), 0.0),
+    "cyclist": ((1.8, 0.6, 1.8), 0.0),
+    "pedestrian": ((0.5, 0.6, 1.8), 0.0),
+    "animal": ((0.9, 0.3, 0.7), 0.0),
+}
+"""Size [m] of a category, and how far ahead of the reference point its middle is [m]."""
+
+OTHER = ((1.0, 1.0, 1.0), 0.0)
+
+ALIKE = (
+    frozenset({"car", "vehicle", "van", "truck", "bus"}),
+    frozenset({"motorcycle", "cyclist", "bicycle"}),
+    frozenset({"pedestrian", "person", "animal"}),
+)
+"""Categories that may lend each other their looks."""
+
+Vector = tuple[float, float, float]
+
+
+def box_of(entity: Entity, subject: ObjectState | None, ego_size: Vector) -> tuple[Vector, Vector]:
+    """Size of an entity's box and where its middle is from the reference point [m]: as it says, of
+    the object or ego that it is, or by its category."""
+    if entity.kind == "ego":
+        return ego_size, (ego_size[0] / 2 - REAR_OVERHANG, 0.0, ego_size[2] / 2)
+    if entity.box is not None:
+        length, width, height = (float(v) for v in entity.box.size)
+        x, y, z = (float(v) for v in entity.box.centre)
+        return (length, width, height), (x, y, z)
+    if entity.kind == "object" and subject is not None:
+        size = subject.scaled_size
+        return size, (0.0, 0.0, size[2] / 2)
+    size, ahead = BOXES.get(entity.category, OTHER)
+    return size, (ahead, 0.0, size[2] / 2)
+
+
+def own_centre(ego: Entity, ego_size: Vector) -> Vector | None:
+    """Where the middle of the ego's box is from its reference point [m], as the storyboard says of
+    a vehicle of that size; None: it speaks of another vehicle, or of none."""
+    if ego.box is None or not np.allclose([float(v) for v in ego.box.size], ego_size, atol=1e-6):
+        return None
+    x, y, z = (float(v) for v in ego.box.centre)
+    return x, y, z
+
+
+def subjects_of(
+    entities: Iterable[Entity], state: ScenarioState, scene: Scene
+) -> dict[str, ObjectState]:
+    """The object of each entity but the ego, by name; new ones look like objects of ``scene``.
+
+    Raises:
+        WorldError: UNKNOWN_OBJECT for an object or look that the world lacks, UNKNOWN_ASSET,
+            INVALID_REQUEST where nobody could be looked like, or an id is taken.
+    """
+    found, number = dict[str, ObjectState](), MAX_OBJECTS
+    for entity in entities:
+        if entity.kind == "ego":
+            continue
+        if entity.kind == "object":
+            found[entity.name] = _known(state, str(entity.object_id), f"entity {entity.name!r}")
+            continue
+        found[entity.name] = _new(entity, state, scene, number)
+        number -= 1
+    ids = [subject.object_id for subject in found.values()]
+    if twice := sorted({i for i in ids if ids.count(i) > 1}):
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"two entities of the storyboard are the object {twice[0]!r}",
+            hint="name each object once, and entities unlike the objects of the scene",
+        )
+    return found
+
+
+def object_ids_of(name: str) -> tuple[str, str]:
+    """The id of the object of a new entity, and the one where that is taken."""
+    object_id = "".join(c if c.isalnum() or c in "_.-" else "_" for c in name)[:80]
+    return object_id, f"{object_id[:72]}.story"
+
+
+def _known(state: ScenarioState, object_id: str, who: str) -> ObjectState:
+    known = {o.object_id: o for o in state.visible}
+    if object_id not in known:
+        raise WorldError(
+            ErrorCode.UNKNOWN_OBJECT,
+            f"{who} of the storyboard is {object_id!r}, which is no object of this world",
+            hint=f"objects of this world: {', '.join(known) or 'none'}",
+        )
+    return known[object_id]
+
+
+def _new(entity: Entity, state: ScenarioState, scene: Scene, instance_id: int) -> ObjectState:
+    size, _ = box_of(entity, None, (1.0, 1.0, 1.0))
+    object_id, else_id = object_ids_of(entity.name)
+    if state.has_id(object_id):
+        object_id = else_id
+    here = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    common = {
+        "object_id": object_id,
+        "category": entity.category,
+        "instance_id": instance_id,
+        "trajectory": here,
+        "velocity": None,
+        "edited": True,
+    }
+    if entity.asset_id is not None:
+        asset = state.assets(entity.asset_id) if state.assets else None
+        if asset is None:
+            raise WorldError(
+                ErrorCode.UNKNOWN_ASSET,
+                f"entity {entity.name!r} shows asset {entity.asset_id!r}, which is not in the "
+                "library",
+                hint="GET /v1/assets lists them; POST /v1/assets adds one",
+            )
+        fitted = _fitted(size, asset.size, walks=asset.figure is not None)
+        return ObjectState(source_id="", asset=asset, **fitted, **common)  # type: ignore[arg-type]
+    look = _look(entity, state, size)
+    fitted = _fitted(size, look.size, walks=figure_of(scene, look) is not None)
+    return replace(look, **fitted, **common)  # type: ignore[arg-type]
+
+
+def _look(entity: Entity, state: ScenarioState, size: Vector) -> ObjectState:
+    """Whom it looks like: who is named, else who is most like it in category, then in size."""
+    if entity.look is not None:
+        return _known(state, entity.look, f"the look of {entity.name!r}")
+    candidates = list(state.visible)
+    if not candidates:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"entity {entity.name!r} has nobody to look like: the scene has no object",
+            hint="name an asset of the library in `asset_id`",
+        )
+    group = next((g for g in ALIKE if entity.category in g), frozenset({entity.category}))
+
+    def unlike(subject: ObjectState) -> tuple[bool, bool, float, str]:
+        ratios = [a / b for a, b in zip(size, subject.size, strict=True)]
+        stretch = sum(math.log(r) ** 2 for r in ratios)
+        same = subject.category == entity.category
+        return subject.category not in group, not same, stretch, subject.object_id
+
+    return min(candidates, key=unlike)
+
+
+def _fitted(size: Vector, of: Vector, *, walks: bool) -> dict[str, Vector]:
+    """Size before its scale, and scale, of whoever has the box ``size`` and looks like something of
+    size ``of``: stretched to it, or as a person only made taller."""
+    if not walks:
+        return {"size": of, "scale": (size[0] / of[0], size[1] / of[1], size[2] / of[2])}
+    scale = size[2] / of[2]
+    length, width, height = (edge / scale for edge in size)
+    return {"size": (length, width, height), "scale": (scale, scale, scale)}
+
 
 TICK_US = 10_000
 """Elements begin and end within a step of the clock at most so far apart [us]."""
@@ -241,3 +484,66 @@ def _nothing_yet(program: Program) -> Memories:
         (0,) * count, (0,) * count, {}, {}, {**board.parameters, **board.variables}, {}, {}, 1,
         over=False, fresh=frozenset(),
     )  # fmt: skip
+
+
+def begin_storyboard(
+    spec: ResetSpec, state: ScenarioState, surroundings: Surroundings, scene: Scene, draws: Draws
+) -> StoryboardRun:
+    """The run of the storyboard that a reset has.
+
+    Args:
+        spec: with a storyboard.
+        state: objects of the scenario.
+        surroundings: the start, the ego as it was recorded.
+        scene: that it runs on.
+        draws: of the episode.
+
+    Raises:
+        WorldError: INVALID_REQUEST where it does not go together with other options or cannot be;
+            UNKNOWN_OBJECT, UNKNOWN_ASSET.
+    """
+    board = spec.storyboard
+    assert board is not None
+    if spec.beyond_log == "loop":
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            "a storyboard goes on in one direction, and beyond_log 'loop' puts the ego back",
+            hint="let beyond_log be 'extend' or 'end'",
+        )
+    if spec.warmup_us:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            "a storyboard says where the ego begins, and a warm-up lets it follow the log",
+            hint="leave out warmup_us, or the storyboard",
+        )
+    driven = {e.object_id for e in board.entities if e.kind == "object"} & set(spec.agents.drivers)
+    if driven:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"object {min(map(str, driven))!r} has a driver and is moved by the storyboard",
+            hint="leave it out of agents.drivers",
+        )
+    return StoryboardRun.begin(
+        board,
+        subjects_of(resolved(board).entities, state, scene),
+        surroundings,
+        ego_size=scene.ego_size,
+        network=_network(board, scene),
+        draws=draws,
+    )
+
+
+def _network(board: Storyboard, scene: Scene) -> RoadNetwork | None:
+    """Roads of the scene's map where the storyboard is for a map; None: lanes along the route."""
+    if not isinstance(board.roads, MapRoads):
+        return None
+    graph: LaneGraph | None = getattr(scene, "lanes", None)
+    if graph is None or not graph.roads:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"the storyboard is for a road network ({board.roads.file or 'unnamed'}), and scene "
+            f"{scene.name!r} has no map with roads",
+            hint="run it on a scene made from that network, or with storyboard.roads of kind "
+            "'route', lanes along the ego's route",
+        )
+    return GraphNetwork(graph)

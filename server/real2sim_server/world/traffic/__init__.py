@@ -1,8 +1,7 @@
 """Other road users: one Protocol, a driver for each way of moving, see :mod:`.drivers`."""
 
 from .driver import AgentDriver, AgentPose, ObservedEgo, Surroundings
-from .drivers import DRIVERS, begin_driver
-from .traffic import Traffic
+from .traffic import DRIVERS, Traffic, begin_driver
 
 __all__ = [
     "DRIVERS",

@@ -15,9 +15,8 @@ from real2sim_proto.episode import CutInDriver, HardBrakeDriver, JunctionCrossin
 from ...edit import ObjectState
 from ...scene import Ground
 from ..path import LoggedPath
-from .driver import AgentPose, Surroundings, level_quaternion, pose_on_path
+from .driver import AgentPose, Surroundings, level_quaternion, pose_on_path, recorded_pose
 from .idm import advance_along
-from .replay import recorded_pose
 
 PACE = 1.0
 """Time constant with which a car beside the ego closes up to its place [s]."""

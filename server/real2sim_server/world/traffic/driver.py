@@ -1,16 +1,19 @@
-"""Drivers of other road users: Protocol, observation and poses."""
+"""Drivers of other road users: their Protocol; replay, plans from outside, and storyboards."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
+from real2sim_proto.episode import ConstantVelocityDriver, ExternalDriver, ReplayDriver
+
 from ...edit import ObjectState
+from ...geometry.rotation import quaternion_yaw
 from ...scene import Ground
 from ...scene.lane_graph import LaneGraph
 from ..agents import Agents, rows_of
@@ -214,3 +217,148 @@ def pose_put_back(pose: AgentPose, route: LoggedPath, way: float) -> AgentPose:
         heading,
         (cos * vx - sin * vy, sin * vx + cos * vy, vz),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Moves along its trajectory in time and is in the world while that lasts; observes nothing."""
+
+    subject: ObjectState
+    pose: AgentPose
+    present: bool = True
+
+    @classmethod
+    def begin(cls, subject: ObjectState, _spec: ReplayDriver, surroundings: Surroundings) -> Replay:
+        """From where the trajectory is now, which it must cover."""
+        return cls(subject, recorded_pose(subject, surroundings.t_us))
+
+    def advance(self, surroundings: Surroundings) -> Self:
+        """The driver one step later."""
+        t_us, trajectory = surroundings.t_us + surroundings.dt_us, self.subject.trajectory
+        if not trajectory.start_us <= t_us <= trajectory.end_us:
+            return replace(self, present=False)
+        return replace(self, pose=recorded_pose(self.subject, t_us), present=True)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantVelocity:
+    """Goes on as it moved when it began, at its height and with its heading; observes nothing."""
+
+    subject: ObjectState
+    pose: AgentPose
+    present: bool = True
+
+    @classmethod
+    def begin(
+        cls, subject: ObjectState, _spec: ConstantVelocityDriver, surroundings: Surroundings
+    ) -> ConstantVelocity:
+        """From how the object moves now."""
+        pose = recorded_pose(subject, surroundings.t_us)
+        vx, vy, _ = pose.velocity
+        return cls(subject, pose._replace(velocity=(vx, vy, 0.0)))
+
+    def advance(self, surroundings: Surroundings) -> Self:
+        """The driver one step later."""
+        (x, y, z), (vx, vy, _) = self.pose.position, self.pose.velocity
+        moved = (x + vx * surroundings.dt, y + vy * surroundings.dt, z)
+        return replace(self, pose=self.pose._replace(position=moved))
+
+
+def recorded_pose(subject: ObjectState, t_us: int) -> AgentPose:
+    """Where the object's trajectory is at ``t_us``, with its velocity there.
+
+    Raises:
+        TimeOutOfRangeError: outside the trajectory.
+    """
+    position, quaternion = subject.trajectory.pose(t_us)
+    x, y, z = position.tolist()
+    w, qx, qy, qz = quaternion.tolist()
+    vx, vy, vz = subject.trajectory.velocity(t_us).tolist()
+    yaw = float(quaternion_yaw(quaternion))
+    return AgentPose((x, y, z), (w, qx, qy, qz), yaw, (vx, vy, vz))
+
+
+@dataclass(frozen=True, eq=False)
+class External:
+    """Follows the newest plan it was given, exactly; then goes straight on as it moved last.
+
+    Attributes:
+        subject: the object.
+        pose, present: see :class:`~.driver.AgentDriver`.
+        times_us: [N] of the plan; empty before the first one [us].
+        poses: [N] x, y [m], yaw [rad], world.
+    """
+
+    subject: ObjectState
+    pose: AgentPose
+    times_us: tuple[int, ...] = ()
+    poses: tuple[tuple[float, float, float], ...] = ()
+    present: bool = True
+
+    @classmethod
+    def begin(
+        cls, subject: ObjectState, _spec: ExternalDriver, surroundings: Surroundings
+    ) -> External:
+        """From how the object moves now."""
+        return cls(subject, recorded_pose(subject, surroundings.t_us))
+
+    def with_plan(
+        self, t_us: int, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]
+    ) -> External:
+        """The driver with a new plan; it leads there from where the object is at ``t_us``."""
+        x, y, _ = self.pose.position
+        here = (x, y, self.pose.yaw)
+        return replace(self, times_us=(t_us, *times_us), poses=(here, *poses))
+
+    def advance(self, surroundings: Surroundings) -> Self:
+        """The driver one step later."""
+        t_us, (x, y, z) = surroundings.t_us + surroundings.dt_us, self.pose.position
+        if not self.times_us or t_us > self.times_us[-1]:
+            vx, vy, _ = self.pose.velocity
+            moved = (x + vx * surroundings.dt, y + vy * surroundings.dt, z)
+            velocity = (vx, vy, 0.0)
+            return replace(self, pose=self.pose._replace(position=moved, velocity=velocity))
+        nx, ny, yaw = self._planned(t_us)
+        velocity = ((nx - x) / surroundings.dt, (ny - y) / surroundings.dt, 0.0)
+        pose = AgentPose((nx, ny, z), level_quaternion(yaw), yaw, velocity)
+        return replace(self, pose=pose)
+
+    def _planned(self, t_us: int) -> tuple[float, float, float]:
+        k = min(int(np.searchsorted(self.times_us, t_us)), len(self.times_us) - 1)
+        a, b = self.poses[k - 1], self.poses[k]
+        fraction = (t_us - self.times_us[k - 1]) / (self.times_us[k] - self.times_us[k - 1])
+        turn = math.remainder(b[2] - a[2], math.tau)
+        return (
+            (1 - fraction) * a[0] + fraction * b[0],
+            (1 - fraction) * a[1] + fraction * b[1],
+            a[2] + fraction * turn,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ScriptedEntity:
+    """Where a storyboard has an object. It is moved with the others of its storyboard, and not by
+    itself.
+
+    Attributes:
+        subject, pose, present: see :class:`~.driver.AgentDriver`.
+    """
+
+    subject: ObjectState
+    pose: AgentPose
+    present: bool = True
+
+    def advance(self, surroundings: Surroundings) -> Self:
+        """Itself: its storyboard makes the next one."""
+        return self
+
+
+class Script(Protocol):
+    """Moves several objects together. Immutable, as drivers are."""
+
+    @property
+    def drivers(self) -> Mapping[str, ScriptedEntity]:
+        """Of the objects, by id."""
+
+    def advance(self, surroundings: Surroundings) -> Script:
+        """The script one step later."""

@@ -1,22 +1,113 @@
-"""The intelligent driver model on a recorded path."""
+"""The intelligent driver model on a path, its leading object, and MOBIL, which changes lanes."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from real2sim_proto.episode import IdmDriver, IdmParameters
+from real2sim_proto.episode import IdmDriver, IdmParameters, LaneDriver
 
 from ...edit import ObjectState
 from ...scene import Ground, Trajectory
-from ..path import LoggedPath
-from .driver import AgentPose, Surroundings, pose_on_path, pose_put_back
-from .lane import lane_of
-from .leader import Leader, leading_agent
-from .replay import recorded_pose
+from ..path import LoggedPath, next_in_strip, previous_in_strip
+from .driver import AgentPose, Surroundings, pose_on_path, pose_put_back, recorded_pose
+
+
+class Leader(NamedTuple):
+    """The nearest body ahead: bumper to bumper [m], and its speed along the path [m/s]."""
+
+    gap: float
+    speed: float
+
+
+def leading_agent(
+    path: LoggedPath,
+    s: float,
+    *,
+    offset: float,
+    length: float,
+    width: float,
+    object_id: str,
+    surroundings: Surroundings,
+) -> Leader | None:
+    """The body that is next in the strip an object sweeps along a path.
+
+    Args:
+        path: of the object.
+        s, offset: of its centre along the path, and from it [m].
+        length, width: of its box [m].
+        object_id: of the object, which is not its own leader.
+        surroundings: everybody.
+    """
+    box = (float(offset), float(length), float(width))
+    gap, speed = next_in_strip(
+        path.knots, float(s), box, surroundings.bodies, surroundings.rows.get(object_id, -1)
+    )
+    return None if math.isinf(gap) else Leader(gap, speed)
+
+
+class Neighbours(NamedTuple):
+    """Who is next before and behind something in a lane; None where nobody is within 80 m."""
+
+    leader: Leader | None
+    follower: Leader | None
+
+
+def neighbours(
+    path: LoggedPath,
+    s: float,
+    *,
+    length: float,
+    width: float,
+    object_id: str,
+    surroundings: Surroundings,
+) -> Neighbours:
+    """Leader and follower that a box would have in the middle of a lane, those among them who have
+    begun to change into it.
+
+    Args:
+        path: of the lane.
+        s: of the middle of the box along it [m].
+        length, width: of the box [m].
+        object_id: of the object, which is neither.
+        surroundings: everybody.
+    """
+    box, own = (0.0, float(length), float(width)), surroundings.rows.get(object_id, -1)
+    now = surroundings.bodies
+    then = surroundings.bodies_as_meant
+    found = []
+    for query in (next_in_strip, previous_in_strip):
+        gap, speed = min(query(path.knots, float(s), box, bodies, own) for bodies in (now, then))
+        found.append(None if math.isinf(gap) else Leader(gap, speed))
+    return Neighbours(*found)
+
+
+STRAIGHT = 600.0
+"""Lanes begin so far before the route and end so far behind it, straight on [m]."""
+
+
+def lane_beside(route: LoggedPath, offset: float, *, oncoming: bool = False) -> LoggedPath:
+    """The lane ``offset`` metres to the left of a route; ``oncoming``: against it."""
+    (x, y, z), (ex, ey, ez) = route.positions[0].tolist(), route.positions[-1].tolist()
+    first, last = float(route.yaws[0]), float(route.yaws[-1])
+    start = [x - STRAIGHT * math.cos(first), y - STRAIGHT * math.sin(first), z]
+    end = [ex + STRAIGHT * math.cos(last), ey + STRAIGHT * math.sin(last), ez]
+    longer = LoggedPath.through(
+        np.vstack([start, route.positions, end]),
+        np.concatenate([[first], route.yaws, [last]]),
+        np.vstack([route.ups[:1], route.ups, route.ups[-1:]]),
+    )
+    return longer.beside(offset, reverse=oncoming)
+
+
+def lane_of(route: LoggedPath, x: float, y: float, yaw: float) -> LoggedPath:
+    """The lane beside a route in which something is at x, y [m], the way it faces: ``yaw``."""
+    near = route.nearest(x, y)
+    return lane_beside(route, near.offset, oncoming=math.cos(yaw - near.yaw) < 0.0)
+
 
 HARDEST = 8.0
 """Deceleration that brakes can bring about [m/s^2]."""
@@ -167,3 +258,49 @@ def highest_speed(trajectory: Trajectory) -> float:
     ways = np.linalg.norm(trajectory.positions[later] - trajectory.positions, axis=1)
     full = spans >= 0.25
     return float((ways / spans)[full].max()) if full.any() else float((ways / spans).max())
+
+
+def incentive(
+    spec: LaneDriver,
+    speed: float,
+    length: float,
+    *,
+    here: tuple[Neighbours, float],
+    there: tuple[Neighbours, float],
+) -> float | None:
+    """What a change of lanes gains, beyond the threshold [m/s^2]; None where it is not safe.
+
+    Others are taken to drive by the same parameters, at least as fast as they do now.
+
+    Args:
+        spec: of the driver.
+        speed: its speed [m/s].
+        length: of its vehicle [m].
+        here, there: neighbours in a lane, and the desired speed in it [m/s].
+    """
+    (now, desired_here), (then, desired_there) = here, there
+    me = speed
+    if any(other is not None and other.gap <= 0.0 for other in then):
+        return None
+    own = acceleration(spec, speed, desired_there, then.leader)
+    gain = own - acceleration(spec, speed, desired_here, now.leader)
+    new_before, new_after = _with_and_without(spec, me, length, then, desired_there)
+    if min(own, new_after) < -spec.safe_braking:
+        return None
+    old_after, old_before = _with_and_without(spec, me, length, now, desired_here)
+    others = (new_after - new_before) + (old_after - old_before)
+    return gain + spec.politeness * others - spec.threshold
+
+
+def _with_and_without(
+    spec: LaneDriver, speed: float, length: float, lane: Neighbours, desired: float
+) -> tuple[float, float]:
+    """Acceleration of the one behind in a lane without the driver, and with it; 0 where nobody is
+    behind."""
+    behind, ahead = lane.follower, lane.leader
+    if behind is None:
+        return 0.0, 0.0
+    wanted = max(desired, behind.speed)
+    beyond = None if ahead is None else Leader(behind.gap + length + ahead.gap, ahead.speed)
+    without = acceleration(spec, behind.speed, wanted, beyond)
+    return without, acceleration(spec, behind.speed, wanted, Leader(behind.gap, speed))

@@ -5,13 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import AgentDriver as DriverSpec
-from real2sim_proto.episode import AgentsSpec, ConstantVelocityDriver, IdmDriver, LaneDriver
+from real2sim_proto.episode import (
+    AgentsSpec,
+    ConstantVelocityDriver,
+    CutInDriver,
+    ExternalDriver,
+    HardBrakeDriver,
+    IdmDriver,
+    JunctionCrossingDriver,
+    LaneDriver,
+    ReplayDriver,
+)
 
 from ...edit import ObjectState
 from ...edit.tracks import PackedTracks
@@ -21,15 +31,41 @@ from ..errors import WorldError
 from ..evolve import evolved
 from ..path import Float
 from .adversarial import CutIn, HardBrake, JunctionCrossing
-from .driver import AgentDriver, Surroundings
-from .drivers import begin_driver
-from .external import External
+from .driver import (
+    AgentDriver,
+    ConstantVelocity,
+    External,
+    Replay,
+    Script,
+    ScriptedEntity,
+    Surroundings,
+)
 from .idm import Idm
 from .lane_changer import LaneChanger
-from .replay import ConstantVelocity, Replay
-from .scripted import Script, ScriptedEntity
 from .spawner import PREFIX as SPAWNED
 from .spawner import Spawner
+
+BeginDriver = Callable[[ObjectState, Any, Surroundings], AgentDriver]
+"""``begin(subject, spec, surroundings)``: the driver of an object from the instant on that the
+surroundings are of; ``spec`` is of the type that it is registered for."""
+
+DRIVERS: dict[type[Any], BeginDriver] = {
+    ReplayDriver: Replay.begin,
+    ConstantVelocityDriver: ConstantVelocity.begin,
+    IdmDriver: Idm.begin,
+    LaneDriver: LaneChanger.begin,
+    CutInDriver: CutIn.begin,
+    HardBrakeDriver: HardBrake.begin,
+    JunctionCrossingDriver: JunctionCrossing.begin,
+    ExternalDriver: External.begin,
+}
+"""By the model of the wire that names the driver and holds its parameters."""
+
+
+def begin_driver(subject: ObjectState, spec: DriverSpec, surroundings: Surroundings) -> AgentDriver:
+    """The driver that a spec names, beginning at the instant of ``surroundings``."""
+    return DRIVERS[type(spec)](subject, spec, surroundings)
+
 
 MOVING = 2.0
 """Objects that cover less than this in the recording stand and get no driver [m]."""
