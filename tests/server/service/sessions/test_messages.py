@@ -10,9 +10,8 @@ import pytest
 
 from real2sim_proto import encode
 from real2sim_proto.codec import encode as encode_arrays
-from real2sim_proto.drive import CLIENT_MESSAGE
 from real2sim_server.service.sessions import messages
-from real2sim_server.service.sessions.messages import BadMessageError, read_as, read_message
+from real2sim_server.service.sessions.messages import BadMessageError, _read, read_message
 
 TRAJECTORY = {"kind": "trajectory", "times_us": [1, 2], "poses": [[1.0, 0.0, 0.0], [2, 0, 0]]}
 ACTION: dict[str, Any] = {"v": 1, "id": 7, "type": "action", "step": 3, "plan": TRAJECTORY}
@@ -38,8 +37,8 @@ def outcome(read, data: bytes) -> object:
 )
 def test_an_action_is_read_at_once_and_as_any_message_is(monkeypatch, changes):
     data = encode_arrays(ACTION | changes)
-    slowly = read_as(CLIENT_MESSAGE, data)
-    monkeypatch.setattr(messages, "read_as", None)
+    slowly = _read(data)
+    monkeypatch.setattr(messages, "_read", None)
     quickly = read_message(data)
     assert quickly.message == slowly
     assert repr(quickly.message) == repr(slowly)
@@ -71,7 +70,7 @@ def test_an_action_is_read_at_once_and_as_any_message_is(monkeypatch, changes):
 )
 def test_whatever_else_comes_is_answered_as_before(data):
     def slowly(data: bytes) -> object:
-        message = read_as(CLIENT_MESSAGE, data)
+        message = _read(data)
         content = b"" if message.type != "action" else messages.plan_payload(message.plan)
         return messages.ReceivedMessage(message, content)
 

@@ -127,18 +127,6 @@ def test_an_image_that_is_no_raw_one_comes_with_the_answer(attached):
     assert image_of(memory, frames[0]).any()
 
 
-def test_images_that_lie_in_memory_count_as_sent_to_the_holder_of_the_token(attached, site):
-    planner, _ = attached
-    account = site.worker.accounts.default
-    planner.ask("reset", spec={"action": "control", "sensors": SENSORS}, slot=0)
-    before = account.sent_bytes
-    answer = planner.ask("action", step=0, plan=CONTROL, slot=1)
-    pixels = 96 * 64
-    assert all("offset" in frame for frame in answer["frames"])
-    most = pixels * (3 + 4 + 2)
-    wait_until(lambda: account.sent_bytes - before > most, "all bytes to be counted")
-
-
 def test_nobody_else_opens_the_file(site, join):
     path = path_of(join(site.create(), role=None).hello())
     assert stat.S_IMODE(path.stat().st_mode) == 0o400
