@@ -38,8 +38,8 @@ from ..scene.io import load_scene, read_packed
 from ..sweeps.episode import observation_of
 from ..sweeps.pictures import draw_frames
 from ..world import World
+from ..world.draws import Draws
 from ..world.path import LoggedPath
-from ..world.randomization import Draws
 
 Figures = dict[str, Any]
 Report = Callable[[str, int, int], None]

@@ -33,6 +33,7 @@ from .collision.obstacles import obstacle_grid
 from .collision.overlaps import overlapping_rows
 from .collision.step_contacts import StepContacts, contacts_of_impacts, contacts_of_overlaps
 from .collision.sweep import StepStart
+from .draws import Draws
 from .ego.box import ego_box
 from .ego.controller import EgoController, Plan, emergency_brake
 from .ego.motion import Motion, logged_motion
@@ -49,7 +50,6 @@ from .observation import LanePiece, Observation, lanes_around
 from .path import Float, LoggedPath, PathPoint
 from .placement import placed
 from .randomization import (
-    Draws,
     RandomizedIdm,
     estimate_error,
     latency_jitter_us,

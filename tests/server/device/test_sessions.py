@@ -60,6 +60,7 @@ class Service:
             max_pixels=10**7,
             max_rays=10**6,
         )
+        self.pipeline.start()
         self._closing = [self.pipeline.close, renderer.close, self.engine.stop]
 
     def close(self) -> None:
@@ -175,7 +176,7 @@ def test_what_fails_in_one_session_leaves_the_others_alone(
     world = begun(tiny_scene)
     sound, refused, unrecorded = (service.step(world, 0.1) for _ in range(3))
 
-    def fail(*_: object) -> World:
+    def fail(*_: object, **__: object) -> World:
         raise ValueError("no")
 
     store = cast(Any, SimpleNamespace(record=fail))

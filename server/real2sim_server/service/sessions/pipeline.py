@@ -193,8 +193,11 @@ class StepPipeline:
         self._max_pixels = max_pixels
         self._clouds = WorldClouds(engine, max_rays=max_rays, caster=caster)
         self._worlds = Engine(name="worlds", queue_length=MAX_WAITING, threads=None)
-        self._worlds.start()
         self._evaluators = ThreadPoolExecutor(1, thread_name_prefix="evaluate")
+
+    def start(self) -> None:
+        """Begin to move worlds."""
+        self._worlds.start()
 
     def close(self) -> None:
         """End its threads."""

@@ -139,6 +139,7 @@ class Sessions:
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Sessions]:
         """Idle sessions are evicted for the length of the block; open ones end with it."""
+        self.pipeline.start()
         evicting = asyncio.create_task(self._evict_idle(), name="idle-sessions")
         try:
             yield self

@@ -31,11 +31,11 @@ from ...edit.compose import figure_of
 from ...scene import Scene, Trajectory
 from ...scene.lane_graph import LaneGraph
 from ...scene.scene import MAX_OBJECTS
+from ..draws import Draws
 from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
 from ..errors import WorldError
 from ..evolve import evolved
-from ..randomization import Draws
 from ..traffic.driver import ScriptedEntity, Surroundings, recorded_pose
 from .program import PLACING, Program, ShownSignal, program_of, shown_at
 from .progress import COMPLETE, ElementChange, Memories, Progress

@@ -18,9 +18,9 @@ from ...geometry.rotation import quaternion_yaw
 from ...scene import Ground, Trajectory
 from ...scene.scene import MAX_OBJECTS
 from ..agents import Agents
+from ..draws import Draws
 from ..errors import WorldError
 from ..path import LoggedPath
-from ..randomization import Draws
 from .driver import AgentDriver, Surroundings, level_quaternion
 from .idm import Idm, highest_speed, lane_beside
 

@@ -171,9 +171,9 @@ def test_fields_that_are_wrong_are_pointed_at_by_their_own_names(client):
 
 def test_a_running_data_set_can_be_cancelled(client):
     long = {"period_us": 5_000, "end_us": 2_000_000, "width": 400}
-    job = client.post("/v1/exports", json=ASKED | long).json()
-    cancelled = client.delete(f"/v1/jobs/{job['job_id']}").json()
-    assert cancelled["state"] == "cancelled"
+    answer = client.post("/v1/exports", json=ASKED | long)
+    client.delete(f"/v1/jobs/{answer.json()['job_id']}")
+    assert finished(client, answer)["state"] == "cancelled"
 
 
 def test_more_than_the_disk_may_hold_is_refused_before_it_is_drawn(client):
