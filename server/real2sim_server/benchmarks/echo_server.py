@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 from collections.abc import Callable, Iterator
-from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -22,9 +21,6 @@ from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES, unpack
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.sessions import SessionInfo
 
-from ..service.http.connections import ConnectionLimits, Connections
-from ..service.http.metrics import Metrics
-from ..service.http.websocket import WatchedWebSocketProtocol
 from ..service.preflight import bind, listen, url_of
 from ..service.sessions.messages import action_in
 
@@ -36,7 +32,6 @@ START_S = 300.0
 ECHOED = ("bytes", "messages")
 """Paths of such a server: it answers by bytes as they are, or reads and checks each action as a
 worker does and packs each observation anew."""
-LIMITS = ConnectionLimits(most=1000, head_s=START_S, body_s=START_S, write_s=START_S)
 
 
 @contextlib.contextmanager
@@ -80,13 +75,12 @@ def _serve(told: Connection, observation: bytes) -> None:
     listener = bind(HOST, 0)
     listen(listener)
     told.send(url_of(HOST, listener).replace("http", "ws", 1))
-    connections = Connections(LIMITS, Metrics())
     config = uvicorn.Config(
         echo_app(observation),
         log_config=None,
         access_log=False,
         lifespan="off",
-        ws=partial(WatchedWebSocketProtocol, connections),  # type: ignore[arg-type]
+        ws="websockets-sansio",
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
     )

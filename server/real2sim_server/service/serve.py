@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from types import FrameType
 
 import uvicorn
@@ -25,8 +24,7 @@ from ..settings import Settings
 from .app import create_app
 from .garbage import search_seldom, spare_what_is_there
 from .http.auth import check_bind
-from .http.protocol import LimitedHttpProtocol
-from .http.websocket import WatchedWebSocketProtocol
+from .http.connections import watch
 from .logging_setup import configure_logging
 from .preflight import bind, check_scenes, listen, url_of
 from .storage.errors import StoreError
@@ -184,15 +182,14 @@ class DrainingServer(uvicorn.Server):
 
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     """How uvicorn serves a worker."""
-    connections = app.state.worker.connections
-    return uvicorn.Config(
+    config = uvicorn.Config(
         app,
-        http=partial(LimitedHttpProtocol, connections),  # type: ignore[arg-type]
+        http="h11",
         log_config=None,
         access_log=False,
         server_header=False,
         lifespan="on",
-        ws=partial(WatchedWebSocketProtocol, connections),  # type: ignore[arg-type]
+        ws="websockets-sansio",
         # Deflating a frame takes 20 ms and gains nothing: images do not compress.
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
@@ -201,6 +198,8 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         timeout_keep_alive=settings.keep_alive_seconds,
         timeout_graceful_shutdown=max(1, round(settings.graceful_seconds)),
     )
+    watch(config, app.state.worker.connections)
+    return config
 
 
 def _announcement(worker: Worker, url: str) -> str:

@@ -127,7 +127,7 @@ class Received:
 
     def wait_received(self, size: int) -> None:
         """Return once the worker has so many bytes of the request."""
-        wait_until(lambda: self.protocol._received == size, f"{size} bytes to arrive")
+        wait_until(lambda: self.protocol.received == size, f"{size} bytes to arrive")
 
     def time_out(self) -> None:
         """Nothing is waited for any more."""
@@ -179,10 +179,11 @@ def test_a_second_request_that_stays_half_sent_is_closed(site, monkeypatch):
     with opened(site.url) as connection:
         received = Received(site, connection, monkeypatch)
         connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET /li")
+        answers = connection.recv(65536)
         connection.sendall(b"v")
-        received.wait_received(len(b"GET /liv"))
+        received.wait_received(len(b"v"))
         received.time_out()
-        answers = read_to_end(connection)
+        answers += read_to_end(connection)
     assert answers.startswith(b"HTTP/1.1 200")
     assert answers.count(b"HTTP/1.1 408") == 1
 
@@ -219,12 +220,11 @@ def test_a_driver_that_never_reads_is_given_up(hasty):
 
 
 @pytest.mark.network
-def test_bytes_that_are_no_http_get_a_problem_document(site):
+def test_bytes_that_are_not_http_are_refused(site):
     with opened(site.url) as connection:
         connection.sendall(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n")
         answer = read_to_end(connection)
     assert status_of(answer) == 400
-    assert b"application/problem+json" in answer
 
 
 def dropped(site: RunningWorker, reason: str) -> float:

@@ -17,7 +17,6 @@ import pytest
 from real2sim_server.service import serve as serve_module
 from real2sim_server.service.app import create_app
 from real2sim_server.service.http.auth import OpenBindError
-from real2sim_server.service.http.websocket import WatchedWebSocketProtocol
 from real2sim_server.service.preflight import (
     AddressError,
     SceneFolderError,
@@ -175,7 +174,6 @@ def test_sockets_are_not_compressed_and_messages_are_limited(make_settings):
     from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 
     config = server_config(create_app(make_settings()), make_settings())
-    assert config.ws.func is WatchedWebSocketProtocol
     assert config.ws_per_message_deflate is False
     assert config.ws_max_size == MAX_CLIENT_MESSAGE_BYTES
 

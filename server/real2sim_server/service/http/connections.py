@@ -1,40 +1,61 @@
 """Connections of clients: how many there may be, and how long one may keep the worker waiting.
 
-Nothing here runs on the way of a request but two assignments: a sweep looks at all connections once
-a second. Where there are too many, those make room that have been silent for longest while it was
-their turn to send; sockets and requests in progress stay.
+uvicorn's own protocols serve every connection. :class:`Connection` stands in front of them and
+passes on what asyncio says; an ASGI wrapper around the application tells it where a request begins,
+waits for its body and ends. A sweep looks at all connections once a second. When there are too
+many, the connections that have been silent for longest while it was their turn to send are closed;
+WebSockets and requests in progress stay.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import logging
+import socket
 import time
 from collections import Counter
+from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, cast
 
 import structlog
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, ErrorCode
 
+from .auth import is_loopback
 from .problems import ServiceError, problem_of
 from .responses import SECURITY_HEADERS
 
 if TYPE_CHECKING:
+    import uvicorn
+
     from .metrics import Metrics
 
 SWEEP_S = 1.0
 SLOWEST_BYTES_PER_S = 10_000
-"""Whoever sends or reads faster is waited for, however long it takes."""
+"""A client that sends or reads faster than this is never dropped for being slow."""
 NEAR, FAR = 0.8, 0.6
 """Shares of the limit at which a warning is given, and below which it may be given again."""
 RESERVED_DESCRIPTORS = 256
 """Kept for the store, scene files, uploads and the pipes of jobs."""
-CLIENTS_NAMED = 5
+MAX_CLIENTS_LOGGED = 5
+MAX_REASON_BYTES = 123
+HARMLESS = (
+    "ASGI callable returned without completing handshake.",
+    "Invalid UTF-8 sequence received from client.",
+)
+"""Errors that uvicorn logs when a client leaves or is refused during the handshake, or sends text
+that is not UTF-8. The worker has answered the client, there is nothing to mend."""
 
 log = structlog.get_logger(__name__)
+
+_connection: ContextVar[Connection | None] = ContextVar("connection", default=None)
+"""The connection whose bytes are being parsed; tasks that serve its requests inherit it."""
 
 
 class DropReason(StrEnum):
@@ -64,18 +85,6 @@ class ConnectionLimits:
     write_s: float
 
 
-class WatchedConnection(Protocol):
-    """A connection as the sweep sees it."""
-
-    client: tuple[str, int] | None
-
-    def overdue(self, now: float) -> DropReason | None:
-        """Why it has to go, if it has to; ``now`` in seconds of the monotonic clock."""
-
-    def drop(self, reason: DropReason) -> None:
-        """Close it, with an answer where one can be given."""
-
-
 class Connections:
     """All connections of a worker. Belongs to the event loop.
 
@@ -87,9 +96,9 @@ class Connections:
     def __init__(self, limits: ConnectionLimits, metrics: Metrics) -> None:
         self.limits = limits
         self._metrics = metrics
-        self._open: set[WatchedConnection] = set()
+        self._open: set[Connection] = set()
         # Those whose turn it is to send; the one that was silent for longest comes first.
-        self._silent: dict[WatchedConnection, None] = {}
+        self._silent: dict[Connection, None] = {}
         self._dropped: Counter[DropReason] = Counter()
         self._dropped_clients: list[str] = []
         self._warned = False
@@ -99,7 +108,7 @@ class Connections:
     def __len__(self) -> int:
         return len(self._open)
 
-    def admit(self, connection: WatchedConnection) -> None:
+    def admit(self, connection: Connection) -> None:
         """A new connection, of which nothing is known yet; it may be dropped at once."""
         if len(self._open) >= self.limits.most:
             silent = next(iter(self._silent), None)
@@ -111,15 +120,18 @@ class Connections:
         self._silent[connection] = None
         self._warn_when_near()
 
-    def heard(self, connection: WatchedConnection, *, more: bool) -> None:
-        """Something came from a connection; ``more``: it is still its turn."""
+    def await_client(self, connection: Connection) -> None:
+        """It is the client's turn to send: the connection may be crowded out."""
         if connection in self._open:
             self._silent.pop(connection, None)
-            if more:
-                self._silent[connection] = None
+            self._silent[connection] = None
 
-    def forget(self, connection: WatchedConnection) -> None:
-        """A connection has ended, or goes on as another one."""
+    def keep(self, connection: Connection) -> None:
+        """It is the worker's turn, or a socket is in use: the connection stays."""
+        self._silent.pop(connection, None)
+
+    def forget(self, connection: Connection) -> None:
+        """A connection has ended."""
         self._open.discard(connection)
         self._silent.pop(connection, None)
 
@@ -146,7 +158,7 @@ class Connections:
             self._dropped.clear()
             self._dropped_clients = []
 
-    def _drop(self, connection: WatchedConnection, reason: DropReason) -> None:
+    def _drop(self, connection: Connection, reason: DropReason) -> None:
         # It stays among the open ones until its end: a client that does not read holds it.
         self._silent.pop(connection, None)
         if reason is DropReason.CROWDED_OUT:
@@ -154,7 +166,7 @@ class Connections:
         self._dropped[reason] += 1
         self._metrics.dropped_connections.labels(reason.value).inc()
         client = connection.client[0] if connection.client else "unknown"
-        if client not in self._dropped_clients and len(self._dropped_clients) < CLIENTS_NAMED:
+        if client not in self._dropped_clients and len(self._dropped_clients) < MAX_CLIENTS_LOGGED:
             self._dropped_clients.append(client)
         connection.drop(reason)
 
@@ -169,6 +181,216 @@ class Connections:
                 "or look for clients that leave connections open",
             )
         self._warned = share >= (FAR if self._warned else NEAR)
+
+
+class Connection(asyncio.Protocol):
+    """One connection of a client: uvicorn's protocol serves it, a worker's connections watch it.
+
+    Args:
+        protocol: of uvicorn, for HTTP.
+        connections: of the worker.
+    """
+
+    def __init__(self, protocol: asyncio.Protocol, connections: Connections) -> None:
+        self.client: tuple[str, int] | None = None
+        self._protocol = protocol
+        self._connections = connections
+        self._backlog = Backlog(connections.limits.write_s)
+        # When the client began to send a request; None while it need not send one.
+        self._head_since: float | None = None
+        # Bytes since then, and those that came after the request in progress.
+        self.received = 0
+        self._ahead = 0
+        # While a request is in progress: seconds waited for its body, and since when.
+        self._body_pending = False
+        self._body_waited_s = 0.0
+        self._body_since: float | None = None
+        self._busy = False
+        self._answering = False
+
+    # --- what asyncio says --------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take over a new connection."""
+        self._transport = transport = cast(asyncio.Transport, transport)
+        self._head_since = time.monotonic()
+        peer = transport.get_extra_info("peername")
+        if isinstance(peer, tuple):
+            self.client = (peer[0], peer[1])
+            if is_loopback(peer[0]):
+                _send_unpaced(transport.get_extra_info("socket"))
+        self._protocol.connection_made(_Transport(transport, self))  # type: ignore[arg-type]
+        self._connections.admit(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection has ended."""
+        self._connections.forget(self)
+        self._protocol.connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Bytes of a client."""
+        if self._transport.is_closing():
+            return
+        if not self._busy:
+            if self._head_since is None:
+                self._head_since, self.received = time.monotonic(), 0
+            self._connections.await_client(self)
+        elif not self._body_pending:
+            self._ahead += len(data)
+        self.received += len(data)
+        token = _connection.set(self)
+        try:
+            self._protocol.data_received(data)
+        finally:
+            _connection.reset(token)
+
+    def eof_received(self) -> bool | None:
+        """The client sends nothing more."""
+        return self._protocol.eof_received()
+
+    def pause_writing(self) -> None:
+        """The client reads more slowly than the worker sends."""
+        self._protocol.pause_writing()
+
+    def resume_writing(self) -> None:
+        """The client has read most of what it was sent."""
+        self._backlog.cleared()
+        self._protocol.resume_writing()
+
+    def upgraded(self, protocol: asyncio.Protocol) -> None:
+        """Another protocol of uvicorn, of WebSockets, goes on with the connection."""
+        self._protocol = protocol
+
+    # --- what the application does ------------------------------------------------------------
+
+    async def serve_http(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request, and note whose turn it is."""
+        self._head_since, self._busy, self._ahead = None, True, 0
+        self._body_pending = _has_body(scope)
+        self._body_waited_s = 0.0
+        self._connections.keep(self)
+        finished = False
+
+        async def receive_noted() -> Message:
+            if not self._body_pending:
+                return await receive()
+            self._body_since = began = time.monotonic()
+            self._connections.await_client(self)
+            try:
+                message = await receive()
+            finally:
+                self._body_since = None
+                self._body_waited_s += time.monotonic() - began
+                self._connections.keep(self)
+            self._body_pending = message.get("more_body", False)
+            return message
+
+        async def send_noted(message: Message) -> None:
+            nonlocal finished
+            self._answering = True
+            await send(message)
+            if message["type"] == "http.response.body" and not message.get("more_body"):
+                finished = True
+                self._request_finished()
+
+        try:
+            await app(scope, receive_noted, send_noted)
+        finally:
+            if not finished:
+                self._request_finished()
+
+    async def serve_websocket(
+        self, app: ASGIApp, scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        """Serve a WebSocket; from its first message on it gives way to no other connection."""
+        self._head_since, self._busy, self._answering = None, True, True
+
+        async def receive_noted() -> Message:
+            message = await receive()
+            if message["type"] == "websocket.receive":
+                self._connections.keep(self)
+            return message
+
+        await app(scope, receive_noted, send)
+
+    def _request_finished(self) -> None:
+        self._busy = self._answering = self._body_pending = False
+        if self._ahead:  # The client has begun to send the next request.
+            self._head_since, self.received = time.monotonic(), self._ahead
+        self._connections.await_client(self)
+
+    # --- what the sweep asks ------------------------------------------------------------------
+
+    def overdue(self, now: float) -> DropReason | None:
+        """Why the connection has to go, if it has to; ``now`` in seconds, monotonic clock."""
+        limits = self._connections.limits
+        if self._backlog.overdue(self._transport, now):
+            return DropReason.WRITE_TIMEOUT
+        if self._transport.is_closing():
+            return None
+        if self._head_since is not None and now - self._head_since > limits.head_s:
+            return DropReason.HEAD_TIMEOUT
+        if self._body_since is not None:
+            waited = self._body_waited_s + now - self._body_since
+            if waited > limits.body_s + self.received / SLOWEST_BYTES_PER_S:
+                return DropReason.BODY_TIMEOUT
+        return None
+
+    def drop(self, reason: DropReason) -> None:
+        """Close the connection, with an answer where a request has begun and none is under way."""
+        transport = self._transport
+        if reason is DropReason.WRITE_TIMEOUT or transport.get_write_buffer_size():
+            transport.abort()
+            return
+        begun = self._busy or (self._head_since is not None and self.received)
+        if (begun or reason is DropReason.REFUSED) and not self._answering:
+            transport.write(last_answer(reason, self._connections.limits))
+        transport.close()
+
+
+class _Transport:
+    """A transport as uvicorn's protocols see it: one that changes protocols behind the watch."""
+
+    def __init__(self, transport: asyncio.Transport, connection: Connection) -> None:
+        self._transport = transport
+        self.set_protocol = connection.upgraded
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+
+def watch(config: uvicorn.Config, connections: Connections) -> None:
+    """Let ``connections`` watch what uvicorn serves."""
+    logging.getLogger("uvicorn.error").addFilter(_is_news)
+    config.app = _noted(config.app)
+    config.load()
+    protocol = config.http_protocol_class
+    config.http_protocol_class = lambda **options: Connection(protocol(**options), connections)  # type: ignore[assignment]
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    return record.msg not in HARMLESS
+
+
+def _noted(app: ASGIApp) -> ASGIApp:
+    """``app``, which tells the connection of each request that it serves."""
+
+    async def served(scope: Scope, receive: Receive, send: Send) -> None:
+        connection = _connection.get()
+        if connection is None:  # the lifespan
+            await app(scope, receive, send)
+        elif scope["type"] == "http":
+            await connection.serve_http(app, scope, receive, send)
+        else:
+            await connection.serve_websocket(app, scope, receive, send)
+
+    return served
+
+
+def _has_body(scope: Scope) -> bool:
+    """Whether a request says that a body follows (RFC 9112, 6)."""
+    headers = dict(scope["headers"])
+    return b"transfer-encoding" in headers or headers.get(b"content-length", b"0") != b"0"
 
 
 class Backlog:
@@ -198,6 +420,33 @@ class Backlog:
         self._bytes = 0
 
 
+async def receive_text(websocket: WebSocket) -> str:
+    """The next message, where messages are text.
+
+    Raises:
+        WebSocketDisconnect: the client has disconnected.
+        ServiceError: BAD_MESSAGE, the message is binary.
+    """
+    event = await websocket.receive()
+    if event["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(event.get("code", 1005))
+    text = event.get("text")
+    if text is None:
+        raise ServiceError(ErrorCode.BAD_MESSAGE, "bytes were sent where messages are JSON text")
+    return str(text)
+
+
+async def close_quietly(websocket: WebSocket, code: int, reason: str) -> None:
+    """Close a socket, unless its client has left."""
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        await websocket.close(code, close_reason(reason))
+
+
+def close_reason(text: str) -> str:
+    """As much of ``text`` as a close frame holds: 123 bytes (RFC 6455, 5.5)."""
+    return text.encode("utf-8", "replace")[:MAX_REASON_BYTES].decode("utf-8", "ignore")
+
+
 def connection_limit(wanted: int) -> int:
     """Connections that the limit of descriptors leaves room for, ``wanted`` at most."""
     try:
@@ -218,15 +467,8 @@ def last_answer(reason: DropReason, limits: ConnectionLimits) -> bytes:
     return _whole_answer(failure, body)
 
 
-def bad_request_answer() -> bytes:
-    """The same for bytes that are no HTTP."""
-    failure = ServiceError(ErrorCode.BAD_MESSAGE, "what was sent is no HTTP request")
-    problem = problem_of(failure, path="", request_id=None)
-    return _whole_answer(failure, problem.model_dump_json(exclude_none=True).encode())
-
-
 def _whole_answer(failure: ServiceError, body: bytes) -> bytes:
-    phrase = {400: "Bad Request", 408: "Request Timeout", 503: "Service Unavailable"}
+    phrase = {408: "Request Timeout", 503: "Service Unavailable"}
     headers = {
         "Content-Type": PROBLEM_MEDIA_TYPE,
         "Content-Length": str(len(body)),
@@ -262,3 +504,12 @@ _FAILURES = {
     DropReason.CROWDED_OUT: _crowded,
     DropReason.REFUSED: _crowded,
 }
+
+
+def _send_unpaced(connection: socket.socket) -> None:
+    """Where the system's congestion control paces what it sends, a timer runs for every 64 kB: a
+    tenth of a millisecond for three images that never leave the machine."""
+    if hasattr(socket, "TCP_CONGESTION"):
+        # Reno is part of every Linux and open to every process.
+        with contextlib.suppress(OSError):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"reno")

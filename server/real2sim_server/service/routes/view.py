@@ -14,8 +14,8 @@ from real2sim_proto import ErrorCode
 
 from ..accounts import Account
 from ..http.auth import act_for
+from ..http.connections import close_quietly, receive_text
 from ..http.problems import ServiceError, service_error
-from ..http.websocket import close_quietly, receive_text
 from ..worker import Worker, WorkerOf
 from .view_connection import ViewConnection
 

@@ -25,8 +25,8 @@ from ...render.uncertainty import UNCERTAINTY, uncertainty_picture
 from ...scene import Scene, SceneError
 from ..accounts import RevokedError, admit_message, owner_name
 from ..engine import QueueFullError
+from ..http.connections import receive_text
 from ..http.problems import ServiceError, service_error
-from ..http.websocket import receive_text
 from ..rendering.frames import EncodedFrame
 from ..rendering.renderer import RenderRequest
 from ..worker import Worker

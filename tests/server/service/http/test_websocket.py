@@ -6,7 +6,6 @@ import contextlib
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from functools import partial
 
 import numpy as np
 import pytest
@@ -16,11 +15,13 @@ from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket
 from websockets.sync.client import connect
 
-from real2sim_server.service.http.connections import ConnectionLimits, Connections
-from real2sim_server.service.http.metrics import Metrics
-from real2sim_server.service.http.websocket import (
-    WatchedWebSocketProtocol,
+from real2sim_server.service.http.connections import (
+    Connection,
+    ConnectionLimits,
+    Connections,
+    watch,
 )
+from real2sim_server.service.http.metrics import Metrics
 from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.network
@@ -40,10 +41,8 @@ def app(talk: Talk) -> Starlette:
 def served(talk: Talk, *, deflate: bool = False) -> Iterator[str]:
     listener = socket.create_server(("127.0.0.1", 0))
     limits = ConnectionLimits(most=100, head_s=60, body_s=60, write_s=60)
-    protocol = partial(WatchedWebSocketProtocol, Connections(limits, Metrics()))
-    config = uvicorn.Config(
-        app(talk), ws=protocol, ws_per_message_deflate=deflate, log_level="error"
-    )
+    config = uvicorn.Config(app(talk), ws_per_message_deflate=deflate, log_level="error")
+    watch(config, Connections(limits, Metrics()))
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, args=([listener],))
     thread.start()
@@ -79,7 +78,7 @@ def test_a_client_that_reads_late_gets_all_messages_in_order(deflate):
 @pytest.mark.skipif(not hasattr(socket, "TCP_CONGESTION"), reason="Linux names them")
 def test_what_goes_to_the_same_machine_is_not_paced(monkeypatch):
     chosen = []
-    made = WatchedWebSocketProtocol.connection_made
+    made = Connection.connection_made
 
     def noted(self, transport) -> None:
         made(self, transport)
@@ -87,7 +86,7 @@ def test_what_goes_to_the_same_machine_is_not_paced(monkeypatch):
         name = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16)
         chosen.append(name.rstrip(b"\0"))
 
-    monkeypatch.setattr(WatchedWebSocketProtocol, "connection_made", noted)
+    monkeypatch.setattr(Connection, "connection_made", noted)
 
     async def talk(websocket: WebSocket) -> None:
         await websocket.send_bytes(b"done")

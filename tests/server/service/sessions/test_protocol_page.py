@@ -11,7 +11,6 @@ import pytest
 
 from real2sim_proto import HTTP_STATUS, ErrorCode
 from real2sim_proto.drive import EgoState, Event, EventType, Hello, Obs, Resume
-from real2sim_server.service.http.websocket import CLOSED_NO_UTF8
 from real2sim_server.service.sessions.connection import NORMAL_CLOSURE
 from real2sim_server.service.sessions.messages import POLICY_VIOLATION
 from real2sim_server.world.scoring import METRICS
@@ -50,9 +49,9 @@ def observed(site, join) -> dict[str, Any]:
 
 def test_every_close_code_is_on_the_page():
     rows = first_cells(section("Closing"))
-    ours = {NORMAL_CLOSURE, POLICY_VIOLATION, CLOSED_NO_UTF8}
-    # Of libraries: too large, an error or no pong, stopping, restarting.
-    theirs = {1009, 1011, 1001, 1012}
+    ours = {NORMAL_CLOSURE, POLICY_VIOLATION}
+    # Of libraries: no UTF-8, too large, an error or no pong, stopping, restarting.
+    theirs = {1007, 1009, 1011, 1001, 1012}
     assert {str(code) for code in ours | theirs} <= rows
 
 
