@@ -362,7 +362,7 @@ class _Transport:
 def watch(config: uvicorn.Config, connections: Connections) -> None:
     """Let ``connections`` watch what uvicorn serves."""
     logging.getLogger("uvicorn.error").addFilter(_is_news)
-    config.app = _noted(config.app)
+    config.app = _noted(config.app)  # type: ignore[arg-type]
     config.load()
     protocol = config.http_protocol_class
     config.http_protocol_class = lambda **options: Connection(protocol(**options), connections)  # type: ignore[assignment]
