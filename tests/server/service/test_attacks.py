@@ -220,11 +220,13 @@ def test_a_driver_that_never_reads_is_given_up(hasty):
 
 
 @pytest.mark.network
-def test_bytes_that_are_not_http_are_refused(site):
+def test_bytes_that_are_not_http_get_a_problem_document(site):
     with opened(site.url) as connection:
         connection.sendall(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n")
         answer = read_to_end(connection)
     assert status_of(answer) == 400
+    assert b"application/problem+json" in answer
+    assert answer.count(b"HTTP/1.1") == 1
 
 
 def dropped(site: RunningWorker, reason: str) -> float:

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, cast
 
+import h11
 import structlog
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -207,6 +208,7 @@ class Connection(asyncio.Protocol):
         self._body_since: float | None = None
         self._busy = False
         self._answering = False
+        self._refused = False
 
     # --- what asyncio says --------------------------------------------------------------------
 
@@ -241,6 +243,9 @@ class Connection(asyncio.Protocol):
         token = _connection.set(self)
         try:
             self._protocol.data_received(data)
+        except h11.LocalProtocolError:
+            # What follows a request that is being answered is not HTTP: there is no answer to it.
+            self._transport.close()
         finally:
             _connection.reset(token)
 
@@ -259,7 +264,17 @@ class Connection(asyncio.Protocol):
 
     def upgraded(self, protocol: asyncio.Protocol) -> None:
         """Another protocol of uvicorn, of WebSockets, goes on with the connection."""
-        self._protocol = protocol
+        self._protocol, self._answering = protocol, True
+
+    def may_write(self, data: bytes) -> bool:
+        """Whether uvicorn may write ``data``. Its answer to bytes that are not HTTP is plain text;
+        the client gets a problem document instead."""
+        if self._answering or data.startswith(b"HTTP/1.1 100 "):
+            return True
+        if not self._refused:
+            self._refused = True
+            self._transport.write(bad_request_answer())
+        return False
 
     # --- what the application does ------------------------------------------------------------
 
@@ -353,7 +368,12 @@ class _Transport:
 
     def __init__(self, transport: asyncio.Transport, connection: Connection) -> None:
         self._transport = transport
+        self._connection = connection
         self.set_protocol = connection.upgraded
+
+    def write(self, data: bytes) -> None:
+        if self._connection.may_write(data):
+            self._transport.write(data)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._transport, name)
@@ -467,8 +487,15 @@ def last_answer(reason: DropReason, limits: ConnectionLimits) -> bytes:
     return _whole_answer(failure, body)
 
 
+def bad_request_answer() -> bytes:
+    """A whole HTTP answer to bytes that are not HTTP."""
+    failure = ServiceError(ErrorCode.BAD_MESSAGE, "what was sent is no HTTP request")
+    problem = problem_of(failure, path="", request_id=None)
+    return _whole_answer(failure, problem.model_dump_json(exclude_none=True).encode())
+
+
 def _whole_answer(failure: ServiceError, body: bytes) -> bytes:
-    phrase = {408: "Request Timeout", 503: "Service Unavailable"}
+    phrase = {400: "Bad Request", 408: "Request Timeout", 503: "Service Unavailable"}
     headers = {
         "Content-Type": PROBLEM_MEDIA_TYPE,
         "Content-Length": str(len(body)),
