@@ -226,7 +226,21 @@ def test_bytes_that_are_not_http_get_a_problem_document(site):
         answer = read_to_end(connection)
     assert status_of(answer) == 400
     assert b"application/problem+json" in answer
-    assert answer.count(b"HTTP/1.1") == 1
+    assert answer.count(b"HTTP/1.1 400") == 1
+
+
+@pytest.mark.network
+def test_a_handshake_of_another_websocket_version_gets_a_problem_document(site):
+    request = (
+        "GET /v1/scenarios/any/view HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
+        "Connection: Upgrade\r\nSec-WebSocket-Version: 8\r\n"
+        "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+    )
+    with opened(site.url) as connection:
+        connection.sendall(request.encode())
+        answer = read_to_end(connection)
+    assert status_of(answer) == 400
+    assert b"WebSocket handshake of version 13" in answer
 
 
 def dropped(site: RunningWorker, reason: str) -> float:

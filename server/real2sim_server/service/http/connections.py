@@ -267,9 +267,10 @@ class Connection(asyncio.Protocol):
         self._protocol, self._answering = protocol, True
 
     def may_write(self, data: bytes) -> bool:
-        """Whether uvicorn may write ``data``. Its answer to bytes that are not HTTP is plain text;
-        the client gets a problem document instead."""
-        if self._answering or data.startswith(b"HTTP/1.1 100 "):
+        """Whether uvicorn may write ``data``. It refuses bad requests and handshakes in plain
+        text; the client gets a problem document instead."""
+        refusing = self._refused or data.startswith(b"HTTP/1.1 400 ")
+        if self._answering or not refusing:
             return True
         if not self._refused:
             self._refused = True
@@ -488,8 +489,11 @@ def last_answer(reason: DropReason, limits: ConnectionLimits) -> bytes:
 
 
 def bad_request_answer() -> bytes:
-    """A whole HTTP answer to bytes that are not HTTP."""
-    failure = ServiceError(ErrorCode.BAD_MESSAGE, "what was sent is no HTTP request")
+    """A whole HTTP answer to bytes that are not HTTP, or no handshake."""
+    failure = ServiceError(
+        ErrorCode.BAD_MESSAGE,
+        "the bytes sent are neither an HTTP/1.1 request nor a WebSocket handshake of version 13",
+    )
     problem = problem_of(failure, path="", request_id=None)
     return _whole_answer(failure, problem.model_dump_json(exclude_none=True).encode())
 
