@@ -58,8 +58,8 @@ LAYERS = (
 PLAY_THEIR_OWN_USER = {"demo", "policies", "sweeps", "benchmarks", "cli"}
 """Only these use the client SDK, since there the program plays its own user."""
 
-APART = {"logging_setup", "write_openapi"}
-"""Modules of the service for whoever starts a program; only ``serve`` imports one, the logging."""
+APART = {"write_openapi"}
+"""Modules of the service that are programs of their own."""
 
 FORBIDDEN = {
     "real2sim_proto": {"real2sim", SERVER, "torch", "fastapi", "numba", "cv2"},
@@ -181,7 +181,7 @@ def test_the_service_lists_every_part():
 @pytest.mark.parametrize("part", service_order())
 def test_a_part_of_the_service_imports_only_those_before_it(part):
     order = service_order()
-    allowed = {*order[: order.index(part) + 1]} | ({"logging_setup"} if part == "serve" else set())
+    allowed = {*order[: order.index(part) + 1]}
     prefix = f"{SERVER}.service."
     wrong = [
         f"{module} imports {imported}"

@@ -26,7 +26,7 @@ Url = Annotated[str | None, typer.Option(help="Default $REAL2SIM_STORE_URL, or S
 @command("status", group=app)
 def status(*, data: Data = None, url: Url = None) -> None:
     """Say which schema a store has, and what migrating it would do; nothing is changed."""
-    from ..service.storage.migrations import schema_status
+    from ..service.storage.schema import schema_status
 
     with _engine(data, url, must_exist=True) as engine:
         found = schema_status(engine)
@@ -40,7 +40,7 @@ def status(*, data: Data = None, url: Url = None) -> None:
 @command("migrate", group=app)
 def migrate(*, data: Data = None, url: Url = None) -> None:
     """Bring a store up to date, in one transaction; a new database gets its tables."""
-    from ..service.storage.migrations import prepare_schema, schema_status
+    from ..service.storage.schema import prepare_schema, schema_status
 
     with _engine(data, url, must_exist=False) as engine:
         before = schema_status(engine)
@@ -64,7 +64,7 @@ def audit(
     import json
     from dataclasses import asdict
 
-    from ..service.storage.audit_log import AuditEntry, AuditLog
+    from ..service.audit import AuditEntry, AuditLog
     from ..service.storage.store import Store
     from ..settings import Settings
 

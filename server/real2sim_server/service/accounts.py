@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 import structlog
 
 from . import clock
-from .storage.tokens import token_hash
-from .token_file import DEFAULT_NAME, Role, TokenFileError, TokenLimits, read_token_file
+from .tokens import DEFAULT_NAME, Role, TokenFileError, TokenLimits, read_token_file, token_hash
 
 RELOAD_S = 1.0
 """Between looks whether the file of tokens has changed."""

@@ -18,6 +18,7 @@ from real2sim_proto.jobs import JobInfo
 
 from ..settings import Settings
 from .accounts import ACCOUNT
+from .audit import AuditEntry
 from .clock import now_us
 from .http.auth import READING, LoopbackOnly, OwnPagesOnly, account_of, require_token
 from .http.idempotency import install_replay_handler
@@ -25,26 +26,7 @@ from .http.openapi import published
 from .http.problems import install_problem_handlers
 from .http.requests import BodyLimit, RequestContext
 from .jobs.jobs import Work
-from .routes import (
-    assets,
-    docs,
-    drive,
-    exports,
-    health,
-    jobs,
-    object_splats,
-    scenarios,
-    scene_imports,
-    scene_splats,
-    scenes,
-    server,
-    sessions,
-    storyboards,
-    sweeps,
-    ui,
-    view,
-)
-from .storage.audit_log import AuditEntry
+from .routes import assets, drive, jobs, scenarios, scenes, server, sessions, splats, view
 from .tracing import Tracing, engine_spans, traces_to
 from .worker import Worker
 
@@ -57,25 +39,24 @@ STEPS = ("/step", "/render", "/reset")
 PROTECTED: tuple[APIRouter, ...] = (
     server.router,
     scenes.router,
-    scene_splats.router,
-    object_splats.router,
-    scene_imports.router,
+    splats.router,
+    splats.object_router,
     scenarios.router,
-    storyboards.router,
+    scenarios.storyboards_router,
     assets.router,
     jobs.router,
-    exports.router,
-    sweeps.router,
+    jobs.exports_router,
+    jobs.sweeps_router,
 )
 """Routers behind the worker's token."""
 
 OPEN: tuple[APIRouter, ...] = (
-    health.router,
+    server.health_router,
     sessions.router,
     drive.router,
     view.router,
-    ui.router,
-    docs.router,
+    server.ui_router,
+    server.docs_router,
 )
 """Routers that ask for a token themselves, where they want one."""
 
@@ -130,7 +111,7 @@ def create_app(settings: Settings) -> FastAPI:
         separate_input_output_schemas=False,
     )
     app.state.worker = worker
-    upload_paths = (*scene_imports.UPLOAD_PATHS, assets.UPLOAD_PATH)
+    upload_paths = (*scenes.UPLOAD_PATHS, assets.UPLOAD_PATH)
     uploads = dict.fromkeys(upload_paths, settings.max_upload_bytes)
     install_problem_handlers(app)
     install_replay_handler(app, worker.replayed)
@@ -195,4 +176,4 @@ async def _work_again(worker: Worker, info: JobInfo) -> Work:
         return await worker.simulations.work_again(info)
     if info.kind == "sweep":
         return await worker.sweeps.work_again(info)
-    return await exports.work_again(worker, info)
+    return await jobs.work_again(worker, info)

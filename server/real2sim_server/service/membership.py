@@ -1,20 +1,24 @@
-"""A worker among those that share its store: it tells that it lives, and leaves the sessions that
-others have taken over while it did not."""
+"""A worker within a fleet: its lease, the scenes it loads ahead, and what it reports to its proxy."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import structlog
 
 from .accounts import Accounts
+from .http.problems import ServiceError
+from .library.scenes import SceneCache
 from .sessions import Sessions
-from .storage.leases import Leases
-from .storage.store import StoreError
+from .storage.errors import StoreError
+from .storage.fleet import Leases, WorkerRow
 
 RENEWALS = 4
 """Of each lease, so that some may be late."""
@@ -109,3 +113,153 @@ class Membership:
             rows = await self._leases.workers()
             others = [w for w in rows if w.alive and w.worker_id != self._leases.worker_id]
             self._accounts.take_word(w.document.get("held", {}) for w in others)
+
+
+# --- Agent check ---------------------------------------------------------------------------------
+
+# Reports in the words of HAProxy's ``agent-check`` how much new work the worker takes. A draining
+# worker keeps its sessions and gets no new ones. The weight does not follow the load, since that
+# would move scenes between workers; the proxy's bounded hashing balances the load.
+
+
+@dataclass(frozen=True)
+class Willingness:
+    """What a worker takes.
+
+    Attributes:
+        ready: whether new work is welcome at all.
+        full: whether as many sessions are open as may be.
+        handed_over: whether its sessions are others' by now: nothing may be sent here any more.
+    """
+
+    ready: bool
+    full: bool
+    handed_over: bool
+
+
+class Agent:
+    """Answers every connection with one line, and closes it.
+
+    Args:
+        willingness: of the worker, asked for each answer.
+        weight: of the worker among others, in per cent of what its proxy gives it.
+    """
+
+    def __init__(self, willingness: Callable[[], Willingness], *, weight: int) -> None:
+        self._willingness = willingness
+        self._weight = weight
+
+    def word(self) -> str:
+        """The line: ``up ready 100%``, ``drain``, or ``down``."""
+        found = self._willingness()
+        if found.handed_over:
+            return "down"
+        if not found.ready or found.full:
+            return "up drain"
+        return f"up ready {self._weight}%"
+
+    @contextlib.asynccontextmanager
+    async def running(self, host: str, port: int) -> AsyncIterator[int]:
+        """Listens for the length of the block.
+
+        Args:
+            host: address to listen on.
+            port: 0 takes a free one.
+
+        Yields:
+            The port.
+
+        Raises:
+            OSError: the address is taken, or none of this machine.
+        """
+        server = await asyncio.start_server(self._answer, host, port)
+        try:
+            yield server.sockets[0].getsockname()[1]
+        finally:
+            server.close()
+            await server.wait_closed()
+
+    async def _answer(self, _reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError):
+            writer.write(f"{self.word()}\n".encode())
+            await writer.drain()
+            writer.close()
+            await writer.wait_closed()
+
+
+# --- Prewarming ----------------------------------------------------------------------------------
+
+# The proxy sends new sessions to the worker that has their scene, until that one has half as many
+# again as the others. The next worker then already has the scene in memory.
+
+LOOK_S = 5.0
+"""Between looks at what the fleet drives in."""
+
+
+class Prewarming:
+    """Loads what other workers are busy with, where this one is next in turn.
+
+    Args:
+        leases: tell of the workers.
+        scene_cache: gets the scenes; they leave it again when memory is needed.
+        worker_id: of this one.
+        hot: sessions in a scene, over all workers, from which on two of them have it.
+    """
+
+    def __init__(
+        self, leases: Leases, scene_cache: SceneCache, *, worker_id: str, hot: int
+    ) -> None:
+        self._leases = leases
+        self._scene_cache = scene_cache
+        self._worker_id = worker_id
+        self._hot = hot
+
+    async def run(self) -> None:
+        """Look again and again, for ever."""
+        while self._hot:
+            await asyncio.sleep(LOOK_S)
+            try:
+                await self.look()
+            except StoreError:
+                continue  # it tells of its trouble itself
+            except ServiceError as error:
+                log.info("scene not loaded ahead", reason=str(error))
+
+    async def look(self) -> None:
+        """Load the scenes that are this worker's to load.
+
+        Raises:
+            StoreError: of the database.
+            ServiceError: a scene cannot be loaded.
+        """
+        for scene in loads_of(self._worker_id, await self._leases.workers(), hot=self._hot):
+            log.info("scene loaded ahead", scene=scene)
+            await self._scene_cache.get(scene)
+
+
+def loads_of(worker_id: str, workers: Sequence[WorkerRow], *, hot: int) -> list[str]:
+    """Hot scenes that one worker alone has, and that ``worker_id`` is the one to load.
+
+    All workers find the same, from what each has told of itself: of those without the scene the
+    first in an order that differs from scene to scene.
+    """
+    living = {w.worker_id: w.document for w in workers if w.alive and takes_work(w.document)}
+    driven: Counter[str] = Counter()
+    for document in living.values():
+        driven.update(document.get("scene_sessions", {}))
+    found = []
+    for scene in sorted(scene for scene, many in driven.items() if many >= hot):
+        without = [name for name, about in living.items() if scene not in about.get("scenes", ())]
+        if len(living) - len(without) == 1 and without:
+            first = min(without, key=lambda name: _order(scene, name))
+            found += [scene] * (first == worker_id)
+    return found
+
+
+def _order(scene: str, worker_id: str) -> bytes:
+    return hashlib.sha256(f"{scene} {worker_id}".encode()).digest()
+
+
+def takes_work(document: Mapping[str, Any]) -> bool:
+    """Whether a worker that tells this of itself takes new sessions and jobs."""
+    return bool(document.get("ready")) and not document.get("draining")

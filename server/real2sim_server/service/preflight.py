@@ -7,7 +7,7 @@ import ipaddress
 import socket
 
 from ..settings import Settings
-from .storage.ownership import check_state_folder
+from .storage.connection import check_state_folder
 
 
 class SceneFolderError(ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import http.client
 import logging
 import signal
@@ -13,7 +14,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
+import structlog
 import uvicorn
 from fastapi import FastAPI
 
@@ -22,13 +25,83 @@ from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
 from ..console import is_expected
 from ..settings import Settings
 from .app import create_app
-from .garbage import search_seldom, spare_what_is_there
 from .http.auth import check_bind
 from .http.connections import watch
-from .logging_setup import configure_logging
 from .preflight import bind, check_scenes, listen, url_of
 from .storage.errors import StoreError
 from .worker import Worker
+
+# --- Garbage collection --------------------------------------------------------------------------
+
+# A full collection takes 0.2 s, during which no session is answered. With the default thresholds
+# one is due every few thousand steps, although nearly all objects were there before the first
+# step and stay.
+
+YOUNG = 20_000
+"""New objects between two small searches; a step makes some 200, nearly all of which go by
+themselves."""
+
+
+def search_seldom() -> None:
+    """Let many steps pass between searches."""
+    gc.set_threshold(YOUNG, *gc.get_threshold()[1:])
+
+
+def spare_what_is_there() -> None:
+    """Search no more through what is there now. Once, when a worker has all that it starts with:
+    what of it becomes garbage in a cycle stays."""
+    gc.collect(1)
+    gc.freeze()
+
+
+# --- Logging -------------------------------------------------------------------------------------
+
+
+def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
+    """Send structlog and the standard library's loggers to stderr in one form.
+
+    Args:
+        level: lowest level that is written.
+        log_format: ``text``, ``json``, or ``auto``: text when stderr is a terminal.
+    """
+    text = log_format == "text" or (log_format == "auto" and sys.stderr.isatty())
+    shared: list[Any] = [
+        structlog.contextvars.merge_contextvars,
+        structlog.stdlib.add_log_level,
+        structlog.stdlib.add_logger_name,
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+    ]
+    structlog.configure(
+        processors=[
+            structlog.stdlib.filter_by_level,
+            *shared,
+            structlog.stdlib.ProcessorFormatter.wrap_for_formatter,
+        ],
+        logger_factory=structlog.stdlib.LoggerFactory(),
+        wrapper_class=structlog.stdlib.BoundLogger,
+        cache_logger_on_first_use=True,
+    )
+    # Tracebacks as plain text: prettier ones print local variables, tokens among them.
+    render: list[Any] = (
+        [structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)]
+        if text
+        else [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(
+        structlog.stdlib.ProcessorFormatter(
+            foreign_pre_chain=shared,
+            processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *render],
+        )
+    )
+    root = logging.getLogger()
+    root.handlers = [handler]
+    root.setLevel(level.upper())
+    # One line a request is ours; the server's own would double it.
+    logging.getLogger("uvicorn.access").disabled = True
+    for name in ("uvicorn", "uvicorn.error", "asyncio", "alembic"):
+        logging.getLogger(name).setLevel(max(logging.WARNING, root.level))
+
 
 PING_INTERVAL_S = 10.0
 PING_TIMEOUT_S = 20.0

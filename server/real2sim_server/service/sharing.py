@@ -18,10 +18,9 @@ from real2sim_proto.jobs import JobState
 
 from .http.problems import ServiceError
 from .library.assets import ASSET_SUFFIX, AssetLibrary
-from .library.scene_catalog import BUNDLE_SUFFIX, SceneCatalog
+from .library.scenes import BUNDLE_SUFFIX, SceneCatalog
 from .objects.object_store import ObjectStoreError
-from .objects.shared_bundles import BundleFolders, SharedBundle
-from .storage.bundle_log import BundleLog, BundleRow
+from .objects.shared_bundles import BundleFolders, BundleLog, BundleRow, SharedBundle
 from .storage.job_log import JobLog
 from .storage.store import StoreError
 

@@ -25,46 +25,37 @@ from ..render.backends import device_of
 from ..scene.io import DEMO_SCENE, SHIPPED_STREET, StagingLimits
 from ..settings import Settings
 from .accounts import Accounts
-from .agent import Agent, Willingness
-from .audit import Audit
-from .drives.drives import Drives
+from .audit import Audit, AuditLog
+from .drives import Drives
 from .engine import Engine
 from .http.connections import ConnectionLimits, Connections, connection_limit
 from .http.idempotency import Idempotency
 from .http.metrics import Metrics
 from .http.problems import ServiceError
-from .jobs.calibrations import Calibrations
 from .jobs.exports import VideoSource
 from .jobs.jobs import Jobs
-from .jobs.simulations import Simulations
+from .jobs.simulations import Calibrations, Simulations
 from .library.assets import AssetLibrary
-from .library.import_queue import ImportQueue
-from .library.imports import import_scene
-from .library.memory import MemoryBudget
-from .library.quotas import Quota
-from .library.scene_cache import SceneCache
-from .library.scene_catalog import SceneCatalog
+from .library.budgets import MemoryBudget, Quota
+from .library.imports import ImportQueue, import_scene
+from .library.scenes import SceneCache, SceneCatalog
 from .library.splat_files import SplatFiles
-from .membership import Membership
+from .maintenance import Maintenance
+from .membership import Agent, Membership, Prewarming, Willingness, takes_work
 from .objects.object_store import open_objects
-from .objects.shared_bundles import BundleFolders
-from .prewarming import Prewarming, takes_work
+from .objects.shared_bundles import BundleFolders, BundleLog
 from .rendering.renderer import Renderer
 from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .sessions.shared_memory import Segments
 from .sharing import Sharing
-from .storage.audit_log import AuditLog
-from .storage.bundle_log import BundleLog
+from .storage.connection import owned_folder
+from .storage.fleet import Leases, Notices
 from .storage.job_log import JobLog
-from .storage.leases import Leases
-from .storage.notices import Notices
-from .storage.ownership import owned_folder
 from .storage.store import Store
-from .storage.tokens import worker_key
-from .sweeps.sweeps import Sweeps
-from .upkeep import Upkeep
+from .sweeps import Sweeps
+from .tokens import worker_key
 from .warm_up import KernelWarmUp
 
 LAG_PERIOD_S = 0.1
@@ -234,9 +225,9 @@ class Worker:
             await self.store.open()
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.store.watch()))
             at_exit.push_async_callback(self.scenarios.flush)
-            upkeep = Upkeep(self.settings, self.store, self.jobs, self.sessions)
+            maintenance = Maintenance(self.settings, self.store, self.jobs, self.sessions)
             # Nobody uploads yet: what lies about now was left behind.
-            await asyncio.to_thread(partial(upkeep.sweep, at_start=True))
+            await asyncio.to_thread(partial(maintenance.sweep, at_start=True))
             if self.settings.demo:
                 await asyncio.to_thread(self._add_demo)
             if not await self.scene_cache.refresh():
@@ -255,7 +246,7 @@ class Worker:
             await at_exit.enter_async_context(self.jobs.running())
             if self.sharing is not None:
                 await at_exit.enter_async_context(self.sharing.running())
-            at_exit.push_async_callback(_cancel, asyncio.create_task(upkeep.run()))
+            at_exit.push_async_callback(_cancel, asyncio.create_task(maintenance.run()))
             prewarming = Prewarming(
                 self.leases,
                 self.scene_cache,

@@ -11,7 +11,7 @@ import pytest
 from real2sim_server.cli.backup import backup, restore
 from real2sim_server.console import CommandError
 from real2sim_server.service.storage.backup import BackupError
-from real2sim_server.service.storage.ownership import StateFolderError, owned_folder
+from real2sim_server.service.storage.connection import StateFolderError, owned_folder
 from real2sim_server.service.storage.store import ScenarioRow, Store
 
 from ..service.storage.test_store import entry, run

@@ -8,41 +8,45 @@ import pytest
 
 from real2sim_server.cli.store import migrate, status
 from real2sim_server.console import CommandError
-from real2sim_server.service.storage import tables
+from real2sim_server.service.storage import schema, tables
 from real2sim_server.service.storage.errors import StoreError
-
-from ..service.storage.test_migrations import write_version_1
 
 
 @pytest.fixture
 def data(tmp_path):
-    """A state folder with a store of the first schema."""
-    write_version_1(f"sqlite:///{tmp_path / 'real2sim.db'}")
+    """A state folder with a store."""
+    migrate(data=tmp_path)
     return tmp_path
 
 
-def test_what_would_be_done_is_told_and_not_done(data, capsys):
-    for _ in range(2):
-        status(data=data)
-        told = capsys.readouterr().out
-        assert f"schema 1; this program's is {tables.SCHEMA_VERSION}" in told
-        assert told.count("to do:") == tables.SCHEMA_VERSION - 1
-        assert "real2sim store migrate" in told
+def write_version(data, version: str) -> None:
+    connection = sqlite3.connect(data / "real2sim.db")
+    connection.execute("UPDATE alembic_version SET version_num = ?", (version,))
+    connection.commit()
+    connection.close()
 
 
-def test_a_store_is_brought_up_to_date_once(data, capsys):
-    migrate(data=data)
-    assert capsys.readouterr().out.count("done:") == tables.SCHEMA_VERSION - 1
-    migrate(data=data)
+def test_a_new_store_gets_its_tables_once(tmp_path, capsys):
+    migrate(data=tmp_path)
+    assert f"done: {tables.SCHEMA_VERSION}: all tables" in capsys.readouterr().out
+    migrate(data=tmp_path)
     assert "nothing to do" in capsys.readouterr().out
 
 
+def test_status_tells_pending_migrations_and_changes_nothing(data, capsys, monkeypatch):
+    capsys.readouterr()
+    monkeypatch.setattr(tables, "SCHEMA_VERSION", 2)
+    monkeypatch.setattr(schema, "_revisions", lambda: [(1, "first"), (2, "colours")])
+    for _ in range(2):
+        status(data=data)
+        told = capsys.readouterr().out
+        assert "schema 1; this program's is 2" in told
+        assert "to do: 2: colours" in told
+        assert "real2sim store migrate" in told
+
+
 def test_a_store_of_a_newer_program_is_refused_with_what_to_do(data):
-    migrate(data=data)
-    connection = sqlite3.connect(data / "real2sim.db")
-    connection.execute("INSERT INTO schema_version VALUES (99)")
-    connection.commit()
-    connection.close()
+    write_version(data, "0099")
     for command in (status, migrate):
         with pytest.raises(StoreError, match="restore a backup"):
             command(data=data)

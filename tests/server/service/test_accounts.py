@@ -21,7 +21,7 @@ from real2sim_server.service.accounts import (
     OverLimitError,
     RevokedError,
 )
-from real2sim_server.service.token_file import (
+from real2sim_server.service.tokens import (
     TokenFileError,
     TokenLimits,
     add_token,

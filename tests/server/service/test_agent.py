@@ -6,10 +6,9 @@ import socket
 
 import pytest
 
-from real2sim_server.service import prewarming, serve
-from real2sim_server.service.agent import Agent, Willingness
-from real2sim_server.service.prewarming import loads_of
-from real2sim_server.service.storage.leases import WorkerRow
+from real2sim_server.service import membership, serve
+from real2sim_server.service.membership import Agent, Willingness, loads_of
+from real2sim_server.service.storage.fleet import WorkerRow
 from tests.waiting import LIMIT_S, wait_until
 
 from ..ports import reserved_port
@@ -124,7 +123,7 @@ def test_a_hot_scene_is_loaded_by_one_more_worker():
 
 
 def test_a_worker_loads_a_hot_scene_ahead(start, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(prewarming, "LOOK_S", 0.05)
+    monkeypatch.setattr(membership, "LOOK_S", 0.05)
     first, second = start("w0", hot_scene_sessions=1), start("w1", hot_scene_sessions=1)
     Site(first)
     for client in (first, second):

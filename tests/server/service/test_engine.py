@@ -14,9 +14,9 @@ from real2sim_server.service.engine import (
     DeviceLostError,
     Engine,
     EngineStoppedError,
+    Lane,
     QueueFullError,
 )
-from real2sim_server.service.lanes import Lane
 from tests.waiting import LIMIT_S, wait_until, wait_until_async
 
 

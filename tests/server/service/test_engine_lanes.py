@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from real2sim_server.service.lanes import WEIGHTS, Lane, Lanes
+from real2sim_server.service.engine import WEIGHTS, Lane, Lanes
 
 
 def filled(**counts: int) -> Lanes[str]:

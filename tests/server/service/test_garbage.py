@@ -6,7 +6,7 @@ import gc
 
 import pytest
 
-from real2sim_server.service.garbage import search_seldom, spare_what_is_there
+from real2sim_server.service.serve import search_seldom, spare_what_is_there
 
 
 @pytest.fixture(autouse=True)

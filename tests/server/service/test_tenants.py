@@ -8,7 +8,7 @@ import pytest
 
 from real2sim_server.cli.store import audit
 from real2sim_server.service.http.auth import needed_role
-from real2sim_server.service.token_file import ROLES, TokenLimits, add_token, read_token_file
+from real2sim_server.service.tokens import ROLES, TokenLimits, add_token, read_token_file
 
 from .test_accounts import bearer
 from .waiting import finished

@@ -6,8 +6,8 @@ import os
 import time
 
 from real2sim_server._files import sweep_leftovers
+from real2sim_server.service.maintenance import Maintenance
 from real2sim_server.service.storage import store as store_module
-from real2sim_server.service.upkeep import Upkeep
 
 from .waiting import succeeded
 
@@ -29,7 +29,7 @@ def test_an_upload_that_is_under_way_outlives_the_hourly_round(run_worker, tmp_p
         staging.mkdir(parents=True)
         (staging / "upload.ply").write_bytes(b"ply")
         worker = client.app.state.worker
-        Upkeep(worker.settings, worker.store, worker.jobs, worker.sessions).sweep()
+        Maintenance(worker.settings, worker.store, worker.jobs, worker.sessions).sweep()
         assert staging.exists()
 
 

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from real2sim_proto import ErrorCode
 
 from ..accounts import ACCOUNT, Account
-from ..token_file import ROLES, Role
+from ..tokens import ROLES, Role
 from .problems import ServiceError
 
 FOREIGN_PAGE = 4403

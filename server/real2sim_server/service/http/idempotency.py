@@ -19,8 +19,7 @@ from starlette.requests import Request
 from real2sim_proto import ErrorCode
 
 from ..storage.store import Store, StoredReply, StoreError
-from ..storage.tokens import sealed, unsealed
-from ..token_file import DEFAULT_NAME
+from ..tokens import DEFAULT_NAME, sealed, unsealed
 from .auth import account_of
 from .problems import ServiceError
 

@@ -23,11 +23,10 @@ from ...datasets.writers import writer_of
 from ...render import Backend, RenderOutput
 from ...render.backends.base import RasterRequest
 from ...render.cast import CastRequest, Echo, select_caster
-from ..engine import Engine, QueueFullError
+from ..engine import Engine, Lane, QueueFullError
 from ..http.problems import ServiceError
-from ..lanes import Lane
-from ..library.quotas import Quota
-from .archive import pack
+from ..library.budgets import Quota
+from .exports import pack
 from .jobs import JobContext, JobResult
 
 T = TypeVar("T")

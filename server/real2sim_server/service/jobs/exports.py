@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import tarfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -133,3 +135,23 @@ def _render_request(video_source: VideoSource, sensor: SensorSpec, t_us: int) ->
         t_us=t_us,
         sensors=(sensor,),
     )
+
+
+# --- Archives ------------------------------------------------------------------------------------
+
+
+def pack(folder: Path, archive: Path, context: JobContext) -> None:
+    """Pack all files below a folder; the same bytes for the same files: without the day, the user
+    or the rights. A file that is packed goes, so that the disk holds each once.
+
+    Raises:
+        JobCancelled: the job was cancelled.
+    """
+    with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as tar:
+        for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+            context.check()
+            member = tarfile.TarInfo(str(path.relative_to(folder)))
+            member.size, member.mtime, member.mode = path.stat().st_size, 0, 0o644
+            with path.open("rb") as file:
+                tar.addfile(member, file)
+            path.unlink()

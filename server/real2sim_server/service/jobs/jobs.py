@@ -1,4 +1,4 @@
-"""Long work: it answers at once, reports as it goes, can be cancelled, and keeps its result."""
+"""Jobs: long work that answers at once, reports progress, can be cancelled and keeps its result."""
 
 from __future__ import annotations
 
@@ -16,18 +16,45 @@ from typing import Any
 
 import structlog
 
-from real2sim_proto import ErrorCode
+from real2sim_proto import ErrorCode, Problem
 from real2sim_proto.jobs import JobFile, JobInfo, JobKind, JobState
 
 from ..accounts import ACCOUNT, owner_name
 from ..clock import now_us
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError, problem_of, service_error
-from ..library.quotas import Quota
+from ..library.budgets import Quota
 from ..scenarios.replies import iso_time
 from ..storage.job_log import ClaimedJob, JobLog
 from ..storage.store import FencedError, StoreError, StoreTroubleError
-from .endings import ended, given_up, interruption
+
+# --- Ends of jobs --------------------------------------------------------------------------------
+
+
+def ended(info: JobInfo, state: JobState, *, error: Problem | None = None) -> JobInfo:
+    """The job once it is over."""
+    return info.model_copy(
+        update={"state": state, "finished_at": iso_time(now_us()), "error": error}
+    )
+
+
+def interruption() -> Problem:
+    """Of a job whose worker stopped."""
+    failure = ServiceError(
+        ErrorCode.DRAINING, "the worker stopped before this job was done", hint="start it again"
+    )
+    return problem_of(failure, path="", request_id=None)
+
+
+def given_up(deaths: int) -> Problem:
+    """Of a job at which so many workers died."""
+    failure = ServiceError(
+        ErrorCode.JOB_FAILED,
+        f"{deaths} workers died at this job; it is not begun once more",
+        hint="look at the logs of the workers, and ask for less at once",
+    )
+    return problem_of(failure, path="", request_id=None)
+
 
 MAX_QUEUED_JOBS = 32
 """Jobs that may wait for their turn; more are refused."""

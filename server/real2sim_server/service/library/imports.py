@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import errno
 import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import ID_PATTERN
@@ -25,12 +29,40 @@ from ...scene.io import (
 )
 from ..http.problems import ServiceError
 from ..storage.errors import FULL_ERRNOS, REFUSED_ERRNOS, is_full, is_refused
-from .claims import bears_claim, put_claim
-from .quotas import Quota, folder_usage
-from .scene_catalog import SCENE_DOCUMENT, bundle_folder
+from .budgets import Quota, folder_usage
+from .scenes import SCENE_DOCUMENT, bundle_folder
+
+# --- Claims --------------------------------------------------------------------------------------
+
+# Files and answers cannot be stored together. A new bundle therefore carries a claim of its request
+# until the answer is stored: after a crash the repeated request recognises its own bundle, and any
+# other request finds the name taken.
+
+CLAIM_FILE = ".made_by"
+
+
+def put_claim(bundle: Path, claim: str | None) -> None:
+    """Mark a bundle that nobody sees yet; ``claim`` is None for requests without a key."""
+    if claim is not None:
+        (bundle / CLAIM_FILE).write_text(claim, encoding="utf-8")
+
+
+def bears_claim(bundle: Path, claim: str | None) -> bool:
+    """Whether the bundle is there and was made by that request, whose answer was not stored."""
+    try:
+        return claim is not None and (bundle / CLAIM_FILE).read_text(encoding="utf-8") == claim
+    except (OSError, ValueError):
+        return False
+
+
+def drop_claim(bundle: Path) -> None:
+    """Forget who made a bundle. Where that cannot be done the claim does no harm."""
+    with contextlib.suppress(OSError):
+        (bundle / CLAIM_FILE).unlink(missing_ok=True)
+
 
 STAGING_PREFIX = ".upload-"
-"""Of folders that are removed when a crash has left them, see :mod:`..upkeep`."""
+"""Prefix of folders that maintenance removes after a crash."""
 
 
 def resolve_import(root: Path, given: str) -> Path:
@@ -191,3 +223,50 @@ def _import_failed(detail: str) -> ServiceError:
         hint=f"give a bundle (a folder with {SCENE_DOCUMENT}) or a splat file: "
         ".ply, .compressed.ply, .spz or .splat",
     )
+
+
+# --- Queue ---------------------------------------------------------------------------------------
+
+T = TypeVar("T")
+
+MAX_IMPORTS = 8
+"""Imports that are received, wait or run; each may hold an upload on disk."""
+
+
+class ImportQueue:
+    """One import after the other, on a thread that nothing else uses. Belongs to the event loop.
+
+    The reading is done by a process with limits, see :mod:`real2sim_server.scene.io.staging`; one
+    at a time, so that these are the limits of all imports together.
+    """
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="imports")
+        self._taken = 0
+
+    def close(self) -> None:
+        """Begin no further import."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    @contextmanager
+    def place(self) -> Iterator[None]:
+        """A place in the queue, taken before the upload is received.
+
+        Raises:
+            ServiceError: QUEUE_FULL.
+        """
+        if self._taken >= MAX_IMPORTS:
+            raise ServiceError(
+                ErrorCode.QUEUE_FULL,
+                f"{self._taken} imports are under way; {MAX_IMPORTS} is the most",
+                hint="send it again after Retry-After seconds",
+            )
+        self._taken += 1
+        try:
+            yield
+        finally:
+            self._taken -= 1
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """``work()`` once the imports before it are over."""
+        return await asyncio.get_running_loop().run_in_executor(self._thread, work)

@@ -12,7 +12,7 @@ from ...edit import ObjectState
 from ...scene import Camera, Trajectory
 from ...scene.io import SceneSummary
 from ...scene.lens import lens_values
-from .scene_catalog import Listing
+from .scenes import Listing
 
 
 def scene_info(

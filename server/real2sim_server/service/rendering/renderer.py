@@ -1,4 +1,4 @@
-"""From instances to encoded frames: rendered on the engine, encoded beside it."""
+"""From instances to encoded frames: rendered on the engine, encoded on other threads."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from typing import TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 import structlog
+from fastapi import Response
 from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.base import Codec
+from real2sim_proto import encode as encode_message
+from real2sim_proto.base import Codec, Modality
 from real2sim_proto.cameras import MotionBlurSpec
 from real2sim_proto.episode import SensorSpec
 
@@ -41,16 +43,13 @@ from ...render.jpeg import JpegEncoder, jpeg_encoder_for, turbo_jpeg
 from ...render.modalities import modality_names, modality_of, options_for
 from ...render.uncertainty import UNCERTAINTY, WITHOUT
 from ...scene import Camera, CameraRig, Scene, SceneError
-from ..engine import Engine, lower_priority
+from ..engine import Engine, Lane, lower_priority
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
-from ..lanes import Lane
-from ..library.memory import MemoryBudget
-from .frames import EncodedFrame, RenderedImage, encode_frame
-from .kernels_beside import KernelsBeside
-from .lens_kernels import LensKernels
-from .levels import DetailLevels
-from .optics import FollowingImage, blurred, camera_with
+from ..http.responses import choose_among, etag
+from ..library.budgets import MemoryBudget
+from .background import DetailLevels, KernelsBeside, LensKernels
+from .frames import EncodedFrame, FollowingImage, RenderedImage, blurred, camera_with, encode_frame
 
 log = structlog.get_logger(__name__)
 
@@ -464,3 +463,74 @@ def check_sensors(
             hint="ask for smaller or fewer images",
         )
     return cameras
+
+
+# --- HTTP answers --------------------------------------------------------------------------------
+
+CODEC_OF: dict[str, Codec] = {
+    "image/jpeg": "jpeg",
+    "image/png": "png",
+    "application/msgpack": "raw",
+}
+"""Codec by media type; the order is that of preference."""
+
+FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "one frame, in the form that Accept picks",
+        "content": {
+            "image/jpeg": {"schema": {"type": "string", "format": "binary"}},
+            "image/png": {"schema": {"type": "string", "format": "binary"}},
+            "application/msgpack": {"schema": {"type": "string", "format": "binary"}},
+        },
+    }
+}
+
+
+def choose_media_type(accept: str | None, modality: Modality) -> str:
+    """The media type that the client likes best (RFC 9110, section 12.5.1).
+
+    Raises:
+        ServiceError: NOT_ACCEPTABLE when there is none; depth and instance are never jpeg.
+    """
+    codecs = modality_of(modality).codecs
+    offered = [media_type for media_type, codec in CODEC_OF.items() if codec in codecs]
+    return choose_among(offered, accept, of=f"modality {modality!r}")
+
+
+MSGPACK = "application/msgpack"
+
+
+def choose_frames_type(accept: str | None, modalities: Sequence[Modality]) -> str:
+    """The same for images of these modalities: msgpack, or, for one image, any of its forms."""
+    if len(modalities) == 1:
+        return choose_media_type(accept, modalities[0])
+    return choose_among([MSGPACK], accept, of="more than one image")
+
+
+def frames_response(rendered: RenderedFrames, media_type: str, *, t_us: int) -> Response:
+    """The answer that carries all frames of one instant; one alone also as an image file."""
+    if media_type != MSGPACK:
+        return frame_response(rendered, media_type)
+    view = {"t_us": t_us, "frames": [frame.fields for frame in rendered.frames]}
+    view["timing"] = rendered.timing_ms
+    headers = {"Vary": "Accept", "Cache-Control": "no-store"}
+    return Response(encode_message(view), media_type=MSGPACK, headers=headers)
+
+
+def frame_response(
+    rendered: RenderedFrames, media_type: str, *, revision: int | None = None
+) -> Response:
+    """The answer that carries the first frame.
+
+    msgpack holds the whole frame (pose, intrinsics, raw pixels) as on the drive socket; image
+    files carry the milliseconds by stage in ``Server-Timing`` as well.
+    """
+    frame = rendered.frames[0]
+    content: bytes = bytes(frame.data)
+    if media_type == MSGPACK:
+        content = encode_message(frame.fields)
+    timing = ", ".join(f"{stage};dur={ms:.2f}" for stage, ms in rendered.timing_ms.items())
+    headers = {"Server-Timing": timing, "Vary": "Accept", "Cache-Control": "no-store"}
+    if revision is not None:
+        headers["X-Real2Sim-Revision"] = etag(revision)
+    return Response(content, media_type=media_type, headers=headers)

@@ -24,12 +24,10 @@ from ..http.auth import TokenRoute
 from ..http.idempotency import IdempotencyKey, form_digest
 from ..http.problems import ServiceError
 from ..http.responses import info_response
-from ..library.assets import extract_object, import_asset
-from ..library.claims import drop_claim
-from ..library.imports import import_errors, scene_name, staging_folder
-from ..library.thumbnails import draw_thumbnail
+from ..library.assets import draw_thumbnail, extract_object, import_asset
+from ..library.imports import drop_claim, import_errors, scene_name, staging_folder
 from ..worker import Worker, WorkerOf
-from .scene_imports import stored_upload
+from .scenes import stored_upload
 
 UPLOAD_PATH = "/v1/assets"
 

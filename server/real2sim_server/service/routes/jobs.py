@@ -1,26 +1,45 @@
-"""Jobs: long work that is followed, cancelled, and whose results are fetched."""
+"""Jobs: follow, cancel and fetch results; start exports, sweeps and searches."""
 
 from __future__ import annotations
 
 import asyncio
+import base64
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import FileResponse, RedirectResponse, StreamingResponse
 
 from real2sim_proto.base import Identifier
-from real2sim_proto.jobs import JobInfo, JobList
+from real2sim_proto.jobs import (
+    EXPORT_BODY,
+    DatasetRequest,
+    ExportBody,
+    ExportRequest,
+    JobInfo,
+    JobList,
+)
+from real2sim_proto.sweeps import SweepRequest
 
-from ..http.auth import TokenRoute
-from ..http.disconnects import cancel_on_disconnect
+from ...datasets.drive import EpisodeDrive, ScenarioDrive
+from ...datasets.variants import Variant, swept
+from ...edit import ScenarioState, instances_at
+from ...scene import Scene
+from ...world.recording.recording import Recording, RecordingError, recording_of_bytes
+from ..http.auth import TokenRoute, bearer_token, unauthorized
+from ..http.idempotency import IdempotencyKey
+from ..http.problems import cancel_on_disconnect
+from ..http.requests import ClientName
 from ..http.responses import event_stream, info_response
-from ..jobs.jobs import Jobs
-from ..rendering.renderer import RenderRequest
-from ..rendering.responses import FRAME_RESPONSES, frame_response
-from ..sessions.recording import RECORDING
-from ..worker import WorkerOf
-from .frame_query import FrameQueryOf
+from ..jobs.datasets import DatasetSource, EngineBackend, check_dataset, make_dataset, plan_of
+from ..jobs.exports import VideoSource, check_camera, export_video, frame_times
+from ..jobs.jobs import JobContext, JobResult, Jobs, NewJob, Work, accepted_headers
+from ..rendering.renderer import FRAME_RESPONSES, RenderRequest, frame_response
+from ..sessions.recording import RECORDING, episode_of
+from ..sessions.registry import check_not_closed
+from ..sessions.session import opens_session
+from ..worker import Worker, WorkerOf
+from .queries import FrameQueryOf
 
 FILE_TYPES = (
     "video/webm",
@@ -163,3 +182,211 @@ async def _named(jobs: Jobs, job_id: str, after: int) -> AsyncIterator[tuple[int
     async for info in jobs.events(job_id, after=after):
         name = info.state.value if info.over else "progress"
         yield info.event, name, info.model_dump_json()
+
+
+# --- Exports -------------------------------------------------------------------------------------
+
+exports_router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=TokenRoute)
+
+
+@exports_router.post("", status_code=202, response_model=JobInfo)
+async def create(
+    worker: WorkerOf,
+    body: ExportBody,
+    request: Request,
+    idempotency_key: IdempotencyKey = None,
+    who: ClientName = "",
+) -> Response:
+    """Make a file that leaves the worker; the answer is a job.
+
+    A **video** of a scene, a scenario as it is now, or a simulation, from a camera's way; once the
+    job has succeeded, `GET /v1/jobs/{id}/files/video.webm`. Or a labelled **data set** of a scene,
+    a scenario as it is now, a recorded episode or the running episode of a session, in public
+    formats: `GET /v1/jobs/{id}/files/dataset.tar`, `manifest.json` and `preview_0.jpg`.
+    """
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        revision = None
+        if body.scenario is not None:
+            revision = (await worker.scenarios.view(body.scenario)).revision
+        work = await _work(worker, body, revision, request)
+        fields = body.model_dump(mode="json", exclude_none=True, exclude={"recording"})
+        if revision is not None:
+            fields["revision"] = revision
+        new = NewJob("export", _subject(body), fields, who, portable=_is_portable(body))
+        info = await worker.jobs.start(new, work, idempotent=idempotent)
+        return info_response(info, status=202, headers=accepted_headers(info))
+
+
+async def work_again(worker: Worker, info: JobInfo) -> Work:
+    """The export of a job on record, of the scenario as it was then."""
+    fields = dict(info.request)
+    revision = fields.pop("revision", None)
+    return await _work(worker, EXPORT_BODY.validate_python(fields), revision, None)
+
+
+async def _work(
+    worker: Worker,
+    body: ExportRequest | DatasetRequest,
+    revision: int | None,
+    request: Request | None,
+) -> Work:
+    if isinstance(body, DatasetRequest):
+        return await _dataset_work(worker, body, revision, request)
+    return await _video_work(worker, body, revision)
+
+
+def _is_portable(body: ExportRequest | DatasetRequest) -> bool:
+    """Whether all that it shows is in the store, and the same for all workers."""
+    if isinstance(body, DatasetRequest):
+        return body.session is None and body.recording is None
+    return body.simulation is None
+
+
+def _subject(body: ExportRequest | DatasetRequest) -> str:
+    other = body.session if isinstance(body, DatasetRequest) else body.simulation
+    return body.scenario or body.scene or other or ""
+
+
+# --- videos -----------------------------------------------------------------------------------
+
+
+async def _video_work(worker: Worker, body: ExportRequest, revision: int | None) -> Work:
+    video_source = await _video_source(worker, body, revision)
+    check_camera(video_source, body, max_pixels=worker.settings.max_pixels_per_step)
+    frame_times(video_source, body)
+
+    async def work(context: JobContext) -> JobResult:
+        return await export_video(video_source, body, renderer=worker.renderer, context=context)
+
+    return work
+
+
+async def _video_source(
+    worker: Worker, request: ExportRequest, revision: int | None
+) -> VideoSource:
+    if request.simulation is not None:
+        return await worker.video_source(request.simulation)
+    if request.scenario is not None and revision is not None:
+        view = await worker.scenarios.view(request.scenario)
+        scene = await worker.scene_cache.get(view.row.scene)
+        state = await worker.scenarios.state_at(request.scenario, revision)
+    else:
+        scene = await worker.scene_cache.get(request.scene or "")
+        state = await asyncio.to_thread(ScenarioState.of, scene)
+    return VideoSource(scene, lambda t_us: instances_at(scene, state, t_us), state.clock)
+
+
+# --- data sets --------------------------------------------------------------------------------
+
+
+async def _dataset_work(
+    worker: Worker, body: DatasetRequest, revision: int | None, request: Request | None
+) -> Work:
+    plan = plan_of(body)
+    source = await _dataset_source(worker, body, revision, request)
+    max_pixels = worker.settings.max_pixels_per_step
+    await asyncio.to_thread(check_dataset, source.variants, plan, max_pixels=max_pixels)
+    loop = asyncio.get_running_loop()
+
+    async def work(context: JobContext) -> JobResult:
+        backend = EngineBackend(worker.engine, worker.backend, context, loop)
+        return await make_dataset(
+            source, plan, dry_run=body.dry_run, backend=backend, quota=worker.jobs.quota
+        )
+
+    return work
+
+
+async def _dataset_source(
+    worker: Worker, body: DatasetRequest, revision: int | None, request: Request | None
+) -> DatasetSource:
+    if body.session is not None and request is not None:
+        return await _session_source(worker, body.session, request)
+    if body.recording is not None:
+        recording = await asyncio.to_thread(_read_recording, body.recording)
+        return await _episode_source(worker, recording, body.scene or "")
+    if body.scenario is not None:
+        view = await worker.scenarios.view(body.scenario)
+        document = await worker.scenarios.export(body.scenario)
+        scene = await worker.scene_cache.get(view.row.scene)
+        done = document.entries[:revision]
+        entries = [entry.model_dump(mode="json", exclude_none=True) for entry in done]
+        assert revision is not None
+        state = await worker.scenarios.state_at(body.scenario, revision)
+        return await _edited_source(scene, state, body, _made_of(entries))
+    scene = await worker.scene_cache.get(body.scene or "")
+    state = await asyncio.to_thread(ScenarioState.of, scene)
+    return await _edited_source(scene, state, body, {"operations": []})
+
+
+async def _edited_source(
+    scene: Scene, state: ScenarioState, body: DatasetRequest, made_of: dict[str, Any]
+) -> DatasetSource:
+    if body.sweep is None:
+        return DatasetSource([Variant(ScenarioDrive(scene, state))], made_of)
+    variants = await asyncio.to_thread(swept, scene, state, body.sweep, body.seed)
+    made_of["sweep"] = body.sweep.model_dump(mode="json", exclude_none=True)
+    return DatasetSource(variants, made_of)
+
+
+def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
+    """A scenario's history without its instants: the same edits give the same bytes."""
+    if all(entry["kind"] == "edit" for entry in entries):
+        return {"operations": [edit for entry in entries for edit in entry["operations"]]}
+    kept = ("kind", "operations", "target")
+    return {"history": [{k: entry[k] for k in kept if k in entry} for entry in entries]}
+
+
+async def _session_source(worker: Worker, session_id: str, request: Request) -> DatasetSource:
+    row = check_not_closed(await worker.sessions.row(session_id))
+    # Where the worker wants a token, the route has seen one: it opens every session.
+    if not worker.accounts.wants_token and not opens_session(bearer_token(request), row):
+        error = unauthorized("the data set of a session wants the session's token")
+        error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
+        raise error
+    session = await worker.sessions.find(session_id)
+    async with session.lock:
+        recording = await episode_of(worker.sessions, session)
+    return await _episode_source(worker, recording, row.scene)
+
+
+def _read_recording(text: str) -> Recording:
+    try:
+        data = base64.b64decode(text, validate=True)
+    except ValueError as error:
+        raise RecordingError(f"recording: it is no base64 ({error})") from error
+    return recording_of_bytes(data, "recording")
+
+
+async def _episode_source(worker: Worker, recording: Recording, name: str) -> DatasetSource:
+    scene = await worker.scene_cache.get(name)
+    find = worker.assets.find
+    drive = await asyncio.to_thread(lambda: EpisodeDrive.of(recording, scene, assets=find))
+    return DatasetSource([Variant(drive)], {"episode": recording.digests[-1]})
+
+
+# --- Sweeps and searches -------------------------------------------------------------------------
+
+sweeps_router = APIRouter(prefix="/v1/sweeps", tags=["sweeps"], route_class=TokenRoute)
+
+
+@sweeps_router.post("", name="create", status_code=202, response_model=JobInfo)
+async def create_sweep(
+    worker: WorkerOf,
+    body: SweepRequest,
+    request: Request,
+    idempotency_key: IdempotencyKey = None,
+    who: ClientName = "",
+) -> Response:
+    """Drive points of a parameter space with planners, or search it for a planner's avoidable
+    failures (`method` of kind `search`); the answer is a job. Once it has succeeded,
+    `GET /v1/jobs/{id}/files/episodes.parquet` has a row an episode, and the `worst` of the result
+    left `EPISODE.r2e` and, of a scenario, `EPISODE.xosc`. A search leaves `failures.json`,
+    `failures.tar` with its page, and each failure as `failure_01.xosc` and `.r2e`."""
+    async with worker.idempotency.guard(request, idempotency_key) as idempotent:
+        if idempotent.replay:
+            return worker.replayed(idempotent.replay)
+        info = await worker.sweeps.start(body, who=who, idempotent=idempotent)
+        return info_response(info, status=202, headers=accepted_headers(info))

@@ -28,7 +28,7 @@ from real2sim_proto.sessions import (
 
 from ...edit import EditOutcome
 from ...world import Event, World
-from ..drives.drives import Seat
+from ..drives import Seat
 from ..http.auth import (
     SESSION_SCHEME,
     TokenRoute,
@@ -43,7 +43,7 @@ from ..http.problems import ServiceError
 from ..http.requests import ClientName
 from ..http.responses import choose_among, etag, info_response, large_response
 from ..jobs.jobs import accepted_headers
-from ..rendering.responses import CODEC_OF, choose_media_type
+from ..rendering.renderer import CODEC_OF, choose_media_type
 from ..sessions.describe import session_edited, session_info, session_state, shown_state
 from ..sessions.pipeline import StepPipeline
 from ..sessions.recording import RECORDING, recording_of

@@ -4,20 +4,278 @@ from __future__ import annotations
 
 import asyncio
 import json
+import struct
 import time
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import structlog
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
-from pydantic import TypeAdapter, ValidationError
+from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter, ValidationError
 
 from real2sim_proto import ErrorCode
+from real2sim_proto.base import Identifier, Microseconds, Model
+from real2sim_proto.episode import SensorSpec
+from real2sim_proto.operations import Operation
 
-from ..accounts import Account
+from ...edit import EditError, instances_at, replay_operations
+from ...geometry.rotation import Float
+from ...render import Instance, RenderError
+from ...render.encode import encode_rgb
+from ...render.uncertainty import UNCERTAINTY, uncertainty_picture
+from ...scene import Scene, SceneError
+from ..accounts import Account, RevokedError, admit_message, owner_name
+from ..engine import QueueFullError
 from ..http.auth import act_for
 from ..http.connections import close_quietly, receive_text
 from ..http.problems import ServiceError, service_error
+from ..rendering.frames import EncodedFrame
+from ..rendering.renderer import RenderRequest
 from ..worker import Worker, WorkerOf
-from .view_connection import ViewConnection
+
+# --- Connection ----------------------------------------------------------------------------------
+
+# The latest question is answered; older ones are dropped.
+
+REVISION_CHECK_S = 1.0
+"""How often an idle view checks the revision of its scenario."""
+PICK_WIDTH = 640
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class ViewRequest(Model):
+    """A question of the browser.
+
+    Attributes:
+        seq: comes back with the answer.
+        T_world_camera: 16 values, row by row: a free camera with the intrinsics of ``camera``;
+            None for the recorded place.
+        operations: applied to this picture alone: the preview of an edit in the making.
+        job: finished simulation to show instead of the scenario.
+        shows: what the picture is of; ``uncertainty`` comes in colours, see uncertainty_picture.
+        pick: (across, down) in shares of the picture: ask for the object there instead.
+    """
+
+    seq: int = 0
+    camera: Identifier
+    t_us: Microseconds
+    width: int = Field(default=640, ge=16, le=1920)
+    T_world_camera: list[float] | None = Field(default=None, min_length=16, max_length=16)
+    operations: list[Operation] = Field(default_factory=list, max_length=16)
+    job: Identifier | None = None
+    shows: Literal["rgb", "uncertainty"] = "rgb"
+    pick: tuple[Fraction, Fraction] | None = None
+
+
+VIEW_REQUEST: TypeAdapter[ViewRequest] = TypeAdapter(ViewRequest)
+
+
+class ViewConnection:
+    """One browser's view of one scenario.
+
+    The reader keeps one picture and one pick that wait; a newer one takes the place of the older,
+    so a slow drawing never leaves a queue behind it.
+    """
+
+    def __init__(self, socket: WebSocket, worker: Worker, scenario_id: str) -> None:
+        self._socket = socket
+        self._worker = worker
+        self._scenario_id = scenario_id
+        self._pending: dict[str, ViewRequest] = {}
+        self._request_received = asyncio.Event()
+        self._sent_revision = -1
+        self._revoked = asyncio.Event()
+
+    def end(self) -> None:
+        """Leave the browser: its token is no more."""
+        self._revoked.set()
+
+    async def serve(self) -> None:
+        """Answer until the browser leaves. Raises RevokedError: it has to."""
+        reader = asyncio.create_task(self._read())
+        answerer = asyncio.create_task(self._answer_requests())
+        tasks = {reader, answerer, asyncio.create_task(self._until_revoked())}
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            # Not gather(): cancelled itself, it would pass on the cancellation of its tasks.
+            await asyncio.wait(tasks)
+        for task in tasks:
+            error = None if task.cancelled() else task.exception()
+            if error is not None and not isinstance(error, WebSocketDisconnect):
+                raise error
+
+    async def _until_revoked(self) -> None:
+        await self._revoked.wait()
+        raise RevokedError(owner_name())
+
+    async def _read(self) -> None:
+        while True:
+            try:
+                request = VIEW_REQUEST.validate_json(await receive_text(self._socket))
+            except ServiceError as error:
+                await self._send_event("error", code=error.code, detail=error.detail)
+                continue
+            except ValidationError as error:
+                first = error.errors()[0]
+                where = ".".join(str(part) for part in first["loc"])
+                await self._send_event(
+                    "error", code="INVALID_REQUEST", detail=f"{where}: {first['msg']}"
+                )
+                continue
+            self._pending["pick" if request.pick else "picture"] = request
+            self._request_received.set()
+
+    async def _answer_requests(self) -> None:
+        while True:
+            try:
+                await asyncio.wait_for(self._request_received.wait(), REVISION_CHECK_S)
+            except TimeoutError:
+                await self._check_revision()
+                continue
+            self._request_received.clear()
+            for kind in ("pick", "picture"):
+                request = self._pending.pop(kind, None)
+                if request is not None:
+                    await self._answer_one(request)
+
+    async def _answer_one(self, request: ViewRequest) -> None:
+        try:
+            admit_message()
+            await self._answer_view(request)
+        except WebSocketDisconnect:
+            raise
+        except (EditError, SceneError, RenderError, QueueFullError) as error:
+            await self._send_event("error", seq=request.seq, code="REFUSED", detail=str(error))
+        except Exception as error:
+            failure = service_error(error, log_unexpected=True)
+            detail = {"code": failure.code, "detail": failure.detail, "hint": failure.hint}
+            await self._send_event("error", seq=request.seq, **detail)
+
+    async def _check_revision(self) -> None:
+        view = await self._worker.scenarios.view(self._scenario_id)
+        if self._sent_revision not in (-1, view.revision):
+            await self._send_event("changed", revision=view.revision)
+        self._sent_revision = view.revision
+
+    async def _answer_view(self, request: ViewRequest) -> None:
+        view = await self._worker.scenarios.view(self._scenario_id)
+        if request.job is None:
+            scene = await self._worker.scene_cache.get(view.row.scene)
+            vehicle_at = scene.ego.transform
+
+            def instances() -> Sequence[Instance]:
+                state = (
+                    replay_operations(view.state, request.operations)
+                    if request.operations
+                    else view.state
+                )
+                return instances_at(scene, state, request.t_us)
+        else:
+            video_source = await self._worker.video_source(request.job)
+            scene = video_source.scene
+            vehicle_at = video_source.T_world_vehicle
+
+            def instances() -> Sequence[Instance]:
+                show = video_source.instances
+                if request.T_world_camera is not None:
+                    show = video_source.outside or show
+                return show(request.t_us)
+
+        render_request = await asyncio.to_thread(
+            lambda: _render_request(scene, instances(), request, vehicle_at)
+        )
+        rendered = await self._worker.renderer.render(render_request, stream="view")
+        frame = rendered.frames[0]
+        if request.pick is not None:
+            ids = np.frombuffer(frame.data, np.uint16).reshape(frame.shape[0], frame.shape[1])
+            picked = instance_at(ids, request.pick)
+            names = {o.instance_id: o.object_id for o in view.state.visible}
+            await self._send_event("picked", seq=request.seq, object_id=names.get(picked))
+            return
+        header: dict[str, Any] = {
+            "type": "frame",
+            "seq": request.seq,
+            "revision": view.revision,
+            "camera": request.camera,
+            "t_us": request.t_us,
+            "width": frame.shape[1],
+            "height": frame.shape[0],
+            "T_world_camera": np.asarray(frame.header.fields["T_world_sensor"]).ravel().tolist(),
+            "K": np.asarray(frame.header.fields["K"]).ravel().tolist(),
+            "timing_ms": {k: round(v, 2) for k, v in rendered.timing_ms.items()},
+        }
+        self._sent_revision = view.revision
+        data = bytes(frame.data)
+        if request.shows == UNCERTAINTY:
+            data = await asyncio.to_thread(_in_colours, frame)
+        await self._socket.send_bytes(pack_frame_message(header, data))
+
+    async def _send_event(self, kind: str, **values: Any) -> None:
+        await self._socket.send_text(json.dumps({"type": kind, **values}))
+
+
+def instance_at(ids: NDArray[np.uint16], place: tuple[float, float], *, reach: int = 3) -> int:
+    """Id under a pointer; near the rim of an object the object, not the background.
+
+    Args:
+        ids: [H, W] instance image.
+        place: (across, down) in shares of the picture.
+        reach: how far beside the pointer an object may be [px].
+    """
+    height, width = ids.shape
+    column = min(int(place[0] * width), width - 1)
+    row = min(int(place[1] * height), height - 1)
+    if ids[row, column]:
+        return int(ids[row, column])
+    top, left = max(row - reach, 0), max(column - reach, 0)
+    near = ids[top : row + reach + 1, left : column + reach + 1]
+    rows, columns = np.nonzero(near)
+    if not len(rows):
+        return 0
+    nearest = np.argmin((rows + top - row) ** 2 + (columns + left - column) ** 2)
+    return int(near[rows[nearest], columns[nearest]])
+
+
+def _in_colours(frame: EncodedFrame) -> bytes:
+    """The jpeg of a raw uncertainty image."""
+    pixels = np.frombuffer(frame.data, "<f4").reshape(frame.shape)
+    return encode_rgb(uncertainty_picture(pixels), "jpeg")
+
+
+def pack_frame_message(header: dict[str, Any], data: bytes) -> bytes:
+    """One binary message: length of the header (uint32, little endian), header as JSON, data."""
+    head = json.dumps(header, separators=(",", ":")).encode()
+    return struct.pack("<I", len(head)) + head + data
+
+
+def _render_request(
+    scene: Scene,
+    instances: Sequence[Instance],
+    request: ViewRequest,
+    vehicle_at: Callable[[int], Float],
+) -> RenderRequest:
+    """Raises SceneError for a time or camera that the scene does not have."""
+    vehicle = vehicle_at(request.t_us)
+    if request.T_world_camera is not None:
+        camera = next((c for c in scene.rig if c.name == request.camera), None)
+        if camera is not None:
+            T_world_camera = np.asarray(request.T_world_camera, np.float64).reshape(4, 4)
+            vehicle = T_world_camera @ np.linalg.inv(camera.T_vehicle_camera)
+    shows = "instance" if request.pick else request.shows
+    sensor = SensorSpec(
+        camera=request.camera,
+        modalities=[shows],
+        width=PICK_WIDTH if request.pick else request.width,
+        codec="jpeg" if shows == "rgb" else "raw",
+    )
+    return RenderRequest(scene, instances, vehicle, request.t_us, (sensor,))
+
 
 HANDSHAKE_TIMEOUT_S = 10.0
 CLOSED_BAD_MESSAGE, CLOSED_UNAUTHORIZED, CLOSED_NOT_FOUND = 4400, 4401, 4404

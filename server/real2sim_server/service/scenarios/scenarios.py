@@ -23,14 +23,11 @@ from real2sim_proto.scenarios import (
 from ...edit import AssetLookup, EditError, LogEntry, PlannedEntry, Scenario, ScenarioState
 from ...scene.io import SceneSummary
 from ..clock import now_us
-from ..http.disconnects import uncancellable
 from ..http.idempotency import IdempotentRequest
 from ..http.metrics import Metrics
-from ..http.problems import ServiceError
-from ..library.scene_cache import SceneCache
-from ..library.scene_catalog import BUNDLE_SUFFIX
+from ..http.problems import ServiceError, uncancellable
+from ..library.scenes import BUNDLE_SUFFIX, SceneCache
 from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply
-from .recorded import check_made
 from .replies import (
     ScenarioView,
     asset_hashes,
@@ -44,8 +41,7 @@ from .replies import (
     stale_revision,
     tag,
 )
-from .scenario_cache import CachedScenario, ScenarioCache
-from .snapshots import Snapshots
+from .scenario_cache import CachedScenario, ScenarioCache, Snapshots, check_made
 
 __all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
 

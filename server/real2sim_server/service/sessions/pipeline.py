@@ -37,12 +37,9 @@ from ...render import Instance
 from ...scene import Camera, Scene
 from ...world import World
 from ...world.ranging import NO_SENSORS, Cloud, Mounted, MountedLidar, RangingSensors
-from ..engine import Engine
+from ..engine import Engine, Lane
 from ..http.metrics import Metrics
-from ..lanes import Lane
-from ..rendering.clouds import cloud_parts
-from ..rendering.frames import EncodedFrame, RenderedImage
-from ..rendering.optics import needs_motion
+from ..rendering.frames import EncodedFrame, RenderedImage, cloud_parts, needs_motion
 from ..rendering.renderer import Renderer, RenderRequest
 from ..storage.store import Claim, SessionEntry, Store
 from ..warm_up import DeformationKernels

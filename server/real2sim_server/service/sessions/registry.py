@@ -29,11 +29,11 @@ from ..accounts import Accounts, owner_name
 from ..http.idempotency import IdempotentRequest
 from ..http.metrics import Metrics
 from ..http.problems import ServiceError
-from ..library.scene_cache import SceneCache
+from ..library.scenes import SceneCache
 from ..scenarios.scenarios import Scenarios
-from ..storage.leases import Leases
+from ..storage.fleet import Leases
 from ..storage.store import SessionEntry, SessionRow, Store
-from ..storage.tokens import token_hash
+from ..tokens import token_hash
 from ..warm_up import KernelWarmUp
 from .describe import session_info
 from .pipeline import StepPipeline

@@ -29,7 +29,7 @@ from ...world.ranging import (
 from ...world.sensing import clouds_of, recorded_cloud
 from ..engine import Engine
 from ..http.problems import ServiceError
-from ..rendering.kernels_beside import KernelsBeside
+from ..rendering.background import KernelsBeside
 from ..rendering.renderer import check_known, check_sensors
 
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024

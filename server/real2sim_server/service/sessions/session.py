@@ -21,7 +21,7 @@ from .. import clock
 from ..http.auth import secrets_equal
 from ..http.problems import ServiceError
 from ..storage.store import SessionRow
-from ..storage.tokens import token_hash
+from ..tokens import token_hash
 from .wire import EncodedMessage
 
 A = TypeVar("A")

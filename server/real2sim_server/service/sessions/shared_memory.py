@@ -31,7 +31,7 @@ from real2sim_proto.shared_memory import ALIGNMENT, FOLDER, HEADER_BYTES, MAGIC,
 
 from ..http.auth import secrets_equal
 from ..http.problems import ServiceError
-from ..library.memory import IdleItem, MemoryBudget
+from ..library.budgets import IdleItem, MemoryBudget
 from ..rendering.frames import EncodedFrame, placed_frame
 
 SLOTS = 4

@@ -23,9 +23,9 @@ from pathlib import Path, PurePosixPath
 
 from ..._files import unpack_tar
 from . import tables as t
+from .connection import owned_folder
 from .errors import StoreError
-from .migrations import check_version
-from .ownership import owned_folder
+from .schema import check_version
 
 MANIFEST = "backup.json"
 DATABASE = "store.db"
@@ -159,7 +159,7 @@ def _checked_schema(database: Path) -> int:
         try:
             (state,) = connection.execute("PRAGMA quick_check(1)").fetchone()
             (found,) = connection.execute(
-                f"SELECT max(version) FROM {t.schema_version.name}"
+                f"SELECT max(CAST(version_num AS INTEGER)) FROM {t.alembic_version.name}"
             ).fetchone()
         except sqlite3.Error as error:
             raise BackupError(f"{database.name} is no store of a worker: {error}") from error

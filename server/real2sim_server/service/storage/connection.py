@@ -1,18 +1,25 @@
-"""How the database of a store is reached: drivers, time limits, journals, private files."""
+"""Connections to the database of a store, and who owns its folder and its names."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import select
 import socket
 import sqlite3
+import sys
 import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import make_url
 from sqlalchemy.pool import StaticPool
+
+from .errors import StoreError
 
 DRIVER_TIMEOUTS = {"pg8000": "timeout", "psycopg": "connect_timeout", "psycopg2": "connect_timeout"}
 """Argument of a PostgreSQL driver that limits its waiting [s]. Only pg8000 limits reading too, so
@@ -185,3 +192,274 @@ def shown_url(url: str) -> str:
         return make_url(url).render_as_string(hide_password=True)
     except sa.exc.ArgumentError:
         return "<no SQLAlchemy URL>"
+
+
+# --- Ownership of a state folder -----------------------------------------------------------------
+
+LOCK_FILE = "worker.lock"
+
+
+class StateFolderError(OSError):
+    """The state folder cannot be used; the message says why and what to do."""
+
+
+def check_state_folder(folder: Path) -> None:
+    """Refuse a state folder that cannot be used now. Raises StateFolderError."""
+    with owned_folder(folder):
+        pass
+
+
+@contextlib.contextmanager
+def owned_folder(folder: Path) -> Iterator[None]:
+    """Own the state folder for the length of the block; made where it is missing.
+
+    The lock is the kernel's, so that it ends with the process however that ends; the file stays.
+
+    Raises:
+        StateFolderError: another process owns it, named by its PID; or it cannot be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        descriptor = _open_private(folder / LOCK_FILE)
+    except OSError as error:
+        raise _unusable(folder, error) from error
+    try:
+        _lock(descriptor, folder)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def owned_name(database: Path, worker_id: str) -> Iterator[None]:
+    """Be the only worker of that name on a database file, for the length of the block.
+
+    Workers with state folders and names of their own may share one database.
+
+    Raises:
+        StateFolderError: another process has the name, named by its PID.
+    """
+    path = database.with_name(f"{database.name}.{worker_id}.lock")
+    try:
+        descriptor = _open_private(path)
+    except OSError as error:
+        raise _unusable(path.parent, error) from error
+    try:
+        _lock(descriptor, database, name=worker_id)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _open_private(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+
+
+def _lock(descriptor: int, place: Path, *, name: str | None = None) -> None:
+    if sys.platform == "win32":
+        return
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        owner = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
+        raise _taken(place, owner or "process unknown", name) from error
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):
+            raise _unusable(place, error) from error
+        raise StateFolderError(
+            f"the file system of {str(place)!r} has no locks, so that two workers could write "
+            "there at once: give a folder on a local disk with --data or REAL2SIM_DATA_DIR"
+        ) from error
+    try:
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+    except OSError as error:
+        raise _unusable(place, error) from error
+
+
+def _taken(place: Path, owner: str, name: str | None) -> StateFolderError:
+    if name is None:
+        return StateFolderError(
+            f"the state folder {str(place)!r} is in use by another worker ({owner}). Stop that "
+            "one, or give this one a folder of its own with --data or REAL2SIM_DATA_DIR"
+        )
+    return StateFolderError(
+        f"a worker {name!r} runs on the store {str(place)!r} already ({owner}). Stop that one, or "
+        "give this one another name with REAL2SIM_WORKER_ID"
+    )
+
+
+def _unusable(folder: Path, error: OSError) -> StateFolderError:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        remedy = "free some space there"
+    else:
+        remedy = (
+            f"make it writable for user {os.getuid() if hasattr(os, 'getuid') else 'of the worker'}"
+        )
+    return StateFolderError(
+        f"the state folder {str(folder)!r} cannot be written to: {error.strerror or error}. "
+        f"{remedy.capitalize()}, or give another one with --data or REAL2SIM_DATA_DIR"
+    )
+
+
+# --- Ownership of a name on a server -------------------------------------------------------------
+
+NAME_SPACE = 0x5232_5302
+"""Of PostgreSQL's advisory locks: names of workers."""
+
+
+class NameOnServer:
+    """Being the only worker of a name on a PostgreSQL database.
+
+    The lock belongs to a connection of its own, and ends with it.
+    """
+
+    def __init__(self, engine: sa.Engine, worker_id: str) -> None:
+        self._engine = engine
+        self._worker_id = worker_id
+        self._connection: sa.Connection | None = None
+
+    def hold(self) -> None:
+        """Take the name, or make sure that it is still ours.
+
+        Raises:
+            StoreError: another worker has it.
+            sqlalchemy.exc.SQLAlchemyError: the server does not answer.
+        """
+        if self._connection is None:
+            self._take()
+            return
+        try:
+            self._connection.exec_driver_sql("SELECT 1")
+        except Exception:
+            # Drivers let errors of sockets through as they are; the connection is spoilt by any.
+            self.drop()
+            raise
+
+    def drop(self) -> None:
+        """Give the name back."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with contextlib.suppress(sa.exc.SQLAlchemyError, OSError):
+                connection.invalidate()
+                connection.close()
+
+    def _take(self) -> None:
+        engine = self._engine.execution_options(isolation_level="AUTOCOMMIT")
+        connection = engine.connect()
+        try:
+            who = f"real2sim {self._worker_id}, process {os.getpid()} on {socket.gethostname()}"
+            name = {"who": who[:63], "name": f"real2sim worker {self._worker_id}"}
+            connection.execute(sa.text("SELECT set_config('application_name', :who, false)"), name)
+            taken = "SELECT pg_try_advisory_lock(:space, hashtext(:name))"
+            if not connection.execute(sa.text(taken), name | {"space": NAME_SPACE}).scalar():
+                raise StoreError(self._told(connection, name))
+        except BaseException:
+            connection.close()
+            raise
+        self._connection = connection
+
+    def _told(self, connection: sa.Connection, name: dict[str, str]) -> str:
+        owner = connection.execute(
+            sa.text(
+                "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) "
+                "WHERE l.locktype = 'advisory' AND l.classid::bigint = :space "
+                "AND l.objid::bigint = (hashtext(:name)::bigint & 4294967295) LIMIT 1"
+            ),
+            name | {"space": NAME_SPACE},
+        ).scalar()
+        return (
+            f"a worker {self._worker_id!r} runs on this store already ({owner or 'unknown'}). Stop "
+            "that one, or give this one another name with REAL2SIM_WORKER_ID"
+        )
+
+
+# --- Prepared statements -------------------------------------------------------------------------
+
+# One message to PostgreSQL and one back for each statement, which is a transaction of its own.
+# SQLAlchemy begins and ends a transaction around each and parses it anew, which takes several times
+# the processor time.
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A statement for such a connection.
+
+    Attributes:
+        text: with ``:name`` for values; it returns a row for each that it changes.
+        values: by name.
+    """
+
+    text: str
+    values: Mapping[str, object]
+
+
+class PreparedStatements:
+    """Statements that are prepared once for each connection. For one thread at a time.
+
+    Args:
+        url: of the database, with the driver pg8000.
+        timeout_s: of a statement, a lock, an answer [s].
+    """
+
+    def __init__(self, url: sa.URL, *, timeout_s: float) -> None:
+        self._url = url
+        self._timeout_s = timeout_s
+        self._connection: Any = None
+        self._socket: socket.socket | None = None
+        self._known: dict[str, Any] = {}
+
+    def execute(self, prepared: Prepared) -> int:
+        """Rows that the statement has changed; it is committed.
+
+        Raises:
+            sqlalchemy.exc.SQLAlchemyError: of the server, or there is none.
+        """
+        if self._is_broken():
+            self.close()
+        try:
+            statement = self._statement(prepared.text)
+            return len(statement.run(**prepared.values))
+        except Exception as error:
+            self._sort(error, prepared.text)
+            raise
+
+    def close(self) -> None:
+        """Disconnect; the next statement connects again."""
+        connection, self._connection = self._connection, None
+        self._known.clear()
+        if connection is not None:
+            with contextlib.suppress(Exception):
+                connection.close()
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _statement(self, text: str) -> Any:
+        if self._connection is None:
+            self._connection, self._socket = native_connection(self._url, self._timeout_s)
+        if (known := self._known.get(text)) is None:
+            known = self._known[text] = self._connection.prepare(text)
+        return known
+
+    def _is_broken(self) -> bool:
+        """Whether the server has said something unasked: that it closes, in all likelihood."""
+        return self._socket is not None and bool(select.select([self._socket], [], [], 0)[0])
+
+    def _sort(self, error: Exception, text: str) -> None:
+        """Raise errors of the driver as SQLAlchemy does; a connection that may be spoilt goes."""
+        from pg8000.exceptions import DatabaseError, InterfaceError
+
+        state = str(error.args[0].get("C", "")) if _is_of_server(error) else ""
+        if not state.startswith("23"):
+            self.close()
+        if isinstance(error, DatabaseError):
+            raise sa.exc.OperationalError(text, None, error) from error
+        if isinstance(error, InterfaceError):
+            raise sa.exc.InterfaceError(text, None, error) from error
+
+
+def _is_of_server(error: Exception) -> bool:
+    return bool(error.args) and isinstance(error.args[0], dict)

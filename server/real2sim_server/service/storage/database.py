@@ -21,7 +21,16 @@ import sqlalchemy as sa
 import structlog
 
 from . import tables as t
-from .connection import connect, file_of, shown_url
+from .connection import (
+    NameOnServer,
+    Prepared,
+    PreparedStatements,
+    StateFolderError,
+    connect,
+    file_of,
+    owned_name,
+    shown_url,
+)
 from .errors import (
     FencedError,
     StoreBusyError,
@@ -31,10 +40,7 @@ from .errors import (
     StoreUnavailableError,
     sorted_error,
 )
-from .migrations import Policy, prepare_schema
-from .ownership import StateFolderError, owned_name
-from .prepared import Prepared, PreparedStatements
-from .server_name import NameOnServer
+from .schema import Policy, prepare_schema
 
 T = TypeVar("T")
 
@@ -428,7 +434,7 @@ class Database:
 
     def _probe(self) -> None:
         """Do what shows whether the database is well: read, and after trouble write."""
-        version = t.schema_version.c.version
+        version = t.alembic_version.c.version_num
         try:
             if self._name_on_server is not None:
                 self._name_on_server.hold()
@@ -441,7 +447,7 @@ class Database:
             if self._trouble is None:
                 return
             with self._write_lock, self._transaction(durable=True) as connection:
-                connection.execute(sa.update(t.schema_version).values(version=version))
+                connection.execute(sa.update(t.alembic_version).values(version_num=version))
         except Exception as error:
             self._reraise(error)
         self._recovered()
@@ -475,7 +481,7 @@ class Database:
             raise StoreError(f"cannot open the store {shown_url(self.url)!r}: {reason}") from error
 
     def _prepare(self) -> None:
-        """Bring the schema up to date, with time enough for it."""
+        """Create or migrate the schema, with a long timeout."""
         engine = self._connected()
         with engine.connect():
             pass  # Whether anybody is there is found out in the usual time.

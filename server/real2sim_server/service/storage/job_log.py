@@ -12,8 +12,7 @@ from real2sim_proto.jobs import JobInfo, JobState
 
 from ..clock import now_us
 from . import tables as t
-from .leases import clock_of, is_alive
-from .notices import notice
+from .fleet import clock_of, is_alive, notice
 from .store import Store, StoredReply, Write
 
 UNFINISHED = (JobState.QUEUED.value, JobState.RUNNING.value)

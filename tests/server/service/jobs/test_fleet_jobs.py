@@ -11,10 +11,10 @@ import sqlalchemy as sa
 from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_server.service.jobs import jobs as module
 from real2sim_server.service.jobs.jobs import MAX_DEATHS, JobResult, Jobs, NewJob
-from real2sim_server.service.library.quotas import Quota
+from real2sim_server.service.library.budgets import Quota
 from real2sim_server.service.storage import job_log, tables
+from real2sim_server.service.storage.fleet import Leases
 from real2sim_server.service.storage.job_log import JobLog
-from real2sim_server.service.storage.leases import Leases
 from real2sim_server.service.storage.store import FencedError, Store, Write
 from tests.waiting import LIMIT_S, wait_until_async
 

@@ -13,7 +13,7 @@ from real2sim_server.executors import InProcess
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.scenarios.openscenario import read_openscenario_text, write_openscenario
 from real2sim_server.service.jobs import command_process
-from real2sim_server.service.sweeps.files import write_spec
+from real2sim_server.service.sweeps import write_spec
 from real2sim_server.sweeps import load_sweep, run_sweep
 from real2sim_server.world.recording.recording import recording_of_bytes
 from tests.waiting import wait_until

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from real2sim_server.service.library.scene_catalog import SceneCatalog
+from real2sim_server.service.library.scenes import SceneCatalog
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from real2sim_server.edit import ScenarioState, things_at_start
 from real2sim_server.render import levels_bytes, scene_levels_bytes, select_backend
 from real2sim_server.render.backends.cpu.detail import hierarchy
 from real2sim_server.service.http.problems import ServiceError
-from real2sim_server.service.library.memory import MemoryBudget
-from real2sim_server.service.rendering.levels import DetailLevels
+from real2sim_server.service.library.budgets import MemoryBudget
+from real2sim_server.service.rendering.background import DetailLevels
 
 from ...conftest import make_tiny_scene
 from ..waiting import wait_ready

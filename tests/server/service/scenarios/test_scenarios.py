@@ -11,7 +11,7 @@ from real2sim_proto import ErrorCode, decode
 from real2sim_proto.scenarios import History, OperationResult, ScenarioInfo
 from real2sim_server.edit import replay_operations
 from real2sim_server.scene.io import save_scene
-from real2sim_server.service.scenarios import snapshots
+from real2sim_server.service.scenarios import scenario_cache
 from real2sim_server.service.storage.store import StoreError
 
 DELETE_RED = {"op": "delete", "object_id": "car_red"}
@@ -265,7 +265,7 @@ def test_scenarios_survive_a_restart_of_the_worker(start_worker, run_worker):
 def test_a_snapshot_spares_replaying_and_is_never_needed(
     run_worker, start_worker, monkeypatch, damage
 ):
-    monkeypatch.setattr(snapshots, "INTERVAL", 2)
+    monkeypatch.setattr(scenario_cache, "INTERVAL", 2)
     with run_worker() as first:
         scenario = create(first)
         for operation in (DELETE_RED, MOVE_POST, COPY_RED | {"object_id": "car_blue"}):

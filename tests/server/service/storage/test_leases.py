@@ -10,7 +10,7 @@ import pytest
 import sqlalchemy as sa
 
 from real2sim_server.service.storage.errors import FencedError
-from real2sim_server.service.storage.leases import Leases
+from real2sim_server.service.storage.fleet import Leases
 from real2sim_server.service.storage.store import (
     SessionEntry,
     SessionRow,

@@ -7,8 +7,8 @@ from collections import Counter
 
 import pytest
 
-from real2sim_server.service.storage import notices as module
-from real2sim_server.service.storage.notices import Notices, notice
+from real2sim_server.service.storage import fleet as module
+from real2sim_server.service.storage.fleet import Notices, notice
 from real2sim_server.service.storage.store import Store
 from tests.waiting import LIMIT_S, wait_until_async
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from real2sim_server.service.preflight import check_start
-from real2sim_server.service.storage.ownership import (
+from real2sim_server.service.storage.connection import (
     StateFolderError,
     check_state_folder,
     owned_folder,
@@ -21,7 +21,7 @@ from real2sim_server.service.storage.store import StoreError
 HOLD = (
     "import sys, time\n"
     "from pathlib import Path\n"
-    "from real2sim_server.service.storage.ownership import owned_folder\n"
+    "from real2sim_server.service.storage.connection import owned_folder\n"
     "with owned_folder(Path(sys.argv[1])):\n"
     "    print('held', flush=True)\n"
     "    time.sleep(3600)\n"

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import sqlalchemy as sa
 
-from real2sim_server.service.storage import retention as module
+from real2sim_server.service import maintenance as module
+from real2sim_server.service.maintenance import DAY_US, Retention, RetentionLimits
 from real2sim_server.service.storage import tables
-from real2sim_server.service.storage.retention import DAY_US, Retention, RetentionLimits
 from real2sim_server.service.storage.store import (
     ScenarioRow,
     SessionEntry,

@@ -12,9 +12,9 @@ from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_server.service.storage import tables
 from real2sim_server.service.storage.errors import StoreFullError, StoreUnavailableError
 from real2sim_server.service.storage.job_log import JobLog
-from real2sim_server.service.storage.session_log import ClaimedEntries
 from real2sim_server.service.storage.store import (
     Claim,
+    ClaimedEntries,
     ConflictError,
     FencedError,
     ScenarioRow,
@@ -243,7 +243,7 @@ def test_a_newer_store_is_refused_with_both_versions(sqlite_url, tmp_path):
 
     run(sqlite_url, nothing)
     connection = sqlite3.connect(tmp_path / "deep" / "store.db")
-    connection.execute("UPDATE schema_version SET version = 99")
+    connection.execute("UPDATE alembic_version SET version_num = '0099'")
     connection.commit()
     connection.close()
     with pytest.raises(StoreError, match=r"schema version 99, this program reads 1 to \d+;"):

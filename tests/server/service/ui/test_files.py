@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from real2sim_server.service.routes.ui import FOLDER, STUDIO
+from real2sim_server.service.routes.server import FOLDER, STUDIO
 
 OWN = sorted(name for name in STUDIO if not name.startswith("vendor/"))
 """What is vendored is as its authors have published it."""

@@ -1,8 +1,7 @@
-"""What Alembic runs for every upgrade: the revisions of this folder, on the connection it is given.
+"""Alembic's environment: runs the revisions of this folder on the connection it is given.
 
-A worker and ``real2sim store migrate`` hand it the connection that holds the lock of the schema,
-see :mod:`..migrations`; whoever writes a revision may run ``alembic revision`` with the URL of a
-store in ``REAL2SIM_STORE_URL``.
+A worker and ``real2sim store migrate`` pass the connection that holds the lock of the schema, see
+:mod:`..schema`. To write a revision, set ``REAL2SIM_STORE_URL`` and run ``alembic revision``.
 """
 
 import os
@@ -14,7 +13,7 @@ from real2sim_server.service.storage import tables
 
 
 def run(connection: sa.Connection) -> None:
-    """All revisions up to the one asked for, within the connection's transaction."""
+    """Run all revisions up to the requested one, within the connection's transaction."""
     on_step = context.config.attributes.get("on_step")
     context.configure(
         connection=connection,

@@ -1,4 +1,4 @@
-"""What programs that draw a scene themselves need of it: its Gaussians and its sky."""
+"""Gaussians and skies of scenes and objects, for programs that draw them themselves."""
 
 from __future__ import annotations
 
@@ -10,13 +10,19 @@ import numpy as np
 from fastapi import APIRouter, Header, Query, Response
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.base import Identifier
+from real2sim_proto.base import Identifier, Microseconds
 
+from ...edit import cloud_of, figure_of
 from ...render.modalities import encode_image
 from ...scene import Scene
+from ...scene.io.formats import Spz
 from ..http.auth import TokenRoute
 from ..http.problems import ServiceError
+from ..http.responses import etag
+from ..library.splat_files import GZIP_LEVEL
 from ..worker import WorkerOf
+
+# --- Scenes --------------------------------------------------------------------------------------
 
 SPZ = "application/octet-stream"
 DEFAULT_COUNT = 32_768
@@ -134,3 +140,56 @@ def _caching(scene: Scene, content_hash: str | None, what: str) -> dict[str, str
     tag = hashlib.sha256(f"{scene.content_hash} {what}".encode()).hexdigest()[:32]
     kept = "private, max-age=31536000, immutable" if content_hash else "private, no-cache"
     return {"ETag": f'"{tag}"', "Cache-Control": kept}
+
+
+object_router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"], route_class=TokenRoute)
+
+
+@object_router.get(
+    "/{scenario_id}/splats",
+    name="splats",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "an spz file of version 3",
+            "headers": {
+                "X-Real2Sim-Figure": {
+                    "description": "`posed`: of a person who walks, at this instant",
+                    "schema": {"type": "string"},
+                },
+            },
+            "content": {SPZ: {"schema": {"type": "string", "format": "binary"}}},
+        },
+    },
+)
+async def object_splats(
+    *,
+    worker: WorkerOf,
+    scenario_id: Identifier,
+    object_id: Annotated[Identifier, Query(description="of which, in the frame of its box")],
+    t_us: Annotated[Microseconds | None, Query(description="default: its start")] = None,
+) -> Response:
+    """The Gaussians of one object of a scenario as it is now, those that cover most first: of an
+    asset, of a person as far in walking as at ``t_us``, as large as edits have made it. An spz file
+    in the frame of its box; axes are kept: z is up."""
+    view = await worker.scenarios.view(scenario_id)
+    scene = await worker.scene_cache.get(view.row.scene)
+    subject = next((o for o in view.state.visible if o.object_id == object_id), None)
+    if subject is None:
+        raise ServiceError(
+            ErrorCode.UNKNOWN_OBJECT,
+            f"scenario {scenario_id!r} has no object {object_id!r}",
+            hint="GET /v1/scenarios/{id} lists them",
+        )
+    instant = view.state.clock[0] if t_us is None else t_us
+    headers = {"Cache-Control": "no-store", "ETag": etag(view.revision)}
+    if figure_of(scene, subject) is not None:
+        headers["X-Real2Sim-Figure"] = "posed"
+
+    def made() -> bytes:
+        cloud = cloud_of(scene, subject, instant)
+        if subject.scale != (1.0, 1.0, 1.0):
+            cloud = cloud.stretched(subject.scale)
+        return Spz(gzip_level=GZIP_LEVEL).encode(cloud.select(cloud.by_importance()))
+
+    return Response(await asyncio.to_thread(made), media_type=SPZ, headers=headers)

@@ -1,1 +1,0 @@
-"""Planners that drive sessions as jobs, and what they leave."""

@@ -1,0 +1,249 @@
+"""Leases of workers on sessions, and notices between workers.
+
+A worker renews its lease every few seconds; others may take over the sessions of one whose lease
+has run out. All compare times by one clock: that of the database server, or of the machine that
+holds the file.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import select
+import threading
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import sqlalchemy as sa
+import structlog
+from sqlalchemy.engine import make_url
+
+from ..clock import now_us
+from . import tables as t
+from .connection import native_connection
+from .database import Write
+from .store import Store
+from .tables import SessionRow
+
+
+@dataclass(frozen=True)
+class WorkerRow:
+    """A worker that shares the store.
+
+    Attributes:
+        worker_id: its name.
+        alive: whether its lease still runs.
+        document: what it last said about itself.
+    """
+
+    worker_id: str
+    alive: bool
+    document: Mapping[str, Any]
+
+
+class Leases:
+    """Promises of a worker, and what comes of those that others do not keep.
+
+    Args:
+        store: open while this is used.
+        worker_id: whose promises these are.
+        seconds: for which each holds.
+
+    Attributes:
+        worker_id: whose promises these are.
+    """
+
+    def __init__(self, store: Store, worker_id: str, *, seconds: float) -> None:
+        self._store = store
+        self.worker_id = worker_id
+        self._seconds = seconds
+
+    async def renew(self, document: Mapping[str, Any]) -> None:
+        """Promise to be alive for so long from now on.
+
+        Args:
+            document: what the fleet is told about the worker, JSON values.
+        """
+        await self._promise(self._seconds, document)
+
+    async def give_up(self, document: Mapping[str, Any]) -> None:
+        """Take the promise back: others may have the sessions at once."""
+        await self._promise(0.0, document)
+
+    async def take_over(self, session_id: str) -> SessionRow | None:
+        """Claim an open session that is this worker's, or whose worker has not kept its promise;
+        None where there is none, or another one has it."""
+        s = t.sessions.c
+        is_free = (s.worker_id == self.worker_id) | ~is_alive(s.worker_id, self._store)
+        claimed = sa.update(t.sessions).where((s.session_id == session_id) & s.closed_us.is_(None))
+        claimed = claimed.where(is_free).values(worker_id=self.worker_id, epoch=s.epoch + 1)
+        (count,) = await self._store.write(Write(claimed))
+        row = await self._store.session(session_id)
+        return row if count and row is not None and row.worker_id == self.worker_id else None
+
+    async def epochs(self, session_ids: Collection[str]) -> dict[str, int]:
+        """Epochs of those of the sessions that this worker has, by their ids."""
+        s = t.sessions.c
+        mine = (s.worker_id == self.worker_id) & s.session_id.in_(session_ids)
+        rows = await self._store.read(sa.select(s.session_id, s.epoch).where(mine))
+        return {row["session_id"]: row["epoch"] for row in rows}
+
+    async def workers(self) -> list[WorkerRow]:
+        """All workers that ever shared the store, by name."""
+        w = t.workers.c
+        alive = (w.lease_until_us > clock_of(self._store)).label("alive")
+        query = sa.select(w.worker_id, alive, w.document).order_by(w.worker_id)
+        return [
+            WorkerRow(row["worker_id"], bool(row["alive"]), json.loads(row["document"]))
+            for row in await self._store.read(query)
+        ]
+
+    async def _promise(self, seconds: float, document: Mapping[str, Any]) -> None:
+        text = json.dumps(document, allow_nan=False)
+        until = clock_of(self._store) + round(seconds * 1e6)
+        mine = t.workers.c.worker_id == self.worker_id
+        values = {"lease_until_us": until, "document": text}
+        renewed = Write(sa.update(t.workers).where(mine).values(values))
+        first = Write(sa.insert(t.workers).values(worker_id=self.worker_id, **values))
+
+        def promise() -> None:
+            # It is no use after the machine has gone down: nothing has to reach the disk.
+            (count,) = self._store.database.execute([renewed], promised=False)
+            if not count:
+                self._store.database.execute([first], promised=False)
+
+        await self._store.database.on_thread(promise)
+
+
+def is_alive(worker_id: sa.ColumnElement[str], store: Store) -> sa.ColumnElement[bool]:
+    """Whether the worker that a column names keeps its promise, as a condition."""
+    w = t.workers.c
+    return sa.exists().where((w.worker_id == worker_id) & (w.lease_until_us > clock_of(store)))
+
+
+def clock_of(store: Store) -> sa.ColumnElement[int]:
+    """Wall clock that all compare times by [us], as an expression."""
+    if store.database.is_server:
+        seconds = sa.func.extract("epoch", sa.func.clock_timestamp())
+        return sa.cast(seconds * 1_000_000, sa.BigInteger)
+    return sa.literal(now_us(), sa.BigInteger)
+
+
+# --- Notices -------------------------------------------------------------------------------------
+
+# PostgreSQL's LISTEN and NOTIFY tell other workers of a change at once. Notices may be lost and
+# SQLite has none, so that waiting is always bounded.
+
+Topic = Literal["jobs", "bundles"]
+"""What has changed."""
+
+CHANNEL = "real2sim"
+BEAT_S = 1.0
+"""Between questions whether the server is still there, and for word that the driver has kept."""
+RETRY_S = 1.0
+"""Between attempts to connect."""
+PAUSE_S = 0.05
+"""From word to the look that it causes, in which more may come."""
+
+log = structlog.get_logger(__name__)
+
+
+def notice(topic: Topic, *, on_server: bool) -> list[Write]:
+    """What lets other workers know, once the transaction that it is part of is committed."""
+    if not on_server:
+        return []
+    return [Write(sa.text("SELECT pg_notify(:channel, :topic)").bindparams(**_of(topic)))]
+
+
+def _of(topic: str) -> dict[str, str]:
+    return {"channel": CHANNEL, "topic": topic}
+
+
+class Notices:
+    """Hears what other workers say. Belongs to the event loop; it listens on a thread of its own.
+
+    Args:
+        url: of the store.
+        timeout_s: of an answer of its server [s].
+    """
+
+    def __init__(self, url: str, *, timeout_s: float) -> None:
+        self._url = make_url(url)
+        self._timeout_s = timeout_s
+        self._counts: Counter[str] = Counter()
+        self._changed = asyncio.Event()
+        self._stop = threading.Event()
+
+    @property
+    def can_hear(self) -> bool:
+        """Whether the store has word to give."""
+        return self._url.get_backend_name() == "postgresql" and (
+            self._url.get_driver_name() == "pg8000"
+        )
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Listens for the length of the block, where there is something to hear."""
+        if not self.can_hear:
+            yield
+            return
+        loop = asyncio.get_running_loop()
+        thread = threading.Thread(target=self._listen, args=(loop,), name="notices", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            await asyncio.to_thread(thread.join)
+
+    def listener(self, topic: Topic) -> Callable[[float], Awaitable[None]]:
+        """A function that waits for word about ``topic`` since its last call, or some seconds."""
+        seen = self._counts[topic]
+
+        async def wait(seconds: float) -> None:
+            nonlocal seen
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    while self._counts[topic] == seen:
+                        await self._changed.wait()
+                    await asyncio.sleep(PAUSE_S)
+            seen = self._counts[topic]
+
+        return wait
+
+    # --- inside -----------------------------------------------------------------------------
+
+    def _heard(self, topics: Counter[str]) -> None:
+        self._counts.update(topics)
+        waiting, self._changed = self._changed, asyncio.Event()
+        waiting.set()
+
+    def _listen(self, loop: asyncio.AbstractEventLoop) -> None:
+        while not self._stop.is_set():
+            try:
+                self._listen_once(loop)
+            except Exception as error:
+                # The store tells of its trouble itself; meanwhile others look now and then.
+                log.debug("not listening", reason=str(error))
+            self._stop.wait(RETRY_S)
+
+    def _listen_once(self, loop: asyncio.AbstractEventLoop) -> None:
+        connection, socket = native_connection(self._url, self._timeout_s)
+        try:
+            connection.run(f"LISTEN {CHANNEL}")
+            # What was said before may have been missed.
+            heard = Counter({"jobs": 1, "bundles": 1})
+            while not self._stop.is_set():
+                if heard:
+                    loop.call_soon_threadsafe(self._heard, heard)
+                select.select([socket], [], [], BEAT_S)
+                connection.run("SELECT 1")
+                heard = Counter(topic for _, _, topic in connection.notifications)
+                connection.notifications.clear()
+        finally:
+            with contextlib.suppress(Exception):
+                connection.close()
+            socket.close()
