@@ -291,9 +291,9 @@ def test_protocol(page: Callable[[str], Page], demo_url: str) -> None:
     with page("docs/protocol.md") as protocol:
         traces = [
             list(messages(protocol.block(words)))
-            for words in ('role:"controller"', "batch_hello", "resume:{", "attach", "lidars:[{")
+            for words in ('role:"controller"', "resume:{", "attach", "lidars:[{")
         ]
-        assert [len(trace) for trace in traces] == [6, 6, 1, 5, 2]
+        assert [len(trace) for trace in traces] == [6, 1, 5, 2]
         for sender, message in itertools.chain(*traces):
             model = MESSAGES[message["type"]]
             assert issubclass(model, ServerEnvelope) == (sender == "S")

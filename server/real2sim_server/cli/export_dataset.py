@@ -104,11 +104,12 @@ def export_dataset(
 
     Stopped and called again it goes on after the last whole clip, and gives the same bytes.
     """
-    from ..datasets.executors import executor_of
     from ..datasets.export import estimate
     from ..datasets.export import export_dataset as export
+    from ..datasets.makers import ClipMakers
     from ..datasets.plan import ExportPlan
     from ..datasets.rig import read_rig
+    from ..executors import executor_of
     from ..scene.io import load_scene
 
     backend = chosen_backend(backend, device)
@@ -147,9 +148,10 @@ def export_dataset(
         sweep=sweep,
         seed=seed,
     )
-    loaded, maker = variants[0].drive.scene, None
+    loaded, makers = variants[0].drive.scene, None
     if workers > 1 or executor != "processes":
-        maker = executor_of(executor, recipe, workers=workers, backend=backend, address=ray_address)
+        workers_of = executor_of(executor, workers=workers, address=ray_address)
+        makers = ClipMakers(workers_of, recipe, backend)
     if dry_run:
         guess = estimate(variants, plan, backend=backend)
         figures: dict[str, Any] = {
@@ -166,7 +168,7 @@ def export_dataset(
                 out,
                 made_of=made_of,
                 backend=backend,
-                executor=maker,
+                makers=makers,
                 on_progress=report,
             )
         manifest = json_module.loads((out / "manifest.json").read_bytes())

@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,9 @@ from ..scene import Scene
 from .clips import Clip, write_shard
 from .drive import Drive
 from .errors import DatasetError
-from .executors import Executor, InProcess
 from .labels import HOW
 from .labels.points import ROOF
+from .makers import ClipMakers
 from .plan import ExportPlan, PlannedClip, planned_cameras, planned_lidar, planned_shards
 from .previews import write_previews
 from .statistics import statistics_of
@@ -95,7 +96,7 @@ def export_dataset(
     *,
     made_of: Mapping[str, Any] | None = None,
     backend: str | Backend = "auto",
-    executor: Executor | None = None,
+    makers: ClipMakers | None = None,
     on_progress: Callable[[str, int, int], None] = lambda _stage, _done, _total: None,
 ) -> Path:
     """Label a drive and write it to the new folder ``out``, which appears only when it is whole.
@@ -110,7 +111,7 @@ def export_dataset(
         made_of: what else decided on the drive (operations, episode ...), for the manifest; JSON
             values only.
         backend: draws.
-        executor: makes the clips, of the same drive; None for this process.
+        makers: workers that make the clips, of the same drive; None for this process.
         on_progress: called with (stage, done, total): frames that are labelled, formats written.
 
     Returns:
@@ -134,8 +135,21 @@ def export_dataset(
     lidar = planned_lidar(plan)
     digest = _digest(variants, plan, made_of or {})
     work = _work_folder(target, digest)
-    maker = executor or InProcess(variants, cameras, backend)
-    opened = _labelled_clips(plan, clips, work=work, executor=maker, on_progress=on_progress)
+
+    def make_here(left: Sequence[PlannedClip], folder: Path, step: Callable[[int], None]) -> None:
+        for clip in left:
+            write_shard(
+                variants[clip.variant],
+                plan,
+                cameras,
+                clip,
+                folder / clip.name,
+                backend=backend,
+                on_frame=lambda: step(1),
+            )
+
+    make = make_here if makers is None else partial(makers.run, plan)
+    opened = _labelled_clips(clips, work=work, make=make, on_progress=on_progress)
     content = LabelledDrive(
         name=scene.name,
         digest=digest,
@@ -152,11 +166,11 @@ def export_dataset(
     for done, writer in enumerate(writers):
         on_progress("formats", done, len(writers))
         if not (result / writer.name).exists():
-            partial = work / f".{writer.name}.partial"
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir()
-            writer.write(content, partial)
-            partial.rename(result / writer.name)
+            unfinished = work / f".{writer.name}.partial"
+            shutil.rmtree(unfinished, ignore_errors=True)
+            unfinished.mkdir()
+            writer.write(content, unfinished)
+            unfinished.rename(result / writer.name)
     on_progress("formats", len(writers), len(writers))
     write_previews(opened, cameras, result / PREVIEW)
     _write_licence(result / LICENCE, scene.provenance)
@@ -194,11 +208,10 @@ def _work_folder(target: Path, digest: str) -> Path:
 
 
 def _labelled_clips(
-    plan: ExportPlan,
     clips: Sequence[PlannedClip],
     *,
     work: Path,
-    executor: Executor,
+    make: Callable[[Sequence[PlannedClip], Path, Callable[[int], None]], None],
     on_progress: Callable[[str, int, int], None],
 ) -> list[Clip]:
     folder = work / "clips"
@@ -214,7 +227,7 @@ def _labelled_clips(
 
     if done:
         on_progress("frames", done, total)
-    executor.run(plan, left, folder, step)
+    make(left, folder, step)
     return [Clip.open(folder / clip.name) for clip in clips]
 
 

@@ -11,7 +11,8 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``first_run``: a second process that compiles kernels, started before anything heavy is loaded.
 - ``warm_up``: kernels compiled or loaded before they are needed.
 - ``engine``: the thread that owns the device, and its queue.
-- ``http``: what all answers share: errors, authorisation, idempotency, limits, metrics, connections.
+- ``http``: what all answers share: errors, authorisation, idempotency, limits, metrics and
+  connections.
 - ``library``: scenes and assets, on disk and in memory.
 - ``rendering``: render requests, and images as frames of the wire.
 - ``scenarios``: edited under a lock each, cached, recorded before they take effect.

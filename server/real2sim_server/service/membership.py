@@ -1,4 +1,4 @@
-"""A worker within a fleet: its lease, the scenes it loads ahead, and what it reports to its proxy."""
+"""A worker within a fleet: its lease, the scenes it loads ahead, its reports to the proxy."""
 
 from __future__ import annotations
 

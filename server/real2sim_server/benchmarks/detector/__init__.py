@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from ...console import print_figures, staged_progress
-from ...datasets.executors import Executor, InProcess, Processes
 from ...datasets.export import export_dataset
-from ...datasets.plan import ExportPlan, planned_cameras, planned_shards
+from ...datasets.makers import ClipMakers
+from ...datasets.plan import ExportPlan, planned_shards
 from ...demo.street import SHIPPED
+from ...executors import Processes
 from ...scene import Scene
 from ...scene.io import load_scene, read_packed
 from ...synthetic import SyntheticConfig
@@ -104,12 +105,9 @@ def training_sets(
     log, plan = true_log(scene), export_plan(options.camera, options.width, options.seed)
     drives = _drives(scene, plan, options)
     variants, out = drives(), folder / "export"
-    if options.workers > 1:
-        maker: Executor = Processes(drives, workers=options.workers, backend="auto")
-    else:
-        maker = InProcess(variants, planned_cameras(variants[0].drive, plan), "auto")
+    makers = ClipMakers(Processes(options.workers), drives) if options.workers > 1 else None
     edits = {"sweeps": [sweep.model_dump(mode="json") for sweep in drives.sweeps]}
-    export_dataset(variants, plan, out, made_of=edits, executor=maker, on_progress=report)
+    export_dataset(variants, plan, out, made_of=edits, makers=makers, on_progress=report)
     camera = scene.rig[options.camera].resized(options.width * FINER)
     cast = cast_pictures(log, out, camera, partial(report, "cast rays"))
     found, count = {EXPORTED: exported_pictures(out), CAST: cast}, options.frames

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from real2sim_server.datasets.drive import ScenarioDrive
-from real2sim_server.datasets.errors import DatasetError
-from real2sim_server.datasets.executors import RayWorkers, executor_of
 from real2sim_server.datasets.export import export_dataset
+from real2sim_server.datasets.makers import ClipMakers
 from real2sim_server.datasets.plan import ExportPlan
 from real2sim_server.datasets.variants import Variant
 from real2sim_server.edit import ScenarioState
+from real2sim_server.executors import executor_of
 from real2sim_server.scene.io import load_scene, save_scene
 
 from .test_export import contents
@@ -68,30 +68,17 @@ def alone(scene_file, tmp_path_factory) -> dict[str, str]:
 
 def made_by(name: str, scene_file: Path, out: Path, *, mark: Path | None = None, workers=2):
     recipe = partial(variants, scene_file, mark)
-    executor = executor_of(name, recipe, workers=workers, backend="cpu")
+    makers = ClipMakers(executor_of(name, workers=workers), recipe, "cpu")
     frames = []
     export_dataset(
         variants(scene_file),
         PLAN,
         out,
-        executor=executor,
+        makers=makers,
         on_progress=lambda stage, done, total: frames.append((stage, done, total)),
     )
     assert ("frames", 7, 7) in frames
     return contents(out)
-
-
-def test_an_executor_that_is_none_is_refused(scene_file):
-    with pytest.raises(DatasetError, match="allowed are processes, ray"):
-        executor_of("threads", partial(variants, scene_file), workers=2, backend="cpu")
-    with pytest.raises(DatasetError, match="at least 1"):
-        executor_of("processes", partial(variants, scene_file), workers=0, backend="cpu")
-
-
-def test_without_ray_its_extra_is_named(monkeypatch, scene_file):
-    monkeypatch.setitem(__import__("sys").modules, "ray", None)
-    with pytest.raises(DatasetError, match=r"real2sim\[ray\]"):
-        RayWorkers(partial(variants, scene_file), workers=1, backend="cpu")
 
 
 @pytest.mark.slow
