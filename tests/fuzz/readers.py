@@ -398,7 +398,7 @@ def _message(parts: Parts, folder: Path) -> Path:
 def _targets() -> list[Target]:
     from real2sim_server.logs import LogError
     from real2sim_server.reconstruct.imports.torch_file import TorchFileError
-    from real2sim_server.scenarios.errors import ScenarioError
+    from real2sim_server.scenarios import ScenarioError
     from real2sim_server.world.recording.recording import RecordingError
 
     scene_errors, log_errors = (SceneError,), (LogError,)
@@ -511,7 +511,7 @@ def read_scenario_file(path: Path) -> Any:
 
 def journal_sample(folder: Path) -> list[Parts]:
     """Three rows."""
-    from real2sim_server.sweeps.journal import Journal
+    from real2sim_server.sweeps.sweep import Journal
 
     with Journal(folder / "journal") as journal:
         for k in range(3):
@@ -521,7 +521,7 @@ def journal_sample(folder: Path) -> list[Parts]:
 
 def read_journal(path: Path) -> Any:
     """As a sweep goes on."""
-    from real2sim_server.sweeps.journal import Journal
+    from real2sim_server.sweeps.sweep import Journal
 
     return Journal(path).rows
 

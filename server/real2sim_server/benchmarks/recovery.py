@@ -31,12 +31,10 @@ from ..datasets.perturbed import Perturbation
 from ..datasets.plan import ExportPlan
 from ..demo.street import SHIPPED
 from ..edit import ScenarioState
-from ..policies.cloning import save_policy, train_network
-from ..policies.exported import LAYOUT, exported_examples
+from ..policies.cloning import LAYOUT, exported_examples, save_policy, train_network
 from ..scene import Camera, Scene
 from ..scene.io import load_scene, read_packed
-from ..sweeps.episode import observation_of
-from ..sweeps.pictures import draw_frames
+from ..sweeps.episode import draw_frames, observation_of
 from ..world import World
 from ..world.draws import Draws
 from ..world.path import LoggedPath

@@ -16,11 +16,11 @@ from real2sim.planners import load_planner
 from ..console import print_figures, staged_progress
 from ..scene import Scene
 from ..sweeps.episode import drive_episode, recording_of
-from ..sweeps.scenes import open_scene
 from ..sweeps.search.evaluation import Evaluation, Evaluator
 from ..sweeps.search.optimise import SearchBudget, SearchState, random_search, search
-from ..sweeps.search.statistics import wilson
+from ..sweeps.search.run import wilson
 from ..sweeps.spec import load_space
+from ..sweeps.storyboard_space import open_scene
 from ..world import warm_up
 from ..world.recording.recording import first_difference
 

@@ -81,11 +81,9 @@ def evaluate_policy(
     A suite names cases: a scene or a scenario, options of `reset`, edits, and the `jitter` of
     numbers in them, by which seeds differ. Its format is described in docs/policies.md.
     """
-    from ..policies.episodes import run_episodes
-    from ..policies.page import render_page
-    from ..policies.planner_process import WorkerTarget
+    from ..policies.episodes import WorkerTarget, run_episodes
+    from ..policies.page import render_page, report_figures, unconfirmed_scores
     from ..policies.suite import EpisodeGrid
-    from ..policies.summary import report_figures, unconfirmed_scores
 
     own_worker = url is None and scenes_dir is None
     cases = _cases(scenes or (), scenarios or (), suite, demo=own_worker, reset=reset)
@@ -186,7 +184,7 @@ def _own_worker(scenes: Path | None, out: Path) -> Iterator[str]:
 
 
 def _print_scores(results: Sequence[EpisodeResult]) -> None:
-    from ..policies.summary import group_scores
+    from ..policies.page import group_scores
 
     groups = [group for group in group_scores(results) if group.case is None]
     table = Table(title="mean over cases and seeds", title_justify="left")

@@ -57,7 +57,7 @@ def _write_points(
 
     from .._files import atomic_file, atomic_folder
     from ..edit import ScenarioState
-    from ..edit.points import ply_of_points, points_at
+    from ..edit.compose import ply_of_points, points_at
 
     state, instant = ScenarioState.of(scene), scene.start_us if t_us is None else t_us
     placed = state.tracks.at(instant).objects

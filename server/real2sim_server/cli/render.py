@@ -109,7 +109,7 @@ def _render_sweep(
     seed: int,
     json: Path | None,
 ) -> None:
-    from ..edit.sweep import sweep_of
+    from ..edit.compose import sweep_of
     from ..render.cast import detect, sensor_poses
     from ..render.cast.call import select_caster
     from ..render.cast.files import SUFFIXES, write_sweep

@@ -110,7 +110,7 @@ def _storyboard(
     """The storyboard that is named, the file of its roads, and what has no effect."""
     from real2sim_proto.storyboard import Storyboard
 
-    from ..scenarios.errors import ScenarioError
+    from ..scenarios import ScenarioError
     from ..scenarios.gallery import corner_case
     from ..scenarios.openscenario import ReadOptions, read_openscenario
 
@@ -132,7 +132,7 @@ def _storyboard(
 
 def _export(board: Storyboard, path: Path) -> None:
     from .._files import atomic_file
-    from ..scenarios.errors import ScenarioError
+    from ..scenarios import ScenarioError
     from ..scenarios.openscenario import write_openscenario
 
     try:
@@ -174,10 +174,10 @@ def _with_speed(board: Storyboard, speed: float) -> Storyboard:
 def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made: Path) -> Scene:
     """The scene to drive in; a flat one is written to ``made`` first, so that it has a hash."""
     from ..maps import MapError
-    from ..scenarios.errors import ScenarioError
+    from ..scenarios import ScenarioError
     from ..scenarios.flat_scene import flat_scene
     from ..scene.io import load_scene, save_scene
-    from ..sweeps.scenes import open_scene
+    from ..sweeps.storyboard_space import open_scene
     from ..world import WorldError
 
     if bundle is not None:
@@ -233,7 +233,7 @@ class _Scripted:
 
 
 def _film(recording: Recording, scene: Scene, video: Path, camera: str | None) -> None:
-    from ..policies.film import film_episode
+    from ..policies.plots import film_episode
 
     film_episode(recording, recording.replayer(scene), scene, video, camera=camera)
     console.print(f"wrote {video}", highlight=False)

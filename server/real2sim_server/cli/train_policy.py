@@ -17,8 +17,7 @@ from .options import JsonFile, LogFormat, Sequence
 if TYPE_CHECKING:
     from real2sim.planners.learned import PolicyShape
 
-    from ..policies.cloning import CloningDataset
-    from ..policies.posed_images import PosedImage
+    from ..policies.cloning import CloningDataset, PosedImage
     from ..scene import CameraRig
 
 
@@ -80,9 +79,14 @@ def _examples(
     sequence: str | None,
 ) -> tuple[PolicyShape, CloningDataset]:
     from ..logs import open_log
-    from ..policies.cloning import build_dataset
-    from ..policies.exported import exported_examples, exported_shape, is_export
-    from ..policies.posed_images import log_images, scene_images
+    from ..policies.cloning import (
+        build_dataset,
+        exported_examples,
+        exported_shape,
+        is_export,
+        log_images,
+        scene_images,
+    )
     from ..scene.io import load_scene
 
     if all(is_export(source) for source in sources):

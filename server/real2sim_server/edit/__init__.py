@@ -1,13 +1,26 @@
 """Edits: typed operations onto objects, and scenarios as append-only logs of them."""
 
+from .appearance import vacated_parking
 from .apply import EditOutcome, apply_operations, replay_operations
-from .compose import cloud_of, compose, figure_of, instances_at, things_at_start, things_of
-from .errors import EditError
-from .ground_inpainting import vacated_parking
-from .posed import posed_instances
+from .compose import (
+    cloud_of,
+    compose,
+    figure_of,
+    instances_at,
+    posed_instances,
+    things_at_start,
+    things_of,
+)
 from .scenario import LogEntry, PlannedEntry, Scenario
-from .snapshot import pack_state, unpack_state
-from .state import AssetLookup, AssetSource, ObjectState, ScenarioState
+from .state import (
+    AssetLookup,
+    AssetSource,
+    EditError,
+    ObjectState,
+    ScenarioState,
+    pack_state,
+    unpack_state,
+)
 from .tracks import PackedTracks, PlacedObjects
 
 __all__ = [

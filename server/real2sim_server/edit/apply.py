@@ -1,22 +1,218 @@
-"""Batches of operations onto a state: pure, atomic, with their inverse."""
+"""Applying batches of operations to a state: pure and atomic, with their inverse and warnings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Operation, subject_of
 from real2sim_proto.scenarios import EditWarning
 
-from ..scene import SceneError
-from . import lifecycle, motion, properties
-from .errors import EditError
-from .operation import AppliedOperation, apply_operation
-from .state import ScenarioState
-from .validation import validate_edit
+from ..geometry.box import box_corners
+from ..geometry.box_kernels import first_overlap
+from ..scene import Ground, SceneError, Trajectory
+from ..service.http.openapi import operations
+from . import motion
+from .motion import AppliedOperation, apply_operation
+from .state import EditError, ObjectState, ScenarioState
+from .tracks import Float, sample
 
-OPERATION_MODULES = (lifecycle, motion, properties)
+# --- Validation ----------------------------------------------------------------------------------
+
+SAMPLE_PERIOD_US = 100_000
+MAX_SAMPLES = 201
+MAX_GROUND_SAMPLES = 21
+OFF_GROUND = 0.3
+"""A box bottom this much higher or lower above ground than in the recording is reported [m]."""
+
+OUTSIDE_MAP = 100.0
+"""An object this far outside the rectangle that the recording reached is reported [m]."""
+
+SLIP, SLIP_STEPS, MOVING = np.radians(20), 5, 1.0
+"""An object that goes this far off its heading [rad] for so many samples more than in the recording
+is reported; what is slower than this [m/s] counts as standing."""
+
+NAMED_OVERLAPS = 5
+
+REMEMBERED_RANGES = 4
+"""Ranges of time whose samples are kept for each trajectory, 26 kB each at most."""
+REMEMBERED = 512
+
+_Samples = tuple[Float, NDArray[np.bool_]]
+_samples: WeakKeyDictionary[Trajectory, dict[tuple[int, int], _Samples]] = WeakKeyDictionary()
+
+
+def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[EditWarning]:
+    """Warnings about the objects ``touched``, looked at every 0.1 s of their trajectories.
+
+    Very long trajectories are looked at 201 times at most, evenly spread.
+
+    Args:
+        state: after the edit.
+        touched: ids that the edit named or created; deleted ones are passed over.
+    """
+    subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
+    for subject in subjects:
+        times = _sample_times(subject.trajectory.start_us, subject.trajectory.end_us)
+        transforms, _ = _sampled(subject.trajectory, int(times[0]), int(times[-1]))
+        yield from _overlaps(subject, state, times, transforms)
+        recorded = None if subject.asset else state.recorded[subject.source_id]
+        yield from _off_ground(subject, recorded, transforms, state.ground)
+        yield from _outside_map(subject, state.extent, transforms)
+        yield from _sideways(subject, recorded, times, transforms)
+
+
+def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> _Samples:
+    """The trajectory at the sample times of that range; remembered as long as the trajectory is
+    there, for few objects move. (A cache of so many entries would drop each of them just before it
+    is asked for, once a scenario has one object more.)"""
+    by_range = _samples.setdefault(trajectory, {})
+    found = by_range.get((start_us, end_us))
+    if found is None:
+        while len(by_range) >= REMEMBERED_RANGES:
+            # Scenarios share trajectories, and are edited on several threads.
+            by_range.pop(next(iter(by_range), (0, 0)), None)
+        found = by_range[start_us, end_us] = sample(trajectory, _sample_times(start_us, end_us))
+    return found
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _sample_times(start: int, end: int) -> NDArray[np.int64]:
+    count = min(2 + (end - start) // SAMPLE_PERIOD_US, MAX_SAMPLES)
+    steps = np.arange(count, dtype=object) * (end - start) // (count - 1)
+    times = np.unique((start + steps).astype(np.int64))
+    times.flags.writeable = False
+    return times
+
+
+def _overlaps(
+    subject: ObjectState, state: ScenarioState, times: NDArray[np.int64], own: Float
+) -> Iterator[EditWarning]:
+    hit = {}
+    for other in _within_reach(subject, state, own):
+        first = _first_overlap(subject, other, times, own)
+        if first < len(times):
+            hit[other.object_id] = times[first] * 1e-6
+    if hit:
+        named = [f"{i!r} from t={t:.2f} s" for i, t in list(hit.items())[:NAMED_OVERLAPS]]
+        more = f" and {len(hit) - len(named)} more" if len(hit) > len(named) else ""
+        yield EditWarning(
+            code="overlap",
+            object_id=subject.object_id,
+            message=f"{subject.object_id!r} overlaps {', '.join(named)}{more}",
+        )
+
+
+def _first_overlap(
+    subject: ObjectState, other: ObjectState, times: NDArray[np.int64], own: Float
+) -> int:
+    """Index of the first of ``times`` at which the boxes overlap; their number where none."""
+    theirs, covered = _sampled(other.trajectory, int(times[0]), int(times[-1]))
+    found: int = first_overlap(
+        (own, theirs),
+        (subject.scaled_size, other.scaled_size),
+        covered,
+        subject.radius + other.radius,
+        subject.standing and other.standing,
+    )
+    return found
+
+
+def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:
+    """Visible objects whose path, as a box around it, comes near that of ``subject``."""
+    others = [o for o in state.objects.values() if not o.deleted and o is not subject]
+    if not others:
+        return
+    bounds = np.array([o.bounds for o in others])
+    at, radius = own[:, :3, 3], subject.radius
+    low, high = at.min(axis=0) - radius, at.max(axis=0) + radius
+    apart = (bounds[:, 0] > high) | (bounds[:, 1] < low)
+    for i in np.flatnonzero(~apart.any(axis=1)):
+        yield others[i]
+
+
+def _off_ground(
+    subject: ObjectState, recorded: ObjectState | None, own: Float, ground: Ground
+) -> Iterator[EditWarning]:
+    usual = 0.0
+    if recorded is not None:
+        usual = _usual_clearance(recorded, ground)
+    off = _clearance(own, subject, ground) - usual
+    worst = float(off[np.argmax(np.abs(off))])
+    if abs(worst) > OFF_GROUND:
+        side = "above" if worst > 0 else "below"
+        yield EditWarning(
+            code="off_ground",
+            object_id=subject.object_id,
+            message=f"the bottom of {subject.object_id!r} is {abs(worst):.2f} m {side} "
+            + ("where it stood in the recording" if recorded else "the ground"),
+        )
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _usual_clearance(recorded: ObjectState, ground: Ground) -> float:
+    track = recorded.trajectory
+    theirs, _ = _sampled(track, track.start_us, track.end_us)
+    return float(np.median(_clearance(theirs, recorded, ground)))
+
+
+def _clearance(transforms: Float, subject: ObjectState, ground: Ground) -> Float:
+    count = 1 if subject.standing else MAX_GROUND_SAMPLES
+    sparse = transforms[:: -(-len(transforms) // count)]
+    lowest: Float = box_corners(sparse, subject.scaled_size)[..., 2].min(axis=-1)
+    return lowest - ground.height_at(sparse[:, :2, 3])
+
+
+def _outside_map(subject: ObjectState, extent: Float, transforms: Float) -> Iterator[EditWarning]:
+    at = transforms[:, :2, 3]
+    beyond = np.maximum(np.maximum(extent[0] - at, at - extent[1]), 0.0)
+    farthest = float(np.linalg.norm(beyond, axis=1).max())
+    if farthest > OUTSIDE_MAP:
+        yield EditWarning(
+            code="outside_map",
+            object_id=subject.object_id,
+            message=f"{subject.object_id!r} gets {farthest:.0f} m away from everything recorded",
+        )
+
+
+def _sideways(
+    subject: ObjectState, recorded: ObjectState | None, times: NDArray[np.int64], own: Float
+) -> Iterator[EditWarning]:
+    if not subject.edited or subject.standing:
+        return
+    slips = _slips(times, own)
+    usual = 0
+    if recorded is not None:
+        track = recorded.trajectory
+        theirs, _ = _sampled(track, track.start_us, track.end_us)
+        usual = int((_slips(_sample_times(track.start_us, track.end_us), theirs) > SLIP).sum())
+    if (slips > SLIP).sum() >= usual + SLIP_STEPS:
+        yield EditWarning(
+            code="sideways",
+            object_id=subject.object_id,
+            message=f"{subject.object_id!r} goes sideways, up to {np.degrees(slips.max()):.0f} "
+            "degrees off its heading; a rotation with about_us turns its path with it",
+        )
+
+
+def _slips(times: NDArray[np.int64], transforms: Float) -> Float:
+    """Angle [T - 1] between way and heading, forwards or backwards [rad]; 0 while it stands."""
+    way = np.diff(transforms[:, :2, 3], axis=0)
+    length = np.linalg.norm(way, axis=1)
+    ahead = transforms[:-1, :2, 0] + transforms[1:, :2, 0]
+    along = np.abs((way * ahead).sum(axis=1))
+    across = np.abs(way[:, 0] * ahead[:, 1] - way[:, 1] * ahead[:, 0])
+    slips: Float = np.where(length > MOVING * np.diff(times) * 1e-6, np.arctan2(across, along), 0.0)
+    return slips
+
+
+OPERATION_MODULES = (operations, motion, operations)
 """Importing them registers their operations, see :mod:`.operation`."""
 
 MAX_OBJECTS = 4096

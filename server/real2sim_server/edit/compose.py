@@ -1,4 +1,4 @@
-"""From a state to what the renderer draws."""
+"""From a state to what the renderer draws and what LiDARs see."""
 
 from __future__ import annotations
 
@@ -7,21 +7,26 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Literal, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from real2sim_proto.base import Pose
 from real2sim_proto.operations import EraseRegion
-from real2sim_proto.semantics import semantic_class
+from real2sim_proto.semantics import GROUND, STATIC, semantic_class
 
-from ..geometry.rotation import Float
+from ..geometry.rotation import Float, quaternion_to_matrix
 from ..geometry.transform import invert_transform, transform_from
+from ..render.cast.recorded import Attributes, SweepScene, incidence_of, met_by_lidar, transforms_at
+from ..render.ground_class import TOLERANCE
 from ..render.types import Instance
-from ..scene import Figure, GaussianCloud, Scene, Stride
-from .ground_inpainting import inpaint_ground, vacated_parking
-from .shadow import contact_shadow
+from ..scene import Figure, GaussianCloud, Lidar, Scene, Stride, Trajectory
+from ..scene.spherical_harmonics import SH_C0
+from .appearance import contact_shadow, inpaint_ground, vacated_parking
+from .motion import require_object
 from .state import ObjectState, ScenarioState
 from .tracks import PlacedObjects
 
@@ -222,3 +227,208 @@ def kept(scene: Scene, key: Hashable, make: Callable[[], T]) -> T:
         while len(made) > KEPT_BACKGROUNDS:
             made.popitem(last=False)
         return made[key]  # type: ignore[return-value]
+
+
+# --- Free poses ----------------------------------------------------------------------------------
+
+# A scene with objects where a request says, without an edit.
+
+Others = Literal["recorded", "parked", "none"]
+
+
+def posed_instances(
+    scene: Scene, t_us: int, poses: Mapping[str, Pose], *, others: Others = "recorded"
+) -> list[Instance]:
+    """What is drawn at an instant with objects at ``poses``, as :func:`instances_at` has it.
+
+    Args:
+        scene: without edits.
+        t_us: instant, for the objects that are not posed and for colours [us].
+        poses: ``T_world_object`` by id.
+        others: what becomes of objects that are not posed: all as recorded, only those of them
+            that are parked, or none.
+
+    Raises:
+        EditError: UNKNOWN_OBJECT, for an object that the scene lacks.
+    """
+    state = ScenarioState.of(scene)
+    for object_id in poses:
+        require_object(state, object_id)
+    objects = {
+        object_id: _placed(subject, poses[object_id], t_us)
+        if object_id in poses
+        else replace(subject, deleted=not _shown(subject, others))
+        if others != "recorded"
+        else subject
+        for object_id, subject in state.objects.items()
+    }
+    return instances_at(scene, replace(state, objects=MappingProxyType(objects)), t_us)
+
+
+def _placed(subject: ObjectState, pose: Pose, t_us: int) -> ObjectState:
+    there = Trajectory(
+        times_us=np.array([t_us], dtype=np.int64),
+        positions=np.array([pose.position]),
+        quaternions=np.array([pose.quaternion]),
+    )
+    return replace(subject, trajectory=there, edited=True)
+
+
+def _shown(subject: ObjectState, others: Others) -> bool:
+    return others == "parked" and not subject.trajectory.moves
+
+
+# --- LiDAR sweeps --------------------------------------------------------------------------------
+
+# Objects where edits put them, moving over the sweep.
+
+
+def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> SweepScene:
+    """What ``lidar`` meets of a scenario in the sweep about ``t_us`` [us].
+
+    Every visible object that exists then, moved, turned, inserted or scaled as the edits say, with
+    its surfaces for LiDARs where the scene has them; the background without erased regions.
+
+    Raises:
+        UnknownObjectError: ``state`` is of another scene.
+    """
+    placed = state.tracks.at(t_us)
+    times = t_us + lidar.beams.slots[0]
+    found = [met_background(scene, state)]
+    moved: list[Float | None] = [None]
+    for subject, transform in zip(placed.objects, placed.transforms, strict=True):
+        found.append(met_object(scene, subject, transform, t_us))
+        moved.append(transforms_at(subject.trajectory, times))
+    instances, known = zip(*found, strict=True)
+    return SweepScene(instances, tuple(moved), known, incidence_of(scene))
+
+
+def met_background(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
+    """What rays meet of the background, without erased regions, and its attributes."""
+    cloud, attributes = met_by_lidar(scene, None)
+    if state.erased:
+        cloud = kept(scene, ("lidar", state.erased), lambda: without_regions(cloud, state.erased))
+    return Instance(cloud), attributes
+
+
+def met_object(
+    scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
+) -> tuple[Instance, Attributes | None]:
+    """What rays meet of an object at ``transform``, in its pose of ``t_us`` or, of a person, as far
+    in walking as ``stride`` says, and its attributes."""
+    cloud, attributes = _met(scene, subject, t_us, stride)
+    semantic = semantic_class(subject.category)
+    instance = Instance(cloud, transform, subject.instance_id, subject.scale, semantic=semantic)
+    return instance, attributes
+
+
+def _met(
+    scene: Scene, subject: ObjectState, t_us: int, stride: Stride | None
+) -> tuple[GaussianCloud, Attributes | None]:
+    if subject.asset is not None or figure_of(scene, subject) is not None:
+        return cloud_of(scene, subject, t_us, stride=stride), None
+    return met_by_lidar(scene, subject.source_id)
+
+
+# --- Points --------------------------------------------------------------------------------------
+
+# The centres of Gaussians at an instant, with colour and normal.
+
+Part = Literal["all", "background", "objects"]
+
+ROW = np.dtype(
+    [
+        *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")),
+        *((name, "u1") for name in ("red", "green", "blue", "semantic")),
+        ("instance", "<u2"),
+    ]
+)
+"""A point in the world [m]; its normal is the thinnest axis of its Gaussian."""
+
+LEAST_OPACITY = 0.1
+"""Fainter Gaussians are left out."""
+
+_TYPES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
+
+
+def points_at(
+    scene: Scene,
+    state: ScenarioState,
+    t_us: int,
+    *,
+    part: Part = "all",
+    instance_id: int | None = None,
+    least_opacity: float = LEAST_OPACITY,
+) -> NDArray[np.void]:
+    """Rows of ROW of a scenario at an instant.
+
+    Normals point towards the recorded path, those of objects away from their centre.
+
+    Args:
+        scene: of the scenario.
+        state: the scenario.
+        t_us: instant [us].
+        part: of the scene.
+        instance_id: of the only object that is wanted; None for all.
+        least_opacity: of a Gaussian that is a point.
+
+    Raises:
+        UnknownObjectError: ``state`` is of another scene.
+    """
+    shown = instances_at(scene, state, t_us)
+    background, objects = shown[0], [i for i in shown[1:] if i.instance_id > 0]
+    if instance_id is not None:
+        objects = [i for i in objects if i.instance_id == instance_id]
+    kept = [background] if part != "objects" and instance_id is None else []
+    kept += objects if part != "background" else []
+    rows = [_rows(scene, instance, least_opacity) for instance in kept]
+    return np.concatenate(rows) if rows else np.zeros(0, ROW)
+
+
+def ply_of_points(rows: NDArray[np.void]) -> Iterable[bytes]:
+    """A binary ply file, in parts."""
+    names = rows.dtype.names or ()
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {_TYPES[rows.dtype[name].str]} {name}" for name in names]
+    yield ("\n".join([*lines, "end_header"]) + "\n").encode()
+    yield rows.tobytes()
+
+
+def _rows(scene: Scene, instance: Instance, least_opacity: float) -> NDArray[np.void]:
+    cloud = instance.cloud
+    if instance.colour is not None:
+        cloud = instance.colour.at(cloud, instance.t_us)
+    seen = (cloud.opacities >= least_opacity).cpu().numpy()
+    means = cloud.means.cpu().numpy()[seen].astype(np.float64)
+    scale = np.asarray(instance.scale)
+    scales = cloud.scales.cpu().numpy()[seen] * scale
+    turns = quaternion_to_matrix(cloud.quats.cpu().numpy()[seen].astype(np.float64))
+    thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[..., 0]
+    points = means * scale
+    placed = instance.T_world_object
+    towards = _nearest(scene.ego.positions, points) if placed is None else 2 * points
+    outward = towards - points
+    thin[(thin * outward).sum(axis=1) < 0] *= -1
+    if placed is not None:
+        pose = np.asarray(placed, dtype=np.float64)
+        points, thin = points @ pose[:3, :3].T + pose[:3, 3], thin @ pose[:3, :3].T
+    rows = np.zeros(len(points), ROW)
+    for k, axis in enumerate("xyz"):
+        rows[axis], rows[f"n{axis}"] = points[:, k], thin[:, k]
+    colours = np.clip(cloud.sh.cpu().numpy()[seen, 0] * SH_C0 + 0.5, 0, 1)
+    for k, name in enumerate(("red", "green", "blue")):
+        rows[name] = np.rint(colours[:, k] * 255)
+    rows["instance"], rows["semantic"] = instance.instance_id, instance.semantic
+    if instance.instance_id == 0:
+        above = np.abs(points[:, 2] - scene.ground.height_at(points[:, :2]))
+        rows["semantic"] = np.where(above < TOLERANCE, GROUND, STATIC)
+    return rows
+
+
+def _nearest(path: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The place on a path, raised to where sensors look from, that is nearest to each point."""
+    from scipy.spatial import cKDTree
+
+    raised = path + np.array([0.0, 0.0, 1.6])
+    found: NDArray[np.float64] = raised[cKDTree(raised).query(points)[1]]
+    return found

@@ -12,8 +12,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Operation
 
 from .apply import EditOutcome, apply_operations, replay_operations
-from .errors import EditError
-from .state import ScenarioState
+from .state import EditError, ScenarioState
 
 KEPT_STATES = 32
 """States kept in memory; older ones are rebuilt from the log when an undo needs them."""

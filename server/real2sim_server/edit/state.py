@@ -1,4 +1,4 @@
-"""State of a scenario at one revision: objects without their Gaussians."""
+"""State of a scenario at one revision: objects without their Gaussians, and snapshots of it."""
 
 from __future__ import annotations
 
@@ -6,20 +6,16 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
+from real2sim_proto import CodecError, ErrorCode, decode, encode
 from real2sim_proto.episode import AgentDriver
-from real2sim_proto.operations import (
-    AddCollider,
-    EraseRegion,
-    SetGait,
-    SetPhysics,
-    SetVelocity,
-)
-from real2sim_proto.storyboard import Storyboard
+from real2sim_proto.operations import AddCollider, EraseRegion, SetGait, SetPhysics, SetVelocity
+from real2sim_proto.storyboard import Storyboard, stored_storyboard
 
 from ..scene import Figure, GaussianCloud, Ground, Scene, Trajectory
 from .tracks import PackedTracks
@@ -237,3 +233,143 @@ class ScenarioState:
 
 def _trajectories(scene: SceneSource, sources: list[ObjectSource]) -> list[Trajectory]:
     return [scene.ego, *(o.trajectory for o in sources)]
+
+
+# --- Errors --------------------------------------------------------------------------------------
+
+
+class EditError(ValueError):
+    """An edit, undo or redo that cannot be done; the state is as before.
+
+    Attributes:
+        code: UNKNOWN_OBJECT, INVALID_OPERATION, STALE_REVISION, NOTHING_TO_UNDO or
+            NOTHING_TO_REDO.
+        hint: what to do next, or None.
+        index: place of the refused operation in its batch, or None.
+    """
+
+    def __init__(
+        self, code: ErrorCode, message: str, *, hint: str | None = None, index: int | None = None
+    ) -> None:
+        super().__init__(message)
+        self.code = code
+        self.hint = hint
+        self.index = index
+
+
+# --- Snapshots -----------------------------------------------------------------------------------
+
+# A state as bytes and back, bit for bit, so that a long log need not be replayed whole.
+
+MAX_BYTES = 256 * 1024 * 1024
+_DRIVER: TypeAdapter[AgentDriver] = TypeAdapter(AgentDriver)
+
+
+def pack_state(state: ScenarioState) -> bytes:
+    """What differs from the recording, as msgpack; the recording itself is not in it."""
+    changed = [o for o in state.objects.values() if state.recorded.get(o.object_id) is not o]
+    story = {} if (board := state.storyboard) is None else {"story": board.model_dump(mode="json")}
+    return encode(
+        {
+            "objects": [_packed_object(o) for o in changed],
+            "next_instance_id": state.next_instance_id,
+            "clock": list(state.clock),
+            "regions": [r.model_dump(mode="json") for r in state.regions.values()],
+            "colliders": [c.model_dump(mode="json") for c in state.colliders.values()],
+            "gone": sorted(state.tombstones),
+        }
+        | story
+    )
+
+
+def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
+    """The state that :func:`pack_state` was given.
+
+    Args:
+        initial: of the same scene, before any edit.
+        packed: the bytes.
+
+    Raises:
+        EditError: UNKNOWN_ASSET where an object shows one that is not in the library;
+            INVALID_OPERATION for bytes that hold no state of this scene.
+    """
+    try:
+        document = decode(packed, max_bytes=MAX_BYTES)
+        found = [_unpacked_object(o, initial.assets) for o in document["objects"]]
+        first, last = document["clock"]
+        regions = [EraseRegion.model_validate(r) for r in document["regions"]]
+        colliders = [AddCollider.model_validate(c) for c in document["colliders"]]
+        story = document.get("story")
+        board = None if story is None else Storyboard.model_validate(stored_storyboard(story))
+        tombstones, next_instance_id = frozenset(document["gone"]), document["next_instance_id"]
+    except (CodecError, KeyError, TypeError, ValueError) as error:
+        raise EditError(
+            ErrorCode.INVALID_OPERATION,
+            f"these bytes hold no state: {error}",
+            hint="replay the whole log instead",
+        ) from error
+    return replace(
+        initial,
+        objects=MappingProxyType(dict(initial.objects) | {o.object_id: o for o in found}),
+        next_instance_id=next_instance_id,
+        clock=(first, last),
+        regions=MappingProxyType({str(r.region_id): r for r in regions}),
+        colliders=MappingProxyType({str(c.collider_id): c for c in colliders}),
+        tombstones=tombstones,
+        storyboard=board,
+    )
+
+
+def _packed_object(subject: ObjectState) -> dict[str, Any]:
+    driver = {"driver": subject.driver.model_dump(mode="json")} if subject.driver else {}
+    gait = {"gait": subject.gait.model_dump(mode="json")} if subject.gait else {}
+    return (
+        driver
+        | gait
+        | {
+            "object_id": subject.object_id,
+            "source_id": subject.source_id,
+            "category": subject.category,
+            "size": list(subject.size),
+            "scale": list(subject.scale),
+            "times_us": subject.trajectory.times_us,
+            "positions": subject.trajectory.positions,
+            "quaternions": subject.trajectory.quaternions,
+            "instance_id": subject.instance_id,
+            "deleted": subject.deleted,
+            "asset_id": subject.asset.asset_id if subject.asset else None,
+            "physics": subject.physics.model_dump(mode="json") if subject.physics else None,
+            "velocity": subject.velocity.model_dump(mode="json") if subject.velocity else None,
+            "placed": subject.edited,
+        }
+    )
+
+
+def _unpacked_object(packed: dict[str, Any], assets: AssetLookup | None) -> ObjectState:
+    asset_id = packed["asset_id"]
+    asset = assets(asset_id) if assets and asset_id is not None else None
+    if asset is None and asset_id is not None:
+        raise EditError(
+            ErrorCode.UNKNOWN_ASSET,
+            f"there is no asset {asset_id!r} in the library",
+            hint="put it back",
+        )
+    physics, velocity = packed["physics"], packed["velocity"]
+    length, width, height = packed["size"]
+    x, y, z = packed["scale"]
+    return ObjectState(
+        object_id=packed["object_id"],
+        source_id=packed["source_id"],
+        category=packed["category"],
+        size=(length, width, height),
+        scale=(x, y, z),
+        trajectory=Trajectory(packed["times_us"], packed["positions"], packed["quaternions"]),
+        instance_id=packed["instance_id"],
+        deleted=packed["deleted"],
+        asset=asset,
+        physics=SetPhysics.model_validate(physics) if physics else None,
+        velocity=SetVelocity.model_validate(velocity) if velocity else None,
+        gait=SetGait.model_validate(packed["gait"]) if "gait" in packed else None,
+        edited=packed["placed"],
+        driver=_DRIVER.validate_python(packed["driver"]) if "driver" in packed else None,
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,15 +16,84 @@ from real2sim.planners.learned import REACH, PolicyShape, network, shrink, state
 
 from .._files import atomic_file
 from ..console import CommandError
+from ..datasets.clips import Clip
+from ..datasets.labels.futures import STEP_US
+from ..edit import ScenarioState
+from ..edit.compose import instances_at
 from ..geometry.rotation import quaternion_yaw
 from ..geometry.transform import transform_from
-from ..scene import Trajectory
+from ..logs import DrivingLog
+from ..render import render_cameras, select_backend
+from ..scene import Scene, Trajectory
 from ..world.ego.route import command_ahead
 from ..world.path import LoggedPath
-from .posed_images import PosedImage
 
 if TYPE_CHECKING:
     import torch
+
+
+# --- Posed images --------------------------------------------------------------------------------
+
+PERIOD_US = 100_000
+"""Between instants of a scene at which images are drawn."""
+LATERAL_SIGMA, YAW_SIGMA = 1.0, 0.12
+"""Standard deviations of poses beside the path, cut at two of them [m], [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """One image and where it was taken.
+
+    Attributes:
+        rgb: uint8 [H, W, 3].
+        t_us: instant.
+        T_world_vehicle: [4, 4] float64, of the vehicle that carries the camera.
+        frame: number of the instant.
+        count: of all images of the drive.
+    """
+
+    rgb: NDArray[np.uint8]
+    t_us: int
+    T_world_vehicle: NDArray[np.float64]
+    frame: int
+    count: int
+
+
+def log_images(log: DrivingLog, shape: PolicyShape) -> Iterator[PosedImage]:
+    """The images of a log."""
+    for frame in range(log.frame_count):
+        t_us = log.image_time_us(shape.camera, frame)
+        pose = transform_from(*log.ego.pose(t_us))
+        yield PosedImage(log.image(shape.camera, frame), t_us, pose, frame, log.frame_count)
+
+
+def scene_images(
+    scene: Scene, shape: PolicyShape, *, shifted: int, seed: int
+) -> Iterator[PosedImage]:
+    """Images drawn along the recorded path of a scene, and ``shifted`` beside it at each instant.
+
+    A policy that has only seen the path does not know how to come back to it (Pomerleau 1989
+    turned images for that; here the scene is drawn from where the vehicle would be).
+    """
+    rng = np.random.default_rng(seed)
+    camera = scene.rig[shape.camera].resized(2 * shape.width)
+    backend, state = select_backend("auto"), ScenarioState.of(scene)
+    instants = range(scene.start_us, scene.end_us + 1, PERIOD_US)
+    for frame, t_us in enumerate(instants):
+        T_world_ego = transform_from(*scene.ego.pose(t_us))
+        for k in range(shifted + 1):
+            pose = T_world_ego @ _random_offset(rng) if k else T_world_ego
+            (rendered,) = render_cameras(
+                instances_at(scene, state, t_us), [camera], pose, sky=scene.sky, backend=backend
+            )
+            yield PosedImage(rendered.rgb, t_us, pose, frame, len(instants) * (shifted + 1))
+
+
+def _random_offset(rng: np.random.Generator) -> NDArray[np.float64]:
+    lateral, yaw = np.clip(rng.normal(size=2), -2.0, 2.0) * [LATERAL_SIGMA, YAW_SIGMA]
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0, 0], [s, c, 0, lateral], [0, 0, 1, 0], [0, 0, 0, 1]])
+
 
 BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 32, 2e-3, 1e-4
 HOLD_OUT_EVERY = 5
@@ -204,3 +275,90 @@ def save_policy(weights: dict[str, torch.Tensor], shape: PolicyShape, out: Path)
 
 def _yaw(T_world_vehicle: NDArray[np.float64]) -> float:
     return float(np.arctan2(T_world_vehicle[1, 0], T_world_vehicle[0, 0]))
+
+
+# --- Examples from data sets ---------------------------------------------------------------------
+
+TRAIN = "train"
+LAYOUT = "labels"
+"""Name of the format that is read, and of its folder in an export."""
+
+
+def is_export(folder: Path) -> bool:
+    """Whether a folder is a labelled data set."""
+    return (folder / "manifest.json").is_file()
+
+
+def exported_shape(folder: Path, camera: str | None) -> PolicyShape:
+    """The shape of a policy that sees ``camera`` of an export, by default the one that looks most
+    nearly ahead.
+
+    Raises:
+        CommandError: there is no such camera, or the export was written in other formats only.
+    """
+    found = _content(folder)["cameras"]
+    cameras = {one["name"]: np.array(one["T_vehicle_camera"]) for one in found}
+    if camera is not None and camera not in cameras:
+        raise CommandError(f"no camera {camera!r} in {folder}; there are {', '.join(cameras)}")
+    ahead = max(cameras, key=lambda name: cameras[name][0, 2])
+    return PolicyShape(camera=camera or ahead, spacing=STEP_US * 1e-6)
+
+
+def exported_examples(
+    folders: Sequence[Path],
+    shape: PolicyShape,
+    *,
+    on_progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> CloningDataset:
+    """All frames of exports whose drive goes on for as long as a plan; ``ego_future`` is the plan.
+
+    Held out are the clips of other splits than ``train``; where there are none, every fifth frame
+    of each clip.
+
+    Args:
+        folders: exports with the format ``labels``.
+        shape: of :func:`exported_shape`.
+        on_progress: called with (clips read, all).
+
+    Raises:
+        CommandError: an export without labels or camera, or too few frames.
+    """
+    clips = [clip for folder in folders for clip in _clips(folder, shape)]
+    splits = any(clip.split != TRAIN for clip in clips)
+    inputs, states, poses, held_out = [], [], [], []
+    for done, clip in enumerate(clips, start=1):
+        for frame in clip.frames:
+            plan = frame["ego_future"][: shape.poses]
+            if len(plan) < shape.poses:
+                continue
+            rgb = clip.pixels("rgb", shape.camera, frame["index"])
+            inputs.append(shrink(rgb, shape.width, shape.height))
+            states.append(state_of(frame["ego"]["speed"], frame["ego"]["command"]))
+            poses.append(np.array(plan)[:, 1:] / [REACH, REACH, 1.0])
+            turn = frame["index"] % HOLD_OUT_EVERY == HOLD_OUT_EVERY - 1
+            held_out.append(clip.split != TRAIN if splits else turn)
+        on_progress(done, len(clips))
+    if len(inputs) < 2 * HOLD_OUT_EVERY:
+        raise CommandError(
+            f"{len(inputs)} frames have {shape.poses * shape.spacing:g} s of driving after them; "
+            f"{2 * HOLD_OUT_EVERY} are needed"
+        )
+    return CloningDataset(
+        np.stack(inputs), np.stack(states), np.stack(poses).astype(np.float32), np.array(held_out)
+    )
+
+
+def _clips(folder: Path, shape: PolicyShape) -> list[Clip]:
+    content = _content(folder)
+    names = [one["name"] for one in content["cameras"]]
+    if shape.camera not in names:
+        raise CommandError(f"no camera {shape.camera!r} in {folder}; there are {', '.join(names)}")
+    return [Clip.open(folder / LAYOUT / name) for name in content["clips"]]
+
+
+def _content(folder: Path) -> dict[str, Any]:
+    file = folder / LAYOUT / "dataset.json"
+    if not file.is_file():
+        raise CommandError(f"{folder} holds no labels; export it with --format {LAYOUT}")
+    content: dict[str, Any] = json.loads(file.read_bytes())
+    return content

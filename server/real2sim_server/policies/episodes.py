@@ -1,20 +1,279 @@
-"""Episodes driven, recorded and scored, several at a time."""
+"""Episodes driven, recorded and scored, several at a time, with planners in their own processes."""
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+import multiprocessing
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import real2sim
+from real2sim._protocol import valid_plan
+from real2sim.planners import load_planner, needs_of, run_episode
+from real2sim.planners.planner import forward_camera
 
 from ..world.recording.recording import Recording, load_recording
-from .planner_process import PlannedEpisode, PlannerProcess, WorkerTarget
 from .suite import Case, EpisodeGrid
+
+if TYPE_CHECKING:
+    from real2sim import DriveSession, Observation
+
+
+# --- Planner processes ---------------------------------------------------------------------------
+
+# A planner that ends its process ends only its own episode.
+
+STILLS, STILL_WIDTH = 6, 320
+END_S = 10.0
+"""So long an idle process has to end [s]."""
+
+
+@dataclass(frozen=True)
+class WorkerTarget:
+    """The worker that episodes run on.
+
+    Attributes:
+        url, token: of the worker.
+        sessions: how many at a time.
+        timeout: seconds that a reply may take.
+    """
+
+    url: str
+    token: str | None = None
+    sessions: int = 2
+    timeout: float = 120.0
+
+    def connect(self) -> real2sim.Client:
+        """A client of the worker."""
+        return real2sim.connect(self.url, token=self.token, timeout=self.timeout)
+
+
+@dataclass(frozen=True)
+class PlannedEpisode:
+    """An episode to drive in a session that is there.
+
+    Attributes:
+        policy: name of the planner.
+        case, seed: what is driven.
+        target: the worker.
+        session_id, token: of the session.
+    """
+
+    policy: str
+    case: Case
+    seed: int
+    target: WorkerTarget
+    session_id: str
+    token: str
+
+
+@dataclass(frozen=True)
+class DrivenEpisode:
+    """What a planner's process tells of an episode.
+
+    Attributes:
+        reason: why it ended; None where the planner failed.
+        error: what the planner raised, was refused for, or ended its process with.
+        times_ms: median times of the stages [ms].
+        stills: (seconds since the start, JPEG) of the camera that looks ahead.
+    """
+
+    reason: str | None = None
+    error: str | None = None
+    times_ms: Mapping[str, float] = field(default_factory=dict)
+    stills: Sequence[tuple[float, bytes]] = ()
+
+
+class PlannerProcess:
+    """A process in which planners drive, one episode after another.
+
+    Where a planner ends it, the next episode starts another.
+    """
+
+    def __init__(self) -> None:
+        self._process: Any = None
+        self._pipe: Connection | None = None
+
+    def check(self, policy: str) -> None:
+        """Load a planner.
+
+        Raises:
+            ValueError: it cannot be loaded.
+        """
+        failed = self._asked(policy)
+        if isinstance(failed, int):
+            raise ValueError(f"planner {policy!r} ends its process with exit code {failed}")
+        if failed is not None:
+            raise failed
+
+    def drive(self, episode: PlannedEpisode) -> DrivenEpisode:
+        """Drive an episode.
+
+        Raises:
+            Real2SimError: the worker refuses, or has ended.
+            ValueError: the planner cannot drive in this scene.
+        """
+        told = self._asked(episode)
+        if isinstance(told, int):
+            return DrivenEpisode(error=f"the planner ended its process with exit code {told}")
+        if isinstance(told, Exception):
+            raise told
+        driven: DrivenEpisode = told
+        return driven
+
+    def _asked(self, what: str | PlannedEpisode) -> Any:
+        """The process's answer, or its exit code where it has ended instead."""
+        if self._pipe is None:
+            context = multiprocessing.get_context("spawn")
+            self._pipe, other = context.Pipe()
+            self._process = context.Process(target=_serve, args=(other,))
+            self._process.start()
+            other.close()
+        try:
+            self._pipe.send(what)
+            return self._pipe.recv()
+        except (EOFError, ConnectionError):
+            self._process.join()
+            code = int(self._process.exitcode)
+            self._pipe.close()
+            self._pipe = None
+            return code
+
+    def close(self) -> None:
+        """End the process."""
+        if self._pipe is not None:
+            self._pipe.close()
+            self._pipe = None
+            self._process.join(END_S)
+            self._process.kill()
+
+
+def _serve(pipe: Connection) -> None:
+    """Answer until the other end closes."""
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            asked = pipe.recv()
+            answer: Any = None
+            try:
+                if isinstance(asked, str):
+                    load_planner(asked)
+                else:
+                    answer = _driven(asked)
+            # Only what a pipe can carry: not every class of errors can be sent.
+            except ValueError as error:
+                answer = ValueError(str(error))
+            except real2sim.Real2SimError as error:
+                answer = real2sim.Real2SimError(str(error))
+            pipe.send(answer)
+
+
+def _driven(episode: PlannedEpisode) -> DrivenEpisode:
+    planner = load_planner(episode.policy)
+    with (
+        episode.target.connect() as client,
+        client.join(episode.session_id, token=episode.token) as session,
+    ):
+        options: Any = episode.case.reset_for(episode.seed)
+        driver = _IsolatedPlanner(planner, session, episode.case)
+        capture = _StillCapture(session, options) if episode.seed == 0 else None
+        summary = None
+        try:
+            summary = run_episode(
+                session,
+                driver,
+                on_observation=capture,
+                **options,
+            )
+        except real2sim.InvalidActionError as error:
+            driver.error = f"plan refused: {error}"
+    return DrivenEpisode(
+        reason=summary.reason if summary and not driver.error else None,
+        error=driver.error,
+        times_ms={k: v.p50 for k, v in summary.stages.items()} if summary else {},
+        stills=capture.stills if capture else (),
+    )
+
+
+class _IsolatedPlanner:
+    """A planner whose exceptions end its own episode only; it applies the edits of the case."""
+
+    def __init__(self, planner: Any, session: DriveSession, case: Case) -> None:
+        self._planner, self._session, self._case = planner, session, case
+        if hasattr(planner, "needs"):
+            self.needs = planner.needs
+        self.error: str | None = None
+
+    def begin(self, welcome: Any) -> None:
+        begin = getattr(self._planner, "begin", None)
+        if begin is not None:
+            with self._catching_errors():
+                begin(welcome)
+
+    def reset(self, obs: Observation) -> None:
+        if self._case.operations:
+            self._session.edit(self._case.operations)
+        with self._catching_errors():
+            self._planner.reset(obs)
+
+    def plan(self, obs: Observation) -> Any:
+        plan: Any = None
+        if self.error is None:
+            with self._catching_errors():
+                plan = self._planner.plan(obs)
+        if self.error is None:
+            try:
+                return valid_plan(plan)
+            except ValueError as error:
+                self.error = f"plan refused: {error}"
+        # The rest of a failed episode is driven standing still, so that it ends as any other.
+        return _standstill_plan(obs, needs_of(self._planner).action)
+
+    @contextlib.contextmanager
+    def _catching_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (Exception, SystemExit) as error:
+            self.error = f"{type(error).__name__}: {error}"
+
+
+def _standstill_plan(obs: Observation, action: str) -> dict[str, Any]:
+    if action == "control":
+        return {"kind": "control", "acceleration": -4.0, "steering": 0.0}
+    if action == "pose":
+        x, y, _ = obs.ego.position
+        return {"kind": "pose", "x": x, "y": y, "yaw": obs.ego.yaw}
+    return {"kind": "trajectory", "times_us": [obs.t_us + 1_000_000], "poses": [(0.0, 0.0, 0.0)]}
+
+
+class _StillCapture:
+    """Takes a few pictures of an episode on the way."""
+
+    def __init__(self, session: DriveSession, options: Mapping[str, Any]) -> None:
+        welcome = session.welcome
+        start = options.get("start_us") or welcome.start_us
+        steps = options.get("horizon") or (welcome.end_us - start) // options.get("dt_us", 100_000)
+        self._session, self._start = session, start
+        self._every = max(int(steps) // (STILLS - 1), 1)
+        self._camera = forward_camera(welcome.cameras) if welcome.cameras else None
+        self.stills: list[tuple[float, bytes]] = []
+
+    def __call__(self, obs: Observation) -> None:
+        if self._camera is None or (obs.step % self._every and not obs.over):
+            return
+        if obs.reason == "horizon" and obs.step % self._every:
+            return
+        view = self._session.render(
+            [{"camera": self._camera, "width": STILL_WIDTH, "codec": "jpeg", "quality": 80}]
+        )
+        frame = view.frames[self._camera]["rgb"]
+        self.stills.append(((obs.t_us - self._start) * 1e-6, frame.data))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,1 +1,8 @@
-"""Scenarios as people write them: files of storyboards, and a gallery of corner cases."""
+"""Scenarios as people write them: OpenSCENARIO files, and a gallery of corner cases."""
+
+
+class ScenarioError(ValueError):
+    """A file that is no scenario, or asks for something unsupported.
+
+    The message names the file, the line, and what to do.
+    """

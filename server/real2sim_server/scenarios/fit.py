@@ -23,7 +23,7 @@ from ..world.path import LoggedPath
 from ..world.storyboard.roads import RoadNetwork, RouteNetwork, straight
 from ..world.storyboard.run import StoryboardRun, own_centre
 from ..world.traffic.driver import ObservedEgo, Surroundings
-from .errors import ScenarioError
+from . import ScenarioError
 
 
 class Recorded(Protocol):

@@ -29,7 +29,7 @@ from ..scene.person import person_asset
 from ..world.path import LoggedPath
 from ..world.storyboard.roads import GraphNetwork, Place, Way, straight
 from ..world.storyboard.run import BOXES, StoryboardRun
-from .errors import ScenarioError
+from . import ScenarioError
 from .fit import begun_alone
 
 BEFORE, SECONDS = 60.0, 40.0

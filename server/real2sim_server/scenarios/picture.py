@@ -20,7 +20,7 @@ from ..world import World
 from .fit import fitted_to_scene
 from .flat_scene import flat_scene
 from .gallery import GALLERY, CornerCase, corner_case
-from .gallery.pictures import FOLDER
+from .gallery.case import PICTURES
 
 EGO_SPEED = 10.0
 """At which the ego goes on straight in the pictures [m/s]."""
@@ -77,7 +77,7 @@ def main() -> None:
     """Write the pictures of all cases."""
     scene = plain_scene()
     for case in GALLERY.values():
-        (FOLDER / f"{case.name}.svg").write_text(picture_of(case, scene), encoding="utf-8")
+        (PICTURES / f"{case.name}.svg").write_text(picture_of(case, scene), encoding="utf-8")
 
 
 # --- driven -------------------------------------------------------------------------------------

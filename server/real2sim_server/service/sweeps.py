@@ -13,7 +13,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import JobInfo
 from real2sim_proto.sweeps import SearchMethod, SweepRequest
 
-from ..scenarios.errors import ScenarioError
+from ..scenarios import ScenarioError
 from ..scenarios.gallery import corner_case
 from ..scenarios.openscenario import ReadOptions, read_openscenario_text
 from .http.idempotency import IdempotentRequest

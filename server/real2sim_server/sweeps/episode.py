@@ -5,15 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from real2sim.images import Frame
 from real2sim.observation import Observation, observation_from_wire
 from real2sim.planners import Needs, needs_of
 from real2sim_proto.drive import Obs
@@ -23,13 +26,83 @@ from real2sim_proto.plans import PLAN, Control, PoseCommand, TrajectoryPlan
 
 from ..edit import EditError, ScenarioState
 from ..policies.suite import Case
-from ..scene import Scene
+from ..render import RasterOptions, View, rasterize_batch
+from ..render.quantize import to_uint8
+from ..scene import Camera, Scene
+from ..service.library.views import camera_infos
 from ..world import World, WorldError
 from ..world.recording.recording import Recording, record
 from ..world.recording.replay import Entry, Replayer, action_payload, edit_payload, reset_payload
 from ..world.scoring import metrics_version
 from .criticality import Danger, adversaries_of
-from .pictures import CameraFeed
+
+# --- Images --------------------------------------------------------------------------------------
+
+RGB = RasterOptions(depth=False, instance=False)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFeed:
+    """The colour images that a planner asks for.
+
+    Attributes:
+        cameras: resized to what it wants.
+    """
+
+    cameras: tuple[Camera, ...]
+
+    @classmethod
+    def of(cls, scene: Scene, needs: Needs) -> CameraFeed | None:
+        """What a planner needs; None for one that is blind.
+
+        Raises:
+            ValueError: images other than colour, or a camera that the scene lacks.
+        """
+        if not needs.modalities:
+            return None
+        if set(needs.modalities) != {"rgb"}:
+            raise ValueError(
+                f"the planner wants {', '.join(needs.modalities)}; sweeps draw rgb alone: drive it "
+                "with evaluate-policy"
+            )
+        sensors = needs.sensors(camera_infos(tuple(scene.rig)))
+        cameras = (scene.rig[sensor["camera"]] for sensor in sensors)
+        return cls(tuple(c if needs.width is None else c.resized(needs.width) for c in cameras))
+
+    def added_to(self, obs: Observation, world: World) -> Observation:
+        """The observation with the images of its instant."""
+        frames = {camera.name: {"rgb": draw_frames([world], camera)[0]} for camera in self.cameras}
+        return replace(obs, frames=frames)
+
+
+def draw_frames(worlds: Sequence[World], camera: Camera) -> list[Frame]:
+    """What a camera sees in each of several worlds of one scene, drawn in one call.
+
+    Args:
+        worlds: at their instants; one at least.
+        camera: of the ego.
+    """
+    views = [View(w.instances(), camera.viewmat(w.T_world_body), camera.K) for w in worlds]
+    drawn = rasterize_batch(
+        views, camera.width, camera.height, sky=worlds[0].scene.sky, options=RGB
+    )
+    images = zip(worlds, to_uint8(drawn.rgb), strict=True)
+    return [_frame(world, camera, image) for world, image in images]
+
+
+def _frame(world: World, camera: Camera, image: NDArray[np.uint8]) -> Frame:
+    return Frame(
+        modality="rgb",
+        codec="raw",
+        dtype="uint8",
+        shape=image.shape,
+        data=image.tobytes(),
+        sensor=camera.name,
+        t_us=world.t_us,
+        T_world_sensor=world.T_world_body @ camera.T_vehicle_camera,
+        K=camera.K,
+    )
+
 
 OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
 PLANS = (TrajectoryPlan, Control, PoseCommand)

@@ -1,24 +1,147 @@
-"""Parameters of a space: what a coordinate between 0 and 1 stands for."""
+"""Parameters of a space, expressions in them, and the points that are sampled."""
 
 from __future__ import annotations
 
+import ast
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from real2sim_proto.sweeps import (
+    MOST_POINTS,
     ChoiceParameter,
     DerivedParameter,
     FloatParameter,
+    GridMethod,
+    ImportanceMethod,
     IntParameter,
     NormalParameter,
     ParameterName,
     ParameterValue,
+    SpreadMethod,
 )
 
-from .expression import evaluate, names_in
+# --- Expressions ---------------------------------------------------------------------------------
+
+# Numbers, names, ``+ - * / **`` and a few functions.
+
+MOST_CHARACTERS = 200
+MOST_POWER = 64.0
+"""An exponent beyond this is refused: such numbers are a mistake."""
+
+BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
+FUNCTIONS: Mapping[str, Callable[..., float]] = {
+    "abs": abs,
+    "cos": math.cos,
+    "max": max,
+    "min": min,
+    "radians": math.radians,
+    "sin": math.sin,
+    "sqrt": math.sqrt,
+}
+
+
+def names_in(expression: str) -> set[str]:
+    """Parameters that an expression needs.
+
+    Raises:
+        ValueError: it is no expression of numbers, names and the operators and functions above.
+    """
+    tree = _parsed(expression)
+    functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
+    names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and id(n) not in functions}
+    evaluate(expression, dict.fromkeys(names, 1.0), check_only=True)
+    return names
+
+
+def evaluate(expression: str, values: Mapping[str, float], *, check_only: bool = False) -> float:
+    """The value of an expression.
+
+    Args:
+        expression: text.
+        values: of the names in it.
+        check_only: what cannot be computed with these values is no error.
+
+    Raises:
+        ValueError: another thing than arithmetic, an unknown name, or no finite result.
+    """
+    try:
+        found = float(_value(_parsed(expression).body, values))
+    except (ArithmeticError, OverflowError) as error:
+        found, reason = math.nan, str(error)
+    else:
+        reason = "no finite number"
+    if not math.isfinite(found) and not check_only:
+        given = ", ".join(f"{k} = {v:g}" for k, v in sorted(values.items()))
+        raise ValueError(f"{expression!r} is {reason} with {given}")
+    return found
+
+
+def _parsed(expression: str) -> ast.Expression:
+    if len(expression) > MOST_CHARACTERS:
+        raise ValueError(f"an expression of {len(expression)} characters; at most 200 are read")
+    try:
+        return ast.parse(expression.strip(), mode="eval")
+    except (SyntaxError, RecursionError, MemoryError) as error:
+        raise ValueError(f"{expression!r} is no expression: {error}") from error
+
+
+def _value(node: ast.expr, values: Mapping[str, float]) -> Any:
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+        return float(node.value)
+    if isinstance(node, ast.Name):
+        if node.id not in values:
+            known = ", ".join(sorted(values)) or "none"
+            raise ValueError(f"{node.id!r} is no parameter; there are {known}")
+        return values[node.id]
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
+        inner = _value(node.operand, values)
+        return -inner if isinstance(node.op, ast.USub) else inner
+    if isinstance(node, ast.BinOp):
+        return _binary(node, values)
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
+        return _called(node.func.id, [_value(a, values) for a in node.args])
+    raise ValueError(
+        f"{ast.unparse(node)!r} is not understood; numbers, parameters, + - * / ** and "
+        f"{', '.join(FUNCTIONS)} are"
+    )
+
+
+def _binary(node: ast.BinOp, values: Mapping[str, float]) -> float:
+    left, right = _value(node.left, values), _value(node.right, values)
+    if isinstance(node.op, ast.Pow):
+        if abs(right) > MOST_POWER:
+            raise ValueError(f"exponent {right:g}; at most {MOST_POWER:g} either way is allowed")
+        found = left**right
+        if isinstance(found, complex):
+            raise ArithmeticError("no real number")
+        return float(found)
+    if type(node.op) not in BINARY:
+        raise ValueError(f"{ast.unparse(node)!r} has an operator other than + - * / **")
+    return BINARY[type(node.op)](left, right)
+
+
+def _called(name: str, arguments: list[float]) -> float:
+    if name not in FUNCTIONS:
+        raise ValueError(f"function {name!r}; allowed are {', '.join(FUNCTIONS)}")
+    try:
+        return FUNCTIONS[name](*arguments)
+    except TypeError as error:
+        raise ValueError(f"{name}: {error}") from error
+    except ValueError as error:
+        raise ArithmeticError(f"{name}: {error}") from error
+
 
 Value = ParameterValue
 Name = ParameterName
@@ -153,3 +276,96 @@ def check_derived(parameters: Mapping[str, Parameter]) -> None:
                     f"parameter {name!r} needs {missing[0]!r}, which is none, or derived after it"
                 )
             known.add(name)
+
+
+# --- Sampling ------------------------------------------------------------------------------------
+
+# A grid, or a given number of points, spread or weighted.
+
+Points = NDArray[np.float64]
+
+Method = Annotated[GridMethod | SpreadMethod | ImportanceMethod, Field(discriminator="kind")]
+
+
+def points_of(
+    method: GridMethod | SpreadMethod | ImportanceMethod, drawn: Mapping[str, Drawn]
+) -> tuple[Points, Points]:
+    """Points [N, D] with coordinates from 0 to 1, and their weights [N], 1 where all are alike.
+
+    Raises:
+        ValueError: too many points, or a parameter that is none.
+    """
+    if isinstance(method, GridMethod):
+        points = _grid(method, drawn)
+        return points, np.ones(len(points))
+    if isinstance(method, ImportanceMethod):
+        return _weighted(method, drawn)
+    points = spread(method.kind, method.count, len(drawn), seed=method.seed)
+    return points, np.ones(len(points))
+
+
+def spread(kind: str, count: int, dimensions: int, *, seed: int) -> Points:
+    """[count, dimensions] in [0, 1); the first of them are those of a longer sequence, but for
+    Latin hypercubes."""
+    from scipy.stats import qmc
+
+    if dimensions == 0:
+        return np.zeros((count, 0))
+    if kind == "random":
+        return np.random.default_rng(seed).random((count, dimensions))
+    if kind == "sobol":
+        engine = qmc.Sobol(dimensions, rng=seed)
+        # A whole power of two is drawn, which is what its balance holds for.
+        whole = engine.random_base2(max(math.ceil(math.log2(count)), 0))
+        return np.asarray(whole[:count], np.float64)
+    makers = {"latin_hypercube": qmc.LatinHypercube, "halton": qmc.Halton}
+    return np.asarray(makers[kind](dimensions, rng=seed).random(count), np.float64)
+
+
+def _grid(method: GridMethod, drawn: Mapping[str, Drawn]) -> Points:
+    levels = method.levels
+    given = levels if isinstance(levels, dict) else dict.fromkeys(drawn, levels)
+    _check_names(given, drawn)
+    axes = [p.levels(max(given.get(name, 5), 1)) for name, p in drawn.items()]
+    if (count := math.prod(len(a) for a in axes)) > MOST_POINTS:
+        raise ValueError(f"a grid of {count} points; {MOST_POINTS} are the most")
+    return np.array(list(itertools.product(*axes)), np.float64).reshape(count, len(drawn))
+
+
+def _weighted(method: ImportanceMethod, drawn: Mapping[str, Drawn]) -> tuple[Points, Points]:
+    """In coordinates the nominal density is 1, whatever a parameter's distribution."""
+    _check_names(method.towards, drawn)
+    rng, names = np.random.default_rng(method.seed), list(drawn)
+    points = rng.random((method.count, len(names)))
+    aimed = rng.random(method.count) >= method.defensive
+    density = np.ones(method.count)
+    for name, bump in method.towards.items():
+        k, parameter = names.index(name), drawn[name]
+        centre = parameter.coordinate(bump.mean)
+        width = abs(parameter.coordinate(bump.mean + bump.std) - centre)
+        points[aimed, k] = _cut_normal(points[aimed, k], centre, width)
+        density *= _cut_density(points[:, k], centre, width)
+    weights: Points = 1.0 / (method.defensive + (1.0 - method.defensive) * density)
+    return points, weights
+
+
+def _cut_normal(u: Points, centre: float, width: float) -> Points:
+    from scipy.special import ndtr, ndtri
+
+    low, high = ndtr((0.0 - centre) / width), ndtr((1.0 - centre) / width)
+    found: Points = np.clip(centre + width * ndtri(low + (high - low) * u), 0.0, 1.0)
+    return found
+
+
+def _cut_density(x: Points, centre: float, width: float) -> Points:
+    from scipy.special import ndtr
+
+    share = ndtr((1.0 - centre) / width) - ndtr((0.0 - centre) / width)
+    z = (x - centre) / width
+    found: Points = np.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * width * share)
+    return found
+
+
+def _check_names(given: Sequence[str] | Mapping[str, object], drawn: Mapping[str, Drawn]) -> None:
+    if unknown := sorted(set(given) - set(drawn)):
+        raise ValueError(f"{unknown[0]!r} is no drawn parameter; there are {', '.join(drawn)}")

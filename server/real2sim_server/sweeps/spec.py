@@ -23,8 +23,16 @@ from real2sim_proto.sweeps import SpreadMethod, StopRule, with_kinds
 
 from ..console import CommandError
 from ..policies.suite import Case
-from .parameters import Name, Parameter, Value, check_derived, drawn_parameters, values_at
-from .sampling import Method, points_of
+from .parameters import (
+    Method,
+    Name,
+    Parameter,
+    Value,
+    check_derived,
+    drawn_parameters,
+    points_of,
+    values_at,
+)
 from .storyboard_space import StoryboardSpace, is_scenario, with_storyboard
 
 MOST_BYTES = 1 << 20

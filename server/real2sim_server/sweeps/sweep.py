@@ -2,30 +2,266 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+import os
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Self
 
 from real2sim.planners import load_planner, needs_of
 from real2sim_proto.sweeps import StopRule
 
+from .._files import atomic_file
 from ..console import CommandError
-from ..executors import Executor
+from ..executors import Executor, Recipe
 from ..scene import Scene
+from ..world import warm_up
 from ..world.recording.recording import save_recording
 from ..world.scoring import metrics_version
-from .episode import Drive, drive_episode, recording_of
-from .journal import Journal
-from .parameters import Choice, IntRange, Value, drawn_parameters, values_at
-from .pictures import CameraFeed
-from .sampling import points_of
-from .scenes import open_scene
+from .episode import CameraFeed, Drive, Driven, drive_episode, recording_of
+from .parameters import Choice, IntRange, Value, drawn_parameters, points_of, values_at
 from .spec import SweepSpec
-from .storyboard_space import write_scenario_file
-from .table import write_table
-from .worker import COLUMNS, Row, recipe_of
+from .storyboard_space import open_scene, write_scenario_file
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+# --- Journal -------------------------------------------------------------------------------------
+
+# Rows of episodes on disk, so that a sweep continues where it was killed.
+
+FORMAT = "real2sim-episodes 1"
+MOST_BYTES = 4 << 30
+MOST_LINE = 1 << 20
+
+
+class Journal:
+    """A file that only grows: ``checksum key row`` a line.
+
+    What was being written when the program was killed is the last line, whose checksum then does
+    not fit; it is cut off. Lines that are damaged elsewhere are left out, and their episodes driven
+    again.
+
+    Args:
+        path: of the file; it is made where it is not there.
+
+    Raises:
+        ValueError: a file of another kind, or too large.
+        OSError: it cannot be read or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.rows: dict[str, dict[str, Any]] = {}
+        self._path = path
+        self._file: IO[bytes] | None = None
+        self._end = self._read() if path.exists() else 0
+
+    def __enter__(self) -> Self:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = self._path.open("ab")
+        self._file.truncate(self._end)
+        if self._end == 0:
+            self._write(FORMAT.encode() + b"\n")
+        return self
+
+    def __exit__(
+        self,
+        _kind: type[BaseException] | None,
+        _error: BaseException | None,
+        _trace: TracebackType | None,
+    ) -> None:
+        assert self._file is not None
+        self._file.close()
+        self._file = None
+
+    def add(self, key: str, row: Mapping[str, Any]) -> None:
+        """Keep a row: once this returns, no kill of the program loses it."""
+        # Numbers are written as the shortest text that reads back as the same bits.
+        text = f"{key} {json.dumps(dict(row), separators=(',', ':'))}".encode()
+        self._write(b"%08x %s\n" % (zlib.crc32(text), text))
+        self.rows[key] = dict(row)
+
+    def _write(self, line: bytes) -> None:
+        assert self._file is not None
+        self._file.write(line)
+        self._file.flush()
+        os.fdatasync(self._file.fileno())
+
+    def _read(self) -> int:
+        """Take in all whole lines; where the last of them ends."""
+        if (size := self._path.stat().st_size) > MOST_BYTES:
+            raise ValueError(f"{self._path} has {size} bytes; at most {MOST_BYTES} are read")
+        end = 0
+        with self._path.open("rb") as file:
+            first = file.readline(MOST_LINE)
+            if not first.endswith(b"\n"):
+                if not (FORMAT.encode() + b"\n").startswith(first):
+                    raise ValueError(f"{self._path} is no journal of episodes")
+                return 0
+            if first.rstrip(b"\n") != FORMAT.encode():
+                raise ValueError(f"{self._path} is no journal of episodes of this version")
+            end = file.tell()
+            while (line := file.readline(MOST_LINE)).endswith(b"\n"):
+                end = file.tell()
+                if (found := _row(line)) is not None:
+                    self.rows[found[0]] = found[1]
+        return end
+
+
+def _row(line: bytes) -> tuple[str, dict[str, Any]] | None:
+    checksum, _, text = line.rstrip(b"\n").partition(b" ")
+    try:
+        if int(checksum, 16) != zlib.crc32(text):
+            return None
+        key, _, fields = text.decode().partition(" ")
+        row = json.loads(fields)
+    except (ValueError, RecursionError):
+        return None
+    return (key, row) if isinstance(row, dict) else None
+
+
+# --- Table ---------------------------------------------------------------------------------------
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, type]) -> None:
+    """Write rows, whole or not at all; equal rows are equal bytes.
+
+    Args:
+        path: of the file.
+        rows: in their order.
+        types: of the columns, in their order: ``bool``, ``int``, ``float`` or ``str``.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    known: dict[type, pa.DataType] = {
+        bool: pa.bool_(),
+        int: pa.int64(),
+        float: pa.float64(),
+        str: pa.string(),
+    }
+    schema = pa.schema([(name, known[kind]) for name, kind in types.items()])
+    columns = [
+        pa.array([_as(kind, row.get(name)) for row in rows], known[kind])
+        for name, kind in types.items()
+    ]
+    table = pa.Table.from_arrays(columns, schema=schema)
+    with atomic_file(path) as file:
+        pq.write_table(table, file, compression="zstd")
+
+
+def _as(kind: type, value: Any) -> Any:
+    return None if value is None else kind(value)
+
+
+# --- Worker --------------------------------------------------------------------------------------
+
+Row = dict[str, Any]
+"""Columns of one episode: numbers, text, truth values, None for what is not known."""
+
+COLUMNS: Mapping[str, type] = {
+    "reason": str,
+    "error": str,
+    "steps": int,
+    "seconds": float,
+    "distance": float,
+    "collisions": int,
+    "at_fault": int,
+    "off_road": bool,
+    "criticality": float,
+    "min_gap": float,
+    "min_margin": float,
+    "min_ttc": float,
+    "impact_speed": float,
+    "impact_side": str,
+    "impact_object": str,
+    "impact_kind": str,
+}
+"""What is measured of every episode; wall-clock times are not, so that tables can be compared."""
+
+
+def recipe_of(scene: str, scenes: Path | None, metrics: Sequence[str] = ()) -> Recipe:
+    """Makes workers for a scene; see :func:`~.scenes.open_scene`."""
+    return partial(EpisodeWorker, scene, scenes, tuple(metrics))
+
+
+class EpisodeWorker:
+    """Holds a scene.
+
+    Args:
+        scene, scenes: as :func:`~.scenes.open_scene` takes them.
+        metrics: scores that get columns.
+        threads: that it computes with.
+    """
+
+    def __init__(
+        self, scene: str, scenes: Path | None, metrics: Sequence[str], threads: int
+    ) -> None:
+        import numba
+        import torch
+
+        numba.set_num_threads(min(threads, numba.get_num_threads()))
+        torch.set_num_threads(threads)
+        warm_up()
+        self._scene = open_scene(scene, scenes)
+        self._metrics = metrics
+
+    def make(self, task: Drive) -> Row:
+        """The row of an episode."""
+        driven = drive_episode(self._scene, task, load_planner(task.planner))
+        return row_of(driven, self._metrics)
+
+
+def row_of(driven: Driven, metrics: Sequence[str] = ()) -> Row:
+    """Columns of an episode that was driven, and the scores that are asked for."""
+    row: Row = dict.fromkeys(COLUMNS)
+    row |= {f"score_{name}": None for name in metrics}
+    row["error"] = driven.error
+    if (world := driven.world) is None:
+        return row | {"reason": "refused"}
+    last = world.accumulator
+    scores = {s.name: s.value for s in world.scores()} if metrics else {}
+    return row | {
+        "reason": "planner failed" if driven.error else world.reason or "over",
+        "steps": world.steps,
+        "seconds": world.steps * world.context.dt,
+        "distance": last.distance,
+        "collisions": last.collisions,
+        "at_fault": sum(last.at_fault.values()),
+        "off_road": last.off_road,
+        "criticality": driven.criticality,
+        "min_gap": _finite(driven.danger.gap),
+        "min_margin": driven.danger.margin,
+        "min_ttc": _finite(last.min_ttc),
+        **_impact(driven),
+        **{f"score_{name}": scores.get(name) for name in metrics},
+    }
+
+
+def _impact(driven: Driven) -> Row:
+    """Of the first contact, where the episode ended with it."""
+    assert driven.world is not None
+    begun = [c for c in driven.world.instant.contacts if c.begun]
+    if not begun:
+        return {"impact_speed": driven.world.accumulator.first_impact}
+    first = min(begun, key=lambda c: (c.since, c.object_id or ""))
+    return {
+        "impact_speed": first.relative_speed,
+        "impact_side": first.side,
+        "impact_object": first.object_id,
+        "impact_kind": first.category,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
 
 JOURNAL, TABLE = "episodes.journal", "episodes.parquet"
 RECORDINGS, SCENARIOS = "recordings", "scenarios"

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from real2sim_proto.semantics import GROUND, STATIC
 
 from ..edit import ScenarioState
-from ..edit.compose import compose
-from ..edit.sweep import met_background, met_object, sweep_of
+from ..edit.compose import compose, met_background, met_object, sweep_of
 from ..geometry.rotation import Float, quaternion_to_matrix
 from ..geometry.transform import invert_transform
 from ..render.cast.detect import Sweep, detect

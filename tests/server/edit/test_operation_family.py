@@ -34,12 +34,7 @@ from real2sim_proto.operations import (
 )
 from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import EditError, ScenarioState, apply_operations
-from real2sim_server.edit.operation import (
-    APPLY,
-    AppliedOperation,
-    object_changed,
-    object_operation,
-)
+from real2sim_server.edit.motion import APPLY, AppliedOperation, object_changed, object_operation
 from real2sim_server.scene import Trajectory
 
 POSE = Pose(position=(3.0, 1.0, 0.8))

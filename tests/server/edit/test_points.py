@@ -8,7 +8,7 @@ from real2sim_proto.operations import Translate
 from real2sim_proto.semantics import GROUND, SEMANTIC_CLASSES
 from real2sim_server.cli import export as command
 from real2sim_server.edit import ScenarioState, apply_operations
-from real2sim_server.edit.points import ROW, ply_of_points, points_at
+from real2sim_server.edit.compose import ROW, ply_of_points, points_at
 from real2sim_server.scene.io import save_scene
 from real2sim_server.scene.io.ply import read_ply_elements
 

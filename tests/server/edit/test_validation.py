@@ -108,7 +108,7 @@ def test_in_a_large_scenario_no_trajectory_is_sampled_again_for_each_edit(state,
         sampled.append(trajectory)
         return sample(trajectory, times)
 
-    monkeypatch.setattr("real2sim_server.edit.validation.sample", counted)
+    monkeypatch.setattr("real2sim_server.edit.apply.sample", counted)
     apply_operations(crowded, [Duplicate(object_id="parked", new_id="one_more", x=0.02)])
 
     assert len(sampled) <= 1

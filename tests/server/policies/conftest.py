@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from real2sim_server.policies.episodes import EpisodeResult, run_episodes
-from real2sim_server.policies.planner_process import WorkerTarget
+from real2sim_server.policies.episodes import EpisodeResult, WorkerTarget, run_episodes
 from real2sim_server.policies.suite import Case, EpisodeGrid
 from real2sim_server.scene import Scene
 from real2sim_server.scene.io import save_scene

@@ -13,11 +13,12 @@ from real2sim.planners.learned import PolicyShape, network, shrink
 from real2sim_server.console import CommandError
 from real2sim_server.policies.cloning import (
     CloningDataset,
+    PosedImage,
     build_dataset,
     expert_poses,
+    scene_images,
     train_network,
 )
-from real2sim_server.policies.posed_images import PosedImage, scene_images
 from real2sim_server.scene.io import save_scene
 
 SHAPE = PolicyShape(camera="front", width=32, height=24, poses=2, spacing=0.5)

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 import real2sim
 from real2sim.cli import build_app
-from real2sim_server.policies.page import render_page
-from real2sim_server.policies.summary import (
+from real2sim_server.policies.page import (
     group_scores,
+    render_page,
     report_figures,
     unconfirmed_scores,
 )

@@ -15,7 +15,7 @@ from real2sim_server.datasets.export import export_dataset
 from real2sim_server.datasets.perturbed import Perturbation
 from real2sim_server.datasets.plan import ExportPlan
 from real2sim_server.edit import ScenarioState
-from real2sim_server.policies.exported import exported_examples, exported_shape
+from real2sim_server.policies.cloning import exported_examples, exported_shape
 
 SHAPE = PolicyShape(camera="front", width=32, height=24, poses=2, spacing=0.5)
 PLAN = ExportPlan(

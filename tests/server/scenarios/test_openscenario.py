@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from real2sim_server.scenarios.errors import ScenarioError
+from real2sim_server.scenarios import ScenarioError
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.scenarios.openscenario import (
     ReadOptions,

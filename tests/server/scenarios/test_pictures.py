@@ -6,8 +6,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from real2sim_server.scenarios.gallery import GALLERY
-from real2sim_server.scenarios.gallery.pictures import shipped
+from real2sim_server.scenarios.gallery import GALLERY, shipped_picture
 from real2sim_server.scenarios.picture import EGO, picture_of, plain_scene
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -21,11 +20,11 @@ def scene():
 @pytest.mark.parametrize("name", GALLERY)
 def test_the_picture_that_is_shipped_is_that_of_the_case(scene, name):
     """Made anew by ``python -m real2sim_server.scenarios.picture``."""
-    assert shipped(name).decode() == picture_of(GALLERY[name], scene)
+    assert shipped_picture(name).decode() == picture_of(GALLERY[name], scene)
 
 
 def test_a_picture_shows_the_title_and_everybody_at_start_and_end():
-    root = ET.fromstring(shipped("cut_out"))
+    root = ET.fromstring(shipped_picture("cut_out"))
     assert root.find(f"{SVG}title").text == GALLERY["cut_out"].title
     colours = [box.get("fill") for box in root.iter(f"{SVG}polygon")]
     assert len(colours) == 6

@@ -8,8 +8,7 @@ import pytest
 
 from real2sim.planners import Needs, load_planner
 from real2sim_server.scene import CameraRig, Scene
-from real2sim_server.sweeps.episode import Drive, begin, observation_of
-from real2sim_server.sweeps.pictures import CameraFeed, draw_frames
+from real2sim_server.sweeps.episode import CameraFeed, Drive, begin, draw_frames, observation_of
 
 
 @pytest.fixture(scope="module")

@@ -16,14 +16,31 @@ from real2sim_server.policies.suite import Case
 from real2sim_server.scene.io import load_scene
 from real2sim_server.sweeps.criticality import Danger, adversaries_of
 from real2sim_server.sweeps.episode import Drive, begin, drive_episode
-from real2sim_server.sweeps.search.archive import Archive
-from real2sim_server.sweeps.search.evaluation import Evaluation, Evaluator
-from real2sim_server.sweeps.search.gaussian_process import GaussianProcess
-from real2sim_server.sweeps.search.optimise import SearchBudget, random_search, search
-from real2sim_server.sweeps.search.reference import SIDEWAYS, drive_reference, manoeuvres, plan_of
-from real2sim_server.sweeps.search.run import FAILURES, PAGE, SearchOptions, run_search
-from real2sim_server.sweeps.search.shrink import boundaries
-from real2sim_server.sweeps.search.statistics import sobol_indices, splitting, wilson
+from real2sim_server.sweeps.search.evaluation import (
+    SIDEWAYS,
+    Evaluation,
+    Evaluator,
+    drive_reference,
+    manoeuvres,
+    plan_of,
+)
+from real2sim_server.sweeps.search.failure import boundaries
+from real2sim_server.sweeps.search.optimise import (
+    Archive,
+    GaussianProcess,
+    SearchBudget,
+    random_search,
+    search,
+)
+from real2sim_server.sweeps.search.run import (
+    FAILURES,
+    PAGE,
+    SearchOptions,
+    run_search,
+    sobol_indices,
+    splitting,
+    wilson,
+)
 from real2sim_server.sweeps.spec import SHIPPED_SPACES, Space, load_space
 from real2sim_server.world.recording.recording import first_difference, load_recording
 

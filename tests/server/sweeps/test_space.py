@@ -12,9 +12,16 @@ from pydantic import ValidationError
 
 from real2sim_proto.sweeps import GridMethod, ImportanceBump, ImportanceMethod, SpreadMethod
 from real2sim_server.console import CommandError
-from real2sim_server.sweeps.expression import evaluate, names_in
-from real2sim_server.sweeps.parameters import Choice, FloatRange, IntRange, Normal, values_at
-from real2sim_server.sweeps.sampling import points_of
+from real2sim_server.sweeps.parameters import (
+    Choice,
+    FloatRange,
+    IntRange,
+    Normal,
+    evaluate,
+    names_in,
+    points_of,
+    values_at,
+)
 from real2sim_server.sweeps.spec import Space, load_space, load_sweep
 
 units = st.floats(0.0, 1.0)

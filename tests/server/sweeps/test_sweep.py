@@ -23,9 +23,8 @@ from real2sim.cli import build_app
 from real2sim_server.console import CommandError
 from real2sim_server.executors import Executor, InProcess, executor_of
 from real2sim_server.sweeps import load_sweep, run_sweep
-from real2sim_server.sweeps.gaps import signed_gaps
-from real2sim_server.sweeps.journal import FORMAT, Journal
-from real2sim_server.sweeps.sweep import JOURNAL, RECORDINGS, TABLE
+from real2sim_server.sweeps.criticality import signed_gaps
+from real2sim_server.sweeps.sweep import FORMAT, JOURNAL, RECORDINGS, TABLE, Journal
 from real2sim_server.world.recording.recording import first_difference, load_recording
 
 SWEEP = {
@@ -239,7 +238,7 @@ def test_an_actor_killed_in_a_sweep_costs_one_episode_and_changes_no_byte(
 KILLED_AFTER_THREE = """
 import os, signal
 from real2sim.cli import main
-from real2sim_server.sweeps.journal import Journal
+from real2sim_server.sweeps.sweep import Journal
 add = Journal.add
 def add_and_die(self, key, row):
     add(self, key, row)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from real2sim_proto.operations import Translate
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
-from real2sim_server.edit import track_kernels
+from real2sim_server.edit import tracks
 from real2sim_server.geometry import box_kernels
 from real2sim_server.geometry.box import box_penetration
 from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
@@ -391,7 +391,7 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
     modules = (
         entries,
         box_kernels,
-        track_kernels,
+        tracks,
         path,
         broad_phase_kernels,
         road,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,15 +13,204 @@ from pydantic import ValidationError
 
 from real2sim_proto.storyboard import Storyboard
 
-from ..errors import ScenarioError
-from .catalogs import Catalogs
-from .distributions import read_distributions
-from .elements import Part, RawElement, Scope, read_elements, unread
-from .names import PEDESTRIANS, PRIORITIES, VEHICLES
-from .parameters import scoped, top_level
+from .. import ScenarioError
+from .elements import (
+    PEDESTRIANS,
+    PRIORITIES,
+    VEHICLES,
+    Part,
+    RawElement,
+    Scope,
+    declared,
+    read_elements,
+    scoped,
+    top_level,
+    unread,
+)
 from .read_actions import Actions
-from .read_conditions import Conditions, plain_value
-from .read_positions import Fields, Positions
+from .read_conditions import Conditions, Fields, Positions, plain_value
+
+# --- Catalogs ------------------------------------------------------------------------------------
+
+KINDS = {
+    "VehicleCatalog": "Vehicle",
+    "PedestrianCatalog": "Pedestrian",
+    "MiscObjectCatalog": "MiscObject",
+    "ControllerCatalog": "Controller",
+    "EnvironmentCatalog": "Environment",
+    "ManeuverCatalog": "Maneuver",
+    "TrajectoryCatalog": "Trajectory",
+    "RouteCatalog": "Route",
+}
+MAX_FILES = 1000
+
+
+class Catalogs:
+    """Entries by catalog and name, of the folders that a scenario names.
+
+    Args:
+        folder: of the scenario; nothing outside of the folders that it names is read.
+        leave_out: see :func:`.elements.read_elements`.
+    """
+
+    def __init__(self, folder: Path | None, leave_out: frozenset[str]) -> None:
+        self._folder, self._leave_out = folder, leave_out
+        self._entries: dict[tuple[str, str, str], tuple[RawElement, str]] = {}
+        self.used: list[tuple[RawElement, str]] = []
+
+    def read(self, part: Part) -> None:
+        """The files of ``CatalogLocations``. Raises ScenarioError."""
+        for location in part.children():
+            if location.tag not in KINDS:
+                raise location.refused(KINDS)
+            path = location.child("Directory").text("path")
+            for file in self._files(location, path):
+                self._read_file(file)
+
+    def entry(self, part: Part, kind: str) -> Part:
+        """The entry that a ``CatalogReference`` names, with its parameters assigned."""
+        catalog, name = part.text("catalogName"), part.text("entryName")
+        found = self._entries.get((kind, catalog, name))
+        if found is None:
+            # Some files name the catalog's kind or file instead.
+            by_name = [v for (k, _, n), v in self._entries.items() if (k, n) == (kind, name)]
+            found = by_name[0] if len(by_name) == 1 else None
+        if found is None:
+            known = sorted(f"{c}/{n}" for k, c, n in self._entries if k == kind)
+            there = ", ".join(known) or "none"
+            raise part.error(f"no catalog has the {kind} {catalog}/{name}; there are: {there}")
+        raw, file = found
+        self.used.append(found)
+        raw.is_read = True
+        assigned = part.find("ParameterAssignments")
+        given = {
+            a.text("parameterRef"): a.raw.attributes["value"]
+            for a in (assigned.children("ParameterAssignment") if assigned is not None else [])
+            if a.text("value") is not None
+        }
+        texts = {name: part.scope.expression(text) for name, text in given.items()}
+        values = {name: part.scope.value(text) for name, text in given.items()}
+        entry = Part(raw, file, Scope({}, {}))
+        return entry.within(declared(entry.find("ParameterDeclarations"), texts, values))
+
+    def _files(self, part: Part, path: str) -> list[Path]:
+        if self._folder is None:
+            raise part.error(f"catalogs in {path!r} cannot be read: the file came alone")
+        folder = (self._folder / path).resolve()
+        if not folder.is_dir():
+            raise part.error(f"there is no folder {path!r} of catalogs beside the scenario")
+        files = sorted(folder.glob("*.xosc"))
+        if len(files) > MAX_FILES:
+            raise part.error(f"folder {path!r} holds more than {MAX_FILES} catalogs")
+        return files
+
+    def _read_file(self, file: Path) -> None:
+        try:
+            root = read_elements(file.read_bytes(), file.name, self._leave_out)
+        except OSError as error:
+            raise ScenarioError(f"{file.name}: cannot be read ({error.strerror})") from error
+        for catalog in (c for c in root.children if c.tag == "Catalog"):
+            name = catalog.attributes.get("name", "")
+            for raw in catalog.children:
+                entry = raw.attributes.get("name", "")
+                self._entries.setdefault((raw.tag, name, entry), (raw, file.name))
+
+
+# --- Distributions -------------------------------------------------------------------------------
+
+MAX_CASES = 1_000_000
+
+
+def read_distributions(part: Part) -> tuple[list[dict[str, Any]], Fields]:
+    """Values of parameters of each case of the deterministic distributions, their product; and the
+    stochastic ones by parameter.
+
+    Raises:
+        ScenarioError: a distribution that is not supported, or more than a million cases.
+    """
+    deterministic, stochastic = part.find("Deterministic"), part.find("Stochastic")
+    if deterministic is not None:
+        return _cases(deterministic), {}
+    if stochastic is None:
+        raise part.error("<ParameterValueDistribution> needs <Deterministic> or <Stochastic>")
+    stochastic.optional("numberOfTestRuns")
+    stochastic.optional("randomSeed")
+    return [], {
+        d.text("parameterName"): _drawn(d) for d in stochastic.children("StochasticDistribution")
+    }
+
+
+def _cases(part: Part) -> list[dict[str, Any]]:
+    axes: list[list[dict[str, Any]]] = []
+    for each in part.children():
+        if each.tag == "DeterministicSingleParameterDistribution":
+            name = each.text("parameterName")
+            axes.append([{name: value} for value in _values(each)])
+        elif each.tag == "DeterministicMultiParameterDistribution":
+            sets = each.child("ValueSetDistribution").children("ParameterValueSet")
+            axes.append(
+                [
+                    {
+                        a.text("parameterRef"): plain_value(a.text("value"))
+                        for a in s.children("ParameterAssignment")
+                    }
+                    for s in sets
+                ]
+            )
+        else:
+            raise each.refused(("DeterministicSingleParameterDistribution",))
+    if math.prod(len(axis) for axis in axes) > MAX_CASES:
+        raise part.error(f"its distributions have more than {MAX_CASES} cases")
+    return [
+        {name: value for values in case for name, value in values.items()}
+        for case in itertools.product(*axes)
+    ]
+
+
+def _values(part: Part) -> list[Any]:
+    found = part.only({"DistributionSet", "DistributionRange"})
+    if found.tag == "DistributionSet":
+        return [plain_value(e.text("value")) for e in found.children("Element")]
+    step, limits = float(found.number("stepWidth")), found.child("Range")
+    low, high = float(limits.number("lowerLimit")), float(limits.number("upperLimit"))
+    if not step > 0 or (high - low) / step > MAX_CASES:
+        raise found.error(f"a range from {low} to {high} in steps of {step} has too many values")
+    return [low + k * step for k in range(math.floor((high - low) / step + 1e-9) + 1)]
+
+
+def _drawn(part: Part) -> Fields:
+    kinds = {
+        "UniformDistribution", "NormalDistribution", "LogNormalDistribution",
+        "PoissonDistribution", "ProbabilityDistributionSet", "Histogram",
+    }  # fmt: skip
+    found = part.only(kinds)
+    if found.tag == "ProbabilityDistributionSet":
+        values = [
+            {"value": plain_value(e.text("value")), "weight": e.number("weight")}
+            for e in found.children("Element")
+        ]
+        return {"kind": "choice", "values": values}
+    if found.tag == "Histogram":
+        bins = [{**_range(b), "weight": b.number("weight")} for b in found.children("Bin")]
+        return {"kind": "histogram", "bins": bins}
+    limits = _range(found) if found.find("Range") is not None else {}
+    if found.tag == "UniformDistribution":
+        return {"kind": "uniform", **limits}
+    if found.tag == "PoissonDistribution":
+        return {"kind": "poisson", "mean": found.number("expectedValue"), **limits}
+    return {
+        "kind": "normal",
+        "mean": found.number("expectedValue"),
+        "variance": found.number("variance"),
+        "log": found.tag == "LogNormalDistribution",
+        **limits,
+    }
+
+
+def _range(part: Part) -> Fields:
+    limits = part.child("Range")
+    return {"low": limits.number("lowerLimit"), "high": limits.number("upperLimit")}
+
 
 EGO_NAMES = frozenset({"ego", "hero", "egovehicle", "ego_vehicle", "vut", "sut"})
 """Names of entities that are the ego, in lower case, where nobody says which it is."""

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from .elements import Part
-from .names import DIMENSIONS, FRAMES, PLACES, SHAPES, SIDES
-from .read_conditions import plain_value
-from .read_positions import Fields, Positions
+from .elements import DIMENSIONS, FRAMES, PLACES, SHAPES, SIDES, Part
+from .read_conditions import Fields, Positions, plain_value
 
 MODES = {"position": "position", "follow": "follow"}
 """Trajectories and dynamics are followed exactly in both: 'follow' only allows to deviate."""

@@ -8,8 +8,8 @@ from typing import Any
 
 from real2sim_proto.storyboard import MapRoads, Storyboard
 
-from ..errors import ScenarioError
-from .names import (
+from .. import ScenarioError
+from .elements import (
     DIMENSIONS,
     EDGES,
     ELEMENTS,

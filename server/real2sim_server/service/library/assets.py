@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from real2sim_proto import ErrorCode
 from real2sim_proto.assets import AssetInfo, AssetUpload
 
-from ...edit.lighting import Colour, ambient_colour, relighting_gain, relit
-from ...edit.shadow import contact_shadow
+from ...edit.appearance import Colour, ambient_colour, contact_shadow, relighting_gain, relit
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize

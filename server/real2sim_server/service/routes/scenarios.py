@@ -32,11 +32,10 @@ from real2sim_proto.scenarios import (
 )
 from real2sim_proto.storyboard import Storyboard
 
-from ...edit.points import Part, ply_of_points, points_at
-from ...scenarios.errors import ScenarioError
+from ...edit.compose import Part, ply_of_points, points_at
+from ...scenarios import ScenarioError
 from ...scenarios.fit import fitted_to_scene
 from ...scenarios.gallery import GALLERY, corner_case
-from ...scenarios.gallery.pictures import shipped
 from ...scenarios.openscenario import ReadOptions, read_openscenario_text, write_openscenario
 from ..http.auth import TokenRoute
 from ..http.idempotency import IdempotencyKey, IdempotentRequest
@@ -414,7 +413,7 @@ async def picture(case: Identifier) -> Response:
             f"the gallery has no {case!r}",
             hint=f"GET /v1/gallery lists them: {', '.join(GALLERY)}",
         )
-    content = await asyncio.to_thread(shipped, case)
+    content = await asyncio.to_thread(shipped_picture, case)
     headers = {"Cache-Control": "private, max-age=3600"}
     return Response(content, media_type=SVG, headers=headers)
 

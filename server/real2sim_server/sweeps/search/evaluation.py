@@ -1,4 +1,4 @@
-"""What a point of a space is worth to a search: how critical it is where it could be avoided."""
+"""The value of a point of a space to a search: how critical it is, and whether it is avoidable."""
 
 from __future__ import annotations
 
@@ -11,15 +11,327 @@ import numpy as np
 from numpy.typing import NDArray
 
 from real2sim.planners import Needs, load_planner
+from real2sim_proto.plans import TrajectoryPlan
 
 from ...scene import Scene
 from ...world import World
-from ..criticality import adversaries_of
+from ..criticality import adversaries_of, signed_gaps
 from ..episode import OPERATIONS, Drive, Driven, begin, drive_episode
 from ..parameters import Value, drawn_parameters, values_at
 from ..spec import Space
-from .realism import Manners, Watch
-from .reference import Drove, drive_reference
+
+# --- Reference driver ----------------------------------------------------------------------------
+
+# It knows the future and tries manoeuvres in copies of the world, in which everybody else acts as
+# they will. What it avoids was avoidable.
+
+CRUISE = 8.0
+"""Speed that it drives at where nothing hinders it, unless it begins faster [m/s]."""
+HORIZON, SPACING = 4.0, 0.2
+"""Of a manoeuvre that is tried, and between poses of its plan [s]."""
+DECIDES_EVERY = 0.3
+"""Seconds after which it looks for another manoeuvre."""
+SIDEWAYS = 5.0
+"""Acceleration of a swerve [m/s^2]; with the hardest braking beside it 7.1 of the 8.8 that tyres on
+dry asphalt give."""
+KEEPS_FREE = 0.2
+"""To everybody, or what there was at the start where that was less [m]."""
+LEAST_TIME = 1.0
+"""To a collision at constant velocities when a manoeuvre ends [s]."""
+
+
+@dataclass(frozen=True)
+class Manoeuvre:
+    """Something to try.
+
+    Attributes:
+        aside: where beside the route it ends, positive on the left [m].
+        acceleration: along the route until standstill or ``most`` [m/s^2].
+        most: speed [m/s].
+    """
+
+    aside: float
+    acceleration: float
+    most: float
+
+    @property
+    def effort(self) -> float:
+        """By which the milder of two is taken."""
+        return abs(self.acceleration) + abs(self.aside)
+
+
+@dataclass(frozen=True)
+class Drove:
+    """How the reference drove.
+
+    Attributes:
+        survived: without contact, on the road, with room to spare.
+        gap: smallest to anybody [m].
+        effort: hardest acceleration that it asked for [m/s^2].
+        steps: that it took.
+        world: at the end.
+    """
+
+    survived: bool
+    gap: float
+    effort: float
+    steps: int
+    world: World
+
+
+def manoeuvres(most: float) -> list[Manoeuvre]:
+    """All of them, mildest first."""
+    found = [Manoeuvre(0.0, 1.5, most)]
+    found += [Manoeuvre(0.0, a, most) for a in (-1.5, -3.0, -5.0, -8.0)]
+    found += [
+        Manoeuvre(side * aside, a, most)
+        for aside in (1.0, 2.0, 3.3)
+        for side in (1.0, -1.0)
+        for a in (1.5, 0.0, -2.5, -5.0)
+    ]
+    found += [Manoeuvre(0.0, 3.0, most + 4.0), Manoeuvre(0.0, 0.0, most)]
+    return [found[0], *sorted(found[1:], key=lambda m: m.effort)]
+
+
+def drive_reference(world: World) -> Drove:
+    """Drive a world to its end; it is changed.
+
+    Args:
+        world: of plans as trajectories, at any instant.
+    """
+    start, free = world.steps, gap_now(world)
+    most = max(CRUISE, world.motion.speed)
+    tried = manoeuvres(most)
+    wanted = min(KEEPS_FREE, 0.5 * max(free, 0.0))
+    smallest, effort, since, chosen = free, 0.0, math.inf, tried[0]
+    plan: TrajectoryPlan | None = None
+    was_off = world.accumulator.off_road
+    while not world.over:
+        if since >= DECIDES_EVERY - 1e-9:
+            chosen = _chosen(world, tried, chosen, wanted)
+            plan, since = plan_of(world, chosen), 0.0
+            effort = max(effort, abs(chosen.acceleration), SIDEWAYS if chosen.aside else 0.0)
+        world.step(plan)
+        plan = None
+        since += world.context.dt
+        smallest = min(smallest, gap_now(world))
+    last = world.accumulator
+    survived = not last.collisions and smallest >= wanted and (was_off or not last.off_road)
+    return Drove(survived, smallest, effort, world.steps - start, world)
+
+
+def plan_of(world: World, manoeuvre: Manoeuvre) -> TrajectoryPlan:
+    """Poses of a manoeuvre from here on, along the route and beside it."""
+    route, motion, point = world.route, world.motion, world.path_point
+    shift = manoeuvre.aside - point.offset
+    # A quintic change of lanes has 5.77 d / T^2 at most.
+    change = max(math.sqrt(5.7735 * abs(shift) / SIDEWAYS), 1.0)
+    poses, times = [], []
+    s, speed, yaw = point.s, max(motion.speed, 0.0), motion.yaw
+    before = (motion.x, motion.y)
+    dt = SPACING / 4
+    for k in range(1, round(HORIZON / SPACING) + 1):
+        for _ in range(4):
+            limit = manoeuvre.most if manoeuvre.acceleration > 0 else max(manoeuvre.most, speed)
+            after = min(max(speed + manoeuvre.acceleration * dt, 0.0), max(limit, speed - 2.0 * dt))
+            s, speed = s + 0.5 * (speed + after) * dt, after
+        u = min(k * SPACING / change, 1.0)
+        # One that hardly moves cannot move aside.
+        offset = point.offset + shift * (u * u * u * (10 - 15 * u + 6 * u * u))
+        x, y, _, heading = route.at(s)
+        x, y = x - offset * math.sin(heading), y + offset * math.cos(heading)
+        dx, dy = x - before[0], y - before[1]
+        if speed > 0.2 and math.hypot(dx, dy) > 0.02:
+            yaw, before = math.atan2(dy, dx), (x, y)
+        else:
+            x, y = before
+        poses.append((x, y, yaw))
+        times.append(world.t_us + round(k * SPACING * 1e6))
+    return TrajectoryPlan(times_us=times, poses=poses, frame="world")
+
+
+def gap_now(world: World) -> float:
+    """Smallest from the ego's box to another's [m]; infinite where there is nobody."""
+    instant, context = world.instant, world.context
+    ego, others = instant.ego, instant.others
+    if not others.ids:
+        return math.inf
+    ahead = context.centre_ahead
+    x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
+    length, width, _ = context.ego_size
+    box = (x, y, ego.yaw, length, width)
+    return float(np.min(signed_gaps(box, others.centres, others.yaws, others.sizes)))
+
+
+def _chosen(
+    world: World, tried: Sequence[Manoeuvre], before: Manoeuvre, wanted: float
+) -> Manoeuvre:
+    """The mildest that ends well, the one under way before others; else the one that goes well for
+    longest."""
+    best, best_end = tried[0], (-math.inf, -math.inf)
+    # From the mild one at first, then what is under way, so that it does not dither.
+    for manoeuvre in dict.fromkeys([tried[0], before, *tried]):
+        end = _end(world, manoeuvre, wanted)
+        if end[0] == math.inf:
+            return manoeuvre
+        if end > best_end:
+            best, best_end = manoeuvre, end
+    return best
+
+
+def _end(world: World, manoeuvre: Manoeuvre, wanted: float) -> tuple[float, float]:
+    """How long a manoeuvre goes well [s], infinite where that is to its end; and its smallest
+    gap."""
+    copy, plan = world.fork(), plan_of(world, manoeuvre)
+    was_off, smallest = copy.accumulator.off_road, math.inf
+    for step in range(round(HORIZON / copy.context.dt)):
+        if copy.over:
+            break
+        copy.step(plan if step == 0 else None)
+        smallest = min(smallest, gap_now(copy))
+        left = copy.accumulator.off_road and not was_off
+        if copy.accumulator.collisions or left or smallest < wanted:
+            return step * copy.context.dt, smallest
+    near = not copy.over and copy.accumulator.ttc < LEAST_TIME
+    return (HORIZON if near else math.inf), smallest
+
+
+# --- Realism -------------------------------------------------------------------------------------
+
+# Subtracted from the criticality of cases that people hardly drive.
+
+Array = NDArray[np.float64]
+
+HARDEST, SIDEWAYS_LIMIT, JERK = 8.0, 4.0, 20.0
+"""Accelerations [m/s^2] along and across, and jerk [m/s^3], that people reach in emergencies."""
+TIGHTEST = 0.2
+"""Curvature of the way of a vehicle, whatever its speed [1/m]: none turns within 5 m."""
+START_GAP = 1.0
+"""Free around the ego when the episode begins [m]."""
+FEWEST_DRIVERS = 5
+"""A log with fewer that move says nothing about how people drive there."""
+LEAST_SPREAD = np.array([1.0, 0.5, 0.5])
+"""Standard deviations are at least these: speed [m/s], accelerations [m/s^2]."""
+ORDINARY = 3.0
+"""Standard deviations within which nothing is subtracted."""
+
+
+@dataclass(frozen=True)
+class Manners:
+    """How those who moved in the log did: mean and spread of speed and accelerations.
+
+    Attributes:
+        mean, spread: [3] each; None where too few moved.
+    """
+
+    mean: Array | None
+    spread: Array | None
+
+    @classmethod
+    def of(cls, scene: Scene) -> Manners:
+        """Those of the objects of a scene, and of its recording vehicle."""
+        tracks = [o.trajectory for o in scene.objects.values()] + [scene.ego]
+        rows = []
+        for track in tracks:
+            times = np.asarray(track.times_us, np.float64) * 1e-6
+            if len(times) < 4 or times[-1] - times[0] < 1.0:
+                continue
+            even = np.arange(times[0], times[-1], 0.2)
+            places = np.asarray(track.positions)[:, :2]
+            points = np.stack([np.interp(even, times, places[:, k]) for k in (0, 1)], axis=1)
+            motion = _motion(points, 0.2)
+            if len(motion) and motion[:, 0].max() > 1.0:
+                rows.append(_features(motion))
+        if len(rows) < FEWEST_DRIVERS:
+            return cls(None, None)
+        found = np.array(rows)
+        return cls(found.mean(axis=0), np.maximum(found.std(axis=0), LEAST_SPREAD))
+
+    def distance(self, features: Array) -> float:
+        """Mahalanobis distance beyond what is ordinary; 0 where the log says nothing."""
+        if self.mean is None or self.spread is None:
+            return 0.0
+        z = (features - self.mean) / self.spread
+        return max(float(np.sqrt((z * z).mean())) - ORDINARY, 0.0)
+
+
+@dataclass
+class Watch:
+    """Follows those who make it hard, over an episode.
+
+    Attributes:
+        names: their objects.
+        manners: of the log.
+    """
+
+    names: frozenset[str]
+    manners: Manners
+    _tracks: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    _dt: float = 0.1
+    _start_gap: float = math.inf
+
+    def add(self, world: World) -> None:
+        """The instant that a world is at."""
+        if world.steps == 0:
+            self._start_gap, self._dt = gap_now(world), world.context.dt
+        others = world.instant.others
+        for k, name in enumerate(others.ids):
+            if name in self.names:
+                x, y = others.centres[k, :2].tolist()
+                self._tracks.setdefault(name, []).append((x, y))
+
+    def implausibility(self) -> float:
+        """0 for what people do, about 1 for what nobody does; none of it is forbidden, but nobody
+        learns from it."""
+        found = max(START_GAP - self._start_gap, 0.0) / START_GAP
+        for track in self._tracks.values():
+            motion = _motion(np.array(track), self._dt)
+            if not len(motion):
+                continue
+            speed = motion[:, 0]
+            moving = speed > 0.5
+            if not moving.any():
+                continue
+            along, across = np.abs(motion[moving, 1]), np.abs(motion[moving, 2])
+            jerk = np.abs(np.diff(motion[:, 1])) / self._dt
+            found += (
+                _beyond(along, HARDEST) + _beyond(across, SIDEWAYS_LIMIT) + _beyond(jerk, JERK) / 4
+            )
+            curvature = across / np.maximum(speed[moving], 0.5) ** 2
+            found += _beyond(curvature[speed[moving] > 1.0], TIGHTEST)
+            found += 0.2 * self.manners.distance(_features(motion))
+        return found
+
+
+def _motion(points: Array, dt: float) -> Array:
+    """[M, 3] speed [m/s], acceleration along and across [m/s^2], from places [N, 2] every dt."""
+    velocity = np.diff(points, axis=0) / dt
+    if len(velocity) < 3:
+        return np.zeros((0, 3))
+    # Smoothed over three instants: places are rounded, and drivers change at steps of the clock.
+    smooth = (velocity[:-2] + velocity[1:-1] + velocity[2:]) / 3
+    change = np.diff(smooth, axis=0) / dt
+    speed = np.hypot(smooth[:-1, 0], smooth[:-1, 1])
+    unit = smooth[:-1] / np.maximum(speed, 1e-6)[:, None]
+    along = (change * unit).sum(axis=1)
+    across = unit[:, 0] * change[:, 1] - unit[:, 1] * change[:, 0]
+    return np.stack([speed, along, across], axis=1)
+
+
+def _features(motion: Array) -> Array:
+    moving = motion[motion[:, 0] > 0.5]
+    if not len(moving):
+        return np.zeros(3)
+    hard = np.percentile(np.abs(moving[:, 1:]), 95, axis=0)
+    return np.concatenate([[moving[:, 0].mean()], hard])
+
+
+def _beyond(values: Array, most: float) -> float:
+    """By how much the nearly largest of values is beyond what people reach, as a share of it."""
+    if not len(values):
+        return 0.0
+    return max(float(np.percentile(values, 98)) / most - 1.0, 0.0)
+
 
 UNAVOIDABLE, REFUSED = -1.0, -200.0
 """Scores of a failure that the reference does not avoid, and of what cannot begin."""

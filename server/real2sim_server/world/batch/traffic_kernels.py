@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from ..._numba import func
-from ...edit.track_kernels import poses_at
+from ...edit.tracks import poses_at
 from ..broad_phase_kernels import heading
 from ..ego.box import REAR_OVERHANG
 from ..path import nearest_point, next_in_strip, point_at, sharpest_turn

@@ -11,8 +11,8 @@ import torch
 from real2sim_proto.base import Pose
 from real2sim_proto.operations import Delete, EraseRegion
 from real2sim_server.edit.apply import apply_operations
+from real2sim_server.edit.compose import sweep_of
 from real2sim_server.edit.state import ScenarioState
-from real2sim_server.edit.sweep import sweep_of
 from real2sim_server.render.cast import cast, detect, recorded_sweep, sensor_poses
 from real2sim_server.render.cast.files import ply_bytes, sweep_picture, write_sweep
 from real2sim_server.render.cast.recorded import transforms_at

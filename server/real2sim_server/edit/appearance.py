@@ -1,0 +1,279 @@
+"""What makes edits look right: ground under removed objects, contact shadows, lighting."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import cache, lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..geometry.box import bottom_centres
+from ..geometry.rotation import Float, yaw_quaternion
+from ..geometry.transform import invert_transform, transform_from
+from ..render.types import Instance
+from ..scene import UNSEEN, GaussianCloud, Ground, Scene
+from ..scene.spherical_harmonics import SH_C0
+from .state import ObjectState, ScenarioState
+
+PARKED = 0.5
+"""An object whose recorded places are all within this of each other is parked; tracks of objects
+that stand still waver by some decimetres [m]."""
+
+AWAY = 0.5
+"""An object this far from its parking place uncovers the ground there [m]."""
+
+MARGIN = 0.25
+"""Colours reach this far beyond a box [m]."""
+
+RIM = 1.2
+"""Ground up to this far beyond the box is taken for what is under it [m]."""
+
+LOW = 0.25
+"""The ground's Gaussians are less than this above or below the box's bottom [m]."""
+
+FEWEST = 6
+NEIGHBOURS = 48
+"""Of so many the middle colour counts, so that neither a line nor a shadow beside the box is drawn
+out into what was under it."""
+
+
+def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
+    """Ids of recorded objects that were parked and are not at their places.
+
+    Args:
+        state: knows what was recorded.
+        poses: ``T_world_object`` [4, 4] of all objects that exist, by id; where an edit or impact
+            has brought them.
+    """
+    return tuple(
+        recorded.object_id
+        for recorded in state.recorded.values()
+        if _parked(recorded)
+        and (
+            _away(poses[recorded.object_id], recorded)
+            if recorded.object_id in poses
+            # What is unedited and not there was not recorded at that time.
+            else state.objects[recorded.object_id] is not recorded
+        )
+    )
+
+
+def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
+    """The background with the ground coloured like that around it where objects ``left`` stood.
+
+    Gaussians inside a box and above its ground become invisible: they belonged to the object. What
+    is coloured by guess has the uncertainty of what was never seen.
+
+    Raises:
+        UnknownObjectError: ``scene`` has no such object.
+    """
+    opacities, sh = background.opacities.clone(), background.sh.clone()
+    known = background.uncertainties
+    uncertainties = None if known is None else known.clone()
+    for object_id in left:
+        parked = scene.object(object_id)
+        track = parked.trajectory
+        T_world_box = track.transform((track.start_us + track.end_us) // 2)
+        to_box = torch.from_numpy(invert_transform(T_world_box)).to(background.means)
+        local = background.means @ to_box[:3, :3].T + to_box[:3, 3]
+        half = torch.tensor(parked.size).to(local) / 2
+        beyond = (local[:, :2].abs() - half[:2]).amax(dim=1)
+        height = local[:, 2] + half[2]
+        level = height.abs() <= LOW
+        opacities[(beyond <= 0) & (height > LOW) & (local[:, 2] <= half[2])] = 0.0
+        around = level & (beyond > MARGIN) & (beyond <= RIM) & (opacities > 0.1)
+        beneath = level & (beyond <= MARGIN)
+        _recolour(sh, local[:, :2], beneath, around)
+        if uncertainties is not None:
+            uncertainties[beneath] = UNSEEN
+    return replace(background, opacities=opacities, sh=sh, uncertainties=uncertainties)
+
+
+@lru_cache(maxsize=4096)
+def _parked(recorded: ObjectState) -> bool:
+    low, high = recorded.bounds[:, :2]
+    return bool((high - low - 2 * recorded.radius).max() <= PARKED)
+
+
+def _away(pose: Float, parked: ObjectState) -> bool:
+    (low_x, low_y), (high_x, high_y) = parked.bounds[:, :2].tolist()
+    x, y = float(pose[0, 3]), float(pose[1, 3])
+    return math.hypot(x - (low_x + high_x) / 2, y - (low_y + high_y) / 2) > AWAY
+
+
+def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
+    """Give those of ``unknown`` [N] bool the median ``sh`` of the nearest ``known``, in place."""
+    count = min(NEIGHBOURS, int(known.sum()))
+    if count < FEWEST or not bool(unknown.any()):
+        return
+    distances = torch.cdist(places[unknown], places[known])
+    nearest = distances.topk(count, largest=False).indices
+    sh[unknown] = sh[known][nearest].median(dim=1).values
+
+
+# --- Contact shadows -----------------------------------------------------------------------------
+
+# Recorded objects have theirs in the background. Edited ones share one cloud of flat dark
+# Gaussians, stretched to the footprint of each.
+
+SHADOW_MARGIN = 0.35
+"""The shadow reaches this far beyond the footprint [m], fading."""
+
+LIFT = 0.04
+"""Above the ground [m], so that it lies in front of the ground's own Gaussians."""
+
+DARKNESS = 0.22
+"""Opacity of each Gaussian in full shadow. About three overlap at any point: half the light."""
+
+FADE_HEIGHT = 1.0
+"""Objects this high above the ground cast no contact shadow [m]."""
+
+LEVELS = 8
+"""Shades between none and full."""
+
+CELLS = (20, 12)
+COLOUR = (0.02, 0.02, 0.025)
+
+
+def contact_shadow(
+    T_world_object: Float,
+    size: tuple[float, float, float],
+    ground: Ground,
+    *,
+    device: torch.device,
+) -> Instance | None:
+    """The shadow of a box; None where it is too far above the ground.
+
+    Args:
+        T_world_object: [4, 4] float64, of the box centre.
+        size: (length, width, height) [m].
+        ground: below it.
+        device: where the shadow's Gaussians should live.
+    """
+    bottom = bottom_centres(T_world_object[None], size)[0]
+    height = ground.height(float(bottom[0]), float(bottom[1]))
+    clearance = max(0.0, float(bottom[2]) - height)
+    level = round(LEVELS * (1 - clearance / FADE_HEIGHT))
+    if level <= 0:
+        return None
+    forward = T_world_object[:3, 0]
+    yaw = np.arctan2(forward[1], forward[0])
+    level_ground = transform_from([bottom[0], bottom[1], height + LIFT], yaw_quaternion(float(yaw)))
+    footprint = (size[0] + 2 * SHADOW_MARGIN, size[1] + 2 * MARGIN, 1.0)
+    return Instance(_decal(level, str(device)), level_ground, instance_id=0, scale=footprint)
+
+
+@cache
+def _decal(level: int, device: str) -> GaussianCloud:
+    """A unit square of flat Gaussians, darkest in the middle, nothing at the rim."""
+    columns, rows = CELLS
+    x, y = np.meshgrid(
+        (np.arange(columns) + 0.5) / columns - 0.5,
+        (np.arange(rows) + 0.5) / rows - 0.5,
+        indexing="ij",
+    )
+    inside = np.clip((0.5 - np.maximum(np.abs(x), np.abs(y))) / 0.2, 0.0, 1.0)
+    corner = np.clip((0.62 - np.hypot(x, y)) / 0.2, 0.0, 1.0)
+    shade = (inside * inside * (3 - 2 * inside) * corner).ravel()
+    count = len(shade)
+    means = np.stack([x.ravel(), y.ravel(), np.zeros(count)], axis=1)
+    spread = [0.7 / columns, 0.7 / rows, 0.004]
+    colour = (torch.tensor(COLOUR) - 0.5) / SH_C0
+    decal = GaussianCloud(
+        means=torch.from_numpy(means).float(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        scales=torch.tensor(spread).repeat(count, 1),
+        opacities=torch.from_numpy(shade * DARKNESS * level / LEVELS).float(),
+        sh=colour.expand(count, 1, 3).contiguous(),
+    )
+    return decal.to(device)
+
+
+# --- Lighting ------------------------------------------------------------------------------------
+
+Colour = tuple[float, float, float]
+
+AROUND = 20.0
+"""Background this far around the ego's path gives the ambient light [m]."""
+
+HEIGHTS = (-2.0, 6.0)
+"""And this far below and above it: the street, not the tree tops [m]."""
+
+GAIN_RANGE = (0.5, 2.0)
+"""Colours are never changed by more; beyond, the guess is likelier wrong than the asset."""
+
+LUMA = (0.2126, 0.7152, 0.0722)
+
+
+def ambient_colour(scene: Scene) -> Colour:
+    """Mean colour of the street around the ego's path, each Gaussian by the area it shows."""
+    cloud = scene.background
+    path = torch.from_numpy(scene.ego.positions).to(cloud.means)
+    low, high = path.min(dim=0).values, path.max(dim=0).values
+    reach = torch.tensor([AROUND, AROUND, 0.0]).to(cloud.means)
+    below, above = (torch.tensor([0.0, 0.0, h]).to(cloud.means) for h in HEIGHTS)
+    near = (cloud.means >= low - reach + below) & (cloud.means <= high + reach + above)
+    chosen = near.all(dim=1)
+    mean = mean_colour(cloud.select(chosen)) if bool(chosen.any()) else mean_colour(cloud)
+    return mean or (0.5, 0.5, 0.5)
+
+
+def mean_colour(cloud: GaussianCloud) -> Colour | None:
+    """Mean RGB of a cloud, each Gaussian by opacity and area; None where it shows nothing."""
+    if not len(cloud):
+        return None
+    largest = cloud.scales.double().topk(2, dim=1).values.prod(dim=1)
+    weights = cloud.opacities.double() * largest
+    if float(weights.sum()) <= 0:
+        return None
+    rgb = (cloud.sh[:, 0].double() * SH_C0 + 0.5).clamp(0.0, 1.0)
+    red, green, blue = ((rgb * weights[:, None]).sum(dim=0) / weights.sum()).tolist()
+    return (red, green, blue)
+
+
+def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Colour:
+    """Factors on the colours of an asset that bring it into the light of ``scene``.
+
+    Where the light is known that the asset was recorded in, they are the ratio of the two ambient
+    colours. Else its brightness is brought to that of the scene's own objects; its tint stays.
+
+    Args:
+        scene: where the asset is put.
+        cloud: of the asset.
+        ambient: see :func:`ambient_colour`, of where the asset was cut out.
+    """
+    if ambient is not None:
+        here = ambient_colour(scene)
+        red, green, blue = (_bounded(h / max(a, 1e-3)) for h, a in zip(here, ambient, strict=True))
+        return (red, green, blue)
+    own = mean_colour(cloud)
+    others = [mean_colour(o.cloud) for o in scene.objects.values()]
+    lumas = [_luma(colour) for colour in others if colour is not None]
+    if own is None or not lumas:
+        return (1.0, 1.0, 1.0)
+    factor = _bounded(float(np.median(lumas)) / max(_luma(own), 1e-3))
+    return (factor, factor, factor)
+
+
+def relit(cloud: GaussianCloud, gain: Colour) -> GaussianCloud:
+    """The cloud with its colours multiplied by ``gain``; itself where that is 1."""
+    if gain == (1.0, 1.0, 1.0):
+        return cloud
+    factors: Tensor = torch.tensor(gain).to(cloud.sh)
+    sh = cloud.sh * factors
+    # The renderer adds 0.5 to what the harmonics give; that part has to be multiplied too.
+    sh[:, 0] += (factors - 1.0) * 0.5 / SH_C0
+    return replace(cloud, sh=sh)
+
+
+def _luma(colour: Colour) -> float:
+    return sum(w * c for w, c in zip(LUMA, colour, strict=True))
+
+
+def _bounded(factor: float) -> float:
+    low, high = GAIN_RANGE
+    return min(high, max(low, factor))
