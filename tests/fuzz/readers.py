@@ -314,7 +314,7 @@ def read_mcap(path: Path) -> None:
 
 
 def read_pickle(path: Path) -> None:
-    from real2sim_server.logs.readers.formats.array_pickles import unpack_arrays
+    from real2sim_server.logs.readers.street_gaussians import unpack_arrays
 
     unpack_arrays(str(path), "clouds", str(path.parent))
 
@@ -340,7 +340,7 @@ def read_sweep(path: Path) -> None:
 
 
 def read_proto(path: Path) -> None:
-    from real2sim_server.logs.readers.formats.wire_format import ProtoMessage
+    from real2sim_server.logs.readers.waymo_v1 import ProtoMessage
 
     message = ProtoMessage(path.read_bytes(), "file")
     message.integer(1)
@@ -352,14 +352,14 @@ def read_proto(path: Path) -> None:
 
 
 def read_records(path: Path) -> None:
-    from real2sim_server.logs.readers.formats.wire_format import list_records, read_record
+    from real2sim_server.logs.readers.waymo_v1 import list_records, read_record
 
     for record in list_records(path):
         read_record(path, record)
 
 
 def records_sample(folder: Path) -> list[Parts]:
-    from real2sim_server.logs.readers.formats.wire_format import masked_crc32c
+    from real2sim_server.logs.readers.waymo_v1 import masked_crc32c
 
     whole = b""
     for payload in (b"first", b"", b"third record"):
@@ -370,7 +370,7 @@ def records_sample(folder: Path) -> list[Parts]:
 
 
 def read_parquet(path: Path) -> None:
-    from real2sim_server.logs.readers.formats.parquet_files import ParquetFile
+    from real2sim_server.logs.readers.files import ParquetFile
 
     file = ParquetFile(path)
     file.numbers("a")
@@ -380,7 +380,7 @@ def read_parquet(path: Path) -> None:
 
 
 def read_feather_file(path: Path) -> None:
-    from real2sim_server.logs.readers.formats.parquet_files import read_feather
+    from real2sim_server.logs.readers.files import read_feather
 
     read_feather(path, ["a", "t"])
 

@@ -39,8 +39,8 @@ def track(
 ) -> None:
     """Find what moves in the LiDAR of a log without boxes, and write the log with them."""
     from ..logs import inspect_log
-    from ..logs.native_writer import write_native_log
     from ..logs.open import open_log
+    from ..logs.readers.native import write_native_log
     from ..logs.tracking import TrackingOptions, merge_tracks, track_moving_objects
 
     refuse_existing(out, overwrite=False)

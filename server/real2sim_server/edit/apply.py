@@ -17,8 +17,7 @@ from real2sim_proto.scenarios import EditWarning
 from ..geometry.box import box_corners
 from ..geometry.box_kernels import first_overlap
 from ..scene import Ground, SceneError, Trajectory
-from ..service.http.openapi import operations
-from . import motion
+from . import lifecycle, motion
 from .motion import AppliedOperation, apply_operation
 from .state import EditError, ObjectState, ScenarioState
 from .tracks import Float, sample
@@ -212,8 +211,8 @@ def _slips(times: NDArray[np.int64], transforms: Float) -> Float:
     return slips
 
 
-OPERATION_MODULES = (operations, motion, operations)
-"""Importing them registers their operations, see :mod:`.operation`."""
+OPERATION_MODULES = (lifecycle, motion)
+"""Importing them registers their operations, see :mod:`.motion`."""
 
 MAX_OBJECTS = 4096
 """Objects of a scenario, without deleted ones; streets have some hundreds."""

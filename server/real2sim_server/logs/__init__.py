@@ -11,12 +11,15 @@ from .driving_log import (
     LidarSweep,
     LogError,
     LoggedMap,
+    LogSelection,
     ObjectTrack,
+    log_of_frames,
+    same_part,
+    select_from_log,
 )
 from .inspect import CameraReport, LogReport, inspect_log, inspected_frames
-from .native_writer import write_native_log
 from .open import open_log
-from .selection import LogSelection, log_of_frames, same_part, select_from_log
+from .readers.native import write_native_log
 
 __all__ = [
     "CameraReport",

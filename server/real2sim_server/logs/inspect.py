@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .drawing import draw_frame, draw_top_view
 from .driving_log import DrivingLog, LidarSweep, LogError
 from .images import write_image
-from .overlay import draw_frame
 from .plausibility import ego_steps, gaps_between, questions_to
-from .top_view import draw_top_view
 
 INSPECTED_FRAMES = 3
 PICTURE_WIDTH = 960

@@ -20,8 +20,8 @@ from real2sim_proto.semantics import CLASS_OF_CATEGORY
 from ..geometry.rotation import Float, quaternion_to_matrix
 from ..geometry.transform import apply_transform, invert_transform
 from ..scene import Camera, Trajectory
+from .drawing import points_in_box
 from .driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from .overlay import points_in_box
 
 GAP_FACTOR = 1.6
 """A frame is missing where the time step is this many times the usual one."""

@@ -1,12 +1,10 @@
 """Maps of other programs as lane graphs, one reader a format; what fits none is refused by name."""
 
 from .align import Alignment, align, driven_poses, laid_on
-from .errors import MapError
-from .from_log import lanes_from_log
-from .of_log import LANE_SOURCES, LaneSource, lanes_of_log
+from .from_log import LANE_SOURCES, LaneSource, lanes_from_log, lanes_of_log
 from .opendrive import OpenDriveReader
 from .read import MAP_READERS, read_map, register_map_reader
-from .reader import MapReader
+from .reader import MapError, MapReader
 
 __all__ = [
     "LANE_SOURCES",

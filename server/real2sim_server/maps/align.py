@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.rotation import Float
 from ..scene import Ground, LaneGraph, Scene, Trajectory
-from .errors import MapError
+from .reader import MapError
 
 STEP_M = 2.0
 """Distance of the poses of a path that are compared with lanes."""

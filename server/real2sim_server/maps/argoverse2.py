@@ -11,9 +11,7 @@ from real2sim_proto.lanes import LaneKind
 
 from ..geometry.rotation import Float
 from ..scene import Area, Lane, LaneGraph
-from .bounds import between, joined
-from .errors import MapError, damage_named
-from .json_files import read_json
+from .reader import MapError, between, damage_named, joined, read_json
 
 PATTERN = "log_map_archive_*.json"
 KINDS: dict[str, LaneKind] = {"VEHICLE": "driving", "BUS": "bus", "BIKE": "bicycle"}

@@ -16,9 +16,7 @@ from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
 
 from ..geometry.rotation import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
-from .bounds import between, joined
-from .errors import MapError, damage_named
-from .xml_files import head_of, number, read_xml
+from .reader import MapError, between, damage_named, head_of, joined, number, read_xml
 
 EARTH_M = 6_378_137.0
 KINDS: dict[str, LaneKind] = {

@@ -11,10 +11,7 @@ import numpy as np
 
 from ..geometry.rotation import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
-from .bounds import joined
-from .errors import MapError, damage_named
-from .json_files import read_json
-from .xml_files import head_of
+from .reader import MapError, damage_named, head_of, joined, read_json
 
 STEP_M = 1.0
 MAX_PIECE_M = 10_000.0

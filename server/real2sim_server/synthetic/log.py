@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, invert_transform
 from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
-from ..logs.native_writer import write_native_log
+from ..logs.readers.native import write_native_log
 from ..scene import Camera, CameraMotion, CameraRig, Lidar
 from .bvh import build_geometry
 from .casting import Instances

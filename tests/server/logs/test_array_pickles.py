@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from real2sim_server.logs import LogError
-from real2sim_server.logs.readers.formats import array_pickles
-from real2sim_server.logs.readers.formats.array_pickles import read_pickled_arrays
+from real2sim_server.logs.readers import street_gaussians
+from real2sim_server.logs.readers.street_gaussians import read_pickled_arrays
 
 
 def written(path: Path, pickled: bytes) -> Path:
@@ -88,7 +88,7 @@ def test_anything_but_arrays_of_numbers_is_refused(tmp_path, value):
 def test_a_pointer_of_the_file_is_never_followed_even_without_a_process_of_its_own(tmp_path):
     file = written(tmp_path / "a.npz", pickle.dumps({0: pointer_array()}, protocol=4))
     with pytest.raises(LogError):
-        array_pickles.unpack_arrays(str(file), "clouds", str(tmp_path))
+        street_gaussians.unpack_arrays(str(file), "clouds", str(tmp_path))
 
 
 def test_bytes_that_do_not_fit_the_shape_are_refused(tmp_path):
@@ -99,10 +99,10 @@ def test_bytes_that_do_not_fit_the_shape_are_refused(tmp_path):
 
 
 def test_an_entry_that_unpacks_to_more_than_is_allowed_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(array_pickles, "MAX_ENTRY_BYTES", 1000)
+    monkeypatch.setattr(street_gaussians, "MAX_ENTRY_BYTES", 1000)
     np.savez_compressed(tmp_path / "a.npz", clouds={0: np.zeros(1000)})
     with pytest.raises(LogError, match="allowed are 1000"):
-        array_pickles.unpack_arrays(str(tmp_path / "a.npz"), "clouds", str(tmp_path))
+        street_gaussians.unpack_arrays(str(tmp_path / "a.npz"), "clouds", str(tmp_path))
 
 
 def test_a_memo_that_asks_for_all_memory_is_an_error(tmp_path):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from real2sim_server.logs import DrivingLog, LidarSweep, inspect_log, open_log
+from real2sim_server.logs.drawing import draw_frame
 from real2sim_server.logs.images import read_image
-from real2sim_server.logs.overlay import draw_frame
 from real2sim_server.scene import Trajectory
 from real2sim_server.synthetic import SyntheticLog
 

@@ -11,7 +11,7 @@ from real2sim_server.geometry.rotation import matrix_to_quaternion, quaternion_y
 from real2sim_server.geometry.transform import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, check_log, open_log
 from real2sim_server.logs.images import write_image
-from real2sim_server.logs.readers.kitti.files import EARTH_RADIUS
+from real2sim_server.logs.readers.kitti_tracking import EARTH_RADIUS
 from real2sim_server.synthetic import SyntheticLog
 
 

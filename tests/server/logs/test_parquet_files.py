@@ -10,7 +10,7 @@ from pyarrow import feather
 from pyarrow import parquet as pq
 
 from real2sim_server.logs import LogError
-from real2sim_server.logs.readers.formats.parquet_files import ParquetFile, read_feather
+from real2sim_server.logs.readers.files import ParquetFile, read_feather
 
 
 def test_text_that_is_none_is_an_error_of_the_file(tmp_path):

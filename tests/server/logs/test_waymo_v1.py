@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from real2sim.cli import build_app
 from real2sim_server.geometry.transform import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
-from real2sim_server.logs.readers.formats.wire_format import (
+from real2sim_server.logs.readers.waymo_v1 import (
     ProtoMessage,
     list_records,
     masked_crc32c,

@@ -23,9 +23,8 @@ from real2sim_server.geometry.rotation import Float, matrix_to_quaternion, quate
 from real2sim_server.geometry.transform import apply_transform, invert_transform, transform_from
 from real2sim_server.logs.driving_log import DrivingLog, LidarSweep, LogError
 from real2sim_server.logs.images import encode_image
-from real2sim_server.logs.readers.waymo.lidar import TOP, angles
-from real2sim_server.logs.readers.waymo.segment import CAMERA_NAMES, FRONT
-from real2sim_server.logs.readers.waymo.v2 import (
+from real2sim_server.logs.readers.waymo_common import CAMERA_NAMES, FRONT, TOP, angles
+from real2sim_server.logs.readers.waymo_v2 import (
     BOX,
     CALIBRATION,
     CAMERA,

@@ -20,7 +20,7 @@ import numpy as np
 
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
-from ...logs.readers.sweep_motion import compensate_sweep
+from ...logs.readers.common import compensate_sweep
 from ...scene import Camera
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ..clips import Clip

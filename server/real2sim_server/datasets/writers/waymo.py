@@ -23,9 +23,16 @@ from real2sim_proto.semantics import SEMANTIC_CLASSES
 
 from ...geometry.rotation import Float, matrix_to_quaternion, quaternion_yaw
 from ...geometry.transform import apply_transform
-from ...logs.readers.waymo.lidar import TOP, Laser, RangeImage, angles, pixel_points
-from ...logs.readers.waymo.segment import CAMERA_NAMES, FRONT
-from ...logs.readers.waymo.v2 import (
+from ...logs.readers.waymo_common import (
+    CAMERA_NAMES,
+    FRONT,
+    TOP,
+    Laser,
+    RangeImage,
+    angles,
+    pixel_points,
+)
+from ...logs.readers.waymo_v2 import (
     BOX,
     CALIBRATION,
     CAMERA,

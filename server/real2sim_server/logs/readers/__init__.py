@@ -1,15 +1,15 @@
 """Log readers, one module per dataset layout."""
 
 from .argoverse2 import Argoverse2Reader
+from .common import LogReader
 from .drivestudio import DrivestudioReader
-from .kitti.raw import KittiRawReader
-from .kitti.tracking import KittiReader
+from .kitti_raw import KittiRawReader
+from .kitti_tracking import KittiReader
 from .native import NativeReader
 from .nuscenes import NuScenesReader
-from .reader import LogReader
 from .street_gaussians import StreetGaussiansReader
-from .waymo.v1 import WaymoV1Reader
-from .waymo.v2 import WaymoV2Reader
+from .waymo_v1 import WaymoV1Reader
+from .waymo_v2 import WaymoV2Reader
 
 READERS: list[LogReader] = [
     NativeReader(),

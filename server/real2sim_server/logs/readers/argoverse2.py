@@ -21,13 +21,8 @@ from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform, transform_from
 from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
-from .box_tracks import FrameBox, build_tracks
-from .formats.image_files import ImageFiles
-from .formats.parquet_files import check_feather, read_feather
-from .formats.tables import check_ego_covers, check_frame_times
-from .image_matching import TimedImages, match_images
-from .lens import Lens
-from .selection import select_sequence
+from .common import FrameBox, Lens, TimedImages, build_tracks, match_images, select_sequence
+from .files import ImageFiles, check_ego_covers, check_feather, check_frame_times, read_feather
 
 AXLE_HEIGHT = 0.33
 """Height of the ego frame above the road [m], from the user guide."""

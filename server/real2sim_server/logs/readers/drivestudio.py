@@ -20,12 +20,17 @@ from ...geometry.transform import invert_transform
 from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import image_size
-from .box_tracks import FrameBox, build_tracks
-from .formats.image_files import ImageFiles
-from .formats.json_tables import read_json
-from .formats.point_files import count_rows, read_rows
-from .formats.tables import check_rigid, parse_numbers, read_lines
-from .waymo.segment import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
+from .common import FrameBox, build_tracks
+from .files import (
+    ImageFiles,
+    check_rigid,
+    count_rows,
+    parse_numbers,
+    read_json,
+    read_lines,
+    read_rows,
+)
+from .waymo_common import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
 
 PERIOD_US = 100_000
 COLUMNS = 14

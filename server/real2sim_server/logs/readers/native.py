@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
+import shutil
+import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +22,10 @@ from ..._npy import read_entries, read_headers, read_npy
 from ...scene import Camera, CameraRig, LaneGraph, SceneError, Trajectory
 from ...scene.camera import Optics
 from ...scene.io.document import OpticsPart
-from ...scene.io.lane_document import read_lanes
+from ...scene.io.lane_document import lane_document, read_lanes
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
-from ..images import IMAGE_SUFFIXES, check_image_file, read_image
-from .formats.tables import check_ego_covers, check_frame_times
+from ..images import IMAGE_SUFFIXES, check_image_file, read_image, write_image
+from .files import check_ego_covers, check_frame_times
 
 FORMAT = "real2sim-log"
 VERSION = 1
@@ -364,3 +367,136 @@ def _check_arrays(path: Path, headers: Mapping[str, tuple[tuple[int, ...], np.dt
         if dtype.kind not in "fiu":
             raise LogError(f"{path}: {name} must hold real numbers, not {dtype}")
     return count
+
+
+# --- Writer --------------------------------------------------------------------------------------
+
+
+def write_native_log(
+    log: DrivingLog,
+    path: str | Path,
+    *,
+    image_format: str = "png",
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write ``log`` to the folder ``path``, which appears only when it is complete.
+
+    Args:
+        log: any log.
+        path: a folder that does not exist yet, or an empty one.
+        image_format: ``png`` (exact) or ``jpg`` (quality 95).
+        on_progress: called with (done, total) after each image and each sweep.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        LogError: the folder is not empty, or the log has a broken image or sweep.
+    """
+    target = Path(path)
+    if image_format not in ("png", "jpg"):
+        raise LogError(f"image_format must be 'png' or 'jpg', not {image_format!r}")
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise LogError(f"{target}: is there already; name a folder that is new or empty")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    try:
+        has_lidar = _write_frames(log, partial, image_format, on_progress)
+        manifest = json.dumps(_manifest(log, has_lidar), indent=1)
+        if log.lanes is not None:
+            document = lane_document(log.lanes)
+            (partial / LANES).write_text(document.model_dump_json(), encoding="utf-8")
+        (partial / MANIFEST).write_text(manifest, encoding="utf-8")
+        partial.chmod(0o755)
+        os.replace(partial, target)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return target
+
+
+def _write_frames(
+    log: DrivingLog,
+    folder: Path,
+    image_format: str,
+    on_progress: Callable[[int, int], None] | None,
+) -> bool:
+    total, done, has_lidar = log.frame_count * (len(log.rig) + 1), 0, False
+    for name in ("lidar", *(f"images/{camera}" for camera in log.rig.names)):
+        (folder / name).mkdir(parents=True)
+    for frame in range(log.frame_count):
+        for camera in log.rig.names:
+            image = log.image(camera, frame)
+            write_image(folder / "images" / camera / f"{frame:06d}.{image_format}", image)
+            done = _report(done, total, on_progress)
+        sweep = log.lidar(frame)
+        has_lidar |= len(sweep.points) > 0
+        np.savez(
+            folder / "lidar" / f"{frame:06d}.npz",
+            points=sweep.points,
+            intensity=sweep.intensity,
+            offset_us=sweep.offset_us,
+            origin=sweep.origin,
+        )
+        done = _report(done, total, on_progress)
+    if not has_lidar:
+        shutil.rmtree(folder / "lidar")
+    return has_lidar
+
+
+def _report(done: int, total: int, on_progress: Callable[[int, int], None] | None) -> int:
+    if on_progress is not None:
+        on_progress(done + 1, total)
+    return done + 1
+
+
+def _recorded(camera: Camera) -> dict[str, Any]:
+    """What the camera really is, where that is known."""
+    if camera.recorded is None:
+        return {}
+    return {"recorded": OpticsPart.of(camera.recorded).model_dump(mode="json")}
+
+
+def _manifest(log: DrivingLog, has_lidar: bool) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": log.name,
+        "frame_times_us": log.frame_times_us.tolist(),
+        "cameras": [
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "K": camera.K.tolist(),
+                "T_vehicle_camera": camera.T_vehicle_camera.tolist(),
+                **_recorded(camera),
+            }
+            for camera in log.rig
+        ],
+        "ego": {"size": list(log.ego_size), **_poses(log.ego)},
+        "tracks": [
+            {
+                "object_id": track.object_id,
+                "category": track.category,
+                "size": list(track.size),
+                **_poses(track.trajectory),
+            }
+            for track in log.tracks
+        ],
+        "lidar": has_lidar,
+        "image_times_us": {
+            name: log.image_times_us[name].tolist()
+            for name in log.rig.names
+            if name in log.image_times_us
+        },
+        "provenance": dict(log.provenance),
+    }
+
+
+def _poses(trajectory: Trajectory) -> dict[str, Any]:
+    return {
+        "times_us": trajectory.times_us.tolist(),
+        "positions": trajectory.positions.tolist(),
+        "quaternions": trajectory.quaternions.tolist(),
+    }

@@ -21,14 +21,16 @@ from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform, transform_from
 from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
-from .box_tracks import FrameBox, build_tracks
-from .formats.image_files import ImageFiles
-from .formats.json_tables import Tables
-from .formats.point_files import count_rows, read_rows
-from .formats.tables import check_ego_covers, check_frame_times
-from .image_matching import MatchedImages, TimedImages, match_images
-from .lens import Lens
-from .selection import select_sequence
+from .common import (
+    FrameBox,
+    Lens,
+    MatchedImages,
+    TimedImages,
+    build_tracks,
+    match_images,
+    select_sequence,
+)
+from .files import ImageFiles, Tables, check_ego_covers, check_frame_times, count_rows, read_rows
 
 LIDAR, FRONT = "LIDAR_TOP", "CAM_FRONT"
 TOLERANCE_US = 60_000

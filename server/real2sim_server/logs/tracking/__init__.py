@@ -1,6 +1,5 @@
 """Finds and tracks moving objects in LiDAR, for logs without boxes."""
 
-from .merge import merge_tracks
-from .track import TrackingOptions, track_moving_objects
+from .track import TrackingOptions, merge_tracks, track_moving_objects
 
 __all__ = ["TrackingOptions", "merge_tracks", "track_moving_objects"]

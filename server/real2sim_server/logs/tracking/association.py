@@ -1,16 +1,106 @@
-"""Associates clusters from frame to frame."""
+"""Tracks of moving objects: association from frame to frame, Kalman smoothing, boxes of one size."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from ...geometry.rotation import Float
 from .clusters import LidarCluster
-from .motion import KalmanState
+
+# --- Motion --------------------------------------------------------------------------------------
+
+# Nearly constant velocity in the plane. Sources: Rauch, Tung, Striebel 1965 for the smoother; white
+# acceleration noise as in Bar-Shalom et al., "Estimation with Applications to Tracking and
+# Navigation", 2001, chapter 6.
+
+ACCELERATION = 2.5
+"""Standard deviation of accelerations [m/s^2]."""
+
+INITIAL_SPEED = 12.0
+"""Standard deviation of the speed of a new track [m/s]."""
+
+OBSERVATION = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0]])
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanState:
+    """Mean [4] (x, y, vx, vy) and covariance [4, 4]."""
+
+    mean: Float
+    covariance: Float
+
+    @classmethod
+    def first(cls, position: Float, deviation: float) -> KalmanState:
+        """At a measured ``position`` [2] with unknown velocity."""
+        variances = [deviation**2] * 2 + [INITIAL_SPEED**2] * 2
+        return cls(np.array([*position, 0.0, 0.0]), np.diag(variances))
+
+    def predict(self, seconds: float) -> KalmanState:
+        """After a time."""
+        transition = _transition(seconds)
+        noise = _process_noise(seconds)
+        return KalmanState(
+            transition @ self.mean, transition @ self.covariance @ transition.T + noise
+        )
+
+    def distance(self, position: Float, deviation: float) -> float:
+        """Mahalanobis distance of a measured position [2]."""
+        residual = position - self.mean[:2]
+        innovation_covariance = self.covariance[:2, :2] + deviation**2 * np.eye(2)
+        return float(np.sqrt(residual @ np.linalg.solve(innovation_covariance, residual)))
+
+    def update(self, position: Float, deviation: float) -> KalmanState:
+        """With a measured position [2] of a standard deviation [m]."""
+        innovation_covariance = (
+            OBSERVATION @ self.covariance @ OBSERVATION.T + deviation** 2 * np.eye(2)
+        )
+        gain = np.linalg.solve(innovation_covariance, OBSERVATION @ self.covariance).T
+        keep = np.eye(4) - gain @ OBSERVATION
+        mean = self.mean + gain @ (position - OBSERVATION @ self.mean)
+        covariance = keep @ self.covariance @ keep.T + deviation**2 * gain @ gain.T
+        return KalmanState(mean, covariance)
+
+
+def smooth(times: Float, positions: Sequence[Float | None], deviation: float) -> Float:
+    """States [T, 4] at ``times`` [T] [s] from measured positions, None where there is none.
+
+    Forward Kalman filter and backward pass; the first position must be known.
+    """
+    assert positions[0] is not None
+    state = KalmanState.first(positions[0], deviation).update(positions[0], deviation)
+    filtered, predicted = [state], [state]
+    for i in range(1, len(times)):
+        predicted_state = state.predict(times[i] - times[i - 1])
+        position = positions[i]
+        state = predicted_state if position is None else predicted_state.update(position, deviation)
+        predicted.append(predicted_state)
+        filtered.append(state)
+    means = [filtered[-1].mean]
+    for i in range(len(times) - 2, -1, -1):
+        transition = _transition(times[i + 1] - times[i])
+        gain = np.linalg.solve(predicted[i + 1].covariance, transition @ filtered[i].covariance).T
+        means.append(filtered[i].mean + gain @ (means[-1] - predicted[i + 1].mean))
+    return np.array(means[::-1])
+
+
+def _transition(seconds: float) -> Float:
+    transition = np.eye(4)
+    transition[0, 2] = transition[1, 3] = seconds
+    return transition
+
+
+def _process_noise(seconds: float) -> Float:
+    t = seconds
+    block = np.array([[t**4 / 4, t**3 / 2], [t**3 / 2, t**2]]) * ACCELERATION**2
+    noise = np.zeros((4, 4))
+    noise[np.ix_([0, 2], [0, 2])] = noise[np.ix_([1, 3], [1, 3])] = block
+    return noise
+
 
 DEVIATION = 0.5
 """Of a cluster's centre from frame to frame [m]: its visible part changes."""
@@ -90,3 +180,159 @@ def _extent_change(track: Track, cluster: LidarCluster) -> float:
     one = np.ptp(latest.points[:, :2], axis=0)
     two = np.ptp(cluster.points[:, :2], axis=0)
     return 0.3 * float(np.abs(one - two).sum())
+
+
+# --- Boxes ---------------------------------------------------------------------------------------
+
+# A box of one size is fitted to all clusters of an object.
+
+BOX_DEVIATION = 0.15
+"""Of the middle of a fitted box [m]."""
+
+MIN_HEADING_SPEED = 0.7
+"""Below this speed [m/s] the direction of motion says nothing about the heading."""
+
+EXTENT_PERCENTILE = 80.0
+"""Percentile of extents that counts as the size: the largest may have a neighbour in it."""
+
+
+TYPICAL_LENGTHS = ((1.85, 4.4), (2.5, 5.1), (np.inf, 6.5))
+"""Of vehicles up to a height [m]: cars, vans, lorries [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedBox:
+    """A box over time.
+
+    Attributes:
+        frames: [T] int, first to last without gaps.
+        centres: [T, 3] world [m].
+        headings: [T] [rad].
+        velocities: [T, 2] world [m/s].
+        size: (length, width, height) [m].
+        residual: of the measured middles, root mean square [m].
+    """
+
+    frames: NDArray[np.intp]
+    centres: Float
+    headings: Float
+    velocities: Float
+    size: tuple[float, float, float]
+    residual: float
+
+    @property
+    def category(self) -> str:
+        """By its size."""
+        length, width, height = self.size
+        if length > 6.5 or height > 2.7:
+            return "truck"
+        if length < 1.3 and width < 1.2:
+            return "pedestrian"
+        if width < 1.1 and length < 2.6:
+            return "cyclist"
+        return "van" if height > 1.85 else "car"
+
+
+def fit_box(clusters: Mapping[int, LidarCluster], times: Float) -> FittedBox:
+    """A box of the size observed over all frames, with a smooth path and headings along it.
+
+    A scanner sees the near sides only (an L from above), so the box is anchored to those: along
+    each of its axes the face towards the sensor is where the points begin, and the far face
+    follows from the size. A car only seen from behind is given a car's typical length.
+
+    Args:
+        clusters: by frame, in the world.
+        times: of all frames of the log [s].
+    """
+    frames = np.arange(min(clusters), max(clusters) + 1)
+    rough = [clusters[f].centre if f in clusters else None for f in frames.tolist()]
+    states = smooth(times[frames], rough, 3 * BOX_DEVIATION)
+    size: tuple[float, float, float] = 0.0, 0.0, 0.0
+    positions: list[Float | None] = []
+    for _ in range(2):
+        headings = _headings(states)
+        faces = {
+            f: _faces(clusters[f], headings[i], states[i, 2:])
+            for i, f in enumerate(frames.tolist())
+            if f in clusters
+        }
+        size = _size(clusters, faces)
+        positions = [
+            _anchor_box(faces[f], clusters[f], headings[i], size) if f in faces else None
+            for i, f in enumerate(frames.tolist())
+        ]
+        states = smooth(times[frames], positions, BOX_DEVIATION)
+    grounds = np.interp(frames, list(clusters), [c.ground for c in clusters.values()])
+    centres = np.column_stack([states[:, :2], _running_mean(grounds) + size[2] / 2])
+    apart = [
+        np.sum((p - s[:2]) ** 2) for p, s in zip(positions, states, strict=True) if p is not None
+    ]
+    residual = float(np.sqrt(np.mean(apart)))
+    return FittedBox(frames, centres, _headings(states), states[:, 2:], size, residual)
+
+
+def _headings(states: Float) -> Float:
+    """Direction of motion [T]; while standing, that of the nearest moment of motion."""
+    velocity = states[:, 2:]
+    fast = np.flatnonzero(np.linalg.norm(velocity, axis=1) > MIN_HEADING_SPEED)
+    if not len(fast):
+        displacement = states[-1, :2] - states[0, :2]
+        return np.full(len(states), np.arctan2(displacement[1], displacement[0]))
+    nearest = fast[np.abs(np.arange(len(states))[:, None] - fast).argmin(axis=1)]
+    angles = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0])[nearest])
+    return _running_mean(angles)
+
+
+def _running_mean(values: Float, reach: int = 3) -> Float:
+    """Running mean over up to 2 reach + 1 values."""
+    padded = np.pad(values, reach, mode="edge")
+    return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode="valid")
+
+
+def _faces(cluster: LidarCluster, heading: float, velocity: Float) -> Float:
+    """Where the points begin and end [2, 2] (axis; low, high) along and across the heading.
+
+    Points that were measured earlier or later than the frame are moved along.
+    """
+    flat = cluster.points[:, :2] - cluster.offset[:, None] * velocity
+    local = flat @ _axes(heading).T
+    return np.percentile(local, [0.5, 99.5], axis=0).T
+
+
+def _axes(heading: float) -> Float:
+    """Rows: forward, left."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.array([[cos, sin], [-sin, cos]])
+
+
+def _size(
+    clusters: Mapping[int, LidarCluster], faces: Mapping[int, Float]
+) -> tuple[float, float, float]:
+    extents = np.array([np.ptp(f, axis=1) for f in faces.values()])
+    length, width = np.percentile(extents, EXTENT_PERCENTILE, axis=0)
+    tops = [np.percentile(c.points[:, 2], 99) - c.ground for c in clusters.values()]
+    height = float(np.percentile(tops, EXTENT_PERCENTILE))
+    # A vehicle seen from one end or one side only is completed by typical sizes.
+    if width > 1.2 and length < 3.6:
+        length = next(typical for top, typical in TYPICAL_LENGTHS if height < top)
+    elif length > 2.6 and width < 1.5:
+        width = 1.8 if height < 2.5 else 2.4
+    return float(max(length, 0.5)), float(max(width, 0.5)), max(height, 0.5)
+
+
+def _anchor_box(
+    faces: Float, cluster: LidarCluster, heading: float, size: tuple[float, float, float]
+) -> Float:
+    """Middle [2] of a box whose near faces are where the points begin."""
+    axes = _axes(heading)
+    sensor = axes @ cluster.sensor[:2]
+    middle = np.empty(2)
+    for axis in (0, 1):
+        low, high = faces[axis]
+        if sensor[axis] < low:
+            middle[axis] = low + size[axis] / 2
+        elif sensor[axis] > high:
+            middle[axis] = high - size[axis] / 2
+        else:
+            middle[axis] = (low + high) / 2
+    return np.asarray(middle @ axes)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,8 @@ from ...geometry.rotation import Float, yaw_quaternion
 from ...geometry.transform import apply_transform, invert_transform
 from ...scene import Trajectory
 from ..driving_log import DrivingLog, LidarSweep, ObjectTrack
-from .association import Track, associate
-from .boxes import FittedBox, fit_box
-from .clusters import LidarCluster, find_clusters
-from .free_space import SweepRays
+from .association import FittedBox, Track, associate, fit_box
+from .clusters import LidarCluster, SweepRays, find_clusters
 
 MAX_LENGTH, MAX_WIDTH, MAX_HEIGHT = 20.0, 3.9, 4.3
 MIN_STRAIGHTNESS = 0.6
@@ -258,3 +257,44 @@ def _named_tracks(log: DrivingLog, boxes: Sequence[FittedBox]) -> tuple[ObjectTr
         )
         numbers[category] += 1
     return tuple(tracks)
+
+
+# --- Merging -------------------------------------------------------------------------------------
+
+# Found tracks beside those of the log.
+
+INSTANTS = 9
+"""How many instants of their common time tell whether two tracks are one object's."""
+
+
+def merge_tracks(
+    given: Sequence[ObjectTrack], found: Sequence[ObjectTrack]
+) -> tuple[ObjectTrack, ...]:
+    """``given``, then those of ``found`` that are none of them, under ids of their own."""
+    tracks = list(given)
+    taken = {track.object_id for track in given}
+    for track in found:
+        if any(same_object(track, other) for other in given):
+            continue
+        number = count()
+        object_id = track.object_id
+        while object_id in taken:
+            object_id = f"{track.category}_{next(number)}"
+        taken.add(object_id)
+        tracks.append(replace(track, object_id=object_id))
+    return tuple(tracks)
+
+
+def same_object(track: ObjectTrack, other: ObjectTrack) -> bool:
+    """Whether a track lies in the box of another for half of the time that both are there."""
+    first = max(track.trajectory.start_us, other.trajectory.start_us)
+    last = min(track.trajectory.end_us, other.trajectory.end_us)
+    if last < first:
+        return False
+    inside = 0
+    times = np.linspace(first, last, INSTANTS).astype(np.int64)
+    for t_us in times:
+        T_other_world = np.linalg.inv(other.trajectory.transform(int(t_us)))
+        centre = T_other_world @ track.trajectory.transform(int(t_us))[:, 3]
+        inside += bool((np.abs(centre[:3]) <= np.array(other.size) / 2).all())
+    return 2 * inside >= len(times)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...logs import DrivingLog, check_log
-from ...logs.selection import SELECTION
+from ...logs.driving_log import SELECTION
 from ...render.backends import Backend
 from ...render.picture_file import write_png
 from ...scene import Scene

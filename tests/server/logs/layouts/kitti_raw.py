@@ -10,7 +10,7 @@ import numpy as np
 from real2sim_server.geometry.rotation import matrix_to_quaternion, quaternion_yaw
 from real2sim_server.geometry.transform import invert_transform
 from real2sim_server.logs import DrivingLog
-from real2sim_server.logs.readers.kitti.files import EARTH_RADIUS
+from real2sim_server.logs.readers.kitti_tracking import EARTH_RADIUS
 
 DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0042_sync"
 LATITUDE, LONGITUDE, COURSE = 49.0, 8.4, 0.7

@@ -12,7 +12,7 @@ from real2sim_server.geometry.rotation import matrix_to_quaternion, quaternion_y
 from real2sim_server.geometry.transform import invert_transform
 from real2sim_server.logs import DrivingLog
 from real2sim_server.logs.images import encode_image
-from real2sim_server.logs.readers.formats.wire_format import masked_crc32c
+from real2sim_server.logs.readers.waymo_v1 import masked_crc32c
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
 
 BEAMS, COLUMNS = 100, 2048

@@ -13,19 +13,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....geometry.rotation import Float
-from ...driving_log import DrivingLog, LidarSweep, LogError
-from ...images import check_encoded_image, decode_image
-from ..formats.parquet_files import ParquetFile
-from ..selection import select_sequence
-from .lidar import TOP, Laser, RangeImage, SweepTiming, merge_range_images
-from .segment import (
+from ...geometry.rotation import Float
+from ..driving_log import DrivingLog, LidarSweep, LogError
+from ..images import check_encoded_image, decode_image
+from .common import select_sequence
+from .files import ParquetFile
+from .waymo_common import (
     CAMERA_NAMES,
+    TOP,
+    Laser,
+    RangeImage,
+    SweepTiming,
     WaymoBox,
     WaymoCamera,
     WaymoFrame,
     WaymoImage,
     build_waymo_log,
+    merge_range_images,
     sweep_timings,
     waymo_camera,
     with_sweeps,

@@ -13,15 +13,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....geometry.rotation import Float
-from ....geometry.transform import invert_transform
-from ....scene import Trajectory
-from ...driving_log import DrivingLog, LogError, ObjectTrack
-from ..box_tracks import FrameBox, build_tracks, upright_pose
-from ..formats.tables import check_frame_times, read_lines, read_number_table
-from ..selection import select_sequence
-from .files import KittiCalibration, calibration_from, oxts_poses, read_entries
-from .tracking import KITTI_EGO_SIZE, MISSING_SCANS, KittiSource, read_rig
+from ...geometry.rotation import Float
+from ...geometry.transform import invert_transform
+from ...scene import Trajectory
+from ..driving_log import DrivingLog, LogError, ObjectTrack
+from .common import FrameBox, build_tracks, select_sequence, upright_pose
+from .files import check_frame_times, read_lines, read_number_table
+from .kitti_tracking import (
+    KITTI_EGO_SIZE,
+    MISSING_SCANS,
+    KittiCalibration,
+    KittiSource,
+    calibration_from,
+    oxts_poses,
+    read_entries,
+    read_rig,
+)
 
 DRIVES_WITH_MISSING_SCANS = {"2011_09_26_drive_0009_sync": MISSING_SCANS["0001"]}
 """Sequence 0001 of the tracking set is this drive."""

@@ -1,0 +1,408 @@
+"""What readers of logs share: tracks from boxes, matching of clocks, motion of sweeps, lenses."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...geometry.rotation import Float
+from ...geometry.transform import invert_transform
+from ...scene import BrownConrady, Camera, SceneError, Shutter, Trajectory
+from ...scene.camera import Optics
+from ...scene.shutter import GLOBAL
+from ..driving_log import DrivingLog, LogError, ObjectTrack
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBox:
+    """One object in one frame.
+
+    Attributes:
+        key: the dataset's own name of the track.
+        category: in the project's words.
+        size: (length, width, height) [m].
+        time_us: [us].
+        T_world_object: [4, 4], origin at the box centre, x forward, z up.
+        where: file and row, for errors.
+    """
+
+    key: str
+    category: str
+    size: tuple[float, float, float]
+    time_us: int
+    T_world_object: Float
+    where: str
+
+
+def upright_pose(centre: Iterable[float], heading: float) -> Float:
+    """``T_frame_object`` [4, 4] of a box that is only turned about z by ``heading`` [rad]."""
+    pose = np.eye(4)
+    cos, sin = np.cos(heading), np.sin(heading)
+    pose[:2, :2] = [[cos, -sin], [sin, cos]]
+    pose[:3, 3] = list(centre)
+    return pose
+
+
+def build_tracks(boxes: Iterable[FrameBox]) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
+    """Tracks in order of first appearance, and the dataset's name of each by object id.
+
+    An object has its median size and its most frequent category; it is called
+    ``<category>_<number>``.
+
+    Raises:
+        LogError: a size that is not positive, a pose that is not finite or no rigid transform, or
+            two boxes of one object at one instant.
+    """
+    by_key: dict[str, list[FrameBox]] = defaultdict(list)
+    for box in sorted(boxes, key=lambda b: (b.time_us, b.key)):
+        _check(box)
+        by_key[box.key].append(box)
+    numbers: Counter[str] = Counter()
+    tracks, keys = [], {}
+    for key, members in by_key.items():
+        category = Counter(b.category for b in members).most_common(1)[0][0]
+        object_id = f"{category}_{numbers[category]}"
+        numbers[category] += 1
+        keys[object_id] = key
+        length, width, height = np.median([b.size for b in members], axis=0).tolist()
+        tracks.append(
+            ObjectTrack(object_id, category, (length, width, height), _trajectory(key, members))
+        )
+    return tuple(tracks), keys
+
+
+def _check(box: FrameBox) -> None:
+    if not (np.isfinite(box.size).all() and min(box.size) > 0):
+        raise LogError(
+            f"{box.where}: the box of {box.key!r} needs a positive length, width and height, not "
+            f"{list(box.size)}"
+        )
+    if not np.isfinite(box.T_world_object).all():
+        raise LogError(f"{box.where}: the pose of {box.key!r} is not finite")
+
+
+def _trajectory(key: str, members: list[FrameBox]) -> Trajectory:
+    times_us = [b.time_us for b in members]
+    for one, two in pairwise(members):
+        if one.time_us == two.time_us:
+            raise LogError(f"{two.where}: {key!r} has two boxes at {one.time_us} us")
+    try:
+        return Trajectory.from_transforms(
+            np.array(times_us, dtype=np.int64), np.array([b.T_world_object for b in members])
+        )
+    except SceneError as error:
+        raise LogError(f"{members[0].where}: {key!r}: {error}") from error
+
+
+# --- Image matching ------------------------------------------------------------------------------
+
+# Every frame gets one image per camera, where cameras run by their own clocks.
+
+
+@dataclass(frozen=True, eq=False)
+class TimedImages:
+    """Images of one camera: files and their time stamps [I] [us], increasing."""
+
+    files: Sequence[Path]
+    times_us: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedImages:
+    """Images by frame.
+
+    Attributes:
+        frames: [F] which of the given frames have an image of every camera: a run without gaps.
+        files: F files by camera.
+        times_us: [F] time stamps by camera.
+    """
+
+    frames: NDArray[np.intp]
+    files: dict[str, list[Path]]
+    times_us: dict[str, NDArray[np.int64]]
+
+
+def match_images(
+    frame_times_us: NDArray[np.int64],
+    cameras: Mapping[str, TimedImages],
+    *,
+    tolerance_us: int,
+    where: Path,
+) -> MatchedImages:
+    """The nearest image of every camera for every frame.
+
+    Frames at both ends, for which some camera has none, are dropped: sensors start and stop at
+    different moments.
+
+    Args:
+        frame_times_us: [F] increasing.
+        cameras: at least one image each.
+        tolerance_us: how far an image may be from its frame.
+        where: the log, for errors.
+
+    Raises:
+        LogError: a camera lacks an image in the middle of the log, or no frame has all images.
+    """
+    nearest = {name: _nearest(frame_times_us, c.times_us) for name, c in cameras.items()}
+    found = {
+        name: np.abs(cameras[name].times_us[index] - frame_times_us) <= tolerance_us
+        for name, index in nearest.items()
+    }
+    whole = np.ones(len(frame_times_us), dtype=bool)
+    for mask in found.values():
+        whole &= mask
+    if not whole.any():
+        raise LogError(
+            f"{where}: no frame has an image of all cameras {sorted(cameras)} within "
+            f"{tolerance_us} us"
+        )
+    first, last = np.flatnonzero(whole)[[0, -1]]
+    for name, mask in found.items():
+        missing = np.flatnonzero(~mask[first : last + 1]) + first
+        if len(missing):
+            raise LogError(
+                f"{where}: camera {name!r} has no image within {tolerance_us} us of the frame at "
+                f"{frame_times_us[missing[0]]} us ({len(missing)} frames lack one)"
+            )
+    frames = np.arange(first, last + 1)
+    return MatchedImages(
+        frames,
+        {n: [c.files[i] for i in nearest[n][frames]] for n, c in cameras.items()},
+        {n: c.times_us[nearest[n][frames]] for n, c in cameras.items()},
+    )
+
+
+def _nearest(wanted: NDArray[np.int64], given: NDArray[np.int64]) -> NDArray[np.intp]:
+    after = np.clip(np.searchsorted(given, wanted), 1, max(len(given) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(given) - 1)
+    closer = np.abs(given[before] - wanted) <= np.abs(given[after] - wanted)
+    return np.asarray(np.where(closer, before, after))
+
+
+# --- Selection of a drive ------------------------------------------------------------------------
+
+SHOWN = 20
+
+
+def select_sequence(folder: Path, known: list[str], sequence: str | None) -> str:
+    """``sequence``, or the only one that is known.
+
+    Raises:
+        LogError: there is none, ``sequence`` is not among them, or it must be named.
+    """
+    if not known:
+        raise LogError(f"{folder}: holds no sequence")
+    if sequence is None and len(known) == 1:
+        return known[0]
+    if sequence is None or sequence not in known:
+        asked = "name one with sequence" if sequence is None else f"there is no {sequence!r}"
+        more = f" and {len(known) - SHOWN} more" if len(known) > SHOWN else ""
+        raise LogError(f"{folder}: holds the sequences {known[:SHOWN]}{more}; {asked}")
+    return sequence
+
+
+# --- Motion within a sweep -----------------------------------------------------------------------
+
+# Moves the points of a sweep to one instant, by the motion of the vehicle.
+
+
+def compensate_sweep(
+    points: Float, offset: Float, vehicle_poses: Float, frame: int
+) -> NDArray[np.float32]:
+    """Points as if all had been measured at the frame's time stamp, were the world static.
+
+    Between frames the vehicle moves with constant velocity and constant angular velocity;
+    before the first and after the last frame it goes on as in the nearest interval.
+
+    Args:
+        points: [N, 3] float64, vehicle frame at each point's own instant [m].
+        offset: [N] float64, that instant relative to the frame's, in frame periods.
+        vehicle_poses: ``T_world_vehicle`` [F, 4, 4] of all frames.
+        frame: index of the frame.
+
+    Returns:
+        [N, 3] float32, vehicle frame at the frame's time stamp [m].
+    """
+    moved = points.copy()
+    for direction in (-1, 1):
+        chosen = offset < 0 if direction < 0 else offset > 0
+        motion = _motion(vehicle_poses, frame, direction)
+        moved[chosen] = _advance(points[chosen], np.abs(offset[chosen]), motion)
+    return moved.astype(np.float32)
+
+
+def _motion(vehicle_poses: Float, frame: int, direction: int) -> Float:
+    """``T_here_there`` [4, 4] of the neighbouring frame, mirrored at the ends of the log."""
+    here = invert_transform(vehicle_poses[frame])
+    if 0 <= frame + direction < len(vehicle_poses):
+        towards: Float = here @ vehicle_poses[frame + direction]
+        return towards
+    if len(vehicle_poses) == 1:
+        return np.eye(4)
+    return invert_transform(here @ vehicle_poses[frame - direction])
+
+
+def _advance(points: Float, fraction: Float, motion: Float) -> Float:
+    """Apply ``fraction`` [N] of a rigid motion to points [N, 3] (Rodrigues' formula)."""
+    rotation = motion[:3, :3]
+    angle = np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))
+    skew = np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
+    length = np.linalg.norm(skew)
+    shift = fraction[:, None] * motion[:3, 3]
+    if length < 1e-12:
+        return points + shift
+    axis = skew / length
+    turn = (fraction * angle)[:, None]
+    cross = np.cross(axis, points)
+    along = (points @ axis)[:, None] * axis
+    turned: Float = points * np.cos(turn) + cross * np.sin(turn) + along * (1 - np.cos(turn))
+    return turned + shift
+
+
+# --- Lenses --------------------------------------------------------------------------------------
+
+# Logs promise pinhole images; distorted ones are rectified.
+
+MAX_ZOOM = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A Brown-Conrady lens (Brown 1966, in OpenCV's notation).
+
+    Attributes:
+        width, height: image size [px].
+        K: [3, 3] float64, intrinsics of the images as recorded, pixel centres at +0.5.
+        distortion: k1, k2, p1, p2, k3; all zero for a pinhole.
+    """
+
+    width: int
+    height: int
+    K: Float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @cached_property
+    def pinhole_K(self) -> Float:
+        """``K`` [3, 3] of the undistorted images, which have the same size.
+
+        It is the lens's own K, with focal lengths made just so much longer that every pixel lies
+        inside the recorded image: no undistorted image has black corners.
+        """
+        if not any(self.distortion) or self._fits(1.0):
+            return self.K.copy()
+        low, high = 1.0, MAX_ZOOM
+        for _ in range(40):
+            middle = (low + high) / 2
+            low, high = (low, middle) if self._fits(middle) else (middle, high)
+        return self._zoomed(high)
+
+    def camera(self, name: str, T_vehicle_camera: Float, shutter: Shutter = GLOBAL) -> Camera:
+        """The pinhole camera of the undistorted images, which knows the lens and the shutter that
+        they had; not a lens that folds inside the image, through which nothing can be drawn.
+
+        Raises:
+            SceneError: values that make no camera.
+        """
+        pinhole = Camera(name, self.width, self.height, self.pinhole_K, T_vehicle_camera)
+        k1, k2, p1, p2, k3 = self.distortion
+        distorted = any(self.distortion)
+        if not distorted and not shutter.rolls:
+            return pinhole
+        model = BrownConrady((k1, k2, k3, 0.0, 0.0, 0.0), (p1, p2)) if distorted else None
+        try:
+            return replace(pinhole, recorded=Optics(self.K, model, shutter))
+        except SceneError:
+            return pinhole
+
+    def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The pinhole image of a recorded image, both RGB uint8 [height, width, 3]."""
+        import cv2
+
+        if not any(self.distortion):
+            return image
+        columns, rows = self._source
+        return np.asarray(
+            cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        )
+
+    def distort(self, pixels: Float) -> Float:
+        """Recorded image positions [..., 2] of positions [..., 2] in the pinhole image [px]."""
+        return self._recorded(pixels, self.pinhole_K)
+
+    @cached_property
+    def _source(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        column, row = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        recorded = self.distort(np.stack([column, row], axis=-1)) - 0.5
+        return recorded[..., 0].astype(np.float32), recorded[..., 1].astype(np.float32)
+
+    def _zoomed(self, zoom: float) -> Float:
+        k = self.K.copy()
+        k[0, 0] *= zoom
+        k[1, 1] *= zoom
+        return k
+
+    def _fits(self, zoom: float) -> bool:
+        column, row = np.arange(self.width + 1.0), np.arange(self.height + 1.0)
+        border = np.concatenate(
+            [np.stack([column, np.full_like(column, y)], 1) for y in (0, self.height)]
+            + [np.stack([np.full_like(row, x), row], 1) for x in (0, self.width)]
+        )
+        found = self._recorded(border, self._zoomed(zoom))
+        return bool((found >= 0).all() and (found <= [self.width, self.height]).all())
+
+    def _recorded(self, pixels: Float, pinhole: Float) -> Float:
+        k1, k2, p1, p2, k3 = self.distortion
+        x = (pixels[..., 0] - pinhole[0, 2]) / pinhole[0, 0]
+        y = (pixels[..., 1] - pinhole[1, 2]) / pinhole[1, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        u = (x * radial + dx) * self.K[0, 0] + self.K[0, 2]
+        v = (y * radial + dy) * self.K[1, 1] + self.K[1, 2]
+        return np.stack([u, v], axis=-1)
+
+
+# --- The reader protocol -------------------------------------------------------------------------
+
+
+class LogReader(Protocol):
+    """Reads one dataset layout.
+
+    Attributes:
+        name: the format's name, as given to ``open_log(format=...)``.
+        expects: one line for users, what the folder must hold.
+    """
+
+    name: str
+    expects: str
+
+    def recognises(self, path: Path) -> bool:
+        """Whether the folder looks like this layout; cheap, and never raises."""
+        ...
+
+    def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
+        """The log at ``path``; images and sweeps stay on disk until they are asked for.
+
+        ``sequence`` picks one where a folder holds several; the only one is the default.
+
+        Raises:
+            LogError: names the file (and line), what is wrong and what is expected. Tables are
+                checked here; images and sweeps when they are read, or by ``check_log``.
+        """
+        ...

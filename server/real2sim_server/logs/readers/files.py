@@ -1,0 +1,398 @@
+"""File formats of data sets, read strictly; every failure is a LogError that names the file."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...geometry.rotation import Float, is_rotation
+from ...scene import Trajectory
+from ..driving_log import LogError
+from ..images import check_image_file, read_image
+from .common import Lens
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFiles:
+    """One file per camera and frame, and the lens of every camera."""
+
+    files: Mapping[str, Sequence[Path]]
+    lenses: Mapping[str, Lens]
+
+    def read(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """The pinhole image, RGB uint8 [H, W, 3]."""
+        return self.lenses[camera].undistort(read_image(self.files[camera][frame]))
+
+    def check(self, camera: str, frame: int) -> None:
+        """Raise LogError when the file is cut off or of another size than its lens."""
+        lens = self.lenses[camera]
+        check_image_file(self.files[camera][frame], (lens.width, lens.height))
+
+
+# --- JSON ----------------------------------------------------------------------------------------
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        LogError: the file is missing or no JSON.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise LogError(f"{path}: is no JSON file ({error})") from error
+
+
+class Tables:
+    """A folder of JSON tables, whose rows refer to each other by ``token``."""
+
+    def __init__(self, folder: Path, names: Sequence[str]) -> None:
+        """Read the tables ``names``. Raises LogError naming a file that is missing or wrong."""
+        self._folder = folder
+        self._rows: dict[str, list[_Row]] = {}
+        self._by_token: dict[str, dict[str, _Row]] = {}
+        for name in names:
+            content = read_json(self.path(name))
+            if not isinstance(content, list) or not all(isinstance(r, dict) for r in content):
+                raise LogError(f"{self.path(name)}: expected a list of objects")
+            rows = [_Row(r, self.path(name)) for r in content]
+            if not all(isinstance(r["token"], str) for r in rows):
+                raise LogError(f"{self.path(name)}: a token is no text")
+            self._rows[name] = rows
+            self._by_token[name] = {r["token"]: r for r in rows}
+
+    def path(self, name: str) -> Path:
+        """The file of a table."""
+        return self._folder / f"{name}.json"
+
+    def rows(self, name: str) -> Sequence[Mapping[str, Any]]:
+        """All rows of a table."""
+        return self._rows[name]
+
+    def row(self, name: str, token: str) -> Mapping[str, Any]:
+        """The row with a token. Raises LogError where there is none."""
+        try:
+            return self._by_token[name][token]
+        except (KeyError, TypeError):
+            raise LogError(f"{self.path(name)}: has no row with token {token!r}") from None
+
+
+class _Row(dict[str, Any]):
+    """A row that says which file lacks which key."""
+
+    def __init__(self, content: Mapping[str, Any], path: Path) -> None:
+        super().__init__(content)
+        self._path = path
+
+    def __missing__(self, key: str) -> Any:
+        raise LogError(f"{self._path}: row {self.get('token')!r} has no {key!r}")
+
+
+# --- Parquet and Feather -------------------------------------------------------------------------
+
+CACHE_BYTES = 1 << 30
+"""How much of decoded row groups a file may keep in memory."""
+
+
+class ParquetFile:
+    """One Parquet file, whose columns are read when they are asked for.
+
+    Cells of heavy columns are read row group by row group; the latest ones stay in memory.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open ``path`` and read its footer. Raises LogError when it is missing or broken."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        self.path = path
+        self._lock = threading.Lock()
+        self._groups: OrderedDict[tuple[int, str], Any] = OrderedDict()
+        try:
+            self._file = pq.ParquetFile(path)
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:  # A name may be damaged.
+            raise LogError(f"{path}: cannot be read as Parquet ({_line(error)})") from error
+        with _broken_named(f"{path}: the list of columns"):
+            self.names = frozenset(self._file.schema_arrow.names)
+        metadata = self._file.metadata
+        sizes = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+        self._starts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def require(self, names: Sequence[str]) -> None:
+        """Raise LogError naming the first column that is missing."""
+        for name in names:
+            if name not in self.names:
+                raise LogError(
+                    f"{self.path}: has no column {name!r}; it has {sorted(self.names)[:12]}"
+                )
+
+    def numbers(self, name: str) -> NDArray[Any]:
+        """A whole column of numbers [N], or of fixed lists of numbers [N, K]."""
+        column = self._whole(name)
+        if column.null_count:
+            raise LogError(f"{self.path}: column {name!r} has {column.null_count} empty cells")
+        if not _is_list(column.type):
+            with _broken_named(f"{self.path}: column {name!r}"):
+                return np.asarray(column.to_numpy(zero_copy_only=False))
+        flat = column.flatten()
+        if len(column) == 0 or len(flat) % len(column) or flat.null_count:
+            raise LogError(f"{self.path}: the lists of column {name!r} differ in length")
+        return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(len(column), -1)
+
+    def texts(self, name: str) -> list[str]:
+        """A whole column of text [N]."""
+        return [str(value) for value in self.lists(name)]
+
+    def lists(self, name: str) -> list[Any]:
+        """A whole column as Python values; for small columns whose lists differ in length."""
+        column = self._whole(name)
+        with _broken_named(f"{self.path}: column {name!r}"):
+            return list(column.to_pylist())
+
+    def cell(self, name: str, row: int) -> Any:
+        """One pyarrow scalar of a heavy column."""
+        group = int(np.searchsorted(self._starts, row, side="right")) - 1
+        with self._lock:
+            column = self._group(group, name)
+        return column[int(row - self._starts[group])]
+
+    def _whole(self, name: str) -> Any:
+        import pyarrow as pa
+
+        self.require([name])
+        try:
+            with self._lock:
+                chunked = self._file.read(columns=[name]).column(name)
+        except (OSError, pa.ArrowException) as error:
+            raise LogError(f"{self.path}: column {name!r} is broken ({_line(error)})") from error
+        return chunked.combine_chunks() if chunked.num_chunks != 1 else chunked.chunk(0)
+
+    def _group(self, group: int, name: str) -> Any:
+        import pyarrow as pa
+
+        key = (group, name)
+        if key not in self._groups:
+            try:
+                table = self._file.read_row_group(group, columns=[name])
+            except (OSError, pa.ArrowException) as error:
+                raise LogError(
+                    f"{self.path}: row group {group} of column {name!r} is broken ({_line(error)})"
+                ) from error
+            self._groups[key] = table.column(name)
+        self._groups.move_to_end(key)
+        while len(self._groups) > 1 and self._kept_bytes() > CACHE_BYTES:
+            self._groups.popitem(last=False)
+        return self._groups[key]
+
+    def _kept_bytes(self) -> int:
+        return sum(int(column.nbytes) for column in self._groups.values())
+
+
+def check_feather(path: Path, columns: Sequence[str]) -> None:
+    """Raise LogError when a Feather file is cut off or lacks a column; reads no values."""
+    import pyarrow as pa
+    from pyarrow import ipc
+
+    try:
+        with path.open("rb") as file:
+            schema = ipc.open_file(file).schema
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
+    with _broken_named(f"{path}: the list of columns"):
+        _require(path, columns, list(schema.names))
+
+
+def _require(path: Path, columns: Sequence[str], there: Sequence[str]) -> None:
+    for name in columns:
+        if name not in there:
+            raise LogError(f"{path}: has no column {name!r}; it has {list(there)[:12]}")
+
+
+def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Columns of a Feather file (version 2) as arrays, text as arrays of objects.
+
+    Raises:
+        LogError: the file is missing or broken, a column is missing or has empty cells.
+    """
+    import pyarrow as pa
+    from pyarrow import ipc
+
+    try:
+        with path.open("rb") as file:
+            table = ipc.open_file(file).read_all()
+        # The file's offsets are followed as they are, unless they are looked at before.
+        table.validate(full=True)
+    except (OSError, ValueError, pa.ArrowException) as error:  # names that are no text among them
+        raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
+    with _broken_named(f"{path}: the list of columns"):
+        _require(path, columns, list(table.column_names))
+    found = {}
+    for name in columns:
+        column = table.column(name)
+        if column.null_count:
+            raise LogError(f"{path}: column {name!r} has {column.null_count} empty cells")
+        with _broken_named(f"{path}: column {name!r}"):
+            found[name] = np.asarray(column.to_numpy())
+    return found
+
+
+@contextmanager
+def _broken_named(where: str) -> Iterator[None]:
+    """Values that pyarrow cannot convert, such as text that is none, as LogError."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except (pa.ArrowException, ValueError, OverflowError) as error:
+        raise LogError(f"{where} is broken ({_line(error)})") from error
+
+
+def _is_list(kind: Any) -> bool:
+    import pyarrow as pa
+
+    return bool(
+        pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind)
+    )
+
+
+def _line(error: Exception) -> str:
+    """The first line of pyarrow's messages, which may be long."""
+    return str(error).split("\n", maxsplit=1)[0][:200]
+
+
+# --- Points --------------------------------------------------------------------------------------
+
+# Rows of float32 in a file without a header (``.bin``).
+
+
+def count_rows(path: Path, columns: int, hint: str = "is the file cut off?") -> int:
+    """How many rows of ``columns`` float32 a file holds, by its size; ``hint`` ends an error.
+
+    Raises:
+        LogError: it is missing or empty, or ends within a row.
+    """
+    if not path.is_file():
+        raise LogError(f"{path}: no such file; every frame needs its sweep")
+    size = path.stat().st_size
+    rows, rest = divmod(size, 4 * columns)
+    if rest or not rows:
+        raise LogError(
+            f"{path}: {size} bytes is no whole number of points ({columns} float32 each, "
+            f"{4 * columns} bytes); {hint}"
+        )
+    return rows
+
+
+def read_rows(path: Path, columns: int, hint: str = "is the file cut off?") -> NDArray[np.float32]:
+    """The rows [N, columns] of a file; arguments and errors are those of :func:`count_rows`."""
+    rows = count_rows(path, columns, hint)
+    try:
+        return np.fromfile(path, dtype=np.float32).reshape(rows, columns)
+    except (OSError, ValueError) as error:
+        raise LogError(f"{path}: cannot be read ({error})") from error
+
+
+# --- Text tables ---------------------------------------------------------------------------------
+
+
+def read_lines(path: Path) -> list[str]:
+    """Lines of a text file without trailing blank ones.
+
+    Raises:
+        LogError: the file is missing, not text, or empty.
+    """
+    try:
+        text = path.read_text(encoding="utf-8").rstrip()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise LogError(f"{path}: is not a text file ({error})") from error
+    if not text:
+        raise LogError(f"{path}: is empty")
+    return text.split("\n")
+
+
+def parse_numbers(words: list[str], where: str) -> Float:
+    """Finite float64 numbers of ``words``; ``where`` names file and line in the LogError."""
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise LogError(f"{where}: expected numbers, {error}") from error
+    if not np.isfinite(values).all():
+        raise LogError(f"{where}: holds a value that is not finite")
+    return values
+
+
+def read_number_table(path: Path, *, columns: int, what: str) -> Float:
+    """Rows [N, columns] float64 of a whitespace-separated table.
+
+    Raises:
+        LogError: with the line, for a wrong number of columns or values that are not finite.
+    """
+    rows = []
+    for number, line in enumerate(read_lines(path), start=1):
+        words = line.split()
+        where = f"{path} line {number}"
+        if len(words) != columns:
+            raise LogError(f"{where}: expected {columns} numbers ({what}), found {len(words)}")
+        rows.append(parse_numbers(words, where))
+    return np.array(rows)
+
+
+def check_rigid(matrix: Float, where: str) -> Float:
+    """The matrix [4, 4] itself when it is a finite rigid transform.
+
+    Raises:
+        LogError: otherwise.
+    """
+    if not np.isfinite(matrix).all():
+        raise LogError(f"{where}: holds a value that is not finite")
+    if not is_rotation(matrix[:3, :3]):
+        raise LogError(f"{where}: its left 3x3 block is no rotation matrix")
+    return matrix
+
+
+def check_frame_times(times_us: NDArray[np.int64], where: str) -> NDArray[np.int64]:
+    """The time stamps themselves when they increase strictly and there is at least one.
+
+    Raises:
+        LogError: naming the first frame that is out of order.
+    """
+    if len(times_us) == 0:
+        raise LogError(f"{where}: a log needs at least one frame")
+    unordered = np.flatnonzero(np.diff(times_us) <= 0)
+    if len(unordered):
+        i = int(unordered[0])
+        raise LogError(
+            f"{where}: frame times must increase strictly, but frame {i} is at {times_us[i]} us "
+            f"and frame {i + 1} at {times_us[i + 1]} us"
+        )
+    return times_us
+
+
+def check_ego_covers(ego: Trajectory, times_us: NDArray[np.int64], where: str) -> None:
+    """Refuse ego poses that do not reach over all frames.
+
+    Raises:
+        LogError: otherwise.
+    """
+    if not (ego.covers(int(times_us[0])) and ego.covers(int(times_us[-1]))):
+        raise LogError(
+            f"{where}: ego poses cover [{ego.start_us}, {ego.end_us}] us, but the frames go from "
+            f"{times_us[0]} to {times_us[-1]} us"
+        )

@@ -1,1 +1,0 @@
-"""File formats of data sets, read strictly; every failure is a LogError."""

@@ -1,1 +1,0 @@
-"""KITTI: tracking layout and raw drives."""

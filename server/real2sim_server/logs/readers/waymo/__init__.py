@@ -1,1 +1,0 @@
-"""Waymo Open Dataset (perception), editions 1 and 2."""
