@@ -1,4 +1,4 @@
-"""What readers of maps share: the protocol, errors, JSON and XML files, lanes from their borders."""
+"""What readers of maps share: the protocol, errors, JSON and XML files, borders of lanes."""
 
 from __future__ import annotations
 

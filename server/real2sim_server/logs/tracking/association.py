@@ -1,4 +1,4 @@
-"""Tracks of moving objects: association from frame to frame, Kalman smoothing, boxes of one size."""
+"""Tracks of moving objects: association of clusters, Kalman smoothing, boxes of one size."""
 
 from __future__ import annotations
 
