@@ -34,8 +34,7 @@ def validate(
     json: JsonFile = None,
 ) -> None:
     """Hold the physics to cases with known answers; exit code 1 when a line fails."""
-    from ..physics.validation.page import render_page
-    from ..physics.validation.table import as_figures
+    from ..physics.validation.table import as_figures, render_page
 
     with progress("validating") as report:
         results = _run(backend, cases, report)

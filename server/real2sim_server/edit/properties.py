@@ -18,8 +18,8 @@ from real2sim_proto.operations import (
     SetVelocity,
 )
 
+from ..physics.colliders import TriangleSurface
 from ..physics.errors import ColliderError
-from ..physics.triangle_mesh import TriangleSurface
 from .operation import (
     AppliedOperation,
     invalid_operation,

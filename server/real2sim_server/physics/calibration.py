@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from ..geometry.rotation import Float
-from .backends.reference.backend import torch_model
-from .backends.reference.step import TorchParameters, TorchState, substep, with_stress
+from . import stress
+from .backends.reference import TorchParameters, TorchState, substep, torch_model, with_stress
 from .colliders import Collider
-from .constitutive import material_row
 from .errors import SolverError
 from .fitting import COARSER, continued
 from .solver import Solver
@@ -238,9 +237,9 @@ def rollout(
 def _scaled(
     state: TorchState, params: TorchParameters, factor: dict[str, Tensor]
 ) -> tuple[TorchState, TorchParameters]:
-    columns = [torch.ones((), dtype=torch.float64)] * material_row.MATERIAL_ROW
-    columns[material_row.MU] = columns[material_row.LAMBDA] = factor["stiffness"]
-    columns[material_row.A], columns[material_row.VISCOSITY] = (
+    columns = [torch.ones((), dtype=torch.float64)] * stress.MATERIAL_ROW
+    columns[stress.MU] = columns[stress.LAMBDA] = factor["stiffness"]
+    columns[stress.A], columns[stress.VISCOSITY] = (
         factor["yield_stress"],
         factor["viscosity"],
     )

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from ..geometry.rotation import Float
+from . import stress
 from .backends import Measure, Model, ParticleArrays, Simulation, select_backend
-from .backends.base import SolverDiverged
 from .body import Body
 from .colliders import Collider
-from .constitutive import material_row
 from .errors import PhysicsError, SolverError, UnstableError
-from .model import build_model
+from .model import SolverDiverged, build_model
 
 CHECK_INTERVAL = 16
 """Substeps between two checks of energy and of finite numbers."""
@@ -400,7 +399,7 @@ class Solver:
 
 def _viscous_limit(model: Model) -> float:
     """Longest substep that Kelvin-Voigt damping allows [s]."""
-    eta = model.table[model.material, material_row.VISCOSITY]
+    eta = model.table[model.material, stress.VISCOSITY]
     density = model.masses / model.volumes
     rate = float((eta / density).max()) / model.dx**2
     return VISCOUS_STEP / rate if rate > 0 else math.inf

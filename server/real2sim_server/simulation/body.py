@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform
-from ..physics.body import Body
+from ..physics.body import Body, Particles
 from ..physics.colliders import Collider, Solid
 from ..physics.materials import Material
-from ..physics.particles import Particles
 from ..physics.solver import BodyState
 from .result import Rebound
 from .rigid import RigidMotion, added_inertia, best_rotation, cross_matrix, inertia_about

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..geometry.rotation import Float, quaternion_to_matrix
+from ..physics.body import Particles
 from ..physics.errors import ParticleError
 from ..physics.model import check_memory
-from ..physics.particles import Particles
 from ..scene import GaussianCloud
 from .masses import default_mass
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform
+from ..physics.body import Particles, box_particles
 from ..physics.colliders import Box, Collider
 from ..physics.materials import Material
-from ..physics.particles import Particles, box_particles
 from ..physics.solver import Solver, SolverOptions
 from ..scene import GaussianCloud
 from .body import DeformableBody, DeformedShape

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..physics.body import Particles
 from ..physics.errors import PhysicsError
 from ..physics.materials import FixedCorotated, Foam, Material
-from ..physics.particles import Particles
 from .structure import VEHICLES, vehicle_structure
 
 GRID_MIN, GRID_MAX = 16, 1000

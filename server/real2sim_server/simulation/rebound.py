@@ -16,7 +16,7 @@ import numpy as np
 
 from ..geometry.rotation import Float
 from ..physics.colliders import Collider, Plane, Solid
-from ..physics.restitution import fit_restitution
+from ..physics.fitting import fit_restitution
 from ..physics.solver import SolverOptions
 from .body import DeformableBody
 from .result import Rebound

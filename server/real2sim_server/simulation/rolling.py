@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._numba import func, kernel
-from ..physics.contact.collider_distance import collider_distance
+from ..physics.contact import collider_distance
 
 ROLLING = 0.015
 """Rolling resistance of a free wheel, fraction of its load."""

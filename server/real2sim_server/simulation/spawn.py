@@ -10,10 +10,9 @@ import numpy as np
 from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, is_rigid
-from ..physics.colliders import Collider, Solid
+from ..physics.body import Particles
+from ..physics.colliders import Collider, Solid, TriangleMesh
 from ..physics.errors import PhysicsError
-from ..physics.particles import Particles
-from ..physics.triangle_mesh import TriangleMesh
 from ..scene import Scene
 from .body import DeformableBody
 from .embedding import stretched

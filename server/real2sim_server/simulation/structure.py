@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.rotation import Float
+from ..physics.body import Particles
 from ..physics.materials import Material, NeoHookean, Snow, Structure
-from ..physics.particles import Particles
 
 M = TypeVar("M", bound=Material)
 

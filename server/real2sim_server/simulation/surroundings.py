@@ -14,9 +14,9 @@ import numpy as np
 
 from .._numba import kernel
 from ..geometry.rotation import Float
-from ..physics.backends.base import pack_colliders
 from ..physics.colliders import Box, Collider, HeightField, Plane, Solid
-from ..physics.contact.collider_distance import collider_distance, collider_velocity
+from ..physics.contact import collider_distance, collider_velocity
+from ..physics.model import pack_colliders
 from .rigid import RigidMotion
 
 

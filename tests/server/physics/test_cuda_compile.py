@@ -11,9 +11,9 @@ import pytest
 
 from real2sim_server._nvrtc import KernelSource
 from real2sim_server.physics import SolverError
-from real2sim_server.physics.backends.cuda import compile as compiling
-from real2sim_server.physics.backends.cuda import translate
-from real2sim_server.physics.backends.cuda.records import THREADS
+from real2sim_server.physics.backends.cuda import launcher as compiling
+from real2sim_server.physics.backends.cuda import source
+from real2sim_server.physics.backends.cuda.launcher import THREADS
 from real2sim_server.physics.backends.cuda.source import KERNELS, PRECISIONS
 from real2sim_server.render.backends.nvrtc.needs import compiler_needs
 
@@ -90,7 +90,7 @@ def spread(values: Any) -> Any:
 
 
 def test_a_function_becomes_cpp_with_the_types_that_it_needs() -> None:
-    made = translate.Translator("double", "some_")
+    made = source.Translator("double", "some_")
     name, kind = made.add(shortened, (("real",) * 3, "real"))
     assert (name, kind) == ("shortened", (("real",) * 3, "real"))
     assert "double total{};" in made.text  # Begun as a whole number, it does not stay one.
@@ -99,6 +99,6 @@ def test_a_function_becomes_cpp_with_the_types_that_it_needs() -> None:
 
 
 def test_more_than_kernels_know_is_refused_with_its_place() -> None:
-    made = translate.Translator("double", "some_")
-    with pytest.raises(translate.Untranslatable, match=r"spread, line \d+: .*\[value \* 2 for"):
+    made = source.Translator("double", "some_")
+    with pytest.raises(source.Untranslatable, match=r"spread, line \d+: .*\[value \* 2 for"):
         made.add(spread, (("real",) * 3,))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.physics.backends.cuda import records as r
+from real2sim_server.physics.backends.cuda import launcher as r
 from real2sim_server.physics.backends.cuda.launcher import Launch
-from real2sim_server.physics.backends.cuda.traffic import substep_traffic
+from real2sim_server.physics.backends.cuda.memory import substep_traffic
 from real2sim_server.physics.backends.layout import arrange
 
 from ..render.kernel_twin import COMPILER, NEEDS_COMPILER

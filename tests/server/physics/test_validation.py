@@ -14,8 +14,7 @@ from real2sim_server.cli.validate import validate
 from real2sim_server.physics import PhysicsError
 from real2sim_server.physics.validation import CASES, Check, ReferenceCurve
 from real2sim_server.physics.validation import table as table_module
-from real2sim_server.physics.validation.page import render_page
-from real2sim_server.physics.validation.table import run_table
+from real2sim_server.physics.validation.table import render_page, run_table
 from real2sim_server.simulation.experiments import published, theory
 
 SLOW_ON_CPU = {

@@ -10,7 +10,7 @@ import torch
 
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.geometry.rotation import quaternion_to_matrix
-from real2sim_server.physics.particles import box_particles
+from real2sim_server.physics.body import box_particles
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.simulation.breakages import find_breakages
 from real2sim_server.simulation.damage import (

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.physics.particles import box_particles
+from real2sim_server.physics.body import box_particles
 from real2sim_server.simulation.experiments.crash_tests import CrashPulse, barrier_test
 from real2sim_server.simulation.experiments.published import (
     MALIBU_CRUSH,

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..body import Body
+from ..body import Body, box_particles
 from ..colliders import Collider
 from ..materials import Material
-from ..particles import box_particles
 from ..solver import Solver, SolverOptions
 
 

@@ -27,8 +27,17 @@ from ...edit import ObjectState, ScenarioState
 from ...edit.compose import composed_background, contact_shadows
 from ...geometry.rotation import Float, quaternion_to_matrix
 from ...geometry.transform import transform_from
-from ...physics.colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane, Solid
-from ...physics.triangle_mesh import TriangleMesh, TriangleSurface
+from ...physics.colliders import (
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    HeightField,
+    Plane,
+    Solid,
+    TriangleMesh,
+    TriangleSurface,
+)
 from ...render import Instance
 from ...scene import Scene, SceneObject
 from ...simulation.ego import EGO, with_ego

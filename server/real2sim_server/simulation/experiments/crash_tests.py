@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
+from ...physics.body import box_particles
 from ...physics.colliders import Box, Collider, Plane
-from ...physics.particles import box_particles
 from ..body import DeformableBody
 from ..impact import vehicle_body
 from ..presets import ObjectPhysics, preset_of

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
+from ...physics.body import box_particles
 from ...physics.colliders import Box, Plane
 from ...physics.materials import FixedCorotated
-from ...physics.particles import box_particles
 from ...physics.validation.check import Check, ReferenceCurve, placed
 from ..body import BodyMode, DeformableBody
 from ..presets import ObjectPhysics

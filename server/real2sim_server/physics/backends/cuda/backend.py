@@ -20,9 +20,9 @@ from torch import Tensor
 from ....geometry.rotation import Float
 from ....render.backends.nvrtc.needs import unmet_need
 from ...colliders import Collider
-from ...contact.collider_distance import AXES, POINT, SPEED, SPIN
+from ...contact import AXES, POINT, SPEED, SPIN
 from ...errors import ParticleError, SolverError
-from ..base import Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
+from ...model import Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
 from ..layout import (
     BLOCK,
     BODY_BITS,
@@ -30,10 +30,9 @@ from ..layout import (
     COORDINATE_BITS,
     COORDINATE_LIMIT,
 )
-from . import records as r
+from . import launcher as r
 from .launcher import CudaLauncher, Launch, Launcher
-from .memory import SolverMemory
-from .sequences import advancing, arranging, flushing, measuring, substeps
+from .memory import SolverMemory, advancing, arranging, flushing, measuring, substeps
 
 INTERVAL = 16
 """Substeps that are queued at once: the solver checks as often, and sequences of launches that come
