@@ -1,4 +1,4 @@
-"""Bodies: particles with a material, a motion and a surface."""
+"""Bodies: particles with mass and volume, a material, a motion and a surface."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, is_rigid
 from .errors import MaterialError, ParticleError
 from .materials import Material
-
-# Particles: where they are, how much mass and volume they carry.
 
 BISECTIONS = 40
 

@@ -1,6 +1,7 @@
-"""Things that do not yield: ground planes, height fields, and solids at rest or in motion.
+"""Rigid obstacles: ground planes, height fields, and solids at rest or in motion.
 
-A solid is closed: a box, a cylinder, a capsule, or a ``triangle_mesh``.
+A solid is closed: a box, a cylinder, a capsule, or triangles. Triangles form a closed body or a
+sheet of a given thickness.
 """
 
 from __future__ import annotations
@@ -291,11 +292,11 @@ def _rotation(rotation_vector: Float) -> Float:
     return rotation
 
 
-# Colliders made of triangles: walls and kerbs as they are, closed bodies or sheets of a thickness.
+# Colliders made of triangles.
 #
-# The sign of a distance comes from pseudonormals of the nearest face, edge or vertex (Baerentzen and
-# Aanaes 2005), which is exact for closed meshes. Triangles are found by a tree of boxes that is one
-# array: of a box that is too far away a query skips all that is within.
+# The sign of a distance comes from pseudonormals of the nearest face, edge or vertex (Baerentzen
+# and Aanaes 2005), which is exact for closed meshes. A bounding volume tree in one array finds
+# triangles: a query skips everything inside a box that is too far away.
 
 TRIANGLES_MAX = 20_000
 FLAT = 1e-10

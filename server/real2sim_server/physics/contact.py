@@ -1,4 +1,13 @@
-"""Distance to colliders, as packed rows: one function for all shapes that there are."""
+"""Contact of bodies with colliders and with each other, one set of functions for every device.
+
+Colliders are packed rows, with one distance function for all shapes. Nodes of the grid stop most of
+a body but may all miss a collider that is thin against the cells. Such a collider also holds each
+particle: the kernel follows the particle's path through the substep to the first touch and removes
+the velocity that would carry it further in, wherever the grid lies.
+"""
+
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -8,9 +17,6 @@ from typing import Any
 import numpy as np
 
 from .numerics import F32, ONE, TINY, ZERO, device_function
-
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
-
 
 PLANE, BOX, HEIGHT_FIELD, CYLINDER, CAPSULE, MESH = range(6)
 
@@ -27,7 +33,7 @@ FIRST_NODE, NODES, HALF_THICKNESS = 24, 25, 27
 """Of a mesh, from where on its boxes and then its triangles stand there, how many boxes there are,
 and half the thickness of a sheet, 0 for a closed body."""
 THIN = 28
-"""1 where a box is thinner than cells of the grid; see ``particle``."""
+"""1 where a box is thinner than cells of the grid; see ``resolve_particle_collider``."""
 COLLIDER_ROW = 29
 MESH_NODE = 8
 """Numbers of a box of a mesh: low (3), high (3), the box after all within it, triangle or -1."""
@@ -245,7 +251,7 @@ def unit(x: Any, y: Any, z: Any) -> Any:
     return (x * inverse, y * inverse, z * inverse), length
 
 
-# Contact at one grid node: where surfaces are, and what contact does to velocities.
+# Where surfaces are at a grid node, and what contact does to velocities.
 
 REACH = F32(1.5)
 """Half width of the spline: a node sees particles up to this many cells away."""
@@ -345,13 +351,9 @@ def coulomb(v: Any, n: Any, friction: Any, separable: Any) -> Any:
     return keep * t[0], keep * t[1], keep * t[2]
 
 
-# Contact at one node: of a body with a collider, of two bodies; the same for every device.
-#
-# Arrays are rows of one node: velocity and mass [4], first moment of volume and volume [4], and the
-# totals [TOTALS] of one touch.
-
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
-# ruff: noqa: PLR0917
+# Contact at one node, of a body with a collider or of two bodies. Arrays are rows of one node:
+# velocity and mass [4], first moment of volume and volume [4], and the totals [TOTALS] of one
+# touch.
 
 
 ON_FACE = 1e-4
@@ -485,14 +487,7 @@ def resolve_node_pair(
         record_impulse(on_b, after, node_a, at, 0.5, total_b)
 
 
-# Contact of one particle with a collider that is thin against the cells of the grid.
-#
-# Nodes of the grid stop most of a body, see ``node``, but may all miss such a collider, so particles
-# are held by it themselves: each is followed over its way in a substep to where it first touches. Its
-# velocity loses what would carry it further in, nothing more, wherever the grid lies.
-
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
-# ruff: noqa: PLR0917
+# Contact of one particle with a thin collider.
 
 
 THIN_CELLS = 2.0

@@ -22,14 +22,6 @@ from .colliders import Collider, Plane
 from .errors import PhysicsError, SolverError
 from .solver import Solver, SolverOptions
 
-# Least squares over a handful of factors on what a simulation was given, by runs alone.
-#
-# Simulations are no smooth functions: contact comes a substep sooner or later. So slopes are taken by
-# differences over a span that is wide against such stairs, and steps are those of Levenberg and
-# Marquardt. What a result may be wrong by has two parts: what the observations leave open, and what
-# the cells do. The latter is how far the result moves when the same observations are explained on
-# coarser cells, continued to none (Richardson 1911, first order).
-
 SPANS = (0.2, 0.1, 0.05)
 """Of the logarithm of a factor, between the runs of a slope: the first, and after steps failed."""
 DAMPING, CALMER, BOLDER = 1e-3, 6.0, 0.2
@@ -252,17 +244,16 @@ def _size(off: Float) -> float:
     return float(np.sqrt(np.mean(off * off)))
 
 
-# Rebound by dissipation: viscosity is fitted so that a body bounces as requested.
+# Restitution by dissipation: the viscosity with which a body bounces as requested.
 #
-# An elastic body on a grid bounces too well, never too badly, so taking energy away is enough and
-# nothing is ever injected. Kelvin-Voigt damping of the first mode, omega = pi c / 2L, gives
-# e = e0 exp(-pi zeta / sqrt(1 - zeta^2)), zeta = eta omega / 2 (lambda + 2 mu); that is the first
-# guess, and canned impacts of the body itself do the rest.
+# An elastic body on a grid bounces too well, never too badly, so removing energy is enough. Kelvin-
+# Voigt damping of the first mode, omega = pi c / 2L, gives e = e0 exp(-pi zeta / sqrt(1 - zeta^2)),
+# zeta = eta omega / 2 (lambda + 2 mu). That is the first guess; impacts of the body itself refine
+# it.
 #
-# How well a body bounces depends on where the wall lies between the nodes of the grid: an elastic
-# block of six cells keeps 0.64 of its speed on a wall that runs through nodes and 0.88 on one just
-# below them, from wherever it comes. So the canned impacts are made on the very wall the body is
-# meant for, where it is given.
+# The rebound depends on where the wall lies between the grid's nodes: an elastic block of six cells
+# keeps 0.64 of its speed on a wall through nodes and 0.88 on one just below them. So the impacts
+# use the wall that the body is meant for, where it is given.
 
 TOLERANCE = 0.015
 """A fit stops when achieved and requested are this near."""

@@ -21,11 +21,7 @@ from . import stress
 from .errors import MaterialError
 from .stress import LAMBDA, LAW, MATERIAL_ROW, MU, PLASTIC, VISCOSITY, A
 
-# Which constitutive laws there are, and what each of them keeps of a particle.
-#
-# The functions themselves are in :mod:`.stress`, compiled, and once more in plain torch in
-# ``backends.reference.stress``. Both choose by the code of a law, so a new law is a record here, a
-# branch in each of the two, and columns of a row in :mod:`.material_row`.
+# Constitutive laws: the name, the code and what each keeps of a particle.
 
 
 @dataclass(frozen=True)
@@ -177,7 +173,7 @@ class Material:
         return math.inf
 
     def row(self) -> NDArray[np.float64]:
-        """The record as kernels read it: [MATERIAL_ROW] float64, see ``constitutive.material_row``.
+        """The record as kernels read it: [MATERIAL_ROW] float64, see ``stress.MATERIAL_ROW``.
 
         Raises:
             MaterialError: when there are not as many law parameters as the law has.
@@ -260,7 +256,7 @@ def named_material(name: str, **values: float) -> Material:
     return make(**values)
 
 
-# Materials that go back to their shape.
+# Elastic materials.
 
 
 @register_material("jelly", young=2e6, poisson=0.4, density=200.0)

@@ -1,4 +1,4 @@
-"""From bodies to a checked model: precision, grid, memory."""
+"""From bodies to a checked model, and the Protocol of the backends that solve it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .contact import STICKS, THIN_CELLS
 from .errors import ParticleError, SolverError
 from .materials import Material, law_of_code
 
-# What every solver backend takes and gives.
+# The interface of solver backends.
 
 TOTALS = 8
 """Columns of contact totals, all on a body: impulse (3) [N s], its moment about the world origin
@@ -40,7 +40,7 @@ class ParticleArrays:
         gradients: [N, 3, 3] APIC velocity gradient [1/s].
         F_elastic: [N, 3, 3], drives stress.
         F_total: [N, 3, 3], drives what is seen.
-        history: [N] plastic memory, see ``constitutive.stress``.
+        history: [N] plastic memory, see ``stress.stress_update``.
     """
 
     positions: Float

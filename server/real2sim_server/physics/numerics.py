@@ -1,4 +1,4 @@
-"""How functions for kernels are marked, and their constants."""
+"""Scalar and tuple functions that the kernels of every backend use, and their decorators."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _square_root(x):
     return root
 
 
-# 3x3 matrices as tuples of nine numbers, row by row; symmetric ones xx, yy, zz, xy, xz, yz.
+# 3x3 matrices as tuples of nine numbers, row by row; symmetric ones as xx, yy, zz, xy, xz, yz.
 
 POLAR_STEPS = 16
 JACOBI_SWEEPS = 8
@@ -271,7 +271,7 @@ def spline_weights(f: Any) -> Any:
     return HALF * left * left, THREE_QUARTERS - middle * middle, HALF * right * right
 
 
-# Options of the solver's kernels; how they are kept on disk is in ``_numba``.
+# Decorators of the CPU's kernels.
 
 inner: Any = functools.partial(func, fastmath=FASTMATH)
 """Compiles functions that only entry points call; they are kept as part of those."""

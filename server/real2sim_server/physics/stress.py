@@ -2,7 +2,7 @@
 
 ``stress_update`` is the one entry: it takes the trial elastic deformation gradient and gives the
 elastic part that is left after plastic flow, the Kirchhoff stress tau, the stored energy per rest
-volume and the history variable. Formulas: reference in :mod:`..materials` at each class.
+volume and the history variable. Formulas: reference in :mod:`.materials` at each class.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from .numerics import (
     times_transposed,
 )
 
-# A material as kernels read it: one row of numbers, columns by name.
+# A material as kernels read it: one row of numbers.
 
 COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW, CRUSH = range(7)
-"""Codes of constitutive laws in column LAW; see :mod:`.law`."""
+"""Codes of constitutive laws in column LAW; see ``materials.CONSTITUTIVE_LAWS``."""
 LAW, MU, LAMBDA, VISCOSITY, A, B, C, PLASTIC = range(8)
 """Columns. A, B and C are read by law. VISCOSITY above 0 damps; PLASTIC above 0 keeps F_total."""
 MATERIAL_ROW = 8
@@ -54,7 +54,7 @@ def stress_update(F: Any, history: Any, row: Any, dt: Any) -> Any:
     Args:
         F: trial deformation gradient, nine numbers.
         history: plastic memory; hardening [Pa], volume correction, or plastic volume ratio.
-        row: the material, see :mod:`.material_row`.
+        row: the material, a row with the columns above.
         dt: time since the last call [s]; 0 leaves rate-dependent flow out.
     """
     law = row[LAW]

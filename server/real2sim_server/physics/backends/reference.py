@@ -1,4 +1,7 @@
-"""The reference backend: plain torch, float64, one thread's worth of speed."""
+"""The reference backend: plain torch, float64, slow, obvious and differentiable.
+
+Other backends are tested against it.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,8 @@ from ..contact import CRUSHED, FLAT_MOMENT, INSIDE, ON_FACE, OPPOSED, STICKS, SU
 from ..model import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, is_thin
 from .reference_laws import collider_distance, first_touch, stress_update, wave_hardening
 
-# One substep in plain torch, as a pure function: slow, obvious, differentiable.
+# One substep as a pure function; it passes its pieces by position, as kernels do.
 
-# The substep passes its pieces on by position, as kernels do.
 # ruff: noqa: PLR0917
 
 
@@ -307,7 +309,7 @@ def _resolve_collider_contact(
 def _distance_behind(
     solid: Collider, nodes: Tensor, moment: Tensor, dx: float
 ) -> tuple[Tensor, Tensor]:
-    """Distance [U] of nodes to the face that the body looks at; see ``contact.node``."""
+    """Distance [U] of nodes to the face that the body looks at, as ``resolve_node_collider``."""
     volume = moment[:, 3:]
     out = dx * moment[:, :3] / torch.where(volume > 0, volume, torch.ones_like(volume))
     distance, n = collider_distance(solid, nodes + out)
@@ -326,8 +328,9 @@ def _resolve_thin_colliders(
 ) -> Tensor:
     """Velocities [N, 3] of particles once thin colliders have had their say, body after body.
 
-    See ``contact.particle``. On the CPU a particle is asked about those near its block alone, and
-    twice where they are several; asking about one more that it does not touch changes nothing.
+    See ``contact.resolve_particle_collider``. On the CPU a particle is asked about those near its
+    block alone, and twice where they are several; asking about one more that it does not touch
+    changes nothing.
     """
     thin = [(k, c) for k, c in enumerate(colliders) if is_thin(c, params.dx)]
     half = params.volume ** (1 / 3) / 2

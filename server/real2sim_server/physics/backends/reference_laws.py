@@ -1,6 +1,6 @@
 """Stress in plain torch, batched over particles: the oracle, and the differentiable path.
 
-Written in matrix form where ``constitutive.stress`` works with scalars and principal values:
+Written in matrix form where ``stress.stress_update`` works with scalars and principal values:
 logarithms by repeated square roots, flow by matrix exponentials. Nothing here divides by
 differences of principal values, so gradients are right at rest, too. Only snow needs singular
 values.
@@ -34,7 +34,7 @@ def stress_update(
 
     Args:
         F: [N, 3, 3] trial F_elastic.
-        history: [N], see ``constitutive.stress``.
+        history: [N], see ``stress.stress_update``.
         rows: [N, MATERIAL_ROW]; gradients flow to all columns but those of the law.
         dt: time since the last call [s].
     """
@@ -205,7 +205,7 @@ def _snow(F: Tensor, history: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Ten
 
 
 def wave_hardening(history: Tensor, rows: Tensor) -> Tensor:
-    """[N] by how much plastic flow has stiffened particles; see ``constitutive.stress``."""
+    """[N] by how much plastic flow has stiffened particles; see ``stress.stress_update``."""
     codes = rows[:, stress.LAW]
     packed = (codes == stress.SNOW) | (codes == stress.CRUSH)
     hardening = (rows[:, stress.C] * (1 - history.exp())).clamp(-3, 3).exp()
@@ -216,7 +216,7 @@ def _trace(a: Tensor) -> Tensor:
     return a.diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
-# Distances to colliders, and ways to them, in plain torch; see ``contact.collider_distance``.
+# Distances to colliders, as in ``contact.collider_distance``.
 
 
 def collider_distance(collider: Collider, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -346,7 +346,7 @@ _LOCAL: dict[type[Solid], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
 def first_touch(solid: Solid, x: Tensor, way: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
     """Fraction [N] of each way until a particle touches a solid, MISSES where none; normals.
 
-    See ``contact.particle``.
+    See ``contact.resolve_particle_collider``.
     """
     if isinstance(solid, Box):
         return _touch_of_box(solid, x, way, half)
@@ -375,7 +375,7 @@ def first_touch(solid: Solid, x: Tensor, way: Tensor, half: Tensor) -> tuple[Ten
 
 
 def _face_on(solid: Solid, along: Tensor, n: Tensor, half: Tensor) -> Tensor:
-    """See ``contact.particle.face_on``; ``along`` is the direction of the way."""
+    """See ``contact.face_on``; ``along`` is the direction of the way."""
     if not isinstance(solid, Cylinder | Capsule):
         return n
     own = (solid.radius / half).clamp(max=1.0)[:, None]

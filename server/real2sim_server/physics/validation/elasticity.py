@@ -1,4 +1,4 @@
-"""Elastic bodies: waves, bending, stiffness, contact of balls."""
+"""Elastic bodies with known answers: waves, bending, stiffness, impacts and Hertz contact."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _pushes(solver: Solver) -> np.ndarray:
     return mean
 
 
-# A clamped beam: how far it bends, and how fast it oscillates (Euler and Bernoulli).
+# A clamped beam: deflection and frequency (Euler and Bernoulli).
 
 LENGTH, HEIGHT, DX = 2.0, 0.2, 0.05
 MATERIAL = FixedCorotated(young=1e6, poisson=0.0, density=1000)
@@ -255,7 +255,7 @@ def _follow_tip(
     return np.array(times), np.array(heights)
 
 
-# Elastic bodies that hit each other: discs that swap velocities, a ball on a wall.
+# Elastic bodies in collision.
 
 _HERTZ_POWER = 1.5 * 1.07
 """Hertz's indentation is close to sin(pi t)^(1.07), its force to the power 3/2 of that."""

@@ -1,4 +1,4 @@
-"""Motion that has exact answers: falling, shearing, spinning, scaling, conserving."""
+"""Motion and contact with exact answers: free fall, shear, spin, friction, rebound, gradients."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def _drop(body: Body, backend: str) -> np.ndarray:
     return solver.particles().positions
 
 
-# Gradients through the reference against central differences.
+# Gradients through the reference backend against central differences.
 
 STEPS, DT = 60, 5e-4
 

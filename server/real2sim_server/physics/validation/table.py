@@ -1,4 +1,4 @@
-"""The whole table at once: ``real2sim validate``."""
+"""The validation table of ``real2sim validate``, and the same table as one HTML page."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _run_case(name: str, case: Case, backend: str) -> CaseResult:
     return CaseResult(name, about, checks, error, time.perf_counter() - begin)
 
 
-# The table as one page without anything beside it: lines, margins, curves.
+# The table as a self-contained page.
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem; color: #20242c; }

@@ -20,9 +20,7 @@ from .deform import SCRATCH
 from .kernels import advance, measure_blocks
 from .particle import COLUMNS, NODES, TILE, ParticleState, StepParameters, Workspace
 
-# What backends on blocks have in common: loading, sorting, sums, contact totals, saving.
-#
-# Arrays live where the backend computes; a backend says how they get there and back.
+# Loading, sorting, sums, contact totals and saving of particles in blocks.
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +77,7 @@ class BlockSimulation:
         raise NotImplementedError
 
     def _measure_blocks(self) -> tuple[Float, Int]:
-        """Rows of sums [R, COLUMNS], see ``particle``, and the block [R] of each."""
+        """Rows of sums [R, COLUMNS], see ``cpu.particle``, and the block [R] of each."""
         raise NotImplementedError
 
     def _load_state(self, state: ParticleState) -> ParticleState:

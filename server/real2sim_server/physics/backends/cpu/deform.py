@@ -8,6 +8,11 @@ bounds. What flows is turned to its principal stretches, a batch together as wel
 few, and what does not converge, go one by one.
 """
 
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
+# Numba types intrinsics without their typing context.
+# mypy: disable-error-code="call-arg, unreachable, var-annotated"
+
 from __future__ import annotations
 
 import math
@@ -56,10 +61,8 @@ from .particle import deform
 
 # Between particles in rows and lanes in columns, as explicit vector code.
 #
-# Rows are turned eight at a time by three rounds of shuffles; moved number by number they cost as
-# much as what is computed from them.
-
-# Numba intrinsics take arguments by position.
+# Rows are turned eight at a time by three rounds of shuffles; moving single numbers would cost as
+# much as the computation.
 
 
 EIGHT = 8
@@ -188,12 +191,6 @@ def _way_back(context: Any, builder: Any, signature: Any, arguments: Any) -> tup
     scratch, plane, rows, first = arguments
     kinds = signature.args[2], signature.args[0]
     return _ColumnEmitter(context, builder, kinds, (rows, scratch)), plane, first
-
-
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
-# ruff: noqa: PLR0917
-# Numba types intrinsics without their typing context.
-# mypy: disable-error-code="call-arg, unreachable, var-annotated"
 
 
 _F, _L, _TAU, _ENERGY, _VOLUME, _MU, _LAMBDA, _ETA, _OFF = 0, 9, 18, 24, 25, 26, 27, 28, 29

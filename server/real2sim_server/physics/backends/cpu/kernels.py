@@ -1,5 +1,10 @@
 """The substep on the CPU: blocks scatter to tiles, fields add up and touch, blocks gather."""
 
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
+# Numba types intrinsics without their typing context.
+# mypy: disable-error-code="call-arg, unreachable, var-annotated"
+
 from __future__ import annotations
 
 import math
@@ -28,8 +33,6 @@ from .particle import (
     place,
     velocity_gradient,
 )
-
-# Contact on the fields of one block: bodies with each other, bodies with colliders.
 
 
 @inner()
@@ -65,9 +68,6 @@ def resolve_body_contact(begin: Any, end: Any, layout: Any, work: Any, params: A
                     )  # fmt: skip
 
 
-# Sums and bounds over the particles of each block.
-
-
 @entry(parallel=True)
 def measure_blocks(state: Any, layout: Any, params: Any, out: Any) -> None:
     """Fill ``out`` [P, COLUMNS] float64, one row for each block."""
@@ -86,9 +86,6 @@ def measure_blocks(state: Any, layout: Any, params: Any, out: Any) -> None:
 #
 # A node is four numbers in a row, so one LLVM vector; LLVM's own vectorisers do not find that shape
 # in scalar loops. Precision follows the array.
-
-# Numba intrinsics take arguments by position.
-# ruff: noqa: PLR0917
 
 
 LANES = 4
@@ -232,12 +229,6 @@ def _total(e: _LaneEmitter, w: Sequence[Any], v: Sequence[Any]) -> Any:
 def _lever(e: _LaneEmitter, w: Sequence[Any], v: Sequence[Any]) -> Any:
     """Sum of w v times 0, 1, 2 over three neighbours."""
     return e.fused(e.builder.fadd(w[2], w[2]), v[2], e.builder.fmul(w[1], v[1]))
-
-
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
-# ruff: noqa: PLR0917
-# Numba types intrinsics without their typing context.
-# mypy: disable-error-code="call-arg, unreachable, var-annotated"
 
 
 @entry()

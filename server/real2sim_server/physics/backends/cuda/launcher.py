@@ -1,4 +1,4 @@
-"""What the solver asks of a device, and the device that is a GPU."""
+"""The solver's interface to a device: compiled kernels, their records, and launches on a GPU."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...._nvrtc import ARCHITECTURES, KernelSource
+from ...._nvrtc import KernelSource
 from ....render.backends.nvrtc.usage import Usage, usage_of
 from ...errors import SolverError
 from .source import FOLDER, KERNELS, SOURCE, solver_source
 
-# What the kernels read, as NumPy types: the structures of ``kernels/space.h``, field by field.
+# The kernels' structures as NumPy types: ``kernels/space.h``, field by field.
 
 THREADS = 128
 PIECE = 1024
@@ -68,11 +68,6 @@ HELD = np.dtype(
         ("unused", np.uint32, (6,)),
     ]
 )
-
-
-# The solver's kernels, compiled by NVRTC.
-
-__all__ = ["ARCHITECTURES", "compile_kernels", "compiled_kernels"]
 
 
 def compiled_kernels(precision: str, architecture: str) -> bytes:

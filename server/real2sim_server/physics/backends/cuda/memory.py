@@ -1,4 +1,4 @@
-"""Memory of one simulation on the device: two sets of particles, lists, work space, a report."""
+"""Memory of one simulation on the device, and the sequences of kernels that work on it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ...model import TOTALS, Model
 from . import launcher as r
 from .launcher import Launch, Launcher
 
-# Which kernels are launched one after the other: nothing here depends on what particles do.
+# Sequences of kernel launches; they do not depend on what particles do.
 
 KEY_BYTES = 8
 
@@ -362,7 +362,7 @@ class SolverMemory:
         return torch.zeros(nbytes, dtype=torch.uint8, device=self._launcher.device)
 
 
-# Bytes that a substep moves between memory and multiprocessors, counted and not measured.
+# Bytes that a substep moves between memory and multiprocessors, counted rather than measured.
 
 _KEYS, _INDEX = 8, 4
 

@@ -1,4 +1,11 @@
-"""The text that is compiled: constants and functions shared with the CPU, then the kernels."""
+"""The kernels' source text: constants and functions shared with the CPU, translated to C++.
+
+Functions marked by ``numerics.device_function`` use a small part of Python: numbers, tuples of
+numbers, rows of arrays that are read or added to, ``if``, ``for`` over a range, ``while``, and
+calls of such functions. All fractional numbers share one type, which the caller names; integers
+stay integers. The translator refuses anything else by name and line, so that compiling the kernels,
+not running them on a device, shows a function that outgrows this subset.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +23,7 @@ import numpy as np
 
 from ... import contact, numerics, stress
 
-# C++ text of the functions that backends share, so that a law and a contact are written once.
-#
-# What is marked by ``numerics.device_function`` is a small part of Python: numbers, tuples of them,
-# rows of arrays that are read or added to, ``if``, ``for`` over a range, ``while``, and calls of such
-# functions. Every number with a fraction is of one type, which the caller names; what is whole stays
-# whole. Anything else is refused by name and line, so that a function that outgrows this is seen when
-# the kernels are compiled, and not on a device.
+# The translator.
 
 Kind = str | tuple[Any, ...]
 """``real``, ``int``, ``bool``, ``rows`` (read), ``row`` (and written), ``void``, or a tuple."""
