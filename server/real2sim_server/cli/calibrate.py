@@ -62,8 +62,7 @@ def calibrate(
     """
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
-    from ..simulation.calibration import calibrate_object
-    from ..simulation.calibration.requested import observations_of
+    from ..simulation.calibration import calibrate_object, observations_of
 
     given = _read(observed)
     loaded = load_scene(scene)

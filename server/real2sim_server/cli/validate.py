@@ -56,8 +56,7 @@ def _run(backend: str, cases: str | None, report: Callable[[int, int], None]) ->
     """The cases asked for; ``published`` stands for all of the published crash figures, and
     ``simulation`` for all of bodies that roll, hand over and hit thin things."""
     from ..physics.validation import table
-    from ..simulation.experiments.published import PUBLISHED
-    from ..simulation.experiments.theory import THEORY
+    from ..simulation.experiments.crash_tests import PUBLISHED, THEORY
 
     names = [*table.CASES, *THEORY]
     if cases is not None:

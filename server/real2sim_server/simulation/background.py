@@ -1,9 +1,9 @@
-"""The background of a scene as colliders: upright boxes about what stands in the way.
+"""Colliders of a scene: its ground, and upright boxes around the obstacles of its background.
 
-What is solid is what the closed loop takes for solid (``scene.obstacles``). Cells that touch each
-other are one thing; its Gaussians are parted along their length until a box seen from above fits
-each part: one for a pole, one for each side of a house, several for a hedge that bends. Only one
-side of a wall was seen, so that boxes grow away from the recorded way.
+Solid cells are the closed loop's (``scene.obstacles``). Adjacent cells form one obstacle. Its
+Gaussians are split along their length until a box seen from above fits each part: one for a pole,
+one for each side of a house, several for a curved hedge. The recording saw only one side of a wall,
+so boxes grow away from the recorded path.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..geometry.rotation import Float
 from ..geometry.transform import invert_transform
-from ..physics.colliders import Box
+from ..physics.colliders import Box, HeightField
 from ..scene import GaussianCloud, Ground, Scene
 from ..scene.obstacles import CELL, HIGHEST, OPAQUE, OccupiedCells, RecordedWay, occupied_cells
 
@@ -232,3 +232,39 @@ def _upright(name: str, rectangle: _Rectangle, ground: Ground, high: Float) -> B
     pose[:2, 0], pose[:2, 1] = rectangle.along, rectangle.across
     pose[:2, 3], pose[2, 3] = rectangle.centre, (low + top) / 2
     return Box(name=name, T_world_box=pose, size=(rectangle.length, rectangle.width, top - low))
+
+
+# The ground.
+
+GROUND = "ground"
+"""Name of the collider; tyres roll on what has it."""
+
+MARGIN = 40.0
+"""The collider reaches this far around what it is for [m]."""
+
+
+def ground_collider(
+    ground: Ground, places: Float, *, offset: float = 0.0, friction: float | None = None
+) -> HeightField:
+    """The cells of a scene's ground around some places: the same surface, bit for bit.
+
+    Args:
+        ground: of the scene.
+        places: [N, 2] what the collider is for, N >= 1, world [m].
+        offset: by which it is raised [m].
+        friction: of the collider; None for that of the bodies.
+    """
+    last = np.array(ground.heights.shape) - 1
+    low, high = places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN
+    first = np.floor((low - ground.first_centre) / ground.cell).astype(np.int64)
+    end = np.ceil((high - ground.first_centre) / ground.cell).astype(np.int64)
+    # At least two samples each way, also where the places are beside the grid.
+    i, j = np.clip(first, 0, last - 1).tolist()
+    m, n = np.clip(end, [i + 1, j + 1], last).tolist()
+    return HeightField(
+        name=GROUND,
+        heights=ground.heights[i : m + 1, j : n + 1].astype(np.float64) + offset,
+        origin=ground.first_centre + np.array([i, j]) * ground.cell,
+        spacing=ground.cell,
+        friction=friction,
+    )

@@ -22,10 +22,17 @@ from ..physics.colliders import Collider, Solid
 from ..physics.materials import Material
 from ..physics.solver import BodyState
 from .result import Rebound
-from .rigid import RigidMotion, added_inertia, best_rotation, cross_matrix, inertia_about
-from .rolling import advance_on_wheels
-from .surroundings import closest, packed, solid_gaps
-from .tyres import TyreReaction, Tyres
+from .rigid import (
+    RigidMotion,
+    added_inertia,
+    best_rotation,
+    closest,
+    cross_matrix,
+    inertia_about,
+    packed,
+    solid_gaps,
+)
+from .tyres import TyreReaction, Tyres, advance_on_wheels
 
 NO_TYRES = Tyres(np.zeros((0, 3)), np.zeros(0), rest=np.zeros(0))
 

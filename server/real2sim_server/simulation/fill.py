@@ -19,7 +19,7 @@ from ..physics.body import Particles
 from ..physics.errors import ParticleError
 from ..physics.model import check_memory
 from ..scene import GaussianCloud
-from .masses import default_mass
+from .structure import default_mass
 
 OPACITY_MIN = 0.05
 """Fainter Gaussians are haze and stand for no particles."""

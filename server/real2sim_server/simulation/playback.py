@@ -16,7 +16,8 @@ from ..geometry.rotation import Float
 from ..physics.errors import PhysicsError
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene, Trajectory
-from .damage import Breakage, DamagedVehicle, fragment_cloud, with_underside
+from .breakage import Breakage, fragment_cloud, with_underside
+from .damage import DamagedVehicle
 from .embedding import Embedding, deform_cloud, stretched
 from .result import ObjectResult, SimulationResult
 from .structure import VEHICLES

@@ -17,7 +17,7 @@ from .._files import atomic_folder
 from ..geometry.rotation import Float
 from ..geometry.transform import transform_from
 from ..physics.errors import PhysicsError
-from .damage.breakage import Breakage
+from .breakage import Breakage
 
 FORMAT = "real2sim-simulation"
 VERSION = 2

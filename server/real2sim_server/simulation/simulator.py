@@ -1,21 +1,257 @@
-"""Bodies and colliders in motion: the simulator decides who deforms and who is rigid."""
+"""Bodies and colliders in motion: the simulator decides which bodies deform and which are rigid."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+import math
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ..geometry.rotation import Float
 from ..physics.colliders import Box, Collider
 from ..physics.solver import ContactTotals, Solver, SolverOptions
 from .body import SLEEP_SPEED, BodyMode, DeformableBody
-from .bounces import Bounces
-from .contacts import ContactLog
-from .resting import GENTLE, Resting, touches_any
-from .support import supports_of
+from .rebound import Bounces
+from .resting import GENTLE, Resting, supports_of, touches_any
+from .result import ContactRecord
 from .tyres import TyreReaction
-from .unyielding import as_boxes, by_owner, withstands
+
+# Contacts and energies, through both deformation and rigid motion.
+
+
+class ContactLog:
+    """Impulses and energies since the start, by body and what touched it.
+
+    Attributes:
+        collider_work: of moving colliders on bodies [J].
+    """
+
+    def __init__(self) -> None:
+        self._impulses: dict[tuple[str, str], Float] = {}
+        self._friction_work: dict[tuple[str, str], float] = {}
+        self._times: dict[tuple[str, str], list[float]] = {}
+        self._dozing: dict[tuple[str, str], float] = {}
+        self._asleep: dict[tuple[str, str], float] = {}
+        self._solver_totals: dict[tuple[str, str], tuple[Float, float, float]] = {}
+        self.collider_work = 0.0
+
+    def start_solver(self) -> None:
+        """A new solver counts from zero."""
+        self._solver_totals = {}
+
+    def add_solver_contacts(
+        self, contacts: Iterable[ContactTotals], time: float, names: set[str]
+    ) -> None:
+        """Add what a solver's contacts have grown by since the last call.
+
+        Args:
+            contacts: of the present solver, since its start.
+            time: [s].
+            names: of all bodies; others are colliders.
+        """
+        for c in contacts:
+            key = (c.body, c.other)
+            impulse, friction_work, work = self._solver_totals.get(key, (np.zeros(3), 0.0, 0.0))
+            self.add(*key, c.impulse - impulse, c.friction_work - friction_work, time)
+            if c.other not in names:
+                self.collider_work += c.work - work
+            self._solver_totals[key] = (np.array(c.impulse), c.friction_work, c.work)
+
+    def add(self, body: str, other: str, impulse: Float, friction_work: float, time: float) -> None:
+        """Add an impulse [3] [N s] and the work of friction [J] at a time [s]."""
+        key = (body, other)
+        if not np.any(impulse):
+            return
+        self._impulses[key] = self._impulses.get(key, np.zeros(3)) + impulse
+        self._friction_work[key] = self._friction_work.get(key, 0.0) + friction_work
+        times = self._times.setdefault(key, [time, time])
+        times[1] = time
+        self._asleep[key] = self._asleep.get(key, 0.0) + self._dozing.pop(key, 0.0)
+
+    def add_sleep(self, bodies: set[str], time: float, duration: float) -> None:
+        """Count a step of sleep at a time [s].
+
+        What holds a sleeping body is recorded only in steps in which others rest beside it; all
+        other steps count as sleep once another impulse follows.
+        """
+        for key, (_, last) in self._times.items():
+            if key[0] in bodies and last != time:
+                self._dozing[key] = self._dozing.get(key, 0.0) + duration
+
+    def totals(self) -> dict[tuple[str, str], Float]:
+        """Impulses so far, by (body, other) [N s]."""
+        return {key: value.copy() for key, value in self._impulses.items()}
+
+    @property
+    def friction_work(self) -> float:
+        """Dissipated by friction so far [J]."""
+        return sum(self._friction_work.values())
+
+    def records(self, masses: dict[str, float], gravity: Float) -> tuple[ContactRecord, ...]:
+        """All contacts, in the order they began.
+
+        Args:
+            masses: of bodies [kg].
+            gravity: [3] acceleration [m/s^2].
+        """
+        order = sorted(self._impulses, key=lambda key: (self._times[key][0], key))
+        return tuple(
+            ContactRecord(
+                object_id=key[0],
+                other=key[1],
+                impulse=_three(self._impulses[key]),
+                delta_v=float(np.linalg.norm(self._impulses[key])) / masses[key[0]],
+                first_s=self._times[key][0],
+                last_s=self._times[key][1],
+                heat=self._friction_work[key],
+                impact_delta_v=self._impact_delta_v(key, masses[key[0]], gravity),
+            )
+            for key in order
+        )
+
+    def _impact_delta_v(self, key: tuple[str, str], mass: float, gravity: Float) -> float:
+        """Of the impulse beyond what the weight asks for from the first touch to the last, but for
+        sleep in between; only the impulse's part against gravity can be that."""
+        impulse, (first, last) = self._impulses[key] / mass, self._times[key]
+        awake = last - first - self._asleep[key]
+        strength = float(np.linalg.norm(gravity))
+        if strength == 0:
+            return float(np.linalg.norm(impulse))
+        up = -gravity / strength
+        carried = float(np.clip(impulse @ up, 0.0, strength * awake))
+        return float(np.linalg.norm(impulse - carried * up))
+
+
+def _three(vector: Float) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def energies(bodies: Iterable[DeformableBody], gravity: Float) -> tuple[float, float, float]:
+    """Kinetic, elastic and gravity energy of all bodies now [J]."""
+    kinetic = elastic = potential = 0.0
+    for body in bodies:
+        kinetic += body.kinetic_energy
+        elastic += body.elastic_energy
+        potential -= body.motion.mass * float(gravity @ body.motion.centre)
+    return kinetic, elastic, potential
+
+
+# Unyielding bodies: they stay rigid and are colliders for the other bodies.
+#
+# A cone does not dent a truck. Where the whole energy of an impact could not dent a body by as much
+# as its particles resolve, only the lighter body deforms. The other body becomes a few boxes on its
+# nearby surface for the lighter one's solver, and receives the impulse and moment they exchanged.
+
+LIGHTER = 10.0
+"""A body may stay rigid against what is so many times lighter."""
+DENT = 0.5
+"""Dents that are shallower than so many spacings of particles are not resolved by them."""
+PATCH_CELLS = 4.0
+"""Boxes cover a body's surface as far as this around what touches it [cells]."""
+ALIKE = 1.5
+"""Layers whose sides lie within so many spacings of each other are one box."""
+
+
+def withstands(body: DeformableBody, other: DeformableBody, gravity: Float) -> bool:
+    """Whether a body keeps its shape whatever another does to it at the speeds they have now.
+
+    The force that yielding takes is the least yield stress near by over the other's smallest face.
+    What is only elastic gives way at any force, and so never withstands.
+
+    Args:
+        body: any.
+        other: that touches it, or will.
+        gravity: [3] [m/s^2].
+    """
+    a, b = body.motion, other.motion
+    if LIGHTER * b.mass > a.mass:
+        return False
+    near = np.unique(body.regions[_patch(body, other)]).tolist()
+    if not near:
+        return True
+    strength = min(body.materials[region].strength for region in near)
+    if not math.isfinite(strength):
+        return False
+    speed = float(np.linalg.norm(a.velocity - b.velocity))
+    speed += body.reach * float(np.linalg.norm(a.angular_velocity))
+    speed += other.reach * float(np.linalg.norm(b.angular_velocity))
+    energy = a.mass * b.mass / (a.mass + b.mass) * speed * speed / 2
+    edges = np.sort(other.box()[1])
+    force = strength * float(edges[0] * edges[1]) - b.mass * float(np.linalg.norm(gravity))
+    return bool(energy < force * DENT * body.spacing)
+
+
+def as_boxes(body: DeformableBody, other: DeformableBody) -> list[Box]:
+    """The part of a body that another may touch, layer upon layer, moving as the body does."""
+    pose, m, s = body.T_world_object, body.motion, body.spacing
+    local = body.local_positions()[_patch(body, other)]
+    boxes: list[Box] = []
+    for low, high in _layers(local, body.cell, s):
+        middle = np.eye(4)
+        middle[:3, 3] = (low + high) / 2
+        place = pose @ middle
+        boxes.append(
+            Box(
+                name=f"{body.name}:{other.name}:{len(boxes)}",
+                T_world_box=place,
+                size=high - low,
+                velocity=m.velocity_at(place[:3, 3]),
+                angular_velocity=m.angular_velocity,
+                friction=math.sqrt(body.friction * other.friction),
+            )
+        )
+    return boxes
+
+
+def by_owner(
+    contacts: Iterable[ContactTotals], owners: Mapping[str, DeformableBody]
+) -> list[ContactTotals]:
+    """Contacts with what boxes of a body have done added up and under its name."""
+    found: dict[tuple[str, str], ContactTotals] = {}
+    for c in contacts:
+        other = owners[c.other].name if c.other in owners else c.other
+        known = found.get((c.body, other))
+        if known is None:
+            found[c.body, other] = replace(c, other=other)
+            continue
+        found[c.body, other] = replace(
+            known,
+            impulse=known.impulse + c.impulse,
+            moment=known.moment + c.moment,
+            friction_work=known.friction_work + c.friction_work,
+            work=known.work + c.work,
+        )
+    return list(found.values())
+
+
+def _patch(body: DeformableBody, other: DeformableBody) -> NDArray[np.bool_]:
+    """Which particles [N] of a body lie in a cube about another, edges along the body's own."""
+    pose = body.T_world_object
+    centre = pose[:3, :3].T @ (other.motion.centre - pose[:3, 3])
+    half = other.reach + PATCH_CELLS * body.cell
+    inside: NDArray[np.bool_] = np.all(np.abs(body.local_positions() - centre) < half, axis=1)
+    return inside
+
+
+def _layers(local: Float, cell: float, spacing: float) -> list[tuple[Float, Float]]:
+    """Corners (low, high) of boxes about particles [N, 3], one above the other."""
+    level = np.floor(local[:, 2] / cell)
+    layers: list[tuple[Float, Float]] = []
+    for k in np.unique(level).tolist():
+        own = local[level == k]
+        low, high = own.min(axis=0) - spacing / 2, own.max(axis=0) + spacing / 2
+        if layers:
+            below_low, below_high = layers[-1]
+            apart = np.abs(np.concatenate([low - below_low, high - below_high])[[0, 1, 3, 4]])
+            if apart.max() < ALIKE * spacing:
+                low, high = np.minimum(low, below_low), np.maximum(high, below_high)
+                layers.pop()
+        layers.append((low, high))
+    return layers
+
 
 STEP = 0.005
 """Longest time between two checks of what is near what [s]."""

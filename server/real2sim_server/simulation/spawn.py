@@ -17,12 +17,11 @@ from ..scene import Scene
 from .body import DeformableBody
 from .embedding import stretched
 from .fill import fill_object
-from .masses import centre_height
 from .playback import PlacedObject, PlacedObjects
 from .presets import ObjectPhysics, Preset
 from .rebound import fit_rebound
-from .structure import VEHICLES
-from .surroundings import clearance
+from .rigid import clearance
+from .structure import VEHICLES, centre_height
 from .tyres import Tyres, track_of
 
 SPEED_MAX = 200.0

@@ -19,10 +19,11 @@ from real2sim_server.simulation.calibration import (
     BoxTrack,
     MarkedPoints,
     ObservedImages,
+    Simulated,
     calibrate_object,
+    drawn,
+    observations_of,
 )
-from real2sim_server.simulation.calibration.observations import Simulated, drawn
-from real2sim_server.simulation.calibration.requested import observations_of
 from real2sim_server.simulation.embedding import Embedding
 from real2sim_server.simulation.playback import Playback
 from real2sim_server.simulation.presets import ObjectPhysics

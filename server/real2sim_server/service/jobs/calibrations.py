@@ -10,9 +10,13 @@ from real2sim_proto.jobs import CalibrateRequest, JobInfo
 
 from ...edit import ScenarioState
 from ...scene import Scene
-from ...simulation.calibration import ObjectCalibration, Observation, calibrate_object
-from ...simulation.calibration.calibrate import CalibrationCancelled
-from ...simulation.calibration.requested import observations_of
+from ...simulation.calibration import (
+    CalibrationCancelled,
+    ObjectCalibration,
+    Observation,
+    calibrate_object,
+    observations_of,
+)
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError
 from ..library.scene_cache import SceneCache

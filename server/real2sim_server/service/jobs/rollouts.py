@@ -40,14 +40,13 @@ from ...physics.colliders import (
 )
 from ...render import Instance
 from ...scene import Scene, SceneObject
+from ...simulation.background import ground_collider
 from ...simulation.ego import EGO, with_ego
 from ...simulation.experiments.setups import set_up
-from ...simulation.ground import ground_collider
 from ...simulation.playback import PlacedObjects, Playback
-from ...simulation.presets import ObjectPhysics
+from ...simulation.presets import ObjectPhysics, with_values
 from ...simulation.result import ENERGIES, SimulationResult
 from ...simulation.rollout import SimulateOptions, simulate
-from ...simulation.values import with_values
 from ..http.problems import ServiceError
 
 NEARBY_DISTANCE = 25.0
