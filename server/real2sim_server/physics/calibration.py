@@ -26,7 +26,7 @@ DAMPING = 1e-3
 DAMPING_MIN = 1e-12
 CALMER, BOLDER = 5.0, 0.2
 """What damping is multiplied by after a step that was rejected, and after one that was kept."""
-LONGEST_STEP = 0.5
+MAX_STEP = 0.5
 """Of the logarithm of a factor, in one step."""
 PATIENCE = 3
 """Rejected steps in a row after which slopes are taken over a wider span."""
@@ -139,7 +139,7 @@ def _discretisation(
         path = rollout(coarse, names, dt=dt, every=every, observations=len(target))
         step = -(inverse @ (path(logs) - target).reshape(-1))
         if bool(torch.isfinite(step).all()):
-            moved[coarser] = step.clamp(-LONGEST_STEP, LONGEST_STEP).numpy()
+            moved[coarser] = step.clamp(-MAX_STEP, MAX_STEP).numpy()
     if not moved:
         return dict.fromkeys(names, math.inf)
     return dict(zip(names, continued(moved).tolist(), strict=True))
@@ -169,7 +169,7 @@ def _step(J: Tensor, off: Tensor, damping: float) -> Tensor:
     normal = scaled.T @ scaled + damping * torch.eye(len(scale), dtype=J.dtype)
     step = torch.linalg.solve(normal, -(scaled.T @ off)) / scale
     longest = float(step.abs().max())
-    bounded: Tensor = step * min(1.0, LONGEST_STEP / max(longest, 1e-30))
+    bounded: Tensor = step * min(1.0, MAX_STEP / max(longest, 1e-30))
     return bounded
 
 

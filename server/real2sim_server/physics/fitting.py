@@ -25,8 +25,8 @@ from .solver import Solver, SolverOptions
 SPANS = (0.2, 0.1, 0.05)
 """Of the logarithm of a factor, between the runs of a slope: the first, and after steps failed."""
 DAMPING, CALMER, BOLDER = 1e-3, 6.0, 0.2
-LONGEST_STEP = 0.5
-"""Of the logarithm of a factor, in one step."""
+MAX_STEP = 0.5
+"""Largest change of a factor's logarithm in one step."""
 SETTLED = 2e-3
 """Steps shorter than this, as a fraction of what is uncertain or of the factor, end the search."""
 KNOWN_BEFORE = 3.0
@@ -35,8 +35,8 @@ TOLD = 1.0
 """Standard deviation of the logarithm from which on observations are said to tell nothing."""
 COARSER = (1.5, 2.0)
 """Cells on which the result is looked at again, against those that it was found on."""
-LEAST_COARSER = 1.25
-"""Where bodies are too thin for those."""
+MIN_COARSER = 1.25
+"""Coarsening where bodies are too thin for those."""
 CHORDS = 2
 """Steps with the same slopes on coarser cells."""
 
@@ -190,8 +190,8 @@ class _Search:
     def _discretisation(self, covariance: Float) -> Float:
         """[K] how far the logarithms are from those on cells of no size."""
         moved: dict[float, Float] = {}
-        for coarser in (*COARSER, LEAST_COARSER):
-            if moved and coarser == LEAST_COARSER:
+        for coarser in (*COARSER, MIN_COARSER):
+            if moved and coarser == MIN_COARSER:
                 break
             logs = self._logs.copy()
             try:
@@ -199,7 +199,7 @@ class _Search:
                     off = self._run(logs, coarser)
                     if np.isfinite(off).all():
                         step = -covariance @ (self._J.T @ off)
-                        logs = logs + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+                        logs = logs + np.clip(step, -MAX_STEP, MAX_STEP)
             except PhysicsError:
                 continue
             moved[coarser] = logs - self._logs
@@ -232,11 +232,11 @@ def _covariance(J: Float) -> Float:
 
 
 def _step(J: Float, off: Float, damping: float) -> Float:
-    """One damped step of the logarithms, at most LONGEST_STEP."""
+    """One damped step of the logarithms, at most MAX_STEP."""
     normal = J.T @ J
     normal = normal + np.diag(damping * np.diag(normal) + 1e-12)
     step = np.linalg.solve(normal, -(J.T @ off))
-    bounded = step * min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-30))
+    bounded = step * min(1.0, MAX_STEP / max(float(np.abs(step).max()), 1e-30))
     return np.asarray(bounded, dtype=np.float64)
 
 

@@ -156,7 +156,7 @@ when its frame is racked by so much, root mean square over the frame [m]. Lamina
 first: side windows give way with their door."""
 OUTER = 0.75
 """Quantile of the way in that counts: half of what is around a lamp is behind it."""
-LEAST_PARTICLES = 3
+MIN_PARTICLES = 3
 NEAR = 0.6
 """Particles within so many spacings of a part's box carry it."""
 
@@ -212,7 +212,7 @@ class BreakageLog:
         self._carried: list[tuple[Part, Any]] = []
         for part in parts_of(category, size):
             near = np.flatnonzero(part.holds(rest, NEAR * spacing))
-            if len(near) >= LEAST_PARTICLES:
+            if len(near) >= MIN_PARTICLES:
                 self._carried.append((part, near))
         self.broken: dict[str, float] = {}
         """How far each part's limit was passed at most; 1 and more is broken."""

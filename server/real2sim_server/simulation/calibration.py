@@ -296,8 +296,8 @@ def _require_sigmas(observation: object, *names: str) -> None:
 
 # Observations from requests and files, checked against a scene.
 
-LONGEST = 30.0
-"""Observations reach so far beyond the start of a simulation at most [s]."""
+MAX_OBSERVED_TIME = 30.0
+"""Latest observation after the start of a simulation [s]."""
 
 
 def observations_of(
@@ -335,10 +335,11 @@ def observations_of(
 
 def _times(times_us: Sequence[int], start_us: int) -> Float:
     times: Float = (np.array(times_us, dtype=np.float64) - start_us) * 1e-6
-    if times.min() < 0 or times.max() > LONGEST:
+    if times.min() < 0 or times.max() > MAX_OBSERVED_TIME:
         raise PhysicsError(
             f"observations reach from {min(times_us)} to {max(times_us)} us; the simulation begins "
-            f"at {start_us} us: give what was seen from then on, for {LONGEST:g} s at most"
+            f"at {start_us} us: give what was seen from then on, for {MAX_OBSERVED_TIME:g} s at "
+            "most"
         )
     return times
 

@@ -34,8 +34,8 @@ STREAK = np.array([0.45, 0.45, 0.05])
 """Length, width and height of scrapes [m]: what moves on a road scrapes along it."""
 SCRAPED_FROM, SCRAPE_EDGE = (0.68, 0.66), 0.1
 """Of a field from 0 to 1, from where on paint is gone or smeared, and how soon wholly."""
-MOST = (0.5, 0.3)
-"""Of paint that is gone, and that is smeared."""
+MAX_SCRAPE = (0.5, 0.3)
+"""Greatest share of paint that is gone, and that is smeared."""
 TABLE = 16
 """Heights repeat after so many cells, more than a vehicle is long."""
 
@@ -61,7 +61,7 @@ def scrapes(points: Float, seed: int) -> Float:
     for k, least in enumerate(SCRAPED_FROM):
         corners = random.uniform(0.0, 1.0, (TABLE,) * 3)
         values, _ = _piecewise(points / STREAK, corners)
-        found[:, k] = MOST[k] * np.clip((values - least) / SCRAPE_EDGE, 0.0, 1.0)
+        found[:, k] = MAX_SCRAPE[k] * np.clip((values - least) / SCRAPE_EDGE, 0.0, 1.0)
     return found
 
 
@@ -386,7 +386,7 @@ LOOSE = 0.25
 """How far its loose end stands off, against how far it hangs down."""
 CLEARANCE = 0.04
 """Of a loose bumper above the road [m]."""
-LEAST_MOVED = 8e-3
+MIN_DISPLACEMENT = 8e-3
 """Particles that have moved less than this leave Gaussians where they are [m]: a body hit hard
 bends elastically by several millimetres all along, and the slowest impact that deforms at all
 dents by more than twice as much."""
@@ -569,7 +569,7 @@ class DamagedVehicle:
 
 def _moved(displacements: Float) -> NDArray[np.bool_]:
     """[N] particles that have moved by more than what leaves Gaussians where they are."""
-    moved: NDArray[np.bool_] = np.linalg.norm(displacements, axis=1) > LEAST_MOVED
+    moved: NDArray[np.bool_] = np.linalg.norm(displacements, axis=1) > MIN_DISPLACEMENT
     return moved
 
 

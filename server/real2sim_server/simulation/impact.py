@@ -40,8 +40,8 @@ CFL = 0.6
 with shorter ones."""
 SAMPLE_DT = 0.005
 FRAME_SAMPLES = 2
-LONGEST = 0.25
-"""A crash is over by then [s]."""
+MAX_CRASH_TIME = 0.25
+"""Longest simulated crash [s]."""
 SETTLING_TIME = 0.015
 """After they parted, shapes displacement_history out for so long [s]."""
 TOUCHED, ENDED = 0.01, 0.002
@@ -318,7 +318,7 @@ def _collide(
     solver = Solver([b.solver_body() for b in bodies], colliders, options)
     first = last = _closing(solver, along)
     samples, settling_time = 0, 0.0
-    for _ in range(round(LONGEST / SAMPLE_DT)):
+    for _ in range(round(MAX_CRASH_TIME / SAMPLE_DT)):
         solver.step(SAMPLE_DT)
         speed = _closing(solver, along)
         if first - speed > TOUCHED * first:

@@ -47,8 +47,8 @@ ELASTIC = 0.8
 """Least restitution between bodies that nothing damps and of which none was requested: what elastic
 cubes with a Poisson's ratio of 0.3 have by finite elements, the rest is vibration. Grids lose more,
 as nodes where two meet take on one velocity at once."""
-LONGEST = 0.1
-"""Impacts that take longer are waited for no more by others of their chain [s]."""
+MAX_IMPACT_TIME = 0.1
+"""Others of a chain no longer wait for an impact that takes longer than this [s]."""
 ROUNDS = 100
 """Impacts of a chain one after the other, at most; with a restitution below 1 few matter."""
 
@@ -215,7 +215,7 @@ class Bounces:
         for chain in self._chains(wanted):
             impacts = {pair: self._impacts[pair] for pair in chain}
             over = {p: i for p, i in impacts.items() if i.quiet >= QUIET}
-            if all(i.quiet >= QUIET or i.age > LONGEST for i in impacts.values()):
+            if all(i.quiet >= QUIET or i.age > MAX_IMPACT_TIME for i in impacts.values()):
                 for pair in over:
                     del self._impacts[pair]
                 yield from self._part(over, wanted, walls, step)

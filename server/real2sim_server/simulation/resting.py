@@ -4,7 +4,7 @@ On a grid, bodies that lie on each other sink a little with every step and never
 longer deform they become rigid, and forces at their contact points keep them apart: never
 attractive, with Coulomb friction, and such that no point goes deeper than when the contact began
 (sequential impulses; Catto 2005). Each step starts from the forces of the last. An approach faster
-than GENTLE is an impact and deforms.
+than GENTLE_THRESHOLD is an impact and deforms.
 """
 
 from __future__ import annotations
@@ -186,15 +186,15 @@ def _balanced(body: DeformableBody, contacts: Sequence[Contacts], gravity: Float
     return bool(left < SHORTFALL)
 
 
-GENTLE = 0.3
+GENTLE_THRESHOLD = 0.3
 """Contacts in which nothing approaches faster carry without deforming, nor bounce [m/s]."""
-STEADY = 2.0
+STEADY_THRESHOLD = 2.0
 """What is pushed away faster has not come to rest against it but is about to bounce [m/s^2]."""
 SWEEPS = 30
 """Passes over all contacts in a step."""
 DRIFT = 0.1
 """Once points have slid or opened by so much their pair is looked at anew [spacings]."""
-LAID = 0.1
+LAID_THRESHOLD = 0.1
 """Points that lie higher than this above a collider do not carry yet [spacings]."""
 PUSH, PUSH_SPEED = 0.2, 0.05
 """Fraction of what is too deep that a step takes back, and at most how fast [m/s]. Bodies are moved
@@ -209,7 +209,7 @@ Pair = tuple[str, str]
 
 
 @dataclass(eq=False)
-class Touch:
+class ContactPoint:
     """One point at which a body touches something.
 
     Attributes:
@@ -261,11 +261,11 @@ class Reaction:
     heat: float
 
 
-class Resting:
+class RestingContacts:
     """The contacts of bodies that have settled, by body and what carries it."""
 
     def __init__(self) -> None:
-        self._touches: dict[Pair, list[Touch]] = {}
+        self._touches: dict[Pair, list[ContactPoint]] = {}
 
     def holds(self, body: DeformableBody, other: str) -> bool:
         """Whether a body and another, or a collider, touch here."""
@@ -303,7 +303,7 @@ class Resting:
             colliders: at rest, that touch its surface.
             others: bodies that it may touch.
         """
-        found: list[tuple[Pair, list[Touch]]] = []
+        found: list[tuple[Pair, list[ContactPoint]]] = []
         for collider in colliders:
             found.append(((body.name, collider.name), _on_collider(body, collider)))
         for other in others:
@@ -373,7 +373,7 @@ class Resting:
                 nearest = min(touches, key=lambda t: float(np.abs(t.local - touch.local).sum()))
                 touch.impulse = nearest.impulse * (len(touches) / len(known))
             # What falls over strikes with its far edge: that is an impact.
-            if known and all(_closing(t) <= GENTLE for t in known):
+            if known and all(_closing(t) <= GENTLE_THRESHOLD for t in known):
                 self._touches[pair] = known
             else:
                 del self._touches[pair]
@@ -390,20 +390,20 @@ def touches_any(
 
 def _on_collider(
     body: DeformableBody, collider: Collider, *, rest: float | None = None
-) -> list[Touch]:
+) -> list[ContactPoint]:
     """Where a body touches a collider; it carries as deep as it lies, or at ``rest`` [m]."""
     touches = []
     for contacts in collider_contacts(body, [collider]):
         distance, _ = clearance(collider, contacts.points)
         for point, gap in zip(contacts.points, distance.tolist(), strict=True):
-            laid = min(gap, 0.0) if gap > LAID * body.spacing else gap
+            laid = min(gap, 0.0) if gap > LAID_THRESHOLD * body.spacing else gap
             depth = laid if rest is None else min(max(rest, laid), 0.0)
             local, mu = _local(body, point), contacts.friction(contacts.normals[0])
-            touches.append(Touch(body, collider, local, local, local, depth, mu))
+            touches.append(ContactPoint(body, collider, local, local, local, depth, mu))
     return touches
 
 
-def _on_body(body: DeformableBody, other: DeformableBody) -> list[Touch]:
+def _on_body(body: DeformableBody, other: DeformableBody) -> list[ContactPoint]:
     """Where a body touches another; it carries as they lie."""
     turn = other.T_world_object[:3, :3]
     touches = []
@@ -411,7 +411,9 @@ def _on_body(body: DeformableBody, other: DeformableBody) -> list[Touch]:
         mu = contacts.friction(contacts.normals[0])
         for point, normal in zip(contacts.points, contacts.normals, strict=True):
             there = _local(other, point)
-            touches.append(Touch(body, other, _local(body, point), there, turn.T @ normal, 0.0, mu))
+            touches.append(
+                ContactPoint(body, other, _local(body, point), there, turn.T @ normal, 0.0, mu)
+            )
     return touches
 
 
@@ -421,7 +423,7 @@ def _local(body: DeformableBody, point: Float) -> Float:
     return local
 
 
-def _closing(touch: Touch) -> float:
+def _closing(touch: ContactPoint) -> float:
     """Speed at which the point and what carries it approach each other [m/s]."""
     own, normal, _, _ = touch.place()
     velocity = touch.body.motion.velocity_at(own)
@@ -430,14 +432,14 @@ def _closing(touch: Touch) -> float:
     return -float(velocity @ normal)
 
 
-def _strikes(touch: Touch) -> bool:
+def _strikes(touch: ContactPoint) -> bool:
     """Whether this is an impact: too fast for rigid contact, or in the midst of being stopped.
 
     Bodies that carry each other jolt each other as they settle, so that only colliders stop.
     """
-    if _closing(touch) > GENTLE or isinstance(touch.other, DeformableBody):
-        return _closing(touch) > GENTLE
-    return float(touch.body.acceleration @ touch.place()[1]) > STEADY
+    if _closing(touch) > GENTLE_THRESHOLD or isinstance(touch.other, DeformableBody):
+        return _closing(touch) > GENTLE_THRESHOLD
+    return float(touch.body.acceleration @ touch.place()[1]) > STEADY_THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -462,7 +464,7 @@ class _Step:
 class _Row:
     """A touch in one step: what impulses along its normal and two tangents do."""
 
-    def __init__(self, touch: Touch, step: _Step) -> None:
+    def __init__(self, touch: ContactPoint, step: _Step) -> None:
         self.touch = touch
         own, normal, gap, _ = touch.place()
         axes = np.stack([normal, *tangents(normal, np.array([1.0, 0.3, 0.2]))])

@@ -14,7 +14,7 @@ from ..physics.colliders import Box, Collider
 from ..physics.solver import ContactTotals, Solver, SolverOptions
 from .body import SLEEP_SPEED, BodyMode, DeformableBody
 from .rebound import Bounces
-from .resting import GENTLE, Resting, supports_of, touches_any
+from .resting import GENTLE_THRESHOLD, RestingContacts, supports_of, touches_any
 from .result import ContactRecord
 from .tyres import TyreReaction
 
@@ -323,7 +323,7 @@ class HybridSimulator:
         self._names = {b.name for b in bodies}
         self._solver: Solver | None = None
         self._solved: list[str] = []
-        self._resting = Resting()
+        self._resting = RestingContacts()
         self._floors: dict[str, float] = {}
         for body in self.bodies:
             if not (np.any(body.motion.velocity) or np.any(body.motion.angular_velocity)):
@@ -514,7 +514,7 @@ class HybridSimulator:
         if any(b.name in held and b.mode == BodyMode.DEFORMING for b in others):
             return True
         beside = self._resting.island(body)
-        fast = [b for b in others if b.name not in beside and _closing(body, b) > GENTLE]
+        fast = [b for b in others if b.name not in beside and _closing(body, b) > GENTLE_THRESHOLD]
         if self._is_near_bodies(body, fast, duration):
             return True
         asleep = body.mode == BodyMode.SLEEPING
@@ -523,7 +523,7 @@ class HybridSimulator:
                 continue
             gap, approach = body.gap_to_colliders([collider])
             # Nothing here carries a collider that moves, however slowly.
-            least = APPROACH_MIN if collider.moving else GENTLE
+            least = APPROACH_MIN if collider.moving else GENTLE_THRESHOLD
             if approach > least and gap < _touch_distance(body) + approach * duration:
                 return True
         return not asleep and self._strikes_through(body, duration)
@@ -537,7 +537,7 @@ class HybridSimulator:
             return False
         gap, approach = body.gap_to_colliders(self.road)
         self._floors[body.name] = gap
-        return approach > GENTLE and gap < ROAD_CELLS * body.cell + approach * duration
+        return approach > GENTLE_THRESHOLD and gap < ROAD_CELLS * body.cell + approach * duration
 
     def _may_be_rigid(self, body: DeformableBody) -> bool:
         """Whether a deforming body that has settled is free, or lies on what does not deform any
@@ -620,7 +620,7 @@ class HybridSimulator:
     ) -> bool:
         for other in others:
             turning = _turning(body) + _turning(other)
-            if not _approach(body, other) and turning <= GENTLE:
+            if not _approach(body, other) and turning <= GENTLE_THRESHOLD:
                 continue
             closing = float(np.linalg.norm(body.motion.velocity - other.motion.velocity))
             near = TOUCH_CELLS * body.cell + (closing + turning) * duration

@@ -85,8 +85,8 @@ END, OUTER = 0.2875, 0.1745
 """Fractions of the length, at each end, that give way, and that are straightened again."""
 END_HEIGHT = 1.35
 """Height of the section that the ends' stresses below are for [m]: the barrier test's."""
-LEAST = 0.3
-"""Sections that are filled less high were seen too little to carry what they should [m]."""
+MIN_SECTION = 0.3
+"""Smallest filled height of a section [m]; a lower one was seen too little to carry its load."""
 OUTER_DENSITY = 0.35
 """Density of the outer part against that of the rest: engine and axles are behind it."""
 ROOF_DENSITY = 0.12
@@ -170,13 +170,13 @@ def vehicle_structure(
             materials.append(_roof(structure.roof * GRAVITY * particles.mass, volume, size[2]))
         elif zone == DOORS:
             height = volume / (2 * SIDE * (1 - 2 * END) * size[0] * size[1])
-            scale = SIDE_STRESS * structure.side / CAR.front * END_HEIGHT / max(height, LEAST)
+            scale = SIDE_STRESS * structure.side / CAR.front * END_HEIGHT / max(height, MIN_SECTION)
             materials.append(_scaled(RAILS_MATERIAL, scale))
         else:
             ahead, kind = divmod(zone - ENDS, len(END_MATERIALS))
             section = section_height or _end_height(particles, zones, ahead, size)
             stiffness = structure.front if ahead else structure.rear
-            scale = stiffness / CAR.front * END_HEIGHT / max(section, LEAST)
+            scale = stiffness / CAR.front * END_HEIGHT / max(section, MIN_SECTION)
             materials.append(_scaled(END_MATERIALS[kind], scale))
     light = (zones >= ENDS) & ((zones - ENDS) % len(END_MATERIALS) > 0)
     masses = particles.masses * np.where(light, OUTER_DENSITY, 1.0)
