@@ -20,7 +20,7 @@ BISECTIONS = 40
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Particles at rest, in one frame.
+    """Particles at rest in one frame.
 
     Attributes:
         positions: [N, 3] float64 [m].
@@ -88,7 +88,7 @@ class Particles:
         return replace(self, positions=apply_transform(matrix, self.positions))
 
     def take(self, index: NDArray[Any]) -> Particles:
-        """Those that ``index`` names: indices in any order, or a mask [N]."""
+        """The particles of ``index``: indices in any order, or a mask [N]."""
         return Particles(
             self.positions[index], self.volumes[index], self.masses[index], self.source[index]
         )
@@ -174,7 +174,7 @@ def _require(holds: NDArray[Any], problem: str) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """One thing that moves and deforms, in the world frame.
+    """A deformable body in the world frame.
 
     Attributes:
         name: unique among the bodies of a solver.

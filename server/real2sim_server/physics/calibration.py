@@ -1,4 +1,4 @@
-"""Materials and motion from what was seen, by least squares through the differentiable solver."""
+"""Materials and motion from observations, by least squares through the differentiable solver."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ FLAT = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What was found.
+    """The result of a calibration.
 
     Attributes:
         factors: by parameter, on the value the solver was given.
@@ -128,7 +128,7 @@ def _discretisation(
     dt: float,
     every: int,
 ) -> dict[str, float]:
-    """How far logarithms are from those on cells of no size, by those on coarser ones."""
+    """Distance of the logarithms to those on cells of size zero, from coarser cells."""
     scale = _scale(J)
     scaled = J / scale
     inverse = torch.linalg.pinv(scaled) / scale[:, None]

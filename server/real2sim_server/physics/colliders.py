@@ -22,7 +22,7 @@ from .errors import ColliderError
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Collider:
-    """What all colliders have in common.
+    """Base class of colliders.
 
     Attributes:
         name: unique among the colliders of a solver.
@@ -54,7 +54,7 @@ class Collider:
 
     @property
     def fastest_point(self) -> float:
-        """Speed [m/s] that no point of it exceeds."""
+        """Upper bound of the speed of its points [m/s]."""
         return 0.0
 
     def after(self, duration: float) -> Collider:
@@ -85,7 +85,7 @@ class Plane(Collider):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solid(Collider):
-    """What has an inside, at rest or moving as a rigid body. Its pose is the field POSE names.
+    """A closed shape, at rest or in rigid motion. The field named POSE is its pose.
 
     Attributes:
         velocity: [3] of the origin of its frame [m/s].
@@ -118,7 +118,7 @@ class Solid(Collider):
 
     @property
     def thickness(self) -> float:
-        """Least extent across it [m]."""
+        """Smallest extent [m]."""
         low, high = self.bounds
         return float((high - low).min())
 
@@ -129,7 +129,7 @@ class Solid(Collider):
 
     @cached_property
     def fastest_point(self) -> float:
-        """Speed [m/s] that no point of it exceeds."""
+        """Upper bound of the speed of its points [m/s]."""
         low, high = self.bounds
         reach = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
         spin = float(np.linalg.norm(self.angular_velocity))
@@ -213,7 +213,7 @@ class Cylinder(Solid):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capsule(Solid):
-    """All that is within ``radius`` of a line along the z axis of its frame; a ball for length 0.
+    """All points within ``radius`` of a line along its z axis; a ball for length 0.
 
     Attributes:
         T_world_capsule: [4, 4] pose; origin at the middle of the line.
@@ -307,7 +307,7 @@ _SIDES = ((0, 1), (1, 2), (2, 0))
 
 @dataclass(frozen=True, eq=False)
 class TriangleSurface:
-    """Triangles that are checked and ready for queries; may be shared by many colliders.
+    """Checked triangles, ready for queries; many colliders may share them.
 
     Attributes:
         vertices: [V, 3] [m]; those at the same place become one.

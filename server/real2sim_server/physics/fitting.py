@@ -47,7 +47,7 @@ to."""
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was found.
+    """The result of a fit.
 
     Attributes:
         factors: by parameter; 1 for what observations do not tell.
@@ -69,12 +69,12 @@ class Fit:
 
     @property
     def untold(self) -> list[str]:
-        """Parameters that observations do not tell."""
+        """Parameters that the observations do not determine."""
         return [name for name, u in self.uncertainty.items() if math.isinf(u)]
 
 
 def fit(residuals: Residuals, parameters: Sequence[str], *, steps: int = 12) -> Fit:
-    """Find the factors that explain observations best.
+    """Find the factors that best explain the observations.
 
     Args:
         residuals: simulates and compares.
@@ -99,7 +99,7 @@ def fit(residuals: Residuals, parameters: Sequence[str], *, steps: int = 12) -> 
 
 
 class _Search:
-    """Logarithms of factors, on their way to the least squares."""
+    """The search over logarithms of factors."""
 
     def __init__(self, residuals: Residuals, names: tuple[str, ...]) -> None:
         self._residuals = residuals
@@ -127,7 +127,7 @@ class _Search:
         return self._J
 
     def determined(self, J: Float) -> np.ndarray:
-        """[K] bool, whether observations tell anything about each parameter.
+        """[K] bool, whether the observations determine each parameter.
 
         Raises:
             SolverError: when they tell nothing at all.
@@ -175,7 +175,7 @@ class _Search:
                 damping *= CALMER
 
     def result(self) -> Fit:
-        """With what it may be wrong by, in both ways."""
+        """The fit with both parts of its uncertainty."""
         covariance = _covariance(self._J)
         observation = np.sqrt(np.diag(covariance)) * self._scatter()
         moved = self._discretisation(covariance)
@@ -212,7 +212,7 @@ class _Search:
 
 
 def continued(moved: Mapping[float, Float]) -> Float:
-    """[K] how far a result is from that on cells of no size, by how far it moves on coarser cells.
+    """[K] distance of a result to that on cells of size zero, from its change on coarser cells.
 
     Of first order, by least squares over all of these: a body that lies differently on the grid
     moves it as well, and from one alone that would count several times.
@@ -263,7 +263,7 @@ IMPACTS_MAX = 14
 
 @dataclass(frozen=True, eq=False)
 class RestitutionFit:
-    """What was requested, what was reached, and with what.
+    """Requested and reached restitution, and the fitted viscosity.
 
     Attributes:
         body: the body with the fitted viscosity in all its materials.
@@ -381,7 +381,7 @@ def impact(
 
 
 def _wall_below(body: Body, normal: ArrayLike) -> Plane:
-    """A wall that the body, where it is, nearly touches."""
+    """A wall just below the body at its place."""
     n = np.asarray(normal, dtype=np.float64)
     n = n / np.linalg.norm(n)
     lowest = float((body.particles.positions @ n).min())

@@ -75,7 +75,7 @@ CONSTITUTIVE_LAWS = {
 
 
 def require_known(law: object, owner: str) -> ConstitutiveLaw:
-    """The law itself, where kernels know it.
+    """Return the law if kernels know it.
 
     Raises:
         MaterialError: for anything else, with what is allowed.
@@ -89,7 +89,7 @@ def require_known(law: object, owner: str) -> ConstitutiveLaw:
 
 
 def law_of_code(code: float) -> ConstitutiveLaw:
-    """The law of a code.
+    """The law with this code.
 
     Raises:
         MaterialError: when there is none, with what is allowed.
@@ -101,13 +101,13 @@ def law_of_code(code: float) -> ConstitutiveLaw:
 
 
 def allowed_laws() -> str:
-    """Names of all laws, for a person."""
+    """Names of all laws for messages."""
     return ", ".join(law.name for law in CONSTITUTIVE_LAWS.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """A record of what a body is made of: elastic constants, and those that a subclass adds.
+    """Material of a body: elastic constants, and those that a subclass adds.
 
     Attributes:
         constitutive_law: of the class; says which function gives the stress and what is kept.
@@ -195,7 +195,7 @@ class Material:
         return ()
 
     def _check(self) -> None:
-        """Check what a subclass adds."""
+        """Check the parameters that a subclass adds."""
 
     def _number(self, name: str) -> float:
         value = getattr(self, name)
@@ -218,7 +218,7 @@ _Kind = TypeVar("_Kind", bound=type[Material])
 
 
 def register_material(name: str, **typical: float) -> Callable[[_Kind], _Kind]:
-    """Decorator: makes a material known by a name.
+    """Decorator that registers a material under a name.
 
     Args:
         name: unique among all materials.
@@ -238,7 +238,7 @@ def register_material(name: str, **typical: float) -> Callable[[_Kind], _Kind]:
 
 
 def named_material(name: str, **values: float) -> Material:
-    """The material that a name stands for, with these values in place of its own.
+    """The material registered under a name, with the given values replaced.
 
     Raises:
         MaterialError: for a name nobody registered, with what is allowed; for a value that the

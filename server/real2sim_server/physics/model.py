@@ -173,7 +173,7 @@ class SolverBackend(Protocol):
 
 
 def is_thin(collider: Collider, dx: float) -> bool:
-    """Whether too few nodes of a grid of ``dx`` [m] lie in a collider to stop anything."""
+    """Whether too few nodes of a grid of ``dx`` [m] lie in a collider to stop a body."""
     return isinstance(collider, Solid) and collider.thickness < THIN_CELLS * dx
 
 
@@ -229,7 +229,7 @@ def _pack_solid(row: Float, solid: Solid) -> None:
 
 
 class SolverDiverged(Exception):
-    """Particles left the numbers or the grid within a step; the state is lost, go back."""
+    """Particles became non-finite or left the grid within a step; restore an earlier state."""
 
 
 PRECISIONS: dict[str, type[np.floating[Any]]] = {"single": np.float32, "double": np.float64}
@@ -272,7 +272,7 @@ def build_model(
 
 
 def check_memory(particles: int, precision: str) -> None:
-    """Refuse what would not fit, before anything is allocated.
+    """Refuse a model that would not fit in memory, before any allocation.
 
     Raises:
         ParticleError: with what is needed and what there is.
@@ -286,7 +286,7 @@ def check_memory(particles: int, precision: str) -> None:
 
 
 def available_memory() -> int:
-    """Memory this machine has left [bytes]."""
+    """Available memory of this machine [bytes]."""
     try:
         with open("/proc/meminfo", encoding="ascii") as lines:
             for line in lines:

@@ -76,14 +76,14 @@ class Part:
 
 
 def parts_of(category: str, size: Sequence[float]) -> tuple[Part, ...]:
-    """Parts of a vehicle of ``size`` (length, width, height) [m]; none of other things."""
+    """Parts of a vehicle of ``size`` (length, width, height) [m]; other objects have none."""
     if category not in VEHICLES:
         return ()
     return (*_end(size, ahead=True), *_end(size, ahead=False), *_glass(size))
 
 
 def in_wheels(points: Float, size: Sequence[float]) -> NDArray[np.bool_]:
-    """[N] whether points [N, 3] of a vehicle are where wheels are under a box of ``size``."""
+    """[N] whether points [N, 3] of a vehicle lie in the wheels below a box of ``size``."""
     length, width, height = size
     along = np.abs(np.abs(points[:, 0]) - AXLES * length)
     up = points[:, 2] + height / 2 - WHEEL_RADIUS
@@ -163,7 +163,7 @@ NEAR = 0.6
 
 @dataclass(frozen=True)
 class Breakage:
-    """A part that broke.
+    """A broken part.
 
     Attributes:
         object_id, part, kind: which one.
@@ -189,7 +189,7 @@ class Breakage:
 
     @classmethod
     def of_record(cls, record: dict[str, Any]) -> Breakage:
-        """What :meth:`record` gave. Raises TypeError for other members."""
+        """Read the result of :meth:`record`. Raises TypeError for other members."""
         members: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in record.items()
         }
@@ -231,7 +231,7 @@ class BreakageLog:
         return new
 
     def copy(self) -> BreakageLog:
-        """A log that goes on from here on its own."""
+        """An independent copy of the log."""
         twin = copy(self)
         twin.broken = dict(self.broken)
         return twin
@@ -244,7 +244,7 @@ class BreakageLog:
 
 
 def _strain(part: Part, moved: Float) -> float:
-    """What counts against the part's limit [m]."""
+    """The displacement to compare with the part's limit [m]."""
     if part.kind in ("windscreen", "pane"):
         return float(np.sqrt(((moved - moved.mean(axis=0)) ** 2).sum(axis=1).mean()))
     return float(np.quantile(-(moved @ np.array(part.outward)), OUTER))
@@ -302,7 +302,7 @@ SHARDS: dict[Kind, _Shards] = {
 def fragment_cloud(
     broken: Sequence[Breakage], time_s: float, heights: Heights
 ) -> GaussianCloud | None:
-    """Everything that has come off by ``time_s`` [s], in the world; None before anything has.
+    """All fragments at ``time_s`` [s], in the world; None while there are none.
 
     Args:
         broken: parts that broke.
@@ -342,7 +342,7 @@ def _cloud(breakage: Breakage, age: float, heights: Heights) -> GaussianCloud:
 def _leaving(
     breakage: Breakage, shards: _Shards, n: int, random: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Where from and how fast, [n, 3] each: along, across and above where the part faces."""
+    """Start and velocity, [n, 3] each: along, across and above the part's facing direction."""
     outward = np.array(breakage.outward)
     outward[2] = 0.0
     outward /= max(float(np.linalg.norm(outward)), 1e-9)
@@ -360,7 +360,7 @@ def _leaving(
 def _fallen(
     start: Float, velocity: Float, thin: Float, age: float, heights: Heights
 ) -> tuple[Float, Float]:
-    """Places [n, 3] at an age [s], and for how long each has tumbled [n]."""
+    """Positions [n, 3] at an age [s], and the time each has tumbled [n]."""
     above = np.maximum(start[:, 2] - heights(start[:, :2]) - thin, 0.0)
     level, up = velocity[:, :2].copy(), velocity[:, 2].copy()
     left, place = np.full(len(start), age), start[:, :2].copy()
@@ -455,7 +455,7 @@ def with_underside(cloud: GaussianCloud, size: Sequence[float]) -> GaussianCloud
 
 
 def _floor(pattern: GaussianCloud, size: Sequence[float]) -> GaussianCloud:
-    """Gaussians of a floor, with all else as the one of ``pattern`` has it."""
+    """Gaussians of a floor; other properties are those of ``pattern``."""
     length, width, height = size
     x, y = (
         np.linspace(-half, half, max(round(2 * half / PITCH), 2))

@@ -40,7 +40,7 @@ IMAGE_WIDTH = 96
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """A simulation as observations see it.
+    """A simulation as observations compare with it.
 
     Attributes:
         scene, state: what was simulated.
@@ -69,7 +69,7 @@ class Simulated:
 
 
 class Observation(Protocol):
-    """One kind of what was seen."""
+    """One kind of observation."""
 
     @property
     def times_s(self) -> Float:
@@ -77,13 +77,13 @@ class Observation(Protocol):
         ...
 
     def differences(self, simulated: Simulated) -> Float:
-        """[M] simulated less observed, over what each is known to."""
+        """[M] simulated minus observed, divided by the standard deviation."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class BoxTrack:
-    """Boxes of a tracker.
+    """Tracked boxes.
 
     Attributes:
         times_s: [T] since the start of the simulation [s].
@@ -138,7 +138,7 @@ class BoxTrack:
 
 @dataclass(frozen=True, eq=False)
 class MarkedPoints:
-    """Points of an object that were followed, as stickers or corners of lamps.
+    """Tracked points on an object, such as stickers or corners of lamps.
 
     Attributes:
         places: [P, 3] where they are on the object before anything happens, object frame [m].
@@ -180,7 +180,7 @@ class MarkedPoints:
 
 @dataclass(frozen=True, eq=False)
 class ObservedImages:
-    """Pictures, compared with what the renderer makes of the simulation at small size.
+    """Images, compared with small renderings of the simulation.
 
     Attributes:
         times_s: [T] since the start of the simulation [s].
@@ -227,7 +227,7 @@ class ObservedImages:
 def drawn(
     playback: Playback, frame: int, camera: Camera, T_world_vehicle: Float
 ) -> NDArray[np.uint8]:
-    """[H, W, 3] what a camera sees of a frame, at IMAGE_WIDTH or its own width."""
+    """[H, W, 3] a camera's rendering of a frame, at IMAGE_WIDTH or its own width."""
     [made] = render_cameras(
         playback.instances(frame), [camera], T_world_vehicle, sky=playback.scene.sky
     )
@@ -254,7 +254,7 @@ def small(camera: Camera, image: NDArray[np.uint8]) -> tuple[Camera, NDArray[np.
 
 
 def recorded_track(trajectory: Trajectory, start_us: int, end_us: int) -> BoxTrack:
-    """The boxes that were tracked after ``start_us`` and up to ``end_us`` [us].
+    """The tracked boxes after ``start_us`` up to ``end_us`` [us].
 
     Raises:
         PhysicsError: when there is none in that time.
@@ -303,7 +303,7 @@ MAX_OBSERVED_TIME = 30.0
 def observations_of(
     given: Requested, scene: Scene, subject: PlacedObject, start_us: int, end_us: int
 ) -> list[Observation]:
-    """What was observed, in seconds from the start.
+    """Observations, in seconds from the start.
 
     Args:
         given: as a request has it.
@@ -409,7 +409,7 @@ CRUSH_MOST = 0.9
 
 @dataclass(frozen=True, eq=False)
 class ObjectCalibration:
-    """What was found.
+    """The result of a calibration.
 
     Attributes:
         fit: factors, what they may be wrong by, residuals.
@@ -423,7 +423,7 @@ class ObjectCalibration:
     cell: float
 
     def figures(self) -> dict[str, Any]:
-        """As JSON values; None for what observations do not tell."""
+        """As JSON values; None for factors that observations do not determine."""
         found = self.fit
 
         def finite(values: Mapping[str, float]) -> dict[str, float | None]:
@@ -454,7 +454,7 @@ def calibrate_object(
     on_run: Callable[[int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> ObjectCalibration:
-    """Fit factors so that what is simulated looks as what was observed.
+    """Fit factors so that the simulation matches the observations.
 
     Args:
         scene, state, options: what is simulated, with initial values; its duration follows from
@@ -497,11 +497,11 @@ def calibrate_object(
 
 
 class CalibrationCancelled(Exception):
-    """Somebody no longer wants the result."""
+    """The calibration was cancelled."""
 
 
 class _Trials:
-    """Simulations of the same start with other values."""
+    """Simulations from the same start with other values."""
 
     def __init__(
         self,
@@ -524,7 +524,7 @@ class _Trials:
         self.cancelled: Callable[[], bool] | None = None
 
     def differences(self, factors: Mapping[str, float], coarser: float) -> Float:
-        """Of all observations, one after the other."""
+        """Differences of all observations, concatenated."""
         bodies = [copy.copy(b) for b in self._bodies(coarser)]
         [body] = [b for b in bodies if b.name == self._object_id]
         apply_factors(body, factors)
@@ -535,7 +535,7 @@ class _Trials:
         return np.concatenate([o.differences(seen) for o in self._observations])
 
     def body(self) -> DeformableBody:
-        """The object at the start, with the values that it was given."""
+        """The object at the start, with its given values."""
         [body] = [b for b in self._bodies(1.0) if b.name == self._object_id]
         return body
 
@@ -571,7 +571,7 @@ def _coarser(physics: ObjectPhysics, coarser: float) -> ObjectPhysics:
 
 
 def apply_factors(body: DeformableBody, factors: Mapping[str, float]) -> None:
-    """Multiply what a body at its start was given."""
+    """Multiply a body's initial values."""
     body.materials = tuple(_scaled(m, factors) for m in body.materials)
     body.friction *= factors.get("friction", 1.0)
     speed = factors.get("speed", 1.0)

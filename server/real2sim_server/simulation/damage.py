@@ -146,7 +146,7 @@ OCCLUDED = 0.4
 
 @dataclass(frozen=True, eq=False)
 class FoldedSheet:
-    """Where points of a sheet are and what they look like.
+    """Positions and looks of points on a sheet.
 
     Attributes:
         deformed: positions, F and rotation of each point.
@@ -196,7 +196,7 @@ class Sheet:
         self._hinge = np.clip((place[:, 0] - 1 + BONNET_BEHIND) / BONNET_BEHIND, 0.0, 1.0)
 
     def shortening(self, F: Float) -> Float:
-        """[G, 3] by what fraction sheet is shorter along the vehicle's axes."""
+        """[G, 3] fraction by which sheet is shortened along the vehicle's axes."""
         shorter: Float = np.clip(1 - np.linalg.norm(F, axis=1) - ELASTIC, 0.0, STEEPEST)
         return shorter
 
@@ -246,7 +246,7 @@ class Sheet:
         return FoldedSheet(Deformed(positions, F, tilt @ body.rotations), light, scraped)
 
     def _pressed(self, body: Deformed, rows: NDArray[np.int64]) -> Float:
-        """[R] how far points were pushed in, from not at all (0) to as deep as it looks (1)."""
+        """[R] how far points were pushed in, from 0 to 1 (the greatest visible depth)."""
         depth = -((body.positions - self._points[rows]) * self.normals[rows]).sum(axis=1)
         pressed: Float = np.clip((depth - DENT[0]) / (DENT[1] - DENT[0]), 0.0, 1.0)
         return pressed
@@ -316,7 +316,7 @@ def _turned(rotations: Float, vectors: Float) -> Float:
 
 
 def _faces(F: Float, normals: Float) -> Float:
-    """[G, 3] where surfaces face that faced along unit ``normals``, mapped by F [G, 3, 3]."""
+    """[G, 3] unit ``normals`` of surfaces after the map F [G, 3, 3]."""
     faces = np.linalg.solve(F.transpose(0, 2, 1), normals[:, :, None])[:, :, 0]
     found: Float = faces / np.maximum(np.linalg.norm(faces, axis=1), 1e-9)[:, None]
     return found
@@ -334,7 +334,7 @@ def _between(first: Float, second: Float) -> Float:
 
 
 def _lit_from(normals: Float) -> Float:
-    """[G, 3] where light comes from that falls on surfaces with unit ``normals`` at rest [G, 3].
+    """[G, 3] direction of the light on surfaces with unit ``normals`` [G, 3] at rest.
 
     What a surface shows at rest is how it was lit when it was seen, whichever side that was. So
     light comes from above and beside each surface, never along it: however it is turned, it gets
@@ -349,7 +349,7 @@ def _lit_from(normals: Float) -> Float:
 
 
 def _light(normals: Float, towards: Float) -> Float:
-    """[G] light on surfaces that face along unit ``normals`` [G, 3]."""
+    """[G] light on surfaces with unit ``normals`` [G, 3]."""
     sky = SKY * (GROUND + (1 - GROUND) * (1 + normals[:, 2]) / 2)
     light: Float = sky + SIDE * np.maximum((normals * towards).sum(axis=1), 0.0)
     return light
@@ -456,7 +456,7 @@ class DamagedVehicle:
     def cloud(
         self, displacements: Float, most: Float, broken: Mapping[str, float]
     ) -> GaussianCloud:
-        """What is drawn; Gaussians that nothing has moved stay as they are, bit for bit.
+        """The drawn Gaussians; those that nothing moved stay unchanged, bit for bit.
 
         Args:
             displacements: [N, 3] of its particles from rest [m].
@@ -490,7 +490,7 @@ class DamagedVehicle:
         return _split(replace(moved, means=means, sh=sh), rows, body.F)
 
     def _rows_of(self, part: Part) -> NDArray[np.int64]:
-        """Gaussians that a part consists of: all at its place, without paint around it."""
+        """Gaussians of a part: all at its place, without the paint around it."""
         inside = part.holds(self._points)
         if part.kind == "pane" and part.outward[1]:
             inside |= self._leaning(part)
@@ -519,7 +519,7 @@ class DamagedVehicle:
         return replace(part, low=tuple(low), high=tuple(high)).holds(self._points)
 
     def _painted(self) -> NDArray[np.bool_]:
-        """[G] what is neither glass nor below the sills; all where nothing is left."""
+        """[G] whether a Gaussian is neither glass nor below the sills; all where none is left."""
         height = self._points[:, 2] / self._size[2] + 0.5
         painted: NDArray[np.bool_] = height > SILLS
         for part in self._parts.values():
@@ -568,7 +568,7 @@ class DamagedVehicle:
 
 
 def _moved(displacements: Float) -> NDArray[np.bool_]:
-    """[N] particles that have moved by more than what leaves Gaussians where they are."""
+    """[N] whether particles have moved by more than MIN_DISPLACEMENT."""
     moved: NDArray[np.bool_] = np.linalg.norm(displacements, axis=1) > MIN_DISPLACEMENT
     return moved
 

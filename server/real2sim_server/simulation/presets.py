@@ -77,7 +77,7 @@ class ObjectPhysics:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """How objects become bodies.
+    """A rule that turns objects into bodies.
 
     Attributes:
         name: ``paper`` or ``vehicle``.
@@ -112,7 +112,7 @@ def _paper(category: str, particles: Particles, spacing: float) -> Build:
 
 
 def _vehicle(category: str, particles: Particles, spacing: float) -> Build:
-    """Vehicles have zones that give way; other things are soft foam."""
+    """Vehicles have crumple zones; other objects are soft foam."""
     if category in VEHICLES:
         return vehicle_structure(category, particles, spacing=spacing)
     foam = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
@@ -146,7 +146,7 @@ PRESETS = {
 
 
 def preset_of(name: str) -> Preset:
-    """The preset of that name.
+    """The preset with this name.
 
     Raises:
         PhysicsError: when there is none.

@@ -55,7 +55,7 @@ ROUNDS = 100
 
 @dataclass(frozen=True)
 class Bounce:
-    """One impact of a body that was given a restitution.
+    """One impact of a body with a given restitution.
 
     Attributes:
         body, other: who, on what.
@@ -75,7 +75,7 @@ class Bounce:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What the end of an impact adds to one body.
+    """The correction to one body at the end of an impact.
 
     Attributes:
         body: that gets it.
@@ -104,7 +104,7 @@ class _Impact:
 
 @dataclass(frozen=True, eq=False)
 class _Meeting:
-    """One impact of a chain that is over.
+    """One impact of a finished chain.
 
     Attributes:
         sides: the body, and the other where that is one.
@@ -154,7 +154,7 @@ class _Meeting:
 
 
 class Bounces:
-    """Impacts of bodies with a wanted restitution, or that nothing damps, from step to step.
+    """Impacts of bodies with a requested restitution or without damping, step by step.
 
     Attributes:
         log: those that are over.
@@ -175,7 +175,7 @@ class Bounces:
         self._totals = {}
 
     def forget(self, body: DeformableBody) -> None:
-        """A body has settled on what it hit."""
+        """Drop the impacts of a body that has settled."""
         self._impacts = {p: i for p, i in self._impacts.items() if body.name not in p}
 
     def follow(
@@ -186,7 +186,7 @@ class Bounces:
         before: Mapping[str, RigidMotion],
         step: tuple[float, float, Float],
     ) -> Iterator[Correction]:
-        """Go on by one step of the solver; what impacts that are over add to bodies.
+        """Advance by one solver step; returns the corrections of finished impacts.
 
         Each is to take effect before the next is asked for.
 
@@ -221,7 +221,7 @@ class Bounces:
                 yield from self._part(over, wanted, walls, step)
 
     def _chains(self, wanted: Mapping[str, DeformableBody]) -> list[list[tuple[str, str]]]:
-        """Impacts under way, those that share a body together, in the order they began."""
+        """Active impacts, grouped by shared bodies, in the order they began."""
         chains: list[list[tuple[str, str]]] = []
         for pair in self._impacts:
             own = {name for name in pair if name in wanted}
@@ -376,7 +376,7 @@ def _corrections(
 
 
 def _centre(impact: _Impact, near: Float) -> Float:
-    """The point on the line of an impulse that is nearest to ``near`` [m]."""
+    """The point on an impulse's line nearest to ``near`` [m]."""
     impulse, moment = impact.impulse, impact.moment
     square = float(impulse @ impulse)
     on_line = np.cross(impulse, moment) / square
@@ -391,7 +391,7 @@ def _ease(motion: RigidMotion, lever: Float, normal: Float) -> float:
 
 
 def _velocity(collider: Collider, point: Float) -> Float:
-    """Of a collider at a point [m/s]."""
+    """Velocity of a collider at a point [m/s]."""
     return collider.velocity_at(point) if isinstance(collider, Solid) else np.zeros(3)
 
 
@@ -412,7 +412,7 @@ USUAL_SPEED = 2.0
 
 @dataclass(frozen=True, eq=False)
 class FirstTouch:
-    """How a body meets the first collider on its way.
+    """A body's first contact with a collider on its path.
 
     Attributes:
         motion: of the body then.
@@ -432,7 +432,7 @@ class FirstTouch:
 def fit_rebound(
     body: DeformableBody, requested: float, colliders: Sequence[Collider], gravity: Float
 ) -> Rebound:
-    """Add the viscosity that lets a body bounce off what it will hit as ``requested``.
+    """Add the viscosity with which a body rebounds from its first collider as ``requested``.
 
     Args:
         body: at its start; its materials change.
@@ -474,7 +474,7 @@ def fit_rebound(
 def first_touch(
     body: DeformableBody, colliders: Sequence[Collider], gravity: Float
 ) -> FirstTouch | None:
-    """The first collider that a body meets on its way, flying or rolling straight; None for none.
+    """The first collider on a body's path, flying or rolling straight; None without one.
 
     Args:
         body: at its start.
@@ -519,7 +519,7 @@ def _is_far(solid: Solid, centre: Float, reach: float) -> bool:
 
 
 def _still(body: DeformableBody) -> Any:
-    """For the solver, at its place; velocities are those of the canned impact."""
+    """The body at its place for the solver; the velocities are those of the test impact."""
     return replace(body.solver_body(), particle_velocities=None, particle_gradients=None)
 
 

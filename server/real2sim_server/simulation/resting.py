@@ -39,7 +39,7 @@ _CUBE = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), axis=-1).reshap
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Where a body touches one other thing.
+    """Contacts of a body with one other body or collider.
 
     Attributes:
         other: name of the collider or body.
@@ -61,7 +61,7 @@ def supports_of(
     others: Iterable[DeformableBody],
     gravity: Float,
 ) -> tuple[str, ...] | None:
-    """Names of what holds a body in rest, or None where it would not stay.
+    """Names of a resting body's supports, or None where it would not stay.
 
     Args:
         body: as it is now.
@@ -95,7 +95,7 @@ def _wheel_contacts(body: DeformableBody, road: Sequence[Collider]) -> Iterable[
 
 
 def collider_contacts(body: DeformableBody, colliders: Sequence[Collider]) -> Iterable[Contacts]:
-    """Where corners of a body's particles touch colliders, the outermost of each."""
+    """Contacts of a body's outermost particles with each collider."""
     shell = body.shell_points()
     turn = body.T_world_object[:3, :3]
     for collider in colliders:
@@ -111,7 +111,7 @@ def collider_contacts(body: DeformableBody, colliders: Sequence[Collider]) -> It
 
 
 def body_contacts(body: DeformableBody, others: Iterable[DeformableBody]) -> list[Contacts]:
-    """Particles beside those of another body; the normal is the mean way from them."""
+    """Contacts with another body's particles; the normal is the mean direction from them."""
     from scipy.spatial import cKDTree
 
     contacts: list[Contacts] = []
@@ -136,7 +136,7 @@ def body_contacts(body: DeformableBody, others: Iterable[DeformableBody]) -> lis
 
 
 def _by_normal(name: str, points: Float, normals: Float, mu: float) -> Iterable[Contacts]:
-    """Contacts of one thing, those with about the same normal together, the outermost of each."""
+    """Contacts grouped by similar normals, the outermost points of each."""
     if not len(points):
         return
     _, group = np.unique(np.round(4 * normals), axis=0, return_inverse=True)
@@ -210,7 +210,7 @@ Pair = tuple[str, str]
 
 @dataclass(eq=False)
 class ContactPoint:
-    """One point at which a body touches something.
+    """One contact point of a body.
 
     Attributes:
         body: that is carried.
@@ -247,7 +247,7 @@ class ContactPoint:
 
 @dataclass(frozen=True, eq=False)
 class Reaction:
-    """What a contact did in a step.
+    """The effect of a contact in one step.
 
     Attributes:
         body, other: on whom, by whom.
@@ -262,7 +262,7 @@ class Reaction:
 
 
 class RestingContacts:
-    """The contacts of bodies that have settled, by body and what carries it."""
+    """Contacts of settled bodies, by body and support."""
 
     def __init__(self) -> None:
         self._touches: dict[Pair, list[ContactPoint]] = {}
@@ -272,11 +272,11 @@ class RestingContacts:
         return (body.name, other) in self._touches or (other, body.name) in self._touches
 
     def partners(self, body: DeformableBody) -> set[str]:
-        """All that a body touches here."""
+        """All contact partners of a body."""
         return {name for pair in self._touches if body.name in pair for name in pair} - {body.name}
 
     def island(self, body: DeformableBody) -> set[str]:
-        """Bodies that are connected with a body by contacts, itself among them."""
+        """The bodies connected by contacts with a body, including itself."""
         first = [touches[0] for touches in self._touches.values()]
         bodies = {t.body.name for t in first}
         bodies |= {t.other.name for t in first if isinstance(t.other, DeformableBody)}
@@ -296,7 +296,7 @@ class RestingContacts:
         colliders: Sequence[Collider],
         others: Iterable[DeformableBody],
     ) -> bool | None:
-        """Take a body in that touches something gently; whether it does, None for nothing at all.
+        """Add a body with gentle contact; returns whether it is gentle, None without contact.
 
         Args:
             body: that keeps its shape.
@@ -320,7 +320,7 @@ class RestingContacts:
         self._touches = {p: t for p, t in self._touches.items() if body.name not in p}
 
     def solve(self, duration: float, starts: Mapping[str, Float]) -> list[Reaction]:
-        """Let contacts act on bodies that have moved freely; what they did.
+        """Apply contacts to bodies that have moved freely; returns their reactions.
 
         Args:
             duration: for how long they have [s].
@@ -444,7 +444,7 @@ def _strikes(touch: ContactPoint) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """A step that contacts act on.
+    """One step in which contacts act.
 
     Attributes:
         before: motions by name, as bodies have moved freely.
@@ -462,7 +462,7 @@ class _Step:
 
 
 class _Row:
-    """A touch in one step: what impulses along its normal and two tangents do."""
+    """A contact point in one step: effects of impulses along its normal and two tangents."""
 
     def __init__(self, touch: ContactPoint, step: _Step) -> None:
         self.touch = touch
@@ -493,7 +493,7 @@ class _Row:
 
     @property
     def carries(self) -> bool:
-        """Whether the point presses."""
+        """Whether the point transmits a pushing force."""
         return float(self.touch.impulse[0]) > 0
 
     @property
@@ -518,7 +518,7 @@ class _Row:
             np.add(speed, impulse @ change, out=speed)
 
     def reactions(self) -> list[Reaction]:
-        """What it did, once all contacts agree."""
+        """Its reaction, once all contacts have converged."""
         touch, slip = self.touch, np.zeros(3)
         for own, jacobian, _ in self._sides:
             slip += jacobian @ own
@@ -532,7 +532,7 @@ class _Row:
         ]
 
     def relax(self) -> None:
-        """The impulse that this contact needs as things are now."""
+        """The impulse that this contact needs at the current velocities."""
         speed = np.zeros(3)
         for own, jacobian, _ in self._sides:
             speed += jacobian @ own

@@ -1,4 +1,4 @@
-"""What a simulation leaves: poses, shapes, contacts, energies; compact on disk."""
+"""Results of a simulation: poses, shapes, contacts, energies; compact on disk."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class ObjectResult:
 
 @dataclass(frozen=True)
 class ContactRecord:
-    """What another object or a collider did to an object, up to the end.
+    """The total effect of another object or a collider on an object.
 
     Attributes:
         object_id, other: who, by whom or what.
@@ -92,7 +92,7 @@ class ContactRecord:
 
 @dataclass(frozen=True)
 class Rebound:
-    """What was asked of a body's rebound, and what canned impacts reached.
+    """A body's requested rebound, and the rebound reached in test impacts.
 
     Attributes:
         requested: separation over approach speed.

@@ -38,7 +38,7 @@ def cross_matrix(vector: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
-    """A body that keeps its shape.
+    """A rigid body in motion.
 
     Attributes:
         rotation: [3, 3], object to world.
@@ -123,7 +123,7 @@ def inertia_about(centre: Float, positions: Float, masses: Float, volumes: Float
 
 
 def added_inertia(masses: Float, volumes: Float, *, cell: float) -> float:
-    """What the grid adds to the inertia of particles about any axis [kg m^2].
+    """Inertia that the grid adds to particles about any axis [kg m^2].
 
     A particle's velocity gradient carries angular momentum m dx^2/4 axial(C), which is m dx^2/2
     times its turning (Jiang et al. 2015, APIC), as if it were a ball that wide.
@@ -165,7 +165,7 @@ def closest(
     within: float,
     ahead: float,
 ) -> tuple[float, float, bool]:
-    """How near points of a rigid body are to colliders that may move.
+    """Closest distances of a rigid body's points to colliders, which may move.
 
     Args:
         points: [N, 3] of the body, world [m].
@@ -219,7 +219,7 @@ def _closest(
 
 
 def solid_gaps(pose: Float, size: Float, solids: Sequence[Solid]) -> tuple[Float, Float]:
-    """How far solids are at least from an oriented box, and how fast they are at most.
+    """Lower bounds of solids' distances to an oriented box, and upper bounds of their speeds.
 
     Args:
         pose: [4, 4] of the one box.
@@ -279,7 +279,7 @@ def _clearances(row: Any, data: Any, points: Any, distances: Any, normals: Any) 
 
 
 def nearest(colliders: Sequence[Collider], points: Float) -> tuple[Float, Float]:
-    """The same for the nearest of several colliders; infinitely far from none."""
+    """The same for the nearest of several colliders; infinite without colliders."""
     best = np.full(len(points), np.inf)
     normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     for collider in colliders:

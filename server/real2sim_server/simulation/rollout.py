@@ -27,7 +27,7 @@ from .spawn import spawn_bodies, starts_of
 
 
 class TrajectoryRecorder:
-    """Keeps trajectories, shapes, energies and contacts, frame by frame.
+    """Records trajectories, shapes, energies and contacts, frame by frame.
 
     Args:
         simulator: whose bodies are recorded; it is only read.
@@ -73,7 +73,7 @@ class TrajectoryRecorder:
             )
 
     def _shape(self, body: DeformableBody) -> int:
-        """Row of the shape that the body has now; a new one only when it has changed."""
+        """Row of the body's current shape; a new row only after a change."""
         rows = self._shapes[body.name]
         moved = (body.local_positions() - body.rest.positions).astype(np.float16)
         if not rows and not moved.any():
@@ -139,7 +139,7 @@ LEAVING_TIME = 0.04
 def find_breakages(
     result: SimulationResult, subjects: Iterable[PlacedObject]
 ) -> tuple[Breakage, ...]:
-    """All parts that broke, in the order of objects and time."""
+    """All broken parts, ordered by object and time."""
     there = {s.object_id: s for s in subjects}
     found: list[Breakage] = []
     for object_id, own in result.objects.items():
@@ -206,7 +206,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulateOptions:
-    """What to simulate.
+    """Options of a rollout.
 
     Attributes:
         preset: ``vehicle`` or ``paper``, see ``presets``.
@@ -268,7 +268,7 @@ def simulate(
     on_progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> SimulationResult:
-    """Let the objects move, collide, deform and come to rest.
+    """Simulate objects that move, collide, deform and come to rest.
 
     Args:
         scene: holds the Gaussians.
@@ -305,7 +305,7 @@ def simulate(
 
 
 def solid_background(scene: Scene, state: PlacedObjects, options: SimulateOptions) -> list[Box]:
-    """What of the background the objects may come to."""
+    """The background within the objects' reach, as colliders."""
     starts = starts_of(state, options.objects, options.start_us)
     cleared = [Cleared(s.T_world_object, np.array(s.size)) for s in starts]
     fastest = max(float(np.linalg.norm(s.velocity)) for s in starts)
@@ -320,7 +320,7 @@ def simulate_bodies(
     on_progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> SimulationResult:
-    """The same for bodies already spawned. They are left as they are at the end."""
+    """The same for spawned bodies, which keep their final state."""
     simulator = HybridSimulator(
         bodies,
         options.colliders,

@@ -22,7 +22,7 @@ from .tyres import TyreReaction
 
 
 class ContactLog:
-    """Impulses and energies since the start, by body and what touched it.
+    """Impulses and energies since the start, by body and contact partner.
 
     Attributes:
         collider_work: of moving colliders on bodies [J].
@@ -44,7 +44,7 @@ class ContactLog:
     def add_solver_contacts(
         self, contacts: Iterable[ContactTotals], time: float, names: set[str]
     ) -> None:
-        """Add what a solver's contacts have grown by since the last call.
+        """Add the growth of a solver's contacts since the last call.
 
         Args:
             contacts: of the present solver, since its start.
@@ -156,7 +156,7 @@ ALIKE = 1.5
 
 
 def withstands(body: DeformableBody, other: DeformableBody, gravity: Float) -> bool:
-    """Whether a body keeps its shape whatever another does to it at the speeds they have now.
+    """Whether a body keeps its shape in an impact with another at their current speeds.
 
     The force that yielding takes is the least yield stress near by over the other's smallest face.
     What is only elastic gives way at any force, and so never withstands.
@@ -185,7 +185,7 @@ def withstands(body: DeformableBody, other: DeformableBody, gravity: Float) -> b
 
 
 def as_boxes(body: DeformableBody, other: DeformableBody) -> list[Box]:
-    """The part of a body that another may touch, layer upon layer, moving as the body does."""
+    """The part of a body in another's reach as stacked boxes that move with the body."""
     pose, m, s = body.T_world_object, body.motion, body.spacing
     local = body.local_positions()[_patch(body, other)]
     boxes: list[Box] = []
@@ -209,7 +209,7 @@ def as_boxes(body: DeformableBody, other: DeformableBody) -> list[Box]:
 def by_owner(
     contacts: Iterable[ContactTotals], owners: Mapping[str, DeformableBody]
 ) -> list[ContactTotals]:
-    """Contacts with what boxes of a body have done added up and under its name."""
+    """Contacts with the effects of a body's boxes summed under the body's name."""
     found: dict[tuple[str, str], ContactTotals] = {}
     for c in contacts:
         other = owners[c.other].name if c.other in owners else c.other
@@ -331,11 +331,11 @@ class HybridSimulator:
 
     @property
     def road(self) -> list[Collider]:
-        """Colliders that carry tyres."""
+        """Colliders that support tyres."""
         return [c for c in self.colliders if c.name in self._road]
 
     def advance(self, duration: float) -> None:
-        """Go on by ``duration`` [s], at most STEP."""
+        """Advance by ``duration`` [s], at most STEP."""
         self._wake()
         self._activate(duration)
         deforming = [b for b in self.bodies if b.mode == BodyMode.DEFORMING]
@@ -363,7 +363,7 @@ class HybridSimulator:
             self._settle(body)
 
     def _activate(self, duration: float) -> None:
-        """Let all bodies deform that something comes near to, and those that these come near to."""
+        """Let all bodies in reach of others deform, and those in reach of these."""
         changed = True
         while changed:
             changed = False
@@ -401,7 +401,7 @@ class HybridSimulator:
             self._solver = None
 
     def _rigid_beside(self, deforming: list[DeformableBody]) -> list[tuple[Box, DeformableBody]]:
-        """What stands for rigid bodies that withstand a deforming one near by."""
+        """Colliders that represent rigid bodies near a deforming one."""
         return [
             (box, other)
             for body in deforming
@@ -438,7 +438,7 @@ class HybridSimulator:
     def _push_back(
         self, contacts: Iterable[ContactTotals], rigid: dict[str, DeformableBody]
     ) -> None:
-        """Give rigid bodies back what they have given to deforming ones in a step."""
+        """Apply to rigid bodies the reactions of deforming ones in a step."""
         for c in contacts:
             if c.other in rigid:
                 rigid[c.other].push(-c.impulse, -c.moment)
@@ -460,7 +460,7 @@ class HybridSimulator:
         self._solver = None
 
     def _brake_if_hit(self, body: DeformableBody) -> None:
-        """Once a vehicle was hit, its wheels lock as far as options say."""
+        """Lock the wheels of a vehicle after a hit, as options request."""
         if body.hit or body.tyres is None:
             return
         for (name, other), impulse in self.contact_log.totals().items():
@@ -470,7 +470,7 @@ class HybridSimulator:
                 return
 
     def _put_to_sleep(self, body: DeformableBody) -> bool:
-        """Let a body sleep that is held by what itself does not move; whether it is."""
+        """Put a body with still supports to sleep; returns whether it has them."""
         others = [b for b in self.bodies if b is not body and not _moves(b)]
         supports = supports_of(body, self.colliders, self.road, others, self.gravity)
         if supports is None or {c.name for c in self.colliders if c.moving}.intersection(supports):
@@ -479,7 +479,7 @@ class HybridSimulator:
         return True
 
     def _wake(self) -> None:
-        """Wake those whose supports have begun to move, and those that rest on these."""
+        """Wake bodies whose supports have begun to move, and those that rest on them."""
         asleep = [b for b in self.bodies if b.mode == BodyMode.SLEEPING]
         if not asleep:
             return
@@ -529,7 +529,7 @@ class HybridSimulator:
         return not asleep and self._strikes_through(body, duration)
 
     def _strikes_through(self, body: DeformableBody, duration: float) -> bool:
-        """Whether springs of a body on wheels no longer keep its floor from striking the road.
+        """Whether the floor of a body on wheels strikes the road through its springs.
 
         What comes down gently does not deform: springs and rigid contacts carry it.
         """
@@ -555,7 +555,7 @@ class HybridSimulator:
         return self._is_free(body) if found is None else found
 
     def _deforming_with(self, body: DeformableBody) -> list[DeformableBody]:
-        """Deforming bodies near it, those near these, and so on."""
+        """Deforming bodies near a body, those near them, and so on."""
         left = [b for b in self.bodies if b.mode == BodyMode.DEFORMING and b is not body]
         found = [body]
         for at in found:
@@ -565,7 +565,7 @@ class HybridSimulator:
         return found[1:]
 
     def _touch_more(self) -> None:
-        """Let bodies that lie on something be carried by what else they have come to touch."""
+        """Add new contacts to the supports of resting bodies."""
         for body in self.bodies:
             held, near = self._resting.partners(body), body.spacing / 2
             if body.mode == BodyMode.RIGID and self._floors.get(body.name, np.inf) < near:
@@ -590,13 +590,13 @@ class HybridSimulator:
                 self._resting.begin(body, walls, others)
 
     def _is_loaded(self, body: DeformableBody) -> bool:
-        """Whether something that deforms may touch it."""
+        """Whether a deforming body may touch it."""
         return any(
             b is not body and b.mode == BodyMode.DEFORMING and _near(body, b) for b in self.bodies
         )
 
     def _lay_to_rest(self, duration: float) -> None:
-        """Put rigid bodies to sleep that have stood or lain still, all that touch together."""
+        """Put still rigid bodies to sleep, all bodies in contact together."""
         for body in self.bodies:
             if body.mode == BodyMode.RIGID and self._resting.partners(body):
                 body.note_standing(duration)
@@ -607,7 +607,7 @@ class HybridSimulator:
                     self._put_to_sleep(body)
 
     def _is_free(self, body: DeformableBody) -> bool:
-        """Whether a deforming body may go its way as a rigid one."""
+        """Whether a deforming body may continue as a rigid one."""
         if self._is_near_bodies(body, [b for b in self.bodies if b is not body], STEP):
             return False
         gap, approach = body.gap_to_colliders(self._walls(body))
@@ -629,14 +629,14 @@ class HybridSimulator:
         return False
 
     def _walls(self, body: DeformableBody) -> list[Collider]:
-        """Colliders that it touches with its own surface, not by its tyres."""
+        """Colliders in contact with the body's own surface, not with its tyres."""
         if body.tyres is None:
             return self.colliders
         return [c for c in self.colliders if c.name not in self._road]
 
 
 def _moves(body: DeformableBody) -> bool:
-    """Whether a body moves or turns faster than what sleeps may."""
+    """Whether a body moves or turns faster than the limit for sleep."""
     m = body.motion
     speed = float(np.linalg.norm(m.velocity)) + float(np.linalg.norm(m.angular_velocity))
     return body.mode != BodyMode.SLEEPING and speed > SLEEP_SPEED
@@ -648,7 +648,7 @@ def _touch_distance(body: DeformableBody) -> float:
 
 
 def _turning(body: DeformableBody) -> float:
-    """Speed that no point of a body exceeds by its turning [m/s]."""
+    """Upper bound of the speed of a body's points due to rotation [m/s]."""
     return body.reach * float(np.linalg.norm(body.motion.angular_velocity))
 
 

@@ -34,7 +34,7 @@ VEHICLES = ("car", "vehicle", "van", "truck", "bus")
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleStructure:
-    """Force over deflection of a class of vehicles.
+    """Force over deflection of a vehicle class.
 
     Attributes:
         front, rear, side: force per metre of width and metre of deflection [N/m^2].
@@ -143,7 +143,7 @@ shallower, and carries along what is beside the place that is struck."""
 def vehicle_structure(
     category: str, particles: Particles, *, spacing: float, section_height: float | None = None
 ) -> tuple[tuple[Material, ...], NDArray[np.int64], Particles]:
-    """The materials of a vehicle, which of them each particle is, and particles with its masses.
+    """A vehicle's materials, each particle's material, and particles with its masses.
 
     Args:
         category: one of ``STRUCTURES``.
@@ -200,7 +200,7 @@ def _zones(place: Float, cells: Float, *, column: bool) -> NDArray[np.int64]:
 
 
 def _end_height(particles: Particles, zones: NDArray[np.int64], ahead: int, size: Float) -> float:
-    """Mean height [m] that is filled over the plan of one end."""
+    """Mean filled height [m] over the plan of one end."""
     first = ENDS + len(END_MATERIALS) * ahead
     end = (zones >= first) & (zones < first + len(END_MATERIALS))
     return float(particles.volumes[end].sum() / (END * size[0] * size[1]))

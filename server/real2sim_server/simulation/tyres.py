@@ -267,7 +267,7 @@ LIFT_MAX = 0.3
 
 @dataclass(frozen=True, eq=False)
 class TyreReaction:
-    """What the road did to a body through its tyres in one step.
+    """The road's effect on a body through its tyres in one step.
 
     Attributes:
         impulse: [3] on the body [N s].
@@ -280,7 +280,7 @@ class TyreReaction:
 
 @dataclass(frozen=True, eq=False)
 class Tyres:
-    """Four wheels of a vehicle, and the road they stand on.
+    """A vehicle's four wheels and the road below them.
 
     Attributes:
         patches: [4, 3] undersides of the wheels in the object's frame, as they stand at rest [m].
@@ -343,7 +343,7 @@ class Tyres:
         return replace(self, brake=fraction)
 
     def lifts(self, T_world_object: Float, road: Sequence[Collider]) -> Float:
-        """[4] by how far springs have given in, so that wheels stand on the road, not in it [m]."""
+        """[4] compression of the springs, so that wheels stand on the road, not in it [m]."""
         heights, normals = nearest(road, self._points(T_world_object))
         carrying = np.isfinite(heights) & (normals @ T_world_object[:3, 2] > UPRIGHT)
         squeeze = np.where(carrying, self.rest - heights, 0.0)
@@ -375,7 +375,7 @@ class Tyres:
         road: Sequence[Collider],
         duration: float,
     ) -> tuple[RigidMotion, TyreReaction]:
-        """What the road does to the body over ``duration`` [s] through its tyres.
+        """Apply the road's forces to the body through its tyres over ``duration`` [s].
 
         See ``rolling.press``.
 
@@ -405,7 +405,7 @@ class Tyres:
 
     @cached_property
     def parameters(self) -> Float:
-        """[5] what kernels take, see ``rolling``."""
+        """[5] a row of tyre parameters for kernels."""
         return np.array([self.friction, self.brake, self.frequency, self.damping, self.travel])
 
     def _points(self, T_world_object: Float) -> Float:

@@ -56,7 +56,7 @@ class TorchState:
 
 @dataclass(frozen=True, eq=False)
 class TorchParameters:
-    """What holds for a run; gradients flow to masses, rows, friction and gravity.
+    """Constants of a run; gradients flow to masses, rows, friction and gravity.
 
     Attributes:
         mass, volume: [N].
@@ -78,7 +78,7 @@ class TorchParameters:
 
 @dataclass(frozen=True, eq=False)
 class NodeContact:
-    """What contact did to a body's nodes in one substep.
+    """Effect of contact on a body's nodes in one substep.
 
     Attributes:
         body: who was touched.
@@ -326,7 +326,7 @@ def _resolve_thin_colliders(
     dt: float,
     contacts: list[NodeContact],
 ) -> Tensor:
-    """Velocities [N, 3] of particles once thin colliders have had their say, body after body.
+    """Velocities [N, 3] of particles after contact with thin colliders, body after body.
 
     See ``contact.resolve_particle_collider``. On the CPU a particle is asked about those near its
     block alone, and twice where they are several; asking about one more that it does not touch
@@ -365,7 +365,7 @@ def _material_velocity(collider: Collider, points: Tensor) -> Tensor:
 
 
 class ReferenceSolverBackend:
-    """Solver to compare others with, and to differentiate; see ``step.substep``."""
+    """Solver to compare others with, and to differentiate; see :func:`substep`."""
 
     name = "reference"
 

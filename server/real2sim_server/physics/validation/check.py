@@ -1,4 +1,4 @@
-"""One line of the validation table."""
+"""Checks of the validation table, and the small setups that cases share."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ReferenceCurve:
 
 @dataclass(frozen=True)
 class Check:
-    """What was measured against what theory says.
+    """A measured value against theory.
 
     Attributes:
         name: what it is, with its case.

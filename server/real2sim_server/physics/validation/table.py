@@ -22,7 +22,7 @@ __all__ = ["CASES", "CaseResult", "as_figures", "run_table"]
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One case as it went.
+    """The result of one case.
 
     Attributes:
         name: key of CASES.
@@ -51,7 +51,7 @@ def run_table(
     available: Mapping[str, Case] | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> list[CaseResult]:
-    """Run the cases of those names, or all, and hold them to theory.
+    """Run the named cases, or all, and compare them with theory.
 
     Args:
         backend: of the solver.
@@ -80,7 +80,7 @@ def run_table(
 
 
 def as_figures(results: Sequence[CaseResult], backend: str) -> dict[str, Any]:
-    """The results as JSON takes them."""
+    """The results as JSON values."""
     return {
         "backend": backend,
         "passed": all(r.passed for r in results),

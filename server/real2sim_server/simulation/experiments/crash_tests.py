@@ -56,7 +56,7 @@ POLE = 0.254
 
 @dataclass(frozen=True)
 class CrashPulse:
-    """What one vehicle did in a crash.
+    """The crash pulse of one vehicle.
 
     Attributes:
         speed: closing speed [m/s].
@@ -162,7 +162,7 @@ def rear_end(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
 
 
 def side_crash(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
-    """A car into the side of another one that stands, squarely: the pulses of both."""
+    """A car squarely into the side of a standing one: the pulses of both."""
     striker = whole_car("striker", place=(-(CAR_SIZE[0] + GAP) / 2, 0, 0), velocity=(speed, 0, 0))
     struck = whole_car("struck", place=((CAR_SIZE[1] + GAP) / 2, 0, 0), yaw=np.pi / 2)
     result = _crash([striker, struck], [], 0.4, backend)
@@ -173,7 +173,7 @@ def side_crash(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
 
 
 def side_pole(speed: float, backend: str) -> CrashPulse:
-    """A car that slides sideways into a rigid pole at its middle."""
+    """A car slides sideways into a rigid pole at its middle."""
     pose = np.eye(4)
     pose[1, 3] = (CAR_SIZE[1] + POLE) / 2 + GAP
     pole = Box(name="pole", T_world_box=pose, size=(POLE, POLE, 3.0), friction=0.4)
@@ -182,7 +182,7 @@ def side_pole(speed: float, backend: str) -> CrashPulse:
 
 
 def roof_drop(speed: float, backend: str) -> CrashPulse:
-    """A car that falls on its roof at ``speed`` [m/s]."""
+    """A car falls on its roof at ``speed`` [m/s]."""
     ground = Plane(name="floor", friction=0.5)
     car = whole_car(place=(0, 0, CAR_SIZE[2] / 2 + GAP), upside_down=True, velocity=(0, 0, -speed))
     result = _crash([car], [ground], 0.3, backend, gravity=-GRAVITY)
@@ -198,7 +198,7 @@ def crash_pulse(
     side: float,
     across: float | None = None,
 ) -> CrashPulse:
-    """What is read off a simulated crash.
+    """Measure the pulse of a simulated crash.
 
     Args:
         result: frames of all bodies.
@@ -247,7 +247,7 @@ def _deflection(own: ObjectResult, axis: int, side: float, across: float | None)
 def _face(
     rest: Float, axis: int, side: float, across: float | None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Particles of the struck face, and of the middle that keeps its shape."""
+    """Particles of the struck face, and of the undeformed middle."""
     inwards = side * rest[:, axis]
     struck = inwards > inwards.max() - LAYER
     below = rest[:, 2] < rest[:, 2].mean()

@@ -46,7 +46,7 @@ Obstacle = tuple[Float, Float]
 
 @dataclass(frozen=True, eq=False)
 class FilmPlan:
-    """What a film shows and from where.
+    """Subjects and viewpoints of a film.
 
     Attributes:
         focus: [3] point of the world that the near camera faces [m].
@@ -70,7 +70,7 @@ class FilmPlan:
 
     @classmethod
     def of(cls, experiment: Experiment, height: Callable[[float, float], float]) -> FilmPlan:
-        """Of an experiment; ``height``: of the ground at a place [m]."""
+        """The plan of an experiment; ``height``: of the ground at a place [m]."""
         solid: list[Obstacle] = []
         for collider in experiment.options.colliders:
             if collider.name in experiment.options.road:
@@ -107,7 +107,7 @@ class FilmPlan:
 
     @classmethod
     def load(cls, folder: Path) -> FilmPlan:
-        """Read what :meth:`save` wrote.
+        """Read the file of :meth:`save`.
 
         Raises:
             PhysicsError: there is none, or none that can be read.
@@ -132,7 +132,7 @@ class FilmPlan:
 
 
 def _slab(wall: Plane, focus: Float, height: Callable[[float, float], float]) -> Obstacle:
-    """The part of a virtual wall near the focus, behind its surface and standing on the ground."""
+    """The part of a virtual wall near the focus: behind its surface, on the ground."""
     point, normal = np.asarray(wall.point), np.asarray(wall.normal)
     foot = focus - ((focus - point) @ normal + SLAB[0] / 2) * normal
     pose = np.eye(4)
@@ -227,7 +227,7 @@ class FilmView:
     moved: Float | None = None
 
     def camera_at(self, frame: int) -> Camera:
-        """The camera as it stands in a frame of the result."""
+        """The camera's pose in a frame of the result."""
         if self.moved is None:
             return self.camera
         pose = self.camera.T_vehicle_camera.copy()
@@ -326,7 +326,7 @@ def draw(playback: Playback, shown: Sequence[FilmView], frame: int, backend: str
 
 
 def _bystanders(playback: Playback, view: FilmView, frame: int) -> set[str]:
-    """What takes no part and is too near to the view to be shown."""
+    """Uninvolved objects too near to the view to be shown."""
     t_us, eye = playback.time_us(frame), view.camera_at(frame).T_vehicle_camera[:3, 3]
     return {
         o.object_id

@@ -30,7 +30,7 @@ DEPTH_MIN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """How an object was seen over the recording.
+    """Visibility of an object over the recording.
 
     Attributes:
         direction: [3] towards the cameras, object frame, each view weighed by the solid angle the
@@ -49,7 +49,7 @@ class Visibility:
 
 
 def visibility_of(scene: Scene, subject: PlacedObject) -> Visibility:
-    """How ``subject`` was seen by all cameras of the scene."""
+    """Visibility of ``subject`` in all cameras of the scene."""
     times = [int(t) for t in scene.frame_times_us if subject.trajectory.covers(int(t))]
     total, front, rear = np.zeros(3), 0.0, 0.0
     for t_us in times[:: max(len(times) // VIEWS_MAX, 1)]:
@@ -120,7 +120,7 @@ class Experiment:
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What an experiment is set up from.
+    """Input of an experiment's setup.
 
     Attributes:
         scene, state: the scene, and its objects.
@@ -151,7 +151,7 @@ def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
 
 
 def level(direction: Float) -> Float:
-    """A direction without its slope, unit."""
+    """The horizontal unit vector of a direction."""
     flat = np.array([direction[0], direction[1], 0.0])
     return flat / max(float(np.linalg.norm(flat)), 1e-9)
 
@@ -159,7 +159,7 @@ def level(direction: Float) -> Float:
 def viewer(
     scene: Scene, subject: PlacedObject, pose: Float, *, slant: float, rise: float = 0.4
 ) -> Float:
-    """Direction [3] to a viewer on the side and at the end from which it was seen.
+    """Direction [3] to a viewer on the recorded side and end.
 
     Args:
         slant: how much to the side, against along the subject; less for a side hardly seen.
@@ -181,7 +181,7 @@ def beside(
     ahead: float = FROM_AHEAD,
     rise: float = 0.35,
 ) -> Float:
-    """Direction [3] to a viewer on the side that was seen.
+    """Direction [3] to a viewer on the recorded side.
 
     Args:
         ahead: how much ahead, against to the side; little where what it runs into is broad, so that
@@ -196,7 +196,7 @@ def beside(
 
 
 def others_near(request: Request, options: SimulateOptions, focus: Float) -> frozenset[str]:
-    """What takes no part and comes near: it would drive through what happens there."""
+    """Uninvolved objects that come near: they would drive through the experiment."""
     times = options.start_us + np.linspace(0, options.duration * 1e6, 5).astype(np.int64)
     return frozenset(
         s.object_id
@@ -267,7 +267,7 @@ def pole(request: Request) -> Experiment:
 
 
 def t_bone(request: Request) -> Experiment:
-    """One vehicle into the middle of the side of another that stands, at 15 m/s."""
+    """One vehicle into the middle of a standing vehicle's side, at 15 m/s."""
     speed = 15.0 if request.speed is None else request.speed
     runner = _best(request)
     others = [s for s in _candidates(request) if s is not runner]
@@ -323,13 +323,13 @@ CRASHES = {"frontal": frontal, "t_bone": t_bone, "pole": pole, "roof": roof}
 
 
 def _best(request: Request) -> PlacedObject:
-    """The vehicle named first, else the car that was seen best."""
+    """The first named vehicle, else the best recorded car."""
     candidates = _candidates(request)
     return candidates[0] if request.named else _seen_best(request, candidates)
 
 
 def _candidates(request: Request) -> list[PlacedObject]:
-    """Vehicles named, else all cars that are there at the start; they are moved anyway."""
+    """The named vehicles, else all cars at the start; they are moved anyway."""
     if request.named:
         return list(request.chosen)
     there = [
@@ -341,7 +341,7 @@ def _candidates(request: Request) -> list[PlacedObject]:
 
 
 def _seen_best(request: Request, candidates: list[PlacedObject]) -> PlacedObject:
-    """Whose front and one of whose sides were seen best; what nobody saw cannot be shown."""
+    """The car with the best recorded front and side; unseen sides cannot be shown."""
 
     def seen(subject: PlacedObject) -> float:
         visibility = visibility_of(request.scene, subject)
@@ -610,7 +610,7 @@ def _pair(request: Request) -> Experiment:
 def _way_aside(
     pair: Sequence[tuple[Float, Float]], placed: Sequence[tuple[Float, Float]], forward: Float
 ) -> Float:
-    """Shortest way [3] sideways that frees the boxes of a pair of all that are placed [m]."""
+    """Shortest sideways shift [3] that frees a pair's boxes of all placed ones [m]."""
     side = np.cross([0.0, 0.0, 1.0], forward)
     for k in range(ASIDE_TRIES):
         shift: Float = ASIDE_STEP * ((k + 1) // 2) * (1 if k % 2 else -1) * side
@@ -656,7 +656,7 @@ def _drop(request: Request) -> Experiment:
 
 
 def _reach(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
-    """How far an object's particles reaches back and forth along its own axes, [3] and [3] [m].
+    """Extent of an object's particles back and forth along its own axes, [3] and [3] [m].
 
     Tracked boxes are not that exact: particles reaches up to a voxel out of them.
     """

@@ -142,11 +142,11 @@ class Launcher(Protocol):
         ...
 
     def host_memory(self, nbytes: int) -> Tensor:
-        """[nbytes] uint8 that the device can copy from and to without help."""
+        """[nbytes] uint8 of pinned host memory."""
         ...
 
     def wait(self) -> None:
-        """Return when all that was queued is done."""
+        """Wait for all queued work."""
         ...
 
 

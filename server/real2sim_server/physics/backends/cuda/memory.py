@@ -23,7 +23,7 @@ KEY_BYTES = 8
 
 @dataclass(frozen=True)
 class Sizes:
-    """What launches are sized by: fixed for a simulation, and room for its lists.
+    """Sizes of launches: fixed for a simulation, and the capacity of its lists.
 
     Attributes:
         particles, bodies, colliders: numbers of each.
@@ -100,7 +100,7 @@ def substeps(sizes: Sizes, first: int, end: int) -> list[Launch]:
 
 
 def advancing(sizes: Sizes, does: int) -> list[Launch]:
-    """Particles of all blocks through what is asked for."""
+    """Advance the particles of all blocks through the requested parts."""
     launches = [Launch("advance_blocks", sizes.blocks, does)]
     if sizes.obstructed:
         launches.append(Launch("advance_obstructed", sizes.blocks, does))
@@ -142,7 +142,7 @@ _U4, _U8, _F8 = 4, 8, 8
 
 
 class SolverMemory:
-    """What a simulation has on the device.
+    """Device memory of a simulation.
 
     Attributes:
         sizes: what there is room for.

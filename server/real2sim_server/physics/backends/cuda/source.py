@@ -35,7 +35,7 @@ _FUNCTIONS = {"sqrt": "root", "log": "logarithm", "exp": "exponential", "copysig
 
 
 class Untranslatable(TypeError):
-    """A function uses more of Python than kernels know."""
+    """A function uses Python that the translator does not support."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Value:
 
 
 class Translator:
-    """Collects functions with all that they call.
+    """Collects functions together with their callees.
 
     Args:
         real: C++ type of every number with a fraction.
@@ -64,7 +64,7 @@ class Translator:
 
     @property
     def text(self) -> str:
-        """All so far, in an order that compiles."""
+        """The collected text, in an order that compiles."""
         return "\n".join(self._text)
 
     def add(self, function: Callable[..., Any], kinds: Sequence[Kind]) -> tuple[str, Kind]:
