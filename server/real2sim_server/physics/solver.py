@@ -365,7 +365,7 @@ class Solver:
         return ""
 
     def _instability(self, before: Measure, work: float) -> str:
-        """Description of the present state's instability, or None."""
+        """Description of the present state's instability; empty where it is stable."""
         m = self._measure
         if not m.finite:
             return "positions, velocities or stresses are not finite"
