@@ -258,7 +258,7 @@ def _size(off: Float) -> float:
 TOLERANCE = 0.015
 """A fit stops when achieved and requested are this near."""
 IMPACTS_MAX = 14
-"""A fit makes at most this many canned impacts."""
+"""A fit makes at most this many test impacts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +270,7 @@ class RestitutionFit:
         requested, achieved: coefficient of restitution against a rigid wall.
         elastic: what the body does without added viscosity; no more can be reached.
         viscosity: added to the materials [Pa s].
-        speed: of the canned impacts [m/s].
+        speed: of the test impacts [m/s].
         impacts: how many were made.
     """
 
@@ -298,7 +298,7 @@ def fit_restitution(
     Args:
         body: its velocity and place do not matter.
         requested: coefficient of restitution, in [0, 1].
-        speed: approach of the canned impacts [m/s]; restitution depends on it.
+        speed: approach of the test impacts [m/s]; restitution depends on it.
         normal: [3] out of the wall, where no ``wall`` is given; it then lies just below the body.
         wall: the one the body will hit; the body is put in front of it.
         collider: what acts in place of the wall, whose face ``wall`` then is; at rest.

@@ -241,7 +241,7 @@ class DeformableBody:
     def _closest(
         self, colliders: Sequence[Collider], *, within: float, ahead: float
     ) -> tuple[float, float, bool]:
-        """See ``surroundings.closest``.
+        """See ``rigid.closest``.
 
         Outermost particles are what meets ground; a solid may meet any place of a flat side.
         """

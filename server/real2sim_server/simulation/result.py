@@ -96,7 +96,7 @@ class Rebound:
 
     Attributes:
         requested: separation over approach speed.
-        achieved: the same in canned impacts; what really happened is in a Bounce each.
+        achieved: the same in test impacts; what really happened is in a Bounce each.
         elastic: without added viscosity; no more can be reached.
         other: name of what it was fitted on; None where the body will meet nothing, and a wall
             across its way stood for it.

@@ -190,7 +190,7 @@ def _to_grid(
 
 
 def surface_offset(centroid: Tensor) -> Tensor:
-    """Where surfaces lie, from centroid offsets [cells]; see ``contact.surface``."""
+    """Where surfaces lie, from centroid offsets [cells]; see :mod:`..contact`."""
     return _interpolate(SURFACE_TABLE, centroid / 1.5)
 
 
@@ -211,7 +211,7 @@ def _depth(moment: Tensor, n: Tensor) -> Tensor:
 
 
 def coulomb(v: Tensor, n: Tensor, friction: Tensor, separable: bool) -> Tensor:
-    """Relative velocities [U, 3] after a contact; see ``contact.surface``."""
+    """Relative velocities [U, 3] after a contact; see :mod:`..contact`."""
     approach = (v * n).sum(-1, keepdim=True)
     t = v - approach * n
     square = t.square().sum(-1, keepdim=True)
@@ -269,7 +269,7 @@ def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _face_score(size: Tensor, fraction: Tensor) -> Tensor:
-    """How well first moments tell normals; see ``contact.surface``."""
+    """How well first moments tell normals; see :mod:`..contact`."""
     flat = _interpolate(FLAT_TABLE, fraction).clamp(min=1e-3)
     return (size / flat).clamp(max=1) ** 2 * size
 
