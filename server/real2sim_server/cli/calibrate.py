@@ -127,7 +127,7 @@ def _figures(found: ObjectCalibration) -> dict[str, object]:
     fit = found.fit
     figures: dict[str, object] = {}
     for name, factor in fit.factors.items():
-        if name in fit.untold:
+        if name in fit.undetermined:
             figures[name] = "not told by these observations"
             continue
         value = f", {found.values[name]:.4g}" if name in found.values else ""

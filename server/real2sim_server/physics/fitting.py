@@ -31,8 +31,8 @@ SETTLED = 2e-3
 """Steps shorter than this, as a fraction of what is uncertain or of the factor, end the search."""
 KNOWN_BEFORE = 3.0
 """Standard deviation of the logarithm of a factor before anything was observed."""
-TOLD = 1.0
-"""Standard deviation of the logarithm from which on observations are said to tell nothing."""
+MAX_UNCERTAINTY = 1.0
+"""Standard deviation of the logarithm above which a factor counts as undetermined."""
 COARSER = (1.5, 2.0)
 """Cells on which the result is looked at again, against those that it was found on."""
 MIN_COARSER = 1.25
@@ -68,7 +68,7 @@ class Fit:
     runs: int
 
     @property
-    def untold(self) -> list[str]:
+    def undetermined(self) -> list[str]:
         """Parameters that the observations do not determine."""
         return [name for name, u in self.uncertainty.items() if math.isinf(u)]
 
@@ -82,18 +82,18 @@ def fit(residuals: Residuals, parameters: Sequence[str], *, steps: int = 12) -> 
         steps: tried at most.
 
     Raises:
-        SolverError: when the first run leaves the numbers, or nothing is told about any parameter.
+        SolverError: when the first run diverges, or the observations determine no parameter.
     """
     search = _Search(residuals, tuple(dict.fromkeys(parameters)))
-    told = search.determined(search.slopes(SPANS[0]))
-    search.keep(told)
+    known = search.determined(search.slopes(SPANS[0]))
+    search.keep(known)
     search.descend(steps)
-    # Where it ended it may be seen that some are told by nothing; the others are found without.
+    # The end of the search may leave some undetermined; the others are then fitted without them.
     for _ in parameters:
-        told = search.determined(search.slopes(SPANS[-1]))
-        if told.all():
+        known = search.determined(search.slopes(SPANS[-1]))
+        if known.all():
             break
-        search.keep(told)
+        search.keep(known)
         search.descend(steps)
     return search.result()
 
@@ -130,23 +130,23 @@ class _Search:
         """[K] bool, whether the observations determine each parameter.
 
         Raises:
-            SolverError: when they tell nothing at all.
+            SolverError: when they determine none.
         """
-        told: np.ndarray = np.sqrt(np.diag(_covariance(J))) * self._scatter() < TOLD
-        if not told.any():
+        known: np.ndarray = np.sqrt(np.diag(_covariance(J))) * self._scatter() < MAX_UNCERTAINTY
+        if not known.any():
             raise SolverError(
                 f"these observations do not tell {', '.join(self._names)}: whatever they are, the "
                 "simulation is the same within what they are known to; observe what the values "
                 "change (a dent, a bounce, a slide), more often or more exactly"
             )
-        return told
+        return known
 
-    def keep(self, told: np.ndarray) -> None:
-        """Go on with some of the parameters; the others are as they were given."""
-        if told.all():
+    def keep(self, known: np.ndarray) -> None:
+        """Continue with the known parameters; the others keep their given values."""
+        if known.all():
             return
-        self._left = tuple(n for n, known in zip(self._left, told, strict=True) if known)
-        self._logs, self._J = self._logs[told], self._J[:, told]
+        self._left = tuple(n for n, is_known in zip(self._left, known, strict=True) if is_known)
+        self._logs, self._J = self._logs[known], self._J[:, known]
         self._off = self._run(self._logs)
         self._history = [*self._history[:1], _size(self._off)]
 

@@ -430,12 +430,14 @@ class ObjectCalibration:
             return {name: None if np.isinf(v) else v for name, v in values.items()}
 
         return {
-            "factors": {n: None if n in found.untold else f for n, f in found.factors.items()},
+            "factors": {
+                n: None if n in found.undetermined else f for n, f in found.factors.items()
+            },
             "uncertainty": finite(found.uncertainty),
             "observation": finite(found.observation),
             "discretisation": finite(found.discretisation),
             "values": self.values,
-            "untold": found.untold,
+            "untold": found.undetermined,
             "residual": list(found.residual),
             "runs": found.runs,
             "cell": self.cell,
@@ -613,5 +615,5 @@ def _values(body: DeformableBody, found: Fit) -> dict[str, float]:
     return {
         name: initial[name] * factor
         for name, factor in found.factors.items()
-        if name in initial and name not in found.untold
+        if name in initial and name not in found.undetermined
     }

@@ -118,7 +118,7 @@ def test_marked_points_tell_stiffness_friction_and_speed(scene, state, truth):
 
 def test_boxes_tell_speed_but_no_yield_stress(scene, state, truth):
     found = calibrated(scene, state, boxes_of(truth), "speed", "yield_stress")
-    assert found.untold == ["yield_stress"]
+    assert found.undetermined == ["yield_stress"]
     assert found.factors["yield_stress"] == 1.0
     assert within(found, "speed")
     assert found.factors["speed"] == pytest.approx(TRUE["speed"], rel=0.06)
