@@ -17,7 +17,7 @@ from ..errors import PhysicsError
 from . import CASES, Case
 from .check import Check, ReferenceCurve
 
-__all__ = ["CASES", "CaseResult", "as_figures", "run_table"]
+__all__ = ["CASES", "CaseResult", "as_figures", "render_page", "run_table"]
 
 
 @dataclass(frozen=True)

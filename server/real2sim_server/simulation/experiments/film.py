@@ -436,13 +436,3 @@ def _captioned(image: Image, time: float) -> Image:
             picture, f"{time:.2f} s", (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, width, 16
         )
     return picture
-
-
-__all__ = [
-    "FilmView",
-    "draw",
-    "draw_curves",
-    "look_at",
-    "views",
-    "write_film",
-]
