@@ -25,7 +25,7 @@ from real2sim_server.service.app import create_app
 from real2sim_server.service.jobs.rollouts import colliders_of
 from real2sim_server.settings import Settings
 from real2sim_server.simulation.experiments import scene_road
-from real2sim_server.simulation.surroundings import clearance
+from real2sim_server.simulation.rigid import clearance
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 from real2sim_server.synthetic.street import FACADE, KERB, KERB_HEIGHT
 from real2sim_server.world import World

@@ -27,10 +27,9 @@ from numpy.typing import NDArray
 
 from ..geometry.rotation import yaw_quaternion
 from ..geometry.transform import transform_from
-from ..physics.body import Body
+from ..physics.body import Body, box_particles
 from ..physics.colliders import Plane
 from ..physics.materials import FixedCorotated
-from ..physics.particles import box_particles
 from ..physics.solver import Solver, SolverOptions
 from ..reconstruct.initialise.stage0 import initialise_scene
 from ..reconstruct.options import InitialiseOptions

@@ -12,10 +12,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from ..physics.body import Body
+from ..physics.body import Body, box_particles
 from ..physics.colliders import Box, Plane
 from ..physics.materials import FixedCorotated, Material, NeoHookean
-from ..physics.particles import box_particles
 from ..physics.solver import Solver, SolverOptions
 from ..simulation.structure import vehicle_structure
 from . import situations
@@ -153,7 +152,7 @@ def _speed(material: str, particles: int, backend: str) -> dict[str, Any]:
 
 def _traffic(solver: Solver, elapsed: float) -> dict[str, Any]:
     """Bytes of a substep on the device, counted, and how fast that moved them."""
-    from ..physics.backends.cuda.traffic import substep_traffic
+    from ..physics.backends.cuda.memory import substep_traffic
 
     simulation: Any = solver.simulation
     positions = simulation.particles().positions / solver.dx

@@ -13,8 +13,8 @@ import numpy as np
 
 from ..geometry.rotation import Float
 from ..geometry.transform import transform_from
+from ..physics.body import box_particles
 from ..physics.colliders import Plane
-from ..physics.particles import box_particles
 from ..simulation.body import DeformableBody
 from ..simulation.presets import preset_of
 from ..simulation.simulator import STEP, HybridSimulator

@@ -62,8 +62,7 @@ def calibrate(
     """
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
-    from ..simulation.calibration import calibrate_object
-    from ..simulation.calibration.requested import observations_of
+    from ..simulation.calibration import calibrate_object, observations_of
 
     given = _read(observed)
     loaded = load_scene(scene)
@@ -128,7 +127,7 @@ def _figures(found: ObjectCalibration) -> dict[str, object]:
     fit = found.fit
     figures: dict[str, object] = {}
     for name, factor in fit.factors.items():
-        if name in fit.untold:
+        if name in fit.undetermined:
             figures[name] = "not told by these observations"
             continue
         value = f", {found.values[name]:.4g}" if name in found.values else ""

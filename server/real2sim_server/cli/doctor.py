@@ -237,8 +237,8 @@ def _compile_serving(*, report: _Report, arch: list[str] | None) -> None:
 def _compile_solver(*, report: _Report, arch: list[str] | None) -> None:
     """Put down what each kernel of the solver takes on each architecture."""
     _require_compiler()
-    from ..physics.backends.cuda.compile import ARCHITECTURES, compile_kernels
-    from ..physics.backends.cuda.records import THREADS
+    from .._nvrtc import ARCHITECTURES
+    from ..physics.backends.cuda.launcher import THREADS, compile_kernels
     from ..physics.backends.cuda.source import PRECISIONS
 
     for architecture in _given(arch) or ARCHITECTURES:

@@ -165,7 +165,7 @@ def values_of(given: list[str]) -> dict[str, PhysicsValues]:
 
 def changed(setup: Experiment, values: dict[str, PhysicsValues]) -> dict[str, ObjectPhysics]:
     """What takes part, with what was given for all and for each."""
-    from ..simulation.values import with_values
+    from ..simulation.presets import with_values
 
     objects = setup.options.objects
     unknown = sorted(values.keys() - objects.keys() - {"*"})

@@ -34,8 +34,7 @@ def validate(
     json: JsonFile = None,
 ) -> None:
     """Hold the physics to cases with known answers; exit code 1 when a line fails."""
-    from ..physics.validation.page import render_page
-    from ..physics.validation.table import as_figures
+    from ..physics.validation.table import as_figures, render_page
 
     with progress("validating") as report:
         results = _run(backend, cases, report)
@@ -57,8 +56,7 @@ def _run(backend: str, cases: str | None, report: Callable[[int, int], None]) ->
     """The cases asked for; ``published`` stands for all of the published crash figures, and
     ``simulation`` for all of bodies that roll, hand over and hit thin things."""
     from ..physics.validation import table
-    from ..simulation.experiments.published import PUBLISHED
-    from ..simulation.experiments.theory import THEORY
+    from ..simulation.experiments.crash_tests import PUBLISHED, THEORY
 
     names = [*table.CASES, *THEORY]
     if cases is not None:

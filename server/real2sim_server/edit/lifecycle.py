@@ -25,8 +25,8 @@ from real2sim_proto.operations import (
     Spawn,
 )
 
+from ..physics.colliders import TriangleSurface
 from ..physics.errors import ColliderError
-from ..physics.triangle_mesh import TriangleSurface
 from ..scene.scene import MAX_OBJECTS
 from .motion import (
     AppliedOperation,

@@ -1,8 +1,18 @@
 """Gaussians with mass: particles, materials, colliders, contact and the solver."""
 
-from .body import Body
+from .body import Body, Particles, ball_particles, box_particles
 from .calibration import Calibration, calibrate
-from .colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane, Solid
+from .colliders import (
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    HeightField,
+    Plane,
+    Solid,
+    TriangleMesh,
+    TriangleSurface,
+)
 from .errors import (
     ColliderError,
     MaterialError,
@@ -11,11 +21,9 @@ from .errors import (
     SolverError,
     UnstableError,
 )
+from .fitting import RestitutionFit, fit_restitution
 from .materials import FixedCorotated, Foam, Material, Metal, NearRigid, NeoHookean, Sand, Snow
-from .particles import Particles, ball_particles, box_particles
-from .restitution import RestitutionFit, fit_restitution
 from .solver import BodyState, ContactTotals, Energies, Solver, SolverOptions, StepReport
-from .triangle_mesh import TriangleMesh, TriangleSurface
 
 __all__ = [
     "Body",

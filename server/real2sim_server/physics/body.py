@@ -1,23 +1,180 @@
-"""Bodies: particles with a material, a motion and a surface."""
+"""Bodies: particles with mass and volume, a material, a motion and a surface."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.rotation import Float
+from ..geometry.transform import apply_transform, is_rigid
 from .errors import MaterialError, ParticleError
 from .materials import Material
-from .particles import Particles
+
+BISECTIONS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """Particles at rest in one frame.
+
+    Attributes:
+        positions: [N, 3] float64 [m].
+        volumes: [N] float64 rest volumes [m^3], > 0.
+        masses: [N] float64 [kg], > 0.
+        source: [N] int64, index of the Gaussian a particle stands for, -1 for interior fill.
+
+    Raises:
+        ParticleError: no particles, shapes that do not fit, values not finite or not positive.
+    """
+
+    positions: Float
+    volumes: Float
+    masses: Float
+    source: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        for name in ("positions", "volumes", "masses"):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "source", np.array(self.source, dtype=np.int64))
+        n = len(self.positions)
+        if n == 0:
+            raise ParticleError("a body needs at least one particle; it has none")
+        shapes = {"positions": (n, 3), "volumes": (n,), "masses": (n,), "source": (n,)}
+        for name, shape in shapes.items():
+            given = getattr(self, name).shape
+            if given != shape:
+                raise ParticleError(f"{name} of {n} particles must be {shape}, not {given}")
+        _require(np.asarray(np.isfinite(self.positions).all(axis=1)), "positions are not finite")
+        _require(np.isfinite(self.volumes) & (self.volumes > 0), "volumes are not positive")
+        _require(np.isfinite(self.masses) & (self.masses > 0), "masses are not positive")
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def mass(self) -> float:
+        """Mass of all particles [kg]."""
+        return float(self.masses.sum())
+
+    @property
+    def centre_of_mass(self) -> Float:
+        """[3] [m]."""
+        centre: Float = self.masses @ self.positions / self.masses.sum()
+        return centre
+
+    @property
+    def inertia(self) -> Float:
+        """[3, 3] inertia about the centre of mass [kg m^2]; each particle counts as a small cube.
+
+        The cubes' own inertia m V^(2/3) / 6 makes a lattice of particles exact for a box.
+        """
+        r = self.positions - self.centre_of_mass
+        second = np.einsum("n,ni,nj->ij", self.masses, r, r)
+        own = float((self.masses * np.cbrt(self.volumes) ** 2).sum()) / 6
+        inertia: Float = np.trace(second) * np.eye(3) - second + own * np.eye(3)
+        return inertia
+
+    def moved(self, T_dst_src: ArrayLike) -> Particles:
+        """The particles in another frame, by a rigid [4, 4] transform."""
+        matrix = np.asarray(T_dst_src, dtype=np.float64)
+        if not is_rigid(matrix):
+            raise ParticleError(f"T_dst_src must be a rigid [4, 4] transform, not {matrix!r}")
+        return replace(self, positions=apply_transform(matrix, self.positions))
+
+    def take(self, index: NDArray[Any]) -> Particles:
+        """The particles of ``index``: indices in any order, or a mask [N]."""
+        return Particles(
+            self.positions[index], self.volumes[index], self.masses[index], self.source[index]
+        )
+
+    def with_mass(self, mass: float) -> Particles:
+        """The particles with masses scaled so that they sum to ``mass`` [kg]."""
+        if not (np.isfinite(mass) and mass > 0):
+            raise ParticleError(f"mass of a body must be positive [kg], not {mass!r}")
+        return replace(self, masses=self.masses * (mass / self.masses.sum()))
+
+    def with_centre_height(self, height: float) -> Particles:
+        """The particles with mass moved between layers, so that the centre of mass has that z [m].
+
+        Each layer weighs by exp(-k z) times what it did: lower parts become denser, none empty. A
+        height outside of the particles is held to what leaves every layer a tenth of a percent.
+        """
+        z = self.positions[:, 2] - self.centre_of_mass[2]
+        most = np.log(1e3) / max(float(np.ptp(z)), 1e-9)
+        low, high = -most, most
+        wanted = height - self.centre_of_mass[2]
+        for _ in range(BISECTIONS):
+            k = (low + high) / 2
+            weights = self.masses * np.exp(-k * z)
+            if float(weights @ z) / float(weights.sum()) > wanted:
+                low = k
+            else:
+                high = k
+        mass = self.masses.sum()
+        return replace(self, masses=weights * (mass / weights.sum()))
+
+
+def box_particles(size: ArrayLike, *, spacing: float, density: float) -> Particles:
+    """A box centred on the origin, filled with a cubic lattice of particles.
+
+    Args:
+        size: [3] edge lengths [m].
+        spacing: wanted distance of particles [m]; it is fitted so that the box is filled.
+        density: mass per volume [kg/m^3].
+
+    Raises:
+        ParticleError: for sizes, spacing or density that are not positive.
+    """
+    edges = np.asarray(size, dtype=np.float64)
+    if edges.shape != (3,) or not (edges > 0).all() or not spacing > 0 or not density > 0:
+        raise ParticleError(
+            f"a box needs three positive edges, spacing and density, not {size!r}, {spacing!r}, "
+            f"{density!r}"
+        )
+    counts = np.maximum(np.rint(edges / spacing).astype(int), 1)
+    axes = [(np.arange(n) + 0.5) / n * e - e / 2 for n, e in zip(counts, edges, strict=True)]
+    positions = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return _uniform(positions, float(edges.prod()) / len(positions), density)
+
+
+def ball_particles(radius: float, *, spacing: float, density: float) -> Particles:
+    """A ball centred on the origin, cut from a cubic lattice; volumes sum to the ball's.
+
+    Raises:
+        ParticleError: for a radius, spacing or density that is not positive.
+    """
+    if not (radius > 0 and spacing > 0 and density > 0):
+        raise ParticleError(
+            f"a ball needs positive radius, spacing, density: {radius!r}, {spacing!r}, {density!r}"
+        )
+    lattice = box_particles([2 * radius] * 3, spacing=spacing, density=density).positions
+    inside = lattice[(lattice**2).sum(axis=1) < radius**2]
+    return _uniform(inside, 4 / 3 * np.pi * radius**3 / max(len(inside), 1), density)
+
+
+def _uniform(positions: Float, volume: float, density: float) -> Particles:
+    n = len(positions)
+    return Particles(
+        positions, np.full(n, volume), np.full(n, volume * density), np.full(n, -1, np.int64)
+    )
+
+
+def _require(holds: NDArray[Any], problem: str) -> None:
+    count = int((~holds).sum())
+    if count:
+        first = int(np.flatnonzero(~holds)[0])
+        raise ParticleError(f"{count} of {len(holds)} particles: {problem} (first: {first})")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """One thing that moves and deforms, in the world frame.
+    """A deformable body in the world frame.
 
     Attributes:
         name: unique among the bodies of a solver.

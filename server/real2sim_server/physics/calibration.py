@@ -1,4 +1,4 @@
-"""Materials and motion from what was seen, by least squares through the differentiable solver."""
+"""Materials and motion from observations, by least squares through the differentiable solver."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from ..geometry.rotation import Float
-from .backends.reference.backend import torch_model
-from .backends.reference.step import TorchParameters, TorchState, substep, with_stress
+from . import stress
+from .backends.reference import TorchParameters, TorchState, substep, torch_model, with_stress
 from .colliders import Collider
-from .constitutive import material_row
 from .errors import SolverError
 from .fitting import COARSER, continued
 from .solver import Solver
@@ -27,7 +26,7 @@ DAMPING = 1e-3
 DAMPING_MIN = 1e-12
 CALMER, BOLDER = 5.0, 0.2
 """What damping is multiplied by after a step that was rejected, and after one that was kept."""
-LONGEST_STEP = 0.5
+MAX_STEP = 0.5
 """Of the logarithm of a factor, in one step."""
 PATIENCE = 3
 """Rejected steps in a row after which slopes are taken over a wider span."""
@@ -41,7 +40,7 @@ FLAT = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What was found.
+    """The result of a calibration.
 
     Attributes:
         factors: by parameter, on the value the solver was given.
@@ -129,7 +128,7 @@ def _discretisation(
     dt: float,
     every: int,
 ) -> dict[str, float]:
-    """How far logarithms are from those on cells of no size, by those on coarser ones."""
+    """Distance of the logarithms to those on cells of size zero, from coarser cells."""
     scale = _scale(J)
     scaled = J / scale
     inverse = torch.linalg.pinv(scaled) / scale[:, None]
@@ -140,7 +139,7 @@ def _discretisation(
         path = rollout(coarse, names, dt=dt, every=every, observations=len(target))
         step = -(inverse @ (path(logs) - target).reshape(-1))
         if bool(torch.isfinite(step).all()):
-            moved[coarser] = step.clamp(-LONGEST_STEP, LONGEST_STEP).numpy()
+            moved[coarser] = step.clamp(-MAX_STEP, MAX_STEP).numpy()
     if not moved:
         return dict.fromkeys(names, math.inf)
     return dict(zip(names, continued(moved).tolist(), strict=True))
@@ -170,7 +169,7 @@ def _step(J: Tensor, off: Tensor, damping: float) -> Tensor:
     normal = scaled.T @ scaled + damping * torch.eye(len(scale), dtype=J.dtype)
     step = torch.linalg.solve(normal, -(scaled.T @ off)) / scale
     longest = float(step.abs().max())
-    bounded: Tensor = step * min(1.0, LONGEST_STEP / max(longest, 1e-30))
+    bounded: Tensor = step * min(1.0, MAX_STEP / max(longest, 1e-30))
     return bounded
 
 
@@ -238,9 +237,9 @@ def rollout(
 def _scaled(
     state: TorchState, params: TorchParameters, factor: dict[str, Tensor]
 ) -> tuple[TorchState, TorchParameters]:
-    columns = [torch.ones((), dtype=torch.float64)] * material_row.MATERIAL_ROW
-    columns[material_row.MU] = columns[material_row.LAMBDA] = factor["stiffness"]
-    columns[material_row.A], columns[material_row.VISCOSITY] = (
+    columns = [torch.ones((), dtype=torch.float64)] * stress.MATERIAL_ROW
+    columns[stress.MU] = columns[stress.LAMBDA] = factor["stiffness"]
+    columns[stress.A], columns[stress.VISCOSITY] = (
         factor["yield_stress"],
         factor["viscosity"],
     )

@@ -1,38 +1,42 @@
-"""Least squares over a handful of factors on what a simulation was given, by runs alone.
+"""Fit what a simulation is given by running it: factors by least squares, viscosity by rebound.
 
-Simulations are no smooth functions: contact comes a substep sooner or later. So slopes are taken by
-differences over a span that is wide against such stairs, and steps are those of Levenberg and
-Marquardt. What a result may be wrong by has two parts: what the observations leave open, and what
-the cells do. The latter is how far the result moves when the same observations are explained on
-coarser cells, continued to none (Richardson 1911, first order).
+Simulations are not smooth: contact comes a substep earlier or later. So slopes are differences over
+a span that is wide against such steps, and the search follows Levenberg and Marquardt. The
+uncertainty of a result has two parts: what the observations leave open, and what the cells cause.
+The latter is how far the result moves when coarser cells explain the same observations,
+extrapolated to cells of size zero (Richardson 1911, first order).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..geometry.rotation import Float
+from .body import Body
+from .colliders import Collider, Plane
 from .errors import PhysicsError, SolverError
+from .solver import Solver, SolverOptions
 
 SPANS = (0.2, 0.1, 0.05)
 """Of the logarithm of a factor, between the runs of a slope: the first, and after steps failed."""
 DAMPING, CALMER, BOLDER = 1e-3, 6.0, 0.2
-LONGEST_STEP = 0.5
-"""Of the logarithm of a factor, in one step."""
+MAX_STEP = 0.5
+"""Largest change of a factor's logarithm in one step."""
 SETTLED = 2e-3
 """Steps shorter than this, as a fraction of what is uncertain or of the factor, end the search."""
 KNOWN_BEFORE = 3.0
 """Standard deviation of the logarithm of a factor before anything was observed."""
-TOLD = 1.0
-"""Standard deviation of the logarithm from which on observations are said to tell nothing."""
+MAX_UNCERTAINTY = 1.0
+"""Standard deviation of the logarithm above which a factor counts as undetermined."""
 COARSER = (1.5, 2.0)
 """Cells on which the result is looked at again, against those that it was found on."""
-LEAST_COARSER = 1.25
-"""Where bodies are too thin for those."""
+MIN_COARSER = 1.25
+"""Coarsening where bodies are too thin for those."""
 CHORDS = 2
 """Steps with the same slopes on coarser cells."""
 
@@ -43,7 +47,7 @@ to."""
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was found.
+    """The result of a fit.
 
     Attributes:
         factors: by parameter; 1 for what observations do not tell.
@@ -64,13 +68,13 @@ class Fit:
     runs: int
 
     @property
-    def untold(self) -> list[str]:
-        """Parameters that observations do not tell."""
+    def undetermined(self) -> list[str]:
+        """Parameters that the observations do not determine."""
         return [name for name, u in self.uncertainty.items() if math.isinf(u)]
 
 
 def fit(residuals: Residuals, parameters: Sequence[str], *, steps: int = 12) -> Fit:
-    """Find the factors that explain observations best.
+    """Find the factors that best explain the observations.
 
     Args:
         residuals: simulates and compares.
@@ -78,24 +82,24 @@ def fit(residuals: Residuals, parameters: Sequence[str], *, steps: int = 12) -> 
         steps: tried at most.
 
     Raises:
-        SolverError: when the first run leaves the numbers, or nothing is told about any parameter.
+        SolverError: when the first run diverges, or the observations determine no parameter.
     """
     search = _Search(residuals, tuple(dict.fromkeys(parameters)))
-    told = search.determined(search.slopes(SPANS[0]))
-    search.keep(told)
+    known = search.determined(search.slopes(SPANS[0]))
+    search.keep(known)
     search.descend(steps)
-    # Where it ended it may be seen that some are told by nothing; the others are found without.
+    # The end of the search may leave some undetermined; the others are then fitted without them.
     for _ in parameters:
-        told = search.determined(search.slopes(SPANS[-1]))
-        if told.all():
+        known = search.determined(search.slopes(SPANS[-1]))
+        if known.all():
             break
-        search.keep(told)
+        search.keep(known)
         search.descend(steps)
     return search.result()
 
 
 class _Search:
-    """Logarithms of factors, on their way to the least squares."""
+    """The search over logarithms of factors."""
 
     def __init__(self, residuals: Residuals, names: tuple[str, ...]) -> None:
         self._residuals = residuals
@@ -123,26 +127,26 @@ class _Search:
         return self._J
 
     def determined(self, J: Float) -> np.ndarray:
-        """[K] bool, whether observations tell anything about each parameter.
+        """[K] bool, whether the observations determine each parameter.
 
         Raises:
-            SolverError: when they tell nothing at all.
+            SolverError: when they determine none.
         """
-        told: np.ndarray = np.sqrt(np.diag(_covariance(J))) * self._scatter() < TOLD
-        if not told.any():
+        known: np.ndarray = np.sqrt(np.diag(_covariance(J))) * self._scatter() < MAX_UNCERTAINTY
+        if not known.any():
             raise SolverError(
                 f"these observations do not tell {', '.join(self._names)}: whatever they are, the "
                 "simulation is the same within what they are known to; observe what the values "
                 "change (a dent, a bounce, a slide), more often or more exactly"
             )
-        return told
+        return known
 
-    def keep(self, told: np.ndarray) -> None:
-        """Go on with some of the parameters; the others are as they were given."""
-        if told.all():
+    def keep(self, known: np.ndarray) -> None:
+        """Continue with the known parameters; the others keep their given values."""
+        if known.all():
             return
-        self._left = tuple(n for n, known in zip(self._left, told, strict=True) if known)
-        self._logs, self._J = self._logs[told], self._J[:, told]
+        self._left = tuple(n for n, is_known in zip(self._left, known, strict=True) if is_known)
+        self._logs, self._J = self._logs[known], self._J[:, known]
         self._off = self._run(self._logs)
         self._history = [*self._history[:1], _size(self._off)]
 
@@ -171,7 +175,7 @@ class _Search:
                 damping *= CALMER
 
     def result(self) -> Fit:
-        """With what it may be wrong by, in both ways."""
+        """The fit with both parts of its uncertainty."""
         covariance = _covariance(self._J)
         observation = np.sqrt(np.diag(covariance)) * self._scatter()
         moved = self._discretisation(covariance)
@@ -186,8 +190,8 @@ class _Search:
     def _discretisation(self, covariance: Float) -> Float:
         """[K] how far the logarithms are from those on cells of no size."""
         moved: dict[float, Float] = {}
-        for coarser in (*COARSER, LEAST_COARSER):
-            if moved and coarser == LEAST_COARSER:
+        for coarser in (*COARSER, MIN_COARSER):
+            if moved and coarser == MIN_COARSER:
                 break
             logs = self._logs.copy()
             try:
@@ -195,7 +199,7 @@ class _Search:
                     off = self._run(logs, coarser)
                     if np.isfinite(off).all():
                         step = -covariance @ (self._J.T @ off)
-                        logs = logs + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+                        logs = logs + np.clip(step, -MAX_STEP, MAX_STEP)
             except PhysicsError:
                 continue
             moved[coarser] = logs - self._logs
@@ -208,7 +212,7 @@ class _Search:
 
 
 def continued(moved: Mapping[float, Float]) -> Float:
-    """[K] how far a result is from that on cells of no size, by how far it moves on coarser cells.
+    """[K] distance of a result to that on cells of size zero, from its change on coarser cells.
 
     Of first order, by least squares over all of these: a body that lies differently on the grid
     moves it as well, and from one alone that would count several times.
@@ -228,13 +232,195 @@ def _covariance(J: Float) -> Float:
 
 
 def _step(J: Float, off: Float, damping: float) -> Float:
-    """One damped step of the logarithms, at most LONGEST_STEP."""
+    """One damped step of the logarithms, at most MAX_STEP."""
     normal = J.T @ J
     normal = normal + np.diag(damping * np.diag(normal) + 1e-12)
     step = np.linalg.solve(normal, -(J.T @ off))
-    bounded = step * min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-30))
+    bounded = step * min(1.0, MAX_STEP / max(float(np.abs(step).max()), 1e-30))
     return np.asarray(bounded, dtype=np.float64)
 
 
 def _size(off: Float) -> float:
     return float(np.sqrt(np.mean(off * off)))
+
+
+# Restitution by dissipation: the viscosity with which a body bounces as requested.
+#
+# An elastic body on a grid bounces too well, never too badly, so removing energy is enough. Kelvin-
+# Voigt damping of the first mode, omega = pi c / 2L, gives e = e0 exp(-pi zeta / sqrt(1 - zeta^2)),
+# zeta = eta omega / 2 (lambda + 2 mu). That is the first guess; impacts of the body itself refine
+# it.
+#
+# The rebound depends on where the wall lies between the grid's nodes: an elastic block of six cells
+# keeps 0.64 of its speed on a wall through nodes and 0.88 on one just below them. So the impacts
+# use the wall that the body is meant for, where it is given.
+
+TOLERANCE = 0.015
+"""A fit stops when achieved and requested are this near."""
+IMPACTS_MAX = 14
+"""A fit makes at most this many test impacts."""
+
+
+@dataclass(frozen=True, eq=False)
+class RestitutionFit:
+    """Requested and reached restitution, and the fitted viscosity.
+
+    Attributes:
+        body: the body with the fitted viscosity in all its materials.
+        requested, achieved: coefficient of restitution against a rigid wall.
+        elastic: what the body does without added viscosity; no more can be reached.
+        viscosity: added to the materials [Pa s].
+        speed: of the test impacts [m/s].
+        impacts: how many were made.
+    """
+
+    body: Body
+    requested: float
+    achieved: float
+    elastic: float
+    viscosity: float
+    speed: float
+    impacts: int
+
+
+def fit_restitution(
+    body: Body,
+    requested: float,
+    *,
+    speed: float,
+    normal: ArrayLike = (0.0, 0.0, 1.0),
+    wall: Plane | None = None,
+    collider: Collider | None = None,
+    options: SolverOptions | None = None,
+) -> RestitutionFit:
+    """Fit viscosity so that ``body`` bounces off a rigid wall with ``requested``.
+
+    Args:
+        body: its velocity and place do not matter.
+        requested: coefficient of restitution, in [0, 1].
+        speed: approach of the test impacts [m/s]; restitution depends on it.
+        normal: [3] out of the wall, where no ``wall`` is given; it then lies just below the body.
+        wall: the one the body will hit; the body is put in front of it.
+        collider: what acts in place of the wall, whose face ``wall`` then is; at rest.
+        options: of the solver the body is meant for; cells and precision matter.
+
+    Returns:
+        The fit; ``achieved`` falls short of ``requested`` where the body cannot bounce so well.
+
+    Raises:
+        SolverError: for a request outside [0, 1] or a speed that is not positive.
+    """
+    if not 0 <= requested <= 1:
+        raise SolverError(f"restitution must be in [0, 1], not {requested!r}")
+    if wall is not None:
+        normal = wall.normal
+
+    def rebound(viscosity: float) -> float:
+        trial = with_viscosity(body, viscosity)
+        return impact(
+            trial, speed=speed, normal=normal, wall=wall, collider=collider, options=options
+        )
+
+    elastic = rebound(0.0)
+    low, high = 0.0, math.inf
+    tried, achieved, impacts = 0.0, elastic, 1
+    best = (abs(elastic - requested), 0.0, elastic)
+    while elastic > requested + TOLERANCE and best[0] > TOLERANCE and impacts < IMPACTS_MAX:
+        if achieved > requested:
+            low = tried
+        else:
+            high = tried
+        if impacts == 1:
+            tried = _first_guess(body, requested / elastic, normal)
+        else:
+            tried = _between(low, high, tried)
+        achieved = rebound(tried)
+        impacts += 1
+        best = min(best, (abs(achieved - requested), tried, achieved))
+    return RestitutionFit(
+        with_viscosity(body, best[1]), requested, best[2], elastic, best[1], speed, impacts
+    )
+
+
+def impact(
+    body: Body,
+    *,
+    speed: float,
+    normal: ArrayLike = (0.0, 0.0, 1.0),
+    wall: Plane | None = None,
+    collider: Collider | None = None,
+    options: SolverOptions | None = None,
+) -> float:
+    """Coefficient of restitution of one impact on a rigid wall, without gravity.
+
+    Arguments are those of :func:`fit_restitution`. Separation over approach speed of the centre
+    of mass; 0 when it does not come off again.
+    """
+    if not (math.isfinite(speed) and speed > 0):
+        raise SolverError(f"speed of an impact must be positive [m/s], not {speed!r}")
+    if wall is None:
+        wall = _wall_below(body, normal)
+    n = np.asarray(wall.normal)
+    lowest = float((body.particles.positions @ n).min()) - float(np.asarray(wall.point) @ n)
+    pose = np.eye(4)
+    pose[:3, 3] = (1.5 * _half_spacing(body) - lowest) * n
+    particles = body.particles.moved(pose)
+    thrown = replace(body, particles=particles, velocity=-speed * n, angular_velocity=np.zeros(3))
+    options = replace(options or SolverOptions(), gravity=(0.0, 0.0, 0.0))
+    solver = Solver([thrown], [wall if collider is None else collider], options)
+    crossing = _length(body, n) / body.materials[0].wave_speed
+    limit = 60 * (crossing + solver.dx / speed)
+    while solver.time < limit:
+        before = solver.measure.momentum[0] @ n
+        solver.step(crossing)
+        after = solver.measure.momentum[0] @ n
+        # Off the wall nothing changes the momentum any more.
+        if after > 0 and abs(after - before) < 1e-4 * speed * body.particles.mass:
+            break
+    return max(float(solver.measure.momentum[0] @ n) / (speed * body.particles.mass), 0.0)
+
+
+def _wall_below(body: Body, normal: ArrayLike) -> Plane:
+    """A wall just below the body at its place."""
+    n = np.asarray(normal, dtype=np.float64)
+    n = n / np.linalg.norm(n)
+    lowest = float((body.particles.positions @ n).min())
+    return Plane(name="wall", point=(lowest - 1.5 * _half_spacing(body)) * n, normal=n)
+
+
+def _half_spacing(body: Body) -> float:
+    """From the outermost particles to the surface [m]."""
+    return 0.5 * float(np.cbrt(body.particles.volumes).mean())
+
+
+def with_viscosity(body: Body, viscosity: float) -> Body:
+    """The body with ``viscosity`` [Pa s] added to each of its materials."""
+    return replace(
+        body,
+        material=[replace(m, viscosity=m.viscosity + viscosity) for m in body.materials],
+    )
+
+
+def _first_guess(body: Body, fraction: float, normal: ArrayLike) -> float:
+    """Viscosity [Pa s] that lets ``fraction`` of the rebound through, by the formula above."""
+    drop = -math.log(max(fraction, 0.02))
+    zeta = drop / math.hypot(math.pi, drop)
+    material = body.materials[0]
+    n = np.asarray(normal, dtype=np.float64)
+    omega = math.pi * material.wave_speed / (2 * _length(body, n))
+    return 2 * material.wave_modulus * zeta / omega
+
+
+def _between(low: float, high: float, tried: float) -> float:
+    """Halve a bracket in the logarithm; widen it while one end is open."""
+    if math.isinf(high):
+        return 1.6 * tried
+    if low == 0.0:
+        return tried / 1.6
+    return math.sqrt(low * high)
+
+
+def _length(body: Body, n: Float) -> float:
+    """Extent of the body along a direction [m]."""
+    along = body.particles.positions @ (n / np.linalg.norm(n))
+    return float(along.max() - along.min()) + float(np.cbrt(body.particles.volumes).mean())

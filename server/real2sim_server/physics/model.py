@@ -1,19 +1,236 @@
-"""From bodies to a checked model: precision, grid, memory."""
+"""From bodies to a checked model, and the Protocol of the backends that solve it."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from .backends.base import Model, ParticleArrays
+from ..geometry.rotation import Float
+from . import contact as collider_rows
+from . import stress
 from .body import Body
-from .contact.surface import STICKS
+from .colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane, Solid, TriangleMesh
+from .contact import STICKS, THIN_CELLS
 from .errors import ParticleError, SolverError
-from .materials import Material
+from .materials import Material, law_of_code
+
+# The interface of solver backends.
+
+TOTALS = 8
+"""Columns of contact totals, all on a body: impulse (3) [N s], its moment about the world origin
+(3) [N m s], work of friction [J], work of the other's motion [J].
+
+Work of friction is impulse times slip after the contact, the other's is impulse times its velocity:
+both are what the impulse did over the substep, whatever the stresses did at the same node.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleArrays:
+    """State of all particles of all bodies, body after body, float64.
+
+    Attributes:
+        positions: [N, 3] [m].
+        velocities: [N, 3] [m/s].
+        gradients: [N, 3, 3] APIC velocity gradient [1/s].
+        F_elastic: [N, 3, 3], drives stress.
+        F_total: [N, 3, 3], drives what is seen.
+        history: [N] plastic memory, see ``stress.stress_update``.
+    """
+
+    positions: Float
+    velocities: Float
+    gradients: Float
+    F_elastic: Float
+    F_total: Float
+    history: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A checked simulation, ready for a backend.
+
+    Attributes:
+        start: particles at the start.
+        masses, volumes: [N] float64 [kg], [m^3].
+        material: [N] int64, row of ``table``.
+        body: [N] int64, increasing.
+        table: [K, MATERIAL_ROW] float64, ``Material.row``.
+        friction: [B] float64, of the bodies' surfaces.
+        dx: cell size of the grid [m].
+        gravity: [3] [m/s^2].
+        dtype: float32 or float64, precision of the state where the backend has a choice.
+
+    Raises:
+        MaterialError: for a law in ``table`` that there is not.
+    """
+
+    start: ParticleArrays
+    masses: Float
+    volumes: Float
+    material: NDArray[np.int64]
+    body: NDArray[np.int64]
+    table: Float
+    friction: Float
+    dx: float
+    gravity: Float
+    dtype: type[np.floating[Any]]
+
+    def __post_init__(self) -> None:
+        for code in np.unique(self.table[:, stress.LAW]).tolist():
+            law_of_code(code)
+
+    @property
+    def plastic(self) -> NDArray[np.bool_]:
+        """[N] which particles keep F_total and history of their own."""
+        flags: NDArray[np.bool_] = self.table[self.material, stress.PLASTIC] > 0
+        return flags
+
+    @property
+    def bodies(self) -> int:
+        """Number of bodies B."""
+        return len(self.friction)
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """Sums over each body, float64, and bounds over all particles.
+
+    Attributes:
+        mass: [B] [kg].
+        centre: [B, 3] centre of mass [m].
+        momentum: [B, 3] [kg m/s].
+        angular_momentum: [B, 3] about the world origin, APIC's affine part included [kg m^2/s].
+        kinetic: [B] kinetic energy, affine part included [J].
+        elastic: [B] stored energy [J].
+        max_speed: fastest particle [m/s].
+        max_wave_speed: fastest pressure wave in the deformed material [m/s].
+        min_volume_ratio: smallest det F_elastic.
+    """
+
+    mass: Float
+    centre: Float
+    momentum: Float
+    angular_momentum: Float
+    kinetic: Float
+    elastic: Float
+    max_speed: float
+    max_wave_speed: float
+    min_volume_ratio: float
+
+    @property
+    def finite(self) -> bool:
+        """Whether no particle has left the numbers."""
+        sums = (self.centre.sum(), self.kinetic.sum(), self.elastic.sum())
+        bounds = (self.max_speed, self.max_wave_speed, self.min_volume_ratio)
+        return bool(np.isfinite([*sums, *bounds]).all())
+
+
+class Simulation(Protocol):
+    """A model in motion on one backend."""
+
+    def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
+        """Make ``steps`` substeps of ``dt`` [s]; moving colliders start where they are given."""
+        ...
+
+    def measure(self) -> Measure:
+        """Sums and bounds of the present state."""
+        ...
+
+    def particles(self) -> ParticleArrays:
+        """A copy of the present state, in the order of the model."""
+        ...
+
+    def contacts(self) -> tuple[Float, Float]:
+        """Totals since the start: on bodies by colliders [B, K, TOTALS], by bodies [B, B, TOTALS].
+
+        Between bodies each side counts half of the work of friction.
+        """
+        ...
+
+    def save(self) -> Any:
+        """The present state, bit by bit."""
+        ...
+
+    def restore(self, saved: Any) -> None:
+        """Go back to a saved state."""
+        ...
+
+
+class SolverBackend(Protocol):
+    """One way to compute; all members agree within the precision they work in."""
+
+    name: str
+
+    def start(self, model: Model, colliders: Sequence[Collider]) -> Simulation:
+        """Load a model. Number and type of colliders stay the same."""
+        ...
+
+
+def is_thin(collider: Collider, dx: float) -> bool:
+    """Whether too few nodes of a grid of ``dx`` [m] lie in a collider to stop a body."""
+    return isinstance(collider, Solid) and collider.thickness < THIN_CELLS * dx
+
+
+def pack_colliders(colliders: Sequence[Collider], dx: float) -> tuple[Float, Float]:
+    """Rows [K, COLLIDER_ROW], and numbers [H] of height fields and meshes, as kernels read them."""
+    rows = np.zeros((len(colliders), collider_rows.COLLIDER_ROW))
+    heights: list[Float] = []
+    stored = 0
+    for row, collider in zip(rows, colliders, strict=True):
+        own = collider.friction
+        row[collider_rows.FRICTION] = -1.0 if own is None else min(own, float(STICKS))
+        row[collider_rows.SEPARABLE] = collider.separable
+        row[collider_rows.THIN] = is_thin(collider, dx)
+        if isinstance(collider, Plane):
+            row[collider_rows.KIND] = collider_rows.PLANE
+            row[collider_rows.POINT : collider_rows.POINT + 3] = collider.point
+            row[collider_rows.AXES : collider_rows.AXES + 3] = collider.normal
+        elif isinstance(collider, Solid):
+            _pack_solid(row, collider)
+            if isinstance(collider, TriangleMesh):
+                row[collider_rows.FIRST_NODE] = stored
+                heights.append(collider.surface.packed)
+        elif isinstance(collider, HeightField):
+            row[collider_rows.KIND] = collider_rows.HEIGHT_FIELD
+            row[collider_rows.POINT : collider_rows.POINT + 2] = collider.origin
+            row[collider_rows.FIRST_HEIGHT] = stored
+            row[collider_rows.COUNT_X], row[collider_rows.COUNT_Y] = collider.heights.shape
+            row[collider_rows.SPACING] = collider.spacing
+            heights.append(collider.heights.ravel())
+        stored = sum(len(h) for h in heights)
+    return rows, np.concatenate(heights) if heights else np.zeros(0)
+
+
+def _pack_solid(row: Float, solid: Solid) -> None:
+    pose, size = solid.pose, slice(collider_rows.HALF_SIZE, collider_rows.HALF_SIZE + 3)
+    row[collider_rows.POINT : collider_rows.POINT + 3] = pose[:3, 3]
+    row[collider_rows.AXES : collider_rows.AXES + 9] = pose[:3, :3].ravel()
+    row[collider_rows.SPIN : collider_rows.SPIN + 3] = solid.angular_velocity
+    row[collider_rows.SPEED : collider_rows.SPEED + 3] = solid.velocity
+    if isinstance(solid, Box):
+        row[collider_rows.KIND] = collider_rows.BOX
+        row[size] = np.asarray(solid.size) / 2
+    elif isinstance(solid, Cylinder):
+        row[collider_rows.KIND] = collider_rows.CYLINDER
+        row[size] = solid.radius, solid.height / 2, 0.0
+    elif isinstance(solid, Capsule):
+        row[collider_rows.KIND] = collider_rows.CAPSULE
+        row[size] = solid.radius, solid.length / 2, 0.0
+    elif isinstance(solid, TriangleMesh):
+        row[collider_rows.KIND] = collider_rows.MESH
+        row[collider_rows.NODES] = solid.surface.nodes
+        row[collider_rows.HALF_THICKNESS] = (solid.surface.thickness or 0.0) / 2
+
+
+class SolverDiverged(Exception):
+    """Particles became non-finite or left the grid within a step; restore an earlier state."""
+
 
 PRECISIONS: dict[str, type[np.floating[Any]]] = {"single": np.float32, "double": np.float64}
 BODIES_MAX = 4096
@@ -55,7 +272,7 @@ def build_model(
 
 
 def check_memory(particles: int, precision: str) -> None:
-    """Refuse what would not fit, before anything is allocated.
+    """Refuse a model that would not fit in memory, before any allocation.
 
     Raises:
         ParticleError: with what is needed and what there is.
@@ -69,7 +286,7 @@ def check_memory(particles: int, precision: str) -> None:
 
 
 def available_memory() -> int:
-    """Memory this machine has left [bytes]."""
+    """Available memory of this machine [bytes]."""
     try:
         with open("/proc/meminfo", encoding="ascii") as lines:
             for line in lines:

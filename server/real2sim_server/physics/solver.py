@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from ..geometry.rotation import Float
+from . import stress
 from .backends import Measure, Model, ParticleArrays, Simulation, select_backend
-from .backends.base import SolverDiverged
 from .body import Body
 from .colliders import Collider
-from .constitutive import material_row
 from .errors import PhysicsError, SolverError, UnstableError
-from .model import build_model
+from .model import SolverDiverged, build_model
 
 CHECK_INTERVAL = 16
 """Substeps between two checks of energy and of finite numbers."""
@@ -30,7 +29,7 @@ DT_SCALE_MIN = 2.0**-12
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """How a solver computes.
+    """Options of a solver.
 
     Attributes:
         dx: cell size [m]; None takes twice the spacing of the coarsest body's particles.
@@ -59,7 +58,7 @@ class SolverOptions:
 
 @dataclass(frozen=True, eq=False)
 class BodyState:
-    """One body as it is now; world frame, float64, particles in the body's order.
+    """The current state of one body; world frame, float64, particles in the body's order.
 
     Attributes:
         positions, velocities: [N, 3] [m], [m/s].
@@ -95,7 +94,7 @@ class BodyState:
 
 @dataclass(frozen=True, eq=False)
 class ContactTotals:
-    """Sums over what a collider or another body did to one body since the start.
+    """Total effect of a collider or another body on one body since the start.
 
     Attributes:
         body, other: names.
@@ -140,7 +139,7 @@ class Energies:
 
 @dataclass(eq=False)
 class StepReport:
-    """What a step took.
+    """Report of a step.
 
     Attributes:
         substeps: made and kept.
@@ -197,11 +196,11 @@ class Solver:
 
     @property
     def colliders(self) -> tuple[Collider, ...]:
-        """In their present poses."""
+        """Colliders in their present poses."""
         return tuple(self._colliders)
 
     def step(self, duration: float) -> StepReport:
-        """Go on by ``duration`` [s], in as many substeps as that needs.
+        """Advance by ``duration`` [s], in as many substeps as needed.
 
         Raises:
             SolverError: for a duration that is not positive or needs too many substeps.
@@ -241,7 +240,7 @@ class Solver:
         return self._dt_scale * min(o.cfl * self.dx / speed, self._viscous_dt, o.dt_max)
 
     def state(self, name: str) -> BodyState:
-        """The body of that name.
+        """State of the body with this name.
 
         Raises:
             SolverError: when there is none.
@@ -366,7 +365,7 @@ class Solver:
         return ""
 
     def _instability(self, before: Measure, work: float) -> str:
-        """What is wrong with the present state, or nothing."""
+        """Description of the present state's instability; empty where it is stable."""
         m = self._measure
         if not m.finite:
             return "positions, velocities or stresses are not finite"
@@ -400,7 +399,7 @@ class Solver:
 
 def _viscous_limit(model: Model) -> float:
     """Longest substep that Kelvin-Voigt damping allows [s]."""
-    eta = model.table[model.material, material_row.VISCOSITY]
+    eta = model.table[model.material, stress.VISCOSITY]
     density = model.masses / model.volumes
     rate = float((eta / density).max()) / model.dx**2
     return VISCOUS_STEP / rate if rate > 0 else math.inf

@@ -1,11 +1,11 @@
 """Bodies of a scene in time: rigid, deforming, at rest."""
 
 from .fill import Filling, fill_object
-from .masses import CLASS_MASSES, default_mass
 from .playback import Playback
 from .presets import PRESETS, ObjectPhysics
 from .result import ContactRecord, ObjectResult, SimulationResult
 from .rollout import SimulateOptions, simulate
+from .structure import CLASS_MASSES, default_mass
 
 __all__ = [
     "CLASS_MASSES",

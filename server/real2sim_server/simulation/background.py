@@ -1,9 +1,9 @@
-"""The background of a scene as colliders: upright boxes about what stands in the way.
+"""Colliders of a scene: its ground, and upright boxes around the obstacles of its background.
 
-What is solid is what the closed loop takes for solid (``scene.obstacles``). Cells that touch each
-other are one thing; its Gaussians are parted along their length until a box seen from above fits
-each part: one for a pole, one for each side of a house, several for a hedge that bends. Only one
-side of a wall was seen, so that boxes grow away from the recorded way.
+Solid cells are the closed loop's (``scene.obstacles``). Adjacent cells form one obstacle. Its
+Gaussians are split along their length until a box seen from above fits each part: one for a pole,
+one for each side of a house, several for a curved hedge. The recording saw only one side of a wall,
+so boxes grow away from the recorded path.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..geometry.rotation import Float
 from ..geometry.transform import invert_transform
-from ..physics.colliders import Box
+from ..physics.colliders import Box, HeightField
 from ..scene import GaussianCloud, Ground, Scene
 from ..scene.obstacles import CELL, HIGHEST, OPAQUE, OccupiedCells, RecordedWay, occupied_cells
 
@@ -47,7 +47,7 @@ BOXES_MAX = 200
 
 @dataclass(frozen=True, eq=False)
 class Cleared:
-    """A box around an object that starts there: where it is nothing else stands.
+    """A box around an object's start, kept free of colliders.
 
     Attributes:
         T_world_box: [4, 4].
@@ -58,7 +58,7 @@ class Cleared:
     size: Float
 
     def holds(self, points: Float) -> NDArray[np.bool_]:
-        """Which points [N, 2] are in it, seen from above."""
+        """Whether points [N, 2] are inside, seen from above."""
         back = invert_transform(self.T_world_box)
         level = np.column_stack([points, np.full(len(points), self.T_world_box[2, 3])])
         local = level @ back[:3, :3].T + back[:3, 3]
@@ -82,7 +82,7 @@ class _Rectangle:
         return np.array([-self.along[1], self.along[0]])
 
     def grid(self, step: float) -> Float:
-        """[N, 2] points all over it, at most ``step`` [m] apart."""
+        """[N, 2] points that cover it, at most ``step`` [m] apart."""
         u, v = (
             np.linspace(-edge / 2, edge / 2, max(math.ceil(edge / step), 1) + 1)
             for edge in (self.length, self.width)
@@ -93,7 +93,7 @@ class _Rectangle:
 
 
 def background_colliders(scene: Scene, cleared: Sequence[Cleared], *, within: float) -> list[Box]:
-    """Boxes about what of a scene's background could be hit, ``background.0`` and so on.
+    """Boxes around the obstacles of a scene's background, ``background.0`` and so on.
 
     Args:
         scene: whose background, ground and recorded way.
@@ -118,7 +118,7 @@ def background_colliders(scene: Scene, cleared: Sequence[Cleared], *, within: fl
 
 
 def described(boxes: Sequence[Box]) -> list[dict[str, object]]:
-    """What was taken for a collider, as JSON values."""
+    """The background colliders as JSON values."""
     rows: list[dict[str, object]] = []
     for box in boxes:
         pose = np.asarray(box.T_world_box)
@@ -134,7 +134,7 @@ def described(boxes: Sequence[Box]) -> list[dict[str, object]]:
 
 
 def _connected(points: Float, cells: OccupiedCells) -> Iterator[Float]:
-    """Points [K, 2] of each thing: of cells that touch each other, by a corner at least."""
+    """Points [K, 2] of each group of cells that touch, if only at a corner."""
     from scipy import ndimage
 
     if not len(points):
@@ -153,7 +153,7 @@ def _connected(points: Float, cells: OccupiedCells) -> Iterator[Float]:
 def _fitted(
     points: Float, cells: OccupiedCells, cleared: Sequence[Cleared]
 ) -> Iterator[_Rectangle]:
-    """Rectangles that cover points [K, 2] of one thing, parted where one does not fit."""
+    """Rectangles that cover points [K, 2] of one obstacle, split where one does not fit."""
     rectangle = _around(points)
     grid = rectangle.grid(CELL / 2)
     blocked = any(c.holds(grid).any() for c in cleared)
@@ -176,7 +176,7 @@ def _fitted(
 
 
 def _around(points: Float) -> _Rectangle:
-    """The rectangle about points [K, 2], along their longest extent."""
+    """The rectangle around points [K, 2], along their longest extent."""
     middle = points.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((points - middle).T) if len(points) > 1 else np.eye(2))
     along = axes[:, 1]
@@ -221,7 +221,7 @@ def _high_points(background: GaussianCloud, ground: Ground, near: Sequence[_Rect
 
 
 def _upright(name: str, rectangle: _Rectangle, ground: Ground, high: Float) -> Box:
-    """The box over a rectangle, as tall as what is above it."""
+    """The box over a rectangle, as tall as the points above it."""
     local = (high[:, :2] - rectangle.centre) @ np.stack([rectangle.along, rectangle.across]).T
     reach = np.array([rectangle.length, rectangle.width]) / 2 + CELL / 2
     above = high[np.all(np.abs(local) < reach, axis=1), 2]
@@ -232,3 +232,39 @@ def _upright(name: str, rectangle: _Rectangle, ground: Ground, high: Float) -> B
     pose[:2, 0], pose[:2, 1] = rectangle.along, rectangle.across
     pose[:2, 3], pose[2, 3] = rectangle.centre, (low + top) / 2
     return Box(name=name, T_world_box=pose, size=(rectangle.length, rectangle.width, top - low))
+
+
+# The ground.
+
+GROUND = "ground"
+"""Name of the collider; tyres roll on what has it."""
+
+MARGIN = 40.0
+"""The collider reaches this far around what it is for [m]."""
+
+
+def ground_collider(
+    ground: Ground, places: Float, *, offset: float = 0.0, friction: float | None = None
+) -> HeightField:
+    """The cells of a scene's ground around given places: the same surface, bit for bit.
+
+    Args:
+        ground: of the scene.
+        places: [N, 2] what the collider is for, N >= 1, world [m].
+        offset: by which it is raised [m].
+        friction: of the collider; None for that of the bodies.
+    """
+    last = np.array(ground.heights.shape) - 1
+    low, high = places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN
+    first = np.floor((low - ground.first_centre) / ground.cell).astype(np.int64)
+    end = np.ceil((high - ground.first_centre) / ground.cell).astype(np.int64)
+    # At least two samples each way, also where the places are beside the grid.
+    i, j = np.clip(first, 0, last - 1).tolist()
+    m, n = np.clip(end, [i + 1, j + 1], last).tolist()
+    return HeightField(
+        name=GROUND,
+        heights=ground.heights[i : m + 1, j : n + 1].astype(np.float64) + offset,
+        origin=ground.first_centre + np.array([i, j]) * ground.cell,
+        spacing=ground.cell,
+        friction=friction,
+    )

@@ -17,16 +17,22 @@ from numpy.typing import NDArray
 from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform
-from ..physics.body import Body
+from ..physics.body import Body, Particles
 from ..physics.colliders import Collider, Solid
 from ..physics.materials import Material
-from ..physics.particles import Particles
 from ..physics.solver import BodyState
 from .result import Rebound
-from .rigid import RigidMotion, added_inertia, best_rotation, cross_matrix, inertia_about
-from .rolling import advance_on_wheels
-from .surroundings import closest, packed, solid_gaps
-from .tyres import TyreReaction, Tyres
+from .rigid import (
+    RigidMotion,
+    added_inertia,
+    best_rotation,
+    closest,
+    cross_matrix,
+    inertia_about,
+    packed,
+    solid_gaps,
+)
+from .tyres import TyreReaction, Tyres, advance_on_wheels
 
 NO_TYRES = Tyres(np.zeros((0, 3)), np.zeros(0), rest=np.zeros(0))
 
@@ -64,7 +70,7 @@ class BodyMode(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class DeformedShape:
-    """What deformation has left, in the object's frame.
+    """Permanent deformation in the object's frame.
 
     Attributes:
         positions: [N, 3] particles [m].
@@ -79,7 +85,7 @@ class DeformedShape:
 
 
 class DeformableBody:
-    """A body of a simulation and how it moves now.
+    """A body of a simulation in its current mode of motion.
 
     Args:
         name: object id.
@@ -176,7 +182,7 @@ class DeformableBody:
         return self._pose
 
     def local_positions(self) -> Float:
-        """[N, 3] particles in the frame of ``T_world_object`` [m]."""
+        """[N, 3] particle positions in the frame of ``T_world_object`` [m]."""
         if self.state is None:
             return self.shape.positions
         pose = self.T_world_object
@@ -200,7 +206,7 @@ class DeformableBody:
         return placed
 
     def box(self) -> tuple[Float, Float]:
-        """Pose [4, 4] and size [3] of the box about its present shape."""
+        """Pose [4, 4] and size [3] of the box around its present shape."""
         kept = self.shape if self.state is None else self.state
         if self._bounds_of is not kept:
             local, half = self.local_positions(), self.spacing / 2
@@ -235,7 +241,7 @@ class DeformableBody:
     def _closest(
         self, colliders: Sequence[Collider], *, within: float, ahead: float
     ) -> tuple[float, float, bool]:
-        """See ``surroundings.closest``.
+        """See ``rigid.closest``.
 
         Outermost particles are what meets ground; a solid may meet any place of a flat side.
         """
@@ -383,7 +389,7 @@ class DeformableBody:
         self._settle_time = self._stood + duration if slow else 0.0
 
     def activate(self) -> None:
-        """Begin to deform; the next ``solver_body`` goes into a solver."""
+        """Start to deform; the next ``solver_body`` goes into a solver."""
         self.mode = BodyMode.DEFORMING
         self._velocity_before = self.motion.velocity
         self._deforming_time = self._settle_time = self._sleep_time = 0.0
@@ -425,7 +431,7 @@ class DeformableBody:
         self._carried = self._on_grid(self.motion)
 
     def apply_road(self, road: Sequence[Collider], duration: float) -> TyreReaction | None:
-        """Let the road act on the wheels while deforming, as on a rigid body.
+        """Apply the road's forces to the wheels while deforming, as on a rigid body.
 
         Returns:
             What the road did, or None when no wheel carries; else a solver must start anew from
@@ -474,7 +480,7 @@ class DeformableBody:
         return float(np.sqrt(self.rest.masses @ ((s.velocities - rigid) ** 2).sum(axis=1) / m.mass))
 
     def update_timers(self, duration: float) -> None:
-        """Count how long it has been deforming, settled and slow; ``duration`` [s] more."""
+        """Add ``duration`` [s] to its times of deforming, being settled and being slow."""
         speed = float(np.linalg.norm(self.motion.velocity))
         turning = float(np.linalg.norm(self.motion.angular_velocity))
         settled = self.residual_speed() < max(SETTLED_SPEED, SETTLED_FRACTION * speed)
@@ -489,21 +495,21 @@ class DeformableBody:
 
     @property
     def is_undamped(self) -> bool:
-        """Whether it is elastic throughout, with nothing that takes energy away."""
+        """Whether it is purely elastic, without any dissipation."""
         return all(m.viscosity == 0 and not m.plastic for m in self.materials)
 
     @property
     def may_rigidify(self) -> bool:
-        """Whether it has deformed and then been settled for long enough."""
+        """Whether it has deformed and has been settled long enough."""
         return self._settle_time >= SETTLE_TIME and self._deforming_time >= 2 * SETTLE_TIME
 
     @property
     def may_sleep(self) -> bool:
-        """Whether it has hardly moved for long enough, too."""
+        """Whether it has also been nearly still long enough."""
         return self.may_rigidify and self._sleep_time > SLEEP_TIME
 
     def rigidify(self) -> None:
-        """Become rigid as it is: no particle moves; momentum and angular momentum stay."""
+        """Become rigid in the present shape, with the same momentum and angular momentum."""
         assert self.state is not None
         pose, s = self.T_world_object, self.state
         back = pose[:3, :3].T
@@ -523,11 +529,11 @@ class DeformableBody:
 
     @property
     def has_parked(self) -> bool:
-        """Whether a rigid body has stood or lain for long enough to be put to sleep."""
+        """Whether a rigid body has been still long enough to be put to sleep."""
         return self._settle_time > WHEELS_SLEEP_TIME
 
     def put_to_sleep(self, supports: Sequence[str] = ()) -> None:
-        """Stand still until something comes near, or what it rests on moves.
+        """Stand still until a body comes near or its support moves.
 
         A deforming body becomes rigid first.
 
@@ -541,11 +547,11 @@ class DeformableBody:
         self.motion = replace(self.motion, velocity=np.zeros(3), angular_velocity=np.zeros(3))
 
     def wake(self) -> None:
-        """Be free to move again."""
+        """Let the body move again."""
         self.mode = BodyMode.RIGID
 
     def push(self, impulse: Float, moment: Float) -> None:
-        """Let an impulse act on a rigid body, and wake it.
+        """Apply an impulse to a rigid body and wake it.
 
         Args:
             impulse: [3] [N s].
@@ -560,7 +566,7 @@ class DeformableBody:
             self.wake()
 
     def translate(self, by: Float) -> None:
-        """Place a rigid body elsewhere, ``by`` [3] [m]."""
+        """Shift a rigid body by ``by`` [3] [m]."""
         self.motion = replace(self.motion, centre=self.motion.centre + by)
 
 
@@ -582,7 +588,7 @@ def _shell(positions: Float, spacing: float) -> NDArray[np.int64]:
 
 
 def _hull(positions: Float) -> NDArray[np.int64]:
-    """Indices of particles that lie outermost along evenly spread directions."""
+    """Indices of the outermost particles along evenly spread directions."""
     k = np.arange(SURFACE_POINTS) + 0.5
     z = 1 - 2 * k / SURFACE_POINTS
     radius, angle = np.sqrt(1 - z * z), np.pi * (1 + 5**0.5) * k

@@ -1,7 +1,7 @@
-"""The vehicle that recorded a scene as an object of it: a body that can be seen and can deform.
+"""The recording vehicle as an object of its scene: visible and deformable.
 
-Nobody recorded what it looks like, so that Gaussians cover a plain car of its size: bonnet, cabin
-with dark glass, wheels. Its box stands on the recorded way, from the rear axle on.
+No recording shows it, so Gaussians cover a plain car of its size: bonnet, cabin with dark glass,
+wheels. Its box stands on the recorded path, measured from the rear axle.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class PlacedEgo:
 
 @dataclass(frozen=True, eq=False)
 class WithEgo:
-    """A scenario's objects, and the ego.
+    """A scenario's objects and the ego.
 
     Attributes:
         visible: all of them, the ego last.
@@ -60,7 +60,7 @@ class WithEgo:
 
 
 def with_ego(scene: Scene, state: PlacedObjects) -> tuple[Scene, PlacedObjects]:
-    """A scene and its objects with the ego among them; as they are where one has its id."""
+    """A scene and its objects including the ego; unchanged where an object has its id."""
     if any(o.object_id == EGO for o in state.visible):
         return scene, state
     trajectory = _boxes(scene.ego, scene.ego_size)
@@ -104,7 +104,7 @@ def ego_cloud(size: tuple[float, float, float]) -> GaussianCloud:
 
 
 def _ticks(extent: float) -> Float:
-    """Places over an extent from 0 on, its ends included [m]."""
+    """Evenly spaced places from 0 to an extent, ends included [m]."""
     return np.linspace(0.0, extent, max(round(extent / STEP), 2) + 1)
 
 

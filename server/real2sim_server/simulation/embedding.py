@@ -73,7 +73,7 @@ class Embedding:
         self._trust = np.clip(2.5 - beyond, 0, 1)[:, None, None]
 
     def near(self, particles: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """[G] which points follow any of some particles [N]."""
+        """[G] whether points follow any of the particles [N]."""
         found: NDArray[np.bool_] = np.any(particles[self._index], axis=1)
         return found
 
@@ -86,7 +86,7 @@ class Embedding:
         return F
 
     def follow(self, displacements: Float, rows: NDArray[np.int64] | None = None) -> Deformed:
-        """Where the points are when particles are displaced by ``displacements`` [N, 3] [m].
+        """Positions of the points under particle displacements [N, 3] [m].
 
         Args:
             displacements: of all particles.
@@ -106,7 +106,7 @@ class Embedding:
         return Deformed(moved, F, rotations)
 
     def _of(self, rows: NDArray[np.int64]) -> Embedding:
-        """Of some of the points alone."""
+        """The embedding of a subset of points."""
         part = copy(self)
         for name in ("_index", "_weights", "_slopes", "_centre", "_offset", "_trust"):
             setattr(part, name, getattr(self, name)[rows])

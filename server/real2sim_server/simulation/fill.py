@@ -1,8 +1,8 @@
-"""An object's Gaussians as particles, with the inside filled.
+"""Particles from an object's Gaussians, with a filled interior.
 
-Voxels that Gaussians cover are the shell. What can be reached from outside along an axis without
-crossing the shell is outside, the rest is inside. Where next to nothing of a side was seen,
-typically the underside, the side across or the tracked box closes it.
+Voxels covered by Gaussians are the shell. Voxels reachable from outside along an axis without
+crossing the shell are outside, the rest is inside. Where the recording hardly saw a side, typically
+the underside, the opposite side or the tracked box closes it.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..geometry.rotation import Float, quaternion_to_matrix
+from ..physics.body import Particles
 from ..physics.errors import ParticleError
 from ..physics.model import check_memory
-from ..physics.particles import Particles
 from ..scene import GaussianCloud
-from .masses import default_mass
+from .structure import default_mass
 
 OPACITY_MIN = 0.05
 """Fainter Gaussians are haze and stand for no particles."""
@@ -36,7 +36,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Filling:
-    """How a body was filled, for inspection before it is simulated.
+    """The filling of a body, for inspection before the simulation.
 
     Attributes:
         particles: Gaussians and interior, in the object's frame.
@@ -172,7 +172,7 @@ SIDES = (
 def _inside(
     shell: Mask, size: Float, origin: Float, spacing: float
 ) -> tuple[Mask, tuple[str, ...]]:
-    """Voxels that cannot be reached straight from outside, and the sides that the box closed.
+    """Voxels out of straight reach from outside, and the sides that the box closed.
 
     From each side everything before the first surface is carved away. Holes in what a side shows
     are closed from around them; a side hardly seen takes the depths of the side across where that

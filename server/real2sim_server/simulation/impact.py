@@ -1,8 +1,8 @@
-"""Two bodies run into each other once: deforming while they touch, dented after.
+"""A single impact of two bodies: they deform while in contact and stay dented.
 
-For a closed loop in which bodies are rigid and their impacts sudden: this says what an impact has
-done to their shapes. The world around (road, gravity, wheels) is left out, since over the tenth of
-a second that a crash lasts it changes velocities by a twentieth of what the crash does.
+The closed loop has rigid bodies and instantaneous impacts; this module computes how an impact
+changes their shapes. It ignores road, gravity and wheels: over the tenth of a second of a crash
+they change velocities by a twentieth of the crash's effect.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform
+from ..physics.body import Particles, box_particles
 from ..physics.colliders import Box, Collider
 from ..physics.materials import Material
-from ..physics.particles import Particles, box_particles
 from ..physics.solver import Solver, SolverOptions
 from ..scene import GaussianCloud
 from .body import DeformableBody, DeformedShape
@@ -40,8 +40,8 @@ CFL = 0.6
 with shorter ones."""
 SAMPLE_DT = 0.005
 FRAME_SAMPLES = 2
-LONGEST = 0.25
-"""A crash is over by then [s]."""
+MAX_CRASH_TIME = 0.25
+"""Longest simulated crash [s]."""
 SETTLING_TIME = 0.015
 """After they parted, shapes displacement_history out for so long [s]."""
 TOUCHED, ENDED = 0.01, 0.002
@@ -69,13 +69,13 @@ class CrashBody:
 
     @property
     def positions(self) -> Float:
-        """[N, 3] particles as they are now, object frame [m]."""
+        """[N, 3] current particle positions, object frame [m]."""
         return self.rest.positions if self.shape is None else self.shape.positions
 
 
 @dataclass(frozen=True, eq=False)
 class ImpactBody:
-    """A body about to hit.
+    """A body before an impact.
 
     Attributes:
         body: what it is.
@@ -91,13 +91,13 @@ class ImpactBody:
 
     @property
     def positions(self) -> Float:
-        """[N, 3] particles in the world [m]."""
+        """[N, 3] particle positions in the world [m]."""
         return apply_transform(self.T_world_object, self.body.positions)
 
 
 @dataclass(frozen=True, eq=False)
 class ImpactResult:
-    """What an impact did to one body.
+    """The effect of an impact on one body.
 
     Attributes:
         body: as it is afterwards.
@@ -142,7 +142,7 @@ def object_body(
 def vehicle_body(
     size: Sequence[float], *, mass: float, friction: float, spacing: float | None = None
 ) -> CrashBody:
-    """A vehicle of which only the box is known: hood, cabin and boot of a plain car.
+    """A vehicle known only by its box: bonnet, cabin and boot of a plain car.
 
     Origin of its frame: the centre of the box. ``spacing``: of particles [m].
     """
@@ -170,7 +170,7 @@ def _body(rest: Particles, category: str, spacing: float, friction: float) -> Cr
 def simulate_impact(
     first: ImpactBody, second: ImpactBody | Box
 ) -> tuple[ImpactResult, ImpactResult | None] | None:
-    """Let a body run into another, or into what does not yield.
+    """Simulate a body's impact on another body or a rigid obstacle.
 
     They are moved along their ways until they are just not in contact. Momentum of both together
     stays; what they exchange is left to the solver.
@@ -224,7 +224,7 @@ class ImpactSimulation:
         return self._frames[role][:count]
 
     def results(self) -> tuple[ImpactResult, ImpactResult | None] | None:
-        """What became of both at the end; see :func:`simulate_impact`. Raises as above."""
+        """The final results of both bodies; see :func:`simulate_impact`. Raises as above."""
         while self._steps is not None:
             self._go_on()
         if not self._bodies:
@@ -236,7 +236,7 @@ class ImpactSimulation:
         return results[0], results[1] if len(results) == 2 else None
 
     def _go_on(self) -> None:
-        """One more frame."""
+        """Simulate one more frame."""
         steps, self._steps = self._steps, None
         assert steps is not None
         with contextlib.suppress(StopIteration):
@@ -318,7 +318,7 @@ def _collide(
     solver = Solver([b.solver_body() for b in bodies], colliders, options)
     first = last = _closing(solver, along)
     samples, settling_time = 0, 0.0
-    for _ in range(round(LONGEST / SAMPLE_DT)):
+    for _ in range(round(MAX_CRASH_TIME / SAMPLE_DT)):
         solver.step(SAMPLE_DT)
         speed = _closing(solver, along)
         if first - speed > TOUCHED * first:

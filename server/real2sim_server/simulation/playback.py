@@ -1,4 +1,4 @@
-"""Frames of a simulation as what the renderer draws."""
+"""Frames of a simulation as the renderer draws them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from ..geometry.rotation import Float
 from ..physics.errors import PhysicsError
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene, Trajectory
-from .damage import Breakage, DamagedVehicle, fragment_cloud, with_underside
+from .breakage import Breakage, fragment_cloud, with_underside
+from .damage import DamagedVehicle
 from .embedding import Embedding, deform_cloud, stretched
 from .result import ObjectResult, SimulationResult
 from .structure import VEHICLES
@@ -32,7 +33,7 @@ HANGING = 2.0
 
 
 class PlacedObject(Protocol):
-    """What is needed of an object of a scenario."""
+    """The properties of a scenario's object that playback reads."""
 
     @property
     def object_id(self) -> str: ...  # noqa: D102
@@ -51,14 +52,14 @@ class PlacedObject(Protocol):
 
 
 class PlacedObjects(Protocol):
-    """What is needed of a scenario's state."""
+    """The properties of a scenario's state that playback reads."""
 
     @property
     def visible(self) -> tuple[PlacedObject, ...]: ...  # noqa: D102
 
 
 class Playback:
-    """A result over its scene.
+    """A simulation's result in its scene.
 
     Args:
         scene: holds the Gaussians.
@@ -84,7 +85,7 @@ class Playback:
         self._damaged: dict[str, _Damaged] = {}
 
     def instances(self, frame: int, *, without: Collection[str] = ()) -> list[Instance]:
-        """Background, then simulated objects as they are at ``frame``, others as recorded.
+        """The background, then simulated objects at ``frame``, other objects as recorded.
 
         Args:
             frame: of the result.
@@ -111,7 +112,7 @@ class Playback:
         return instances + self._fragments(frame, without)
 
     def _fragments(self, frame: int, without: Collection[str]) -> list[Instance]:
-        """What has come off vehicles by then, with their ids."""
+        """Fragments of vehicles at that time, with their ids."""
         time_s, found = float(self.result.times_s[frame]), []
         for subject in self.state.visible:
             broken = self._breakages.get(subject.object_id)
@@ -152,7 +153,7 @@ class Playback:
         return _placed(kept[1], pose, subject)
 
     def _damage(self, subject: PlacedObject) -> _Damaged | None:
-        """What is seen of a crash on a vehicle; None where nobody looked at what broke."""
+        """Visible damage of a vehicle; None where breakages were not recorded."""
         if self.result.breakages is None or subject.category not in VEHICLES:
             return None
         key = subject.object_id
@@ -172,7 +173,7 @@ class Playback:
     def _lifted(
         self, subject: PlacedObject, cloud: GaussianCloud, lifts: NDArray[np.float32]
     ) -> GaussianCloud:
-        """Wheels stay on the road when the body comes down on its springs."""
+        """Keep the wheels on the road when the body compresses its springs."""
         key = subject.object_id
         if key not in self._wheels:
             rest = self._cloud(subject).means.detach().cpu().numpy()
@@ -194,7 +195,7 @@ class Playback:
         return self._clouds[key]
 
     def _turns_over(self, subject: PlacedObject) -> bool:
-        """Whether it is a vehicle that is seen from below at any time."""
+        """Whether a vehicle shows its underside at any time."""
         if self.result.breakages is None or subject.category not in VEHICLES:
             return False
         x, y = self.result.objects[subject.object_id].quaternions[:, 1:3].T
@@ -212,7 +213,7 @@ class Playback:
 
 
 class _Damaged:
-    """A vehicle through the frames of a result; what once folded stays folded."""
+    """A vehicle through the frames of a result; folds are permanent."""
 
     def __init__(
         self, own: ObjectResult, vehicle: DamagedVehicle, broken: Sequence[Breakage]
@@ -222,7 +223,7 @@ class _Damaged:
         self._most: Float | None = None
 
     def state(self, row: int, time_s: float) -> Hashable:
-        """What it looks like depends on this alone; a loose bumper moves on for a while."""
+        """The look depends on this state alone; a loose bumper keeps moving for a while."""
         ages = [time_s - b.time_s for b in self._broken if b.time_s <= time_s]
         loose = [round(min(age, HANGING), 6) for age in ages]
         return row, tuple(loose)

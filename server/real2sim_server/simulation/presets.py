@@ -1,17 +1,21 @@
-"""What objects are made of: the paper's soft bodies, and vehicles with crumple zones."""
+"""Materials of objects: the paper's soft bodies, vehicles with crumple zones, and values over
+them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from real2sim_proto.operations import PhysicsValues
+
+from ..physics.body import Particles
 from ..physics.errors import PhysicsError
-from ..physics.materials import FixedCorotated, Foam, Material
-from ..physics.particles import Particles
+from ..physics.materials import FixedCorotated, Foam, Material, named_material
 from .structure import VEHICLES, vehicle_structure
 
 GRID_MIN, GRID_MAX = 16, 1000
@@ -73,7 +77,7 @@ class ObjectPhysics:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """How objects become bodies.
+    """A rule that turns objects into bodies.
 
     Attributes:
         name: ``paper`` or ``vehicle``.
@@ -108,7 +112,7 @@ def _paper(category: str, particles: Particles, spacing: float) -> Build:
 
 
 def _vehicle(category: str, particles: Particles, spacing: float) -> Build:
-    """Vehicles have zones that give way; other things are soft foam."""
+    """Vehicles have crumple zones; other objects are soft foam."""
     if category in VEHICLES:
         return vehicle_structure(category, particles, spacing=spacing)
     foam = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
@@ -142,7 +146,7 @@ PRESETS = {
 
 
 def preset_of(name: str) -> Preset:
-    """The preset of that name.
+    """The preset with this name.
 
     Raises:
         PhysicsError: when there is none.
@@ -150,3 +154,43 @@ def preset_of(name: str) -> Preset:
     if name not in PRESETS:
         raise PhysicsError(f"unknown preset {name!r}; allowed are {', '.join(PRESETS)}")
     return PRESETS[name]
+
+
+# An object's physical values from edits, requests and commands, over known defaults.
+
+
+def with_values(own: ObjectPhysics, *given: PhysicsValues | None) -> ObjectPhysics:
+    """What is known of an object, with the values that are given in place of those; later ones go
+    before earlier ones.
+
+    Raises:
+        MaterialError: for a value that the material does not have.
+    """
+    fields: dict[str, Any] = {}
+    for values in given:
+        new = {} if values is None else values.model_dump(include=_NAMES, exclude_none=True)
+        for one, other in (("mass", "density"), ("density", "mass")):
+            if one in new:
+                fields.pop(other, None)
+        fields |= new
+    changed: dict[str, Any] = {
+        name: fields[name] for name in ("friction", "restitution", "grid") if name in fields
+    }
+    if "mass" in fields or "density" in fields:
+        changed |= {"mass": fields.get("mass"), "density": fields.get("density")}
+    material = _material(fields)
+    return (
+        replace(own, **changed) if material is None else replace(own, **changed, material=material)
+    )
+
+
+def _material(fields: dict[str, Any]) -> Material | None:
+    """The one material that values ask for; None where they leave that to the category."""
+    values = {n: fields[n] for n in ("young", "poisson", "density", "yield_stress") if n in fields}
+    name = fields.get("material")
+    if name is None and values.keys() <= {"density"}:
+        return None
+    return named_material(name or ("metal" if "yield_stress" in values else "jelly"), **values)
+
+
+_NAMES = set(PhysicsValues.model_fields)

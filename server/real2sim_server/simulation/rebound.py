@@ -1,27 +1,403 @@
-"""A wanted restitution, fitted on what the body will hit, where it will hit it.
+"""Restitution of simulated bodies: fitted before an impact, and enforced when the bodies part.
 
-How well a body on a grid bounces depends on where the surface lies between nodes and how it is
-turned: an elastic block keeps 0.6 to 0.9 of its speed. So the body is followed on its way to the
-first collider that it meets, and viscosity is fitted by canned impacts right there.
+The rebound of a body on a grid depends on where the surface lies between nodes and how it is
+turned: an elastic block keeps 0.6 to 0.9 of its speed. So the fit follows the body to the first
+collider it meets, and finds the viscosity by test impacts right there.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..geometry.rotation import Float
 from ..physics.colliders import Collider, Plane, Solid
-from ..physics.restitution import fit_restitution
-from ..physics.solver import SolverOptions
-from .body import DeformableBody
+from ..physics.fitting import fit_restitution
+from ..physics.solver import ContactTotals, SolverOptions
+from .body import BodyMode, DeformableBody
 from .result import Rebound
-from .rigid import RigidMotion
-from .surroundings import clearance
+from .rigid import RigidMotion, clearance
+
+# The end of an impact between bodies with a given restitution.
+#
+# Surfaces on a grid meet node by node, without rebound, and the loss depends on where nodes lie. So
+# an impact is followed from its first to its last impulse. What is missing from Newton's
+# restitution at the contact is one more impulse when the bodies part: along the normal, through the
+# centre of the earlier impulses, and on both sides, so that momentum and angular momentum are
+# conserved. With a restitution of at most 1 it never returns more energy than the impact took.
+#
+# Simultaneous impacts that share a body form one chain, as where the first of three touching bodies
+# is struck. They are resolved one after the other, the fastest approach first, so the last of equal
+# bodies leaves with the momentum of the first. A wave passes from one elastic body to the next as
+# through one piece, so the impact leaves its vibration once, not at every face.
+
+QUIET = 2
+"""An impact is over after so many steps without an impulse."""
+NOTHING = 1e-3
+"""Impulses below this fraction of what there was are none."""
+EXACT = 0.01
+"""What parts within this fraction of the approach of what was requested is left as it is."""
+SLOWEST = 0.3
+"""Impacts that begin more slowly are no bounces [m/s]."""
+ELASTIC = 0.8
+"""Least restitution between bodies that nothing damps and of which none was requested: what elastic
+cubes with a Poisson's ratio of 0.3 have by finite elements, the rest is vibration. Grids lose more,
+as nodes where two meet take on one velocity at once."""
+MAX_IMPACT_TIME = 0.1
+"""Others of a chain no longer wait for an impact that takes longer than this [s]."""
+ROUNDS = 100
+"""Impacts of a chain one after the other, at most; with a restitution below 1 few matter."""
+
+
+@dataclass(frozen=True)
+class Bounce:
+    """One impact of a body with a given restitution.
+
+    Attributes:
+        body, other: who, on what.
+        time_s: when they parted.
+        speed: of approach along the normal [m/s].
+        grid: separation over approach speed as the grid left it.
+        achieved: as it is now.
+    """
+
+    body: str
+    other: str
+    time_s: float
+    speed: float
+    grid: float
+    achieved: float
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The correction to one body at the end of an impact.
+
+    Attributes:
+        body: that gets it.
+        other: name of what gave it.
+        impulse: [3] [N s].
+        after: motion of the body with it.
+    """
+
+    body: DeformableBody
+    other: str
+    impulse: Float
+    after: RigidMotion
+
+
+@dataclass(eq=False)
+class _Impact:
+    """An impact under way: motions before it, and impulse and moment on the body so far; for how
+    long, and for how many steps nothing has acted."""
+
+    before: tuple[RigidMotion, ...]
+    impulse: Float = field(default_factory=lambda: np.zeros(3))
+    moment: Float = field(default_factory=lambda: np.zeros(3))
+    quiet: int = 0
+    age: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Meeting:
+    """One impact of a finished chain.
+
+    Attributes:
+        sides: the body, and the other where that is one.
+        other: what it has hit.
+        point, normal: where [m], and the unit normal towards the body.
+        requested: restitution.
+        still: speed along the normal of what is no body, when it began and now [m/s].
+        hands_on: of none of its sides anything was requested, so that waves pass between them
+            without loss where they touched before the chain began.
+    """
+
+    sides: tuple[DeformableBody, ...]
+    other: DeformableBody | Collider
+    point: Float
+    normal: Float
+    requested: float
+    still: tuple[float, float]
+    hands_on: bool
+
+    def apart(self, motions: Mapping[str, RigidMotion]) -> float:
+        """Speed at which the sides part, or the body from what does not move [m/s]."""
+        speeds = [float(self._velocity(motions[s.name], s) @ self.normal) for s in self.sides]
+        return speeds[0] - sum(speeds[1:])
+
+    def _velocity(self, motion: RigidMotion, side: DeformableBody) -> Float:
+        lever = self.point - side.motion.centre
+        velocity: Float = motion.velocity + np.cross(motion.angular_velocity, lever)
+        return velocity
+
+    @property
+    def ease(self) -> float:
+        """Speed at which the sides part by one N s between them [1/kg]."""
+        return sum(_ease(s.motion, self.point - s.motion.centre, self.normal) for s in self.sides)
+
+    def pushed(self, motions: dict[str, RigidMotion], impulse: float) -> None:
+        """Change motions by an impulse [N s] between the sides, turning about the present place."""
+        for sign, side in zip((1.0, -1.0), self.sides, strict=False):
+            now = motions[side.name]
+            lever = self.point - side.motion.centre
+            given = sign * impulse * self.normal
+            turn = np.linalg.solve(side.motion.world_inertia, np.cross(lever, given))
+            motions[side.name] = replace(
+                now,
+                velocity=now.velocity + given / now.mass,
+                angular_velocity=now.angular_velocity + turn,
+            )
+
+
+class Bounces:
+    """Impacts of bodies with a requested restitution or without damping, step by step.
+
+    Attributes:
+        log: those that are over.
+    """
+
+    def __init__(self) -> None:
+        self.log: list[Bounce] = []
+        self._impacts: dict[tuple[str, str], _Impact] = {}
+        self._totals: dict[tuple[str, str], tuple[Float, Float]] = {}
+
+    def figures(self, body: str) -> list[dict[str, Any]]:
+        """Bounces of a body as JSON values."""
+        members = (asdict(b) for b in self.log if b.body == body)
+        return [{k: _rounded(v) for k, v in m.items() if k != "body"} for m in members]
+
+    def start_solver(self) -> None:
+        """A new solver counts impulses from zero."""
+        self._totals = {}
+
+    def forget(self, body: DeformableBody) -> None:
+        """Drop the impacts of a body that has settled."""
+        self._impacts = {p: i for p, i in self._impacts.items() if body.name not in p}
+
+    def follow(
+        self,
+        contacts: Iterable[ContactTotals],
+        bodies: Sequence[DeformableBody],
+        colliders: Sequence[Collider],
+        before: Mapping[str, RigidMotion],
+        step: tuple[float, float, Float],
+    ) -> Iterator[Correction]:
+        """Advance by one solver step; returns the corrections of finished impacts.
+
+        Each is to take effect before the next is asked for.
+
+        Args:
+            contacts: of the solver, since its start.
+            bodies: in the solver, as they are now.
+            colliders: as they are now.
+            before: motions of the bodies before the step.
+            step: time now and length of the step [s], and gravity [m/s^2].
+        """
+        wanted = {b.name: b for b in bodies if _restitution(b) is not None}
+        walls = {c.name: c for c in colliders}
+        seen = set()
+        for c in contacts:
+            pair = (c.body, c.other)
+            both = c.other in wanted and c.body < c.other
+            on_wall = c.other in walls and c.body in wanted and wanted[c.body].rebound is not None
+            if c.body in wanted and (both or on_wall):
+                seen.add(pair)
+                members = (c.body, c.other) if both else (c.body,)
+                self._add(pair, c, tuple(before[name] for name in members))
+        for pair, impact in self._impacts.items():
+            impact.age += step[1]
+            if pair not in seen:
+                impact.quiet += 1
+        for chain in self._chains(wanted):
+            impacts = {pair: self._impacts[pair] for pair in chain}
+            over = {p: i for p, i in impacts.items() if i.quiet >= QUIET}
+            if all(i.quiet >= QUIET or i.age > MAX_IMPACT_TIME for i in impacts.values()):
+                for pair in over:
+                    del self._impacts[pair]
+                yield from self._part(over, wanted, walls, step)
+
+    def _chains(self, wanted: Mapping[str, DeformableBody]) -> list[list[tuple[str, str]]]:
+        """Active impacts, grouped by shared bodies, in the order they began."""
+        chains: list[list[tuple[str, str]]] = []
+        for pair in self._impacts:
+            own = {name for name in pair if name in wanted}
+            linked = [c for c in chains if any(own.intersection(p) for p in c)]
+            chains = [c for c in chains if c not in linked]
+            chains.append([p for c in linked for p in c] + [pair])
+        return chains
+
+    def _add(
+        self, pair: tuple[str, str], now: ContactTotals, before: tuple[RigidMotion, ...]
+    ) -> None:
+        impulse, moment = self._totals.get(pair, (np.zeros(3), np.zeros(3)))
+        self._totals[pair] = (np.array(now.impulse), np.array(now.moment))
+        impulse, moment = now.impulse - impulse, now.moment - moment
+        impact = self._impacts.get(pair)
+        size = float(np.linalg.norm(impulse))
+        if impact is None:
+            if size > 0:
+                self._impacts[pair] = _Impact(before, impulse, moment)
+            return
+        if size <= NOTHING * float(np.linalg.norm(impact.impulse)):
+            impact.quiet += 1
+            return
+        impact.quiet = 0
+        impact.impulse = impact.impulse + impulse
+        impact.moment = impact.moment + moment
+
+    def _part(
+        self,
+        chain: Mapping[tuple[str, str], _Impact],
+        wanted: Mapping[str, DeformableBody],
+        walls: Mapping[str, Collider],
+        step: tuple[float, float, Float],
+    ) -> Iterator[Correction]:
+        """The impulses with which bodies of a chain and what they hit part as requested."""
+        meetings: list[_Meeting] = []
+        before: dict[str, RigidMotion] = {}
+        for pair, impact in chain.items():
+            other = wanted.get(pair[1]) or walls.get(pair[1])
+            if pair[0] in wanted and other is not None:
+                meeting = _meeting(wanted[pair[0]], other, impact, step)
+                if all(side.mode == BodyMode.DEFORMING for side in meeting.sides):
+                    meetings.append(meeting)
+                    for side, motion in zip(meeting.sides, impact.before, strict=True):
+                        before.setdefault(side.name, motion)
+        if not meetings:
+            return
+        approaches, after = _one_after_the_other(meetings, before)
+        now = {side.name: side.motion for m in meetings for side in m.sides}
+        speeds = np.array([m.apart(now) - m.still[1] for m in meetings])
+        if max(approaches) < SLOWEST or (len(meetings) == 1 and speeds[0] <= 0):
+            return
+        give = np.array([m.apart(after) - m.still[0] for m in meetings]) - speeds
+        # What is at least so elastic on the grid stays as it has it.
+        given = [not m.hands_on for m in meetings]
+        if any(given):
+            give = np.where(given, give, np.maximum(give, 0.0))
+        elif np.all(give <= 0.0) or _kinetic(after) <= _kinetic(now):
+            give = np.zeros(len(meetings))
+        if np.all(np.abs(give) < EXACT * np.maximum(approaches, SLOWEST)):
+            give = np.zeros(len(meetings))
+        for m, approach, speed, more in zip(meetings, approaches, speeds, give, strict=True):
+            if approach >= SLOWEST:
+                self.log.append(
+                    Bounce(
+                        m.sides[0].name,
+                        m.other.name,
+                        step[0],
+                        approach,
+                        float(speed) / approach,
+                        float(speed + more) / approach,
+                    )
+                )
+        if np.any(give):
+            yield from _corrections(meetings, now, give)
+
+
+def _meeting(
+    body: DeformableBody,
+    other: DeformableBody | Collider,
+    impact: _Impact,
+    step: tuple[float, float, Float],
+) -> _Meeting:
+    _, duration, gravity = step
+    point = _centre(impact, body.motion.centre)
+    if isinstance(other, DeformableBody):
+        normal = impact.impulse / float(np.linalg.norm(impact.impulse))
+        known = [e for e in map(_restitution, (body, other)) if e is not None]
+        elastic = body.rebound is None and other.rebound is None
+        return _Meeting((body, other), other, point, normal, min(known), (0.0, 0.0), elastic)
+    assert body.rebound is not None
+    distance, normals = clearance(other, body.shell_points())
+    normal = normals[int(distance.argmin())]
+    moving = _velocity(other, point)
+    # A wall does not fall with the body while nothing acts.
+    drift = QUIET * duration * gravity + moving
+    still = float(moving @ normal), float(drift @ normal)
+    return _Meeting((body,), other, point, normal, body.rebound.requested, still, False)
+
+
+def _restitution(body: DeformableBody) -> float | None:
+    """What was requested of a body, or what one has that nothing damps; None for what else is."""
+    if body.rebound is not None:
+        return body.rebound.requested
+    return ELASTIC if body.is_undamped else None
+
+
+def _one_after_the_other(
+    meetings: Sequence[_Meeting], before: Mapping[str, RigidMotion]
+) -> tuple[list[float], dict[str, RigidMotion]]:
+    """Fastest approach of each impact of a chain [m/s], and motions in the end, by Newton's
+    restitution at the fastest approach until there is none. Elastic bodies that did not come nearer
+    to each other when the chain began touched."""
+    motions = dict(before)
+    fastest = [0.0] * len(meetings)
+    first = [m.still[0] - m.apart(motions) for m in meetings]
+    touching = [
+        m.hands_on and a <= EXACT * max(first) for m, a in zip(meetings, first, strict=True)
+    ]
+    for _ in range(ROUNDS):
+        approaches = [m.still[0] - m.apart(motions) for m in meetings]
+        fastest = [max(f, a) for f, a in zip(fastest, approaches, strict=True)]
+        k = int(np.argmax(approaches))
+        if approaches[k] <= EXACT * max(*fastest, SLOWEST):
+            break
+        m = meetings[k]
+        restitution = 1.0 if touching[k] else m.requested
+        m.pushed(motions, (1 + restitution) * approaches[k] / m.ease)
+    return fastest, motions
+
+
+def _kinetic(motions: Mapping[str, RigidMotion]) -> float:
+    """Energy of bodies in motion [J]."""
+    return sum(m.kinetic for m in motions.values())
+
+
+def _corrections(
+    meetings: Sequence[_Meeting], now: Mapping[str, RigidMotion], give: Float
+) -> Iterator[Correction]:
+    """Impulses that change the speeds at which sides part by ``give`` [m/s]."""
+    response = np.zeros((len(meetings), len(meetings)))
+    for k, m in enumerate(meetings):
+        pushed = dict(now)
+        m.pushed(pushed, 1.0)
+        response[:, k] = [other.apart(pushed) - other.apart(now) for other in meetings]
+    impulses = np.linalg.lstsq(response, give, rcond=1e-9)[0]
+    after = dict(now)
+    for m, impulse in zip(meetings, impulses.tolist(), strict=True):
+        m.pushed(after, impulse)
+        for sign, side, other in zip((1.0, -1.0), m.sides, (m.other, m.sides[0]), strict=False):
+            yield Correction(side, other.name, sign * impulse * m.normal, after[side.name])
+
+
+def _centre(impact: _Impact, near: Float) -> Float:
+    """The point on an impulse's line nearest to ``near`` [m]."""
+    impulse, moment = impact.impulse, impact.moment
+    square = float(impulse @ impulse)
+    on_line = np.cross(impulse, moment) / square
+    point: Float = on_line + float((near - on_line) @ impulse) / square * impulse
+    return point
+
+
+def _ease(motion: RigidMotion, lever: Float, normal: Float) -> float:
+    """Change of speed along the normal by one N s along it at a lever [1/kg]."""
+    turn = np.cross(lever, normal)
+    return 1.0 / motion.mass + float(turn @ np.linalg.solve(motion.world_inertia, turn))
+
+
+def _velocity(collider: Collider, point: Float) -> Float:
+    """Velocity of a collider at a point [m/s]."""
+    return collider.velocity_at(point) if isinstance(collider, Solid) else np.zeros(3)
+
+
+def _rounded(value: Any) -> Any:
+    return round(value, 6) if isinstance(value, float) else value
+
 
 HORIZON = 10.0
 """Time for which a body is followed [s]."""
@@ -36,7 +412,7 @@ USUAL_SPEED = 2.0
 
 @dataclass(frozen=True, eq=False)
 class FirstTouch:
-    """How a body meets the first collider on its way.
+    """A body's first contact with a collider on its path.
 
     Attributes:
         motion: of the body then.
@@ -56,7 +432,7 @@ class FirstTouch:
 def fit_rebound(
     body: DeformableBody, requested: float, colliders: Sequence[Collider], gravity: Float
 ) -> Rebound:
-    """Add the viscosity that lets a body bounce off what it will hit as ``requested``.
+    """Add the viscosity with which a body rebounds from its first collider as ``requested``.
 
     Args:
         body: at its start; its materials change.
@@ -98,7 +474,7 @@ def fit_rebound(
 def first_touch(
     body: DeformableBody, colliders: Sequence[Collider], gravity: Float
 ) -> FirstTouch | None:
-    """The first collider that a body meets on its way, flying or rolling straight; None for none.
+    """The first collider on a body's path, flying or rolling straight; None without one.
 
     Args:
         body: at its start.
@@ -143,7 +519,7 @@ def _is_far(solid: Solid, centre: Float, reach: float) -> bool:
 
 
 def _still(body: DeformableBody) -> Any:
-    """For the solver, at its place; velocities are those of the canned impact."""
+    """The body at its place for the solver; the velocities are those of the test impact."""
     return replace(body.solver_body(), particle_velocities=None, particle_gradients=None)
 
 

@@ -1,15 +1,15 @@
-"""Bodies that lie on each other and on colliders: rigid contacts that are kept from step to step.
+"""Resting contact: rigid contacts that persist from step to step, and stability at rest.
 
-On a grid, bodies that lie on each other sink a little with every step and never stop. Once nothing
-of them deforms any more they are rigid, and what holds them apart are forces at the points where
-they touch: not towards each other, with Coulomb friction, and such that no point goes deeper than
-it lay when the contact began (sequential impulses; Catto 2005). Forces of the last step are where
-the next begins. What approaches faster than GENTLE is an impact and deforms.
+On a grid, bodies that lie on each other sink a little with every step and never stop. Once they no
+longer deform they become rigid, and forces at their contact points keep them apart: never
+attractive, with Coulomb friction, and such that no point goes deeper than when the contact began
+(sequential impulses; Catto 2005). Each step starts from the forces of the last. An approach faster
+than GENTLE_THRESHOLD is an impact and deforms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,19 +17,184 @@ import numpy as np
 from ..geometry.rotation import Float
 from ..physics.colliders import Collider
 from .body import BodyMode, DeformableBody
-from .rigid import RigidMotion, rotation_of
-from .support import body_contacts, collider_contacts, tangents
-from .surroundings import clearance
+from .rigid import RigidMotion, clearance, rotation_of
 
-GENTLE = 0.3
+# Stability at rest: forces of the contacts against gravity.
+#
+
+GAP_CELLS = 0.15
+"""A corner of a particle that is nearer to something than this touches it [cells]."""
+SINK_CELLS = 1.5
+"""What is deeper inside a collider is no contact any more but was placed there [cells]."""
+DIRECTIONS = 8
+"""Of friction at a contact, the first against gravity's pull along the surface."""
+CORNERS = 16
+"""Directions in which the outermost contacts are taken; those between carry nothing more."""
+SHORTFALL = 2e-3
+"""Fraction of the weight that may stay unbalanced: a tenth of a degree of slope."""
+FRICTION_MAX = 1e3
+"""Stands for what sticks."""
+_CUBE = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Contacts of a body with one other body or collider.
+
+    Attributes:
+        other: name of the collider or body.
+        points: [K, 3] [m].
+        normals: [K, 3] towards the body, unit.
+        friction: most friction over normal force in a direction [3] along the surface.
+    """
+
+    other: str
+    points: Float
+    normals: Float
+    friction: Callable[[Float], float]
+
+
+def supports_of(
+    body: DeformableBody,
+    colliders: Sequence[Collider],
+    road: Sequence[Collider],
+    others: Iterable[DeformableBody],
+    gravity: Float,
+) -> tuple[str, ...] | None:
+    """Names of a resting body's supports, or None where it would not stay.
+
+    Args:
+        body: as it is now.
+        colliders: that touch its surface.
+        road: those that carry tyres.
+        others: bodies at rest that may carry it.
+        gravity: [3] [m/s^2]; without any, nothing has to hold it.
+    """
+    if not np.any(gravity):
+        return ()
+    contacts = [*_wheel_contacts(body, road), *collider_contacts(body, colliders)]
+    if not _balanced(body, contacts, gravity):
+        contacts += body_contacts(body, others)
+        if not _balanced(body, contacts, gravity):
+            return None
+    return tuple(sorted({c.other for c in contacts}))
+
+
+def _wheel_contacts(body: DeformableBody, road: Sequence[Collider]) -> Iterable[Contacts]:
+    """Wheels that carry; locked along their way as far as brakes hold."""
+    if body.tyres is None or not road:
+        return
+    tyres, pose = body.tyres, body.T_world_object
+    forward = pose[:3, 0]
+
+    def friction(along: Float) -> float:
+        return tyres.grip_along(along, forward)
+
+    for collider, point, normal in tyres.carrying(pose, road):
+        yield Contacts(collider.name, point[None], normal[None], friction)
+
+
+def collider_contacts(body: DeformableBody, colliders: Sequence[Collider]) -> Iterable[Contacts]:
+    """Contacts of a body's outermost particles with each collider."""
+    shell = body.shell_points()
+    turn = body.T_world_object[:3, :3]
+    for collider in colliders:
+        distance, _ = clearance(collider, shell)
+        near = shell[distance < body.spacing]
+        if not len(near):
+            continue
+        corners = (near[:, None] + body.spacing * _CUBE @ turn.T).reshape(-1, 3)
+        distance, normals = clearance(collider, corners)
+        touching = (distance < GAP_CELLS * body.cell) & (distance > -SINK_CELLS * body.cell)
+        mu = body.friction if collider.friction is None else collider.friction
+        yield from _by_normal(collider.name, corners[touching], normals[touching], mu)
+
+
+def body_contacts(body: DeformableBody, others: Iterable[DeformableBody]) -> list[Contacts]:
+    """Contacts with another body's particles; the normal is the mean direction from them."""
+    from scipy.spatial import cKDTree
+
+    contacts: list[Contacts] = []
+    own = body.shell_points()
+    for other in others:
+        reach = (body.spacing + other.spacing) / 2 + GAP_CELLS * body.cell
+        if other is body or body.gap_to(other) > reach:
+            continue
+        theirs = other.shell_points()
+        found = cKDTree(theirs).query_ball_point(own, 1.2 * reach)
+        touching = np.flatnonzero([len(f) > 0 for f in found])
+        if not len(touching):
+            continue
+        away = np.stack([own[k] - theirs[found[k]].mean(axis=0) for k in touching])
+        normals = away / np.maximum(np.linalg.norm(away, axis=1), 1e-9)[:, None]
+        mean = normals.mean(axis=0)
+        mean /= max(float(np.linalg.norm(mean)), 1e-9)
+        points = own[touching] - normals * body.spacing / 2
+        mu = float(np.sqrt(body.friction * other.friction))
+        contacts += _by_normal(other.name, points, np.tile(mean, (len(points), 1)), mu)
+    return contacts
+
+
+def _by_normal(name: str, points: Float, normals: Float, mu: float) -> Iterable[Contacts]:
+    """Contacts grouped by similar normals, the outermost points of each."""
+    if not len(points):
+        return
+    _, group = np.unique(np.round(4 * normals), axis=0, return_inverse=True)
+    for g in range(int(group.max()) + 1):
+        own = np.flatnonzero(group.ravel() == g)
+        kept = own[_outermost(points[own], normals[own].mean(axis=0))]
+        yield Contacts(name, points[kept], normals[kept], lambda along: mu)
+
+
+def _outermost(points: Float, normal: Float) -> Float:
+    first, second = tangents(normal, np.array([1.0, 0.3, 0.2]))
+    angle = 2 * np.pi * np.arange(CORNERS) / CORNERS
+    directions = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    return np.unique((points @ directions.T).argmax(axis=0))
+
+
+def tangents(normal: Float, pull: Float) -> tuple[Float, Float]:
+    """Two unit vectors along the surface: against ``pull``, and across it."""
+    along = (pull @ normal) * normal - pull
+    length = float(np.linalg.norm(along))
+    if length < 1e-6 * float(np.linalg.norm(pull)):
+        along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+        length = float(np.linalg.norm(along))
+    first = along / length
+    return first, np.cross(normal, first)
+
+
+def _balanced(body: DeformableBody, contacts: Sequence[Contacts], gravity: Float) -> bool:
+    """Whether forces within all friction cones hold the weight, without a moment."""
+    from scipy.optimize import nnls
+
+    if not contacts:
+        return False
+    arm = max(body.reach, 1e-6)
+    columns = []
+    for c in contacts:
+        for point, normal in zip(c.points, c.normals, strict=True):
+            first, second = tangents(normal, gravity)
+            lever = (point - body.motion.centre) / arm
+            for k in range(DIRECTIONS):
+                angle = 2 * np.pi * k / DIRECTIONS
+                along = np.cos(angle) * first + np.sin(angle) * second
+                force = normal + min(c.friction(along), FRICTION_MAX) * along
+                columns.append(np.concatenate([force, np.cross(lever, force)]))
+    weight = np.concatenate([-gravity / np.linalg.norm(gravity), np.zeros(3)])
+    _, left = nnls(np.array(columns).T, weight)
+    return bool(left < SHORTFALL)
+
+
+GENTLE_THRESHOLD = 0.3
 """Contacts in which nothing approaches faster carry without deforming, nor bounce [m/s]."""
-STEADY = 2.0
+STEADY_THRESHOLD = 2.0
 """What is pushed away faster has not come to rest against it but is about to bounce [m/s^2]."""
 SWEEPS = 30
 """Passes over all contacts in a step."""
 DRIFT = 0.1
 """Once points have slid or opened by so much their pair is looked at anew [spacings]."""
-LAID = 0.1
+LAID_THRESHOLD = 0.1
 """Points that lie higher than this above a collider do not carry yet [spacings]."""
 PUSH, PUSH_SPEED = 0.2, 0.05
 """Fraction of what is too deep that a step takes back, and at most how fast [m/s]. Bodies are moved
@@ -44,8 +209,8 @@ Pair = tuple[str, str]
 
 
 @dataclass(eq=False)
-class Touch:
-    """One point at which a body touches something.
+class ContactPoint:
+    """One contact point of a body.
 
     Attributes:
         body: that is carried.
@@ -82,7 +247,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class Reaction:
-    """What a contact did in a step.
+    """The effect of a contact in one step.
 
     Attributes:
         body, other: on whom, by whom.
@@ -96,22 +261,22 @@ class Reaction:
     heat: float
 
 
-class Resting:
-    """The contacts of bodies that have settled, by body and what carries it."""
+class RestingContacts:
+    """Contacts of settled bodies, by body and support."""
 
     def __init__(self) -> None:
-        self._touches: dict[Pair, list[Touch]] = {}
+        self._touches: dict[Pair, list[ContactPoint]] = {}
 
     def holds(self, body: DeformableBody, other: str) -> bool:
         """Whether a body and another, or a collider, touch here."""
         return (body.name, other) in self._touches or (other, body.name) in self._touches
 
     def partners(self, body: DeformableBody) -> set[str]:
-        """All that a body touches here."""
+        """All contact partners of a body."""
         return {name for pair in self._touches if body.name in pair for name in pair} - {body.name}
 
     def island(self, body: DeformableBody) -> set[str]:
-        """Bodies that are connected with a body by contacts, itself among them."""
+        """The bodies connected by contacts with a body, including itself."""
         first = [touches[0] for touches in self._touches.values()]
         bodies = {t.body.name for t in first}
         bodies |= {t.other.name for t in first if isinstance(t.other, DeformableBody)}
@@ -131,14 +296,14 @@ class Resting:
         colliders: Sequence[Collider],
         others: Iterable[DeformableBody],
     ) -> bool | None:
-        """Take a body in that touches something gently; whether it does, None for nothing at all.
+        """Add a body with gentle contact; returns whether it is gentle, None without contact.
 
         Args:
             body: that keeps its shape.
             colliders: at rest, that touch its surface.
             others: bodies that it may touch.
         """
-        found: list[tuple[Pair, list[Touch]]] = []
+        found: list[tuple[Pair, list[ContactPoint]]] = []
         for collider in colliders:
             found.append(((body.name, collider.name), _on_collider(body, collider)))
         for other in others:
@@ -155,7 +320,7 @@ class Resting:
         self._touches = {p: t for p, t in self._touches.items() if body.name not in p}
 
     def solve(self, duration: float, starts: Mapping[str, Float]) -> list[Reaction]:
-        """Let contacts act on bodies that have moved freely; what they did.
+        """Apply contacts to bodies that have moved freely; returns their reactions.
 
         Args:
             duration: for how long they have [s].
@@ -208,7 +373,7 @@ class Resting:
                 nearest = min(touches, key=lambda t: float(np.abs(t.local - touch.local).sum()))
                 touch.impulse = nearest.impulse * (len(touches) / len(known))
             # What falls over strikes with its far edge: that is an impact.
-            if known and all(_closing(t) <= GENTLE for t in known):
+            if known and all(_closing(t) <= GENTLE_THRESHOLD for t in known):
                 self._touches[pair] = known
             else:
                 del self._touches[pair]
@@ -225,20 +390,20 @@ def touches_any(
 
 def _on_collider(
     body: DeformableBody, collider: Collider, *, rest: float | None = None
-) -> list[Touch]:
+) -> list[ContactPoint]:
     """Where a body touches a collider; it carries as deep as it lies, or at ``rest`` [m]."""
     touches = []
     for contacts in collider_contacts(body, [collider]):
         distance, _ = clearance(collider, contacts.points)
         for point, gap in zip(contacts.points, distance.tolist(), strict=True):
-            laid = min(gap, 0.0) if gap > LAID * body.spacing else gap
+            laid = min(gap, 0.0) if gap > LAID_THRESHOLD * body.spacing else gap
             depth = laid if rest is None else min(max(rest, laid), 0.0)
             local, mu = _local(body, point), contacts.friction(contacts.normals[0])
-            touches.append(Touch(body, collider, local, local, local, depth, mu))
+            touches.append(ContactPoint(body, collider, local, local, local, depth, mu))
     return touches
 
 
-def _on_body(body: DeformableBody, other: DeformableBody) -> list[Touch]:
+def _on_body(body: DeformableBody, other: DeformableBody) -> list[ContactPoint]:
     """Where a body touches another; it carries as they lie."""
     turn = other.T_world_object[:3, :3]
     touches = []
@@ -246,7 +411,9 @@ def _on_body(body: DeformableBody, other: DeformableBody) -> list[Touch]:
         mu = contacts.friction(contacts.normals[0])
         for point, normal in zip(contacts.points, contacts.normals, strict=True):
             there = _local(other, point)
-            touches.append(Touch(body, other, _local(body, point), there, turn.T @ normal, 0.0, mu))
+            touches.append(
+                ContactPoint(body, other, _local(body, point), there, turn.T @ normal, 0.0, mu)
+            )
     return touches
 
 
@@ -256,7 +423,7 @@ def _local(body: DeformableBody, point: Float) -> Float:
     return local
 
 
-def _closing(touch: Touch) -> float:
+def _closing(touch: ContactPoint) -> float:
     """Speed at which the point and what carries it approach each other [m/s]."""
     own, normal, _, _ = touch.place()
     velocity = touch.body.motion.velocity_at(own)
@@ -265,19 +432,19 @@ def _closing(touch: Touch) -> float:
     return -float(velocity @ normal)
 
 
-def _strikes(touch: Touch) -> bool:
+def _strikes(touch: ContactPoint) -> bool:
     """Whether this is an impact: too fast for rigid contact, or in the midst of being stopped.
 
     Bodies that carry each other jolt each other as they settle, so that only colliders stop.
     """
-    if _closing(touch) > GENTLE or isinstance(touch.other, DeformableBody):
-        return _closing(touch) > GENTLE
-    return float(touch.body.acceleration @ touch.place()[1]) > STEADY
+    if _closing(touch) > GENTLE_THRESHOLD or isinstance(touch.other, DeformableBody):
+        return _closing(touch) > GENTLE_THRESHOLD
+    return float(touch.body.acceleration @ touch.place()[1]) > STEADY_THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """A step that contacts act on.
+    """One step in which contacts act.
 
     Attributes:
         before: motions by name, as bodies have moved freely.
@@ -295,9 +462,9 @@ class _Step:
 
 
 class _Row:
-    """A touch in one step: what impulses along its normal and two tangents do."""
+    """A contact point in one step: effects of impulses along its normal and two tangents."""
 
-    def __init__(self, touch: Touch, step: _Step) -> None:
+    def __init__(self, touch: ContactPoint, step: _Step) -> None:
         self.touch = touch
         own, normal, gap, _ = touch.place()
         axes = np.stack([normal, *tangents(normal, np.array([1.0, 0.3, 0.2]))])
@@ -326,7 +493,7 @@ class _Row:
 
     @property
     def carries(self) -> bool:
-        """Whether the point presses."""
+        """Whether the point transmits a pushing force."""
         return float(self.touch.impulse[0]) > 0
 
     @property
@@ -351,7 +518,7 @@ class _Row:
             np.add(speed, impulse @ change, out=speed)
 
     def reactions(self) -> list[Reaction]:
-        """What it did, once all contacts agree."""
+        """Its reaction, once all contacts have converged."""
         touch, slip = self.touch, np.zeros(3)
         for own, jacobian, _ in self._sides:
             slip += jacobian @ own
@@ -365,7 +532,7 @@ class _Row:
         ]
 
     def relax(self) -> None:
-        """The impulse that this contact needs as things are now."""
+        """The impulse that this contact needs at the current velocities."""
         speed = np.zeros(3)
         for own, jacobian, _ in self._sides:
             speed += jacobian @ own

@@ -1,4 +1,4 @@
-"""What a simulation leaves: poses, shapes, contacts, energies; compact on disk."""
+"""Results of a simulation: poses, shapes, contacts, energies; compact on disk."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .._files import atomic_folder
 from ..geometry.rotation import Float
 from ..geometry.transform import transform_from
 from ..physics.errors import PhysicsError
-from .damage.breakage import Breakage
+from .breakage import Breakage
 
 FORMAT = "real2sim-simulation"
 VERSION = 2
@@ -68,7 +68,7 @@ class ObjectResult:
 
 @dataclass(frozen=True)
 class ContactRecord:
-    """What another object or a collider did to an object, up to the end.
+    """The total effect of another object or a collider on an object.
 
     Attributes:
         object_id, other: who, by whom or what.
@@ -92,11 +92,11 @@ class ContactRecord:
 
 @dataclass(frozen=True)
 class Rebound:
-    """What was asked of a body's rebound, and what canned impacts reached.
+    """A body's requested rebound, and the rebound reached in test impacts.
 
     Attributes:
         requested: separation over approach speed.
-        achieved: the same in canned impacts; what really happened is in a Bounce each.
+        achieved: the same in test impacts; what really happened is in a Bounce each.
         elastic: without added viscosity; no more can be reached.
         other: name of what it was fitted on; None where the body will meet nothing, and a wall
             across its way stood for it.

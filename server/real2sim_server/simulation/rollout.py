@@ -1,26 +1,201 @@
-"""Rollouts: objects of a scenario, colliders and gravity, from one instant on."""
+"""Rollouts: a scenario's objects, colliders and gravity from one instant on, and their frames."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from ..geometry.rotation import Float, matrix_to_quaternion
+from ..geometry.transform import apply_transform
 from ..physics.colliders import Box, Collider
 from ..physics.errors import PhysicsError
 from ..scene import Scene
 from .background import BACKGROUND, Cleared, background_colliders, described
-from .body import DeformableBody
-from .breakages import find_breakages
-from .playback import PlacedObjects
+from .body import BodyMode, DeformableBody
+from .breakage import Breakage, BreakageLog, Part
+from .playback import PlacedObject, PlacedObjects
 from .presets import ObjectPhysics, preset_of
-from .recorder import TrajectoryRecorder
-from .result import SimulationResult
-from .simulator import STEP, HybridSimulator
+from .result import ObjectResult, SimulationResult
+from .simulator import STEP, HybridSimulator, energies
 from .spawn import spawn_bodies, starts_of
+
+# Frames as the simulation advances.
+
+
+class TrajectoryRecorder:
+    """Records trajectories, shapes, energies and contacts, frame by frame.
+
+    Args:
+        simulator: whose bodies are recorded; it is only read.
+    """
+
+    def __init__(self, simulator: HybridSimulator) -> None:
+        self._simulator = simulator
+        self._times: list[float] = []
+        self._energies: list[list[float]] = []
+        self._impulses: list[dict[tuple[str, str], Float]] = []
+        self._rows: dict[str, list[tuple[Float, Float, Float, Float, int, int, Float]]] = {
+            b.name: [] for b in simulator.bodies
+        }
+        self._shapes: dict[str, list[np.ndarray]] = {b.name: [] for b in simulator.bodies}
+        self._start = 0.0
+
+    def record(self, time: float) -> None:
+        """Record the present state as the frame of ``time`` [s]."""
+        s = self._simulator
+        kinetic, elastic, potential = energies(s.bodies, s.gravity)
+        total = kinetic + elastic + potential
+        if not self._times:
+            self._start = total
+        log = s.contact_log
+        dissipated = self._start + log.collider_work - log.friction_work - total
+        self._energies.append(
+            [kinetic, elastic, potential, log.friction_work, log.collider_work, dissipated]
+        )
+        self._times.append(time)
+        self._impulses.append(s.contact_log.totals())
+        for body in s.bodies:
+            pose, m = body.T_world_object, body.motion
+            self._rows[body.name].append(
+                (
+                    pose[:3, 3],
+                    matrix_to_quaternion(pose[:3, :3]),
+                    m.velocity,
+                    m.angular_velocity,
+                    body.mode,
+                    self._shape(body),
+                    _wheel_lifts(body, pose, s.road),
+                )
+            )
+
+    def _shape(self, body: DeformableBody) -> int:
+        """Row of the body's current shape; a new row only after a change."""
+        rows = self._shapes[body.name]
+        moved = (body.local_positions() - body.rest.positions).astype(np.float16)
+        if not rows and not moved.any():
+            return -1
+        if not rows or (body.mode == BodyMode.DEFORMING or not np.array_equal(rows[-1], moved)):
+            rows.append(moved)
+        return len(rows) - 1
+
+    def result(self, start_us: int, stopped: str, figures: Mapping[str, Any]) -> SimulationResult:
+        """Everything recorded so far."""
+        s = self._simulator
+        objects = {b.name: self._object(b) for b in s.bodies}
+        masses = {b.name: b.motion.mass for b in s.bodies}
+        contacts = s.contact_log.records(masses, s.gravity)
+        impulses = np.zeros((len(self._times), len(contacts), 3))
+        for f, totals in enumerate(self._impulses):
+            for c, contact in enumerate(contacts):
+                impulses[f, c] = totals.get((contact.object_id, contact.other), np.zeros(3))
+        return SimulationResult(
+            objects,
+            np.array(self._times),
+            start_us,
+            np.array(self._energies),
+            contacts,
+            impulses,
+            stopped,
+            figures,
+        )
+
+    def _object(self, body: DeformableBody) -> ObjectResult:
+        positions, quaternions, velocities, spins, modes, index, lifts = zip(
+            *self._rows[body.name], strict=True
+        )
+        n = len(body.rest)
+        wheels = np.zeros((0, 3)) if body.tyres is None else body.tyres.patches
+        return ObjectResult(
+            object_id=body.name,
+            mass=body.motion.mass,
+            spacing=body.spacing,
+            rest=body.rest.positions.astype(np.float32),
+            positions=np.array(positions),
+            quaternions=np.array(quaternions),
+            velocities=np.array(velocities),
+            angular_velocities=np.array(spins),
+            modes=np.array(modes, dtype=np.uint8),
+            shape_index=np.array(index, dtype=np.int32),
+            shapes=np.array(self._shapes[body.name], dtype=np.float16).reshape(-1, n, 3),
+            wheels=wheels.astype(np.float32),
+            wheel_lifts=np.array(lifts, dtype=np.float32).reshape(len(positions), len(wheels)),
+        )
+
+
+def _wheel_lifts(body: DeformableBody, pose: Float, road: Sequence[Collider]) -> Float:
+    return np.zeros(0) if body.tyres is None else body.tyres.lifts(pose, road)
+
+
+# Broken parts of simulated vehicles, found in the frames.
+
+LEAVING_TIME = 0.04
+"""After a part has broken its fragments are free [s]."""
+
+
+def find_breakages(
+    result: SimulationResult, subjects: Iterable[PlacedObject]
+) -> tuple[Breakage, ...]:
+    """All broken parts, ordered by object and time."""
+    there = {s.object_id: s for s in subjects}
+    found: list[Breakage] = []
+    for object_id, own in result.objects.items():
+        subject = there[object_id]
+        log = BreakageLog(
+            subject.category,
+            subject.scaled_size,
+            own.rest.astype(np.float64),
+            spacing=own.spacing,
+        )
+        broken: list[tuple[Part, int]] = []
+        last = -1
+        for frame, row in enumerate(own.shape_index.tolist()):
+            if row not in (-1, last):
+                last = row
+                new = log.follow(own.shapes[row].astype(np.float64))
+                broken += [(part, frame) for part in new]
+        found += [_breakage(result, own, log, part, frame) for part, frame in broken]
+    return tuple(found)
+
+
+def _breakage(
+    result: SimulationResult, own: ObjectResult, log: BreakageLog, part: Part, frame: int
+) -> Breakage:
+    # Fragments leave with what is left of the velocity when all has given way there.
+    after = int(np.searchsorted(result.times_s, result.times_s[frame] + LEAVING_TIME))
+    after = min(max(after, frame + 1), result.frames - 1)
+    before = max(after - 1, 0)
+    places = {f: _place(own, log, part, f) for f in (before, frame, after)}
+    elapsed = float(result.times_s[after] - result.times_s[before])
+    velocity = (places[after] - places[before]) / max(elapsed, 1e-9)
+    outward = own.transform(frame)[:3, :3] @ np.array(part.outward)
+    return Breakage(
+        own.object_id,
+        part.name,
+        part.kind,
+        float(result.times_s[frame]),
+        _triple(places[frame]),
+        _triple(velocity),
+        _triple(outward),
+        log.broken[part.name],
+    )
+
+
+def _place(own: ObjectResult, log: BreakageLog, part: Part, frame: int) -> Float:
+    moved = own.displacements(frame)
+    still = np.zeros_like(own.rest) if moved is None else moved
+    local = log.place(part, still.astype(np.float64))
+    placed: Float = apply_transform(own.transform(frame), local[None])[0]
+    return placed
+
+
+def _triple(vector: Float) -> tuple[float, float, float]:
+    x, y, z = np.round(vector, 6).tolist()
+    return x, y, z
+
 
 PARTICLES_MIN = 100
 BESIDE, FURTHEST = 10.0, 80.0
@@ -31,7 +206,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulateOptions:
-    """What to simulate.
+    """Options of a rollout.
 
     Attributes:
         preset: ``vehicle`` or ``paper``, see ``presets``.
@@ -93,7 +268,7 @@ def simulate(
     on_progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> SimulationResult:
-    """Let the objects move, collide, deform and come to rest.
+    """Simulate objects that move, collide, deform and come to rest.
 
     Args:
         scene: holds the Gaussians.
@@ -130,7 +305,7 @@ def simulate(
 
 
 def solid_background(scene: Scene, state: PlacedObjects, options: SimulateOptions) -> list[Box]:
-    """What of the background the objects may come to."""
+    """The background within the objects' reach, as colliders."""
     starts = starts_of(state, options.objects, options.start_us)
     cleared = [Cleared(s.T_world_object, np.array(s.size)) for s in starts]
     fastest = max(float(np.linalg.norm(s.velocity)) for s in starts)
@@ -145,7 +320,7 @@ def simulate_bodies(
     on_progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> SimulationResult:
-    """The same for bodies already spawned. They are left as they are at the end."""
+    """The same for spawned bodies, which keep their final state."""
     simulator = HybridSimulator(
         bodies,
         options.colliders,

@@ -1,21 +1,257 @@
-"""Bodies and colliders in motion: the simulator decides who deforms and who is rigid."""
+"""Bodies and colliders in motion: the simulator decides which bodies deform and which are rigid."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+import math
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ..geometry.rotation import Float
 from ..physics.colliders import Box, Collider
 from ..physics.solver import ContactTotals, Solver, SolverOptions
 from .body import SLEEP_SPEED, BodyMode, DeformableBody
-from .bounces import Bounces
-from .contacts import ContactLog
-from .resting import GENTLE, Resting, touches_any
-from .support import supports_of
+from .rebound import Bounces
+from .resting import GENTLE_THRESHOLD, RestingContacts, supports_of, touches_any
+from .result import ContactRecord
 from .tyres import TyreReaction
-from .unyielding import as_boxes, by_owner, withstands
+
+# Contacts and energies, through both deformation and rigid motion.
+
+
+class ContactLog:
+    """Impulses and energies since the start, by body and contact partner.
+
+    Attributes:
+        collider_work: of moving colliders on bodies [J].
+    """
+
+    def __init__(self) -> None:
+        self._impulses: dict[tuple[str, str], Float] = {}
+        self._friction_work: dict[tuple[str, str], float] = {}
+        self._times: dict[tuple[str, str], list[float]] = {}
+        self._dozing: dict[tuple[str, str], float] = {}
+        self._asleep: dict[tuple[str, str], float] = {}
+        self._solver_totals: dict[tuple[str, str], tuple[Float, float, float]] = {}
+        self.collider_work = 0.0
+
+    def start_solver(self) -> None:
+        """A new solver counts from zero."""
+        self._solver_totals = {}
+
+    def add_solver_contacts(
+        self, contacts: Iterable[ContactTotals], time: float, names: set[str]
+    ) -> None:
+        """Add the growth of a solver's contacts since the last call.
+
+        Args:
+            contacts: of the present solver, since its start.
+            time: [s].
+            names: of all bodies; others are colliders.
+        """
+        for c in contacts:
+            key = (c.body, c.other)
+            impulse, friction_work, work = self._solver_totals.get(key, (np.zeros(3), 0.0, 0.0))
+            self.add(*key, c.impulse - impulse, c.friction_work - friction_work, time)
+            if c.other not in names:
+                self.collider_work += c.work - work
+            self._solver_totals[key] = (np.array(c.impulse), c.friction_work, c.work)
+
+    def add(self, body: str, other: str, impulse: Float, friction_work: float, time: float) -> None:
+        """Add an impulse [3] [N s] and the work of friction [J] at a time [s]."""
+        key = (body, other)
+        if not np.any(impulse):
+            return
+        self._impulses[key] = self._impulses.get(key, np.zeros(3)) + impulse
+        self._friction_work[key] = self._friction_work.get(key, 0.0) + friction_work
+        times = self._times.setdefault(key, [time, time])
+        times[1] = time
+        self._asleep[key] = self._asleep.get(key, 0.0) + self._dozing.pop(key, 0.0)
+
+    def add_sleep(self, bodies: set[str], time: float, duration: float) -> None:
+        """Count a step of sleep at a time [s].
+
+        What holds a sleeping body is recorded only in steps in which others rest beside it; all
+        other steps count as sleep once another impulse follows.
+        """
+        for key, (_, last) in self._times.items():
+            if key[0] in bodies and last != time:
+                self._dozing[key] = self._dozing.get(key, 0.0) + duration
+
+    def totals(self) -> dict[tuple[str, str], Float]:
+        """Impulses so far, by (body, other) [N s]."""
+        return {key: value.copy() for key, value in self._impulses.items()}
+
+    @property
+    def friction_work(self) -> float:
+        """Dissipated by friction so far [J]."""
+        return sum(self._friction_work.values())
+
+    def records(self, masses: dict[str, float], gravity: Float) -> tuple[ContactRecord, ...]:
+        """All contacts, in the order they began.
+
+        Args:
+            masses: of bodies [kg].
+            gravity: [3] acceleration [m/s^2].
+        """
+        order = sorted(self._impulses, key=lambda key: (self._times[key][0], key))
+        return tuple(
+            ContactRecord(
+                object_id=key[0],
+                other=key[1],
+                impulse=_three(self._impulses[key]),
+                delta_v=float(np.linalg.norm(self._impulses[key])) / masses[key[0]],
+                first_s=self._times[key][0],
+                last_s=self._times[key][1],
+                heat=self._friction_work[key],
+                impact_delta_v=self._impact_delta_v(key, masses[key[0]], gravity),
+            )
+            for key in order
+        )
+
+    def _impact_delta_v(self, key: tuple[str, str], mass: float, gravity: Float) -> float:
+        """Of the impulse beyond what the weight asks for from the first touch to the last, but for
+        sleep in between; only the impulse's part against gravity can be that."""
+        impulse, (first, last) = self._impulses[key] / mass, self._times[key]
+        awake = last - first - self._asleep[key]
+        strength = float(np.linalg.norm(gravity))
+        if strength == 0:
+            return float(np.linalg.norm(impulse))
+        up = -gravity / strength
+        carried = float(np.clip(impulse @ up, 0.0, strength * awake))
+        return float(np.linalg.norm(impulse - carried * up))
+
+
+def _three(vector: Float) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def energies(bodies: Iterable[DeformableBody], gravity: Float) -> tuple[float, float, float]:
+    """Kinetic, elastic and gravity energy of all bodies now [J]."""
+    kinetic = elastic = potential = 0.0
+    for body in bodies:
+        kinetic += body.kinetic_energy
+        elastic += body.elastic_energy
+        potential -= body.motion.mass * float(gravity @ body.motion.centre)
+    return kinetic, elastic, potential
+
+
+# Unyielding bodies: they stay rigid and are colliders for the other bodies.
+#
+# A cone does not dent a truck. Where the whole energy of an impact could not dent a body by as much
+# as its particles resolve, only the lighter body deforms. The other body becomes a few boxes on its
+# nearby surface for the lighter one's solver, and receives the impulse and moment they exchanged.
+
+LIGHTER = 10.0
+"""A body may stay rigid against what is so many times lighter."""
+DENT = 0.5
+"""Dents that are shallower than so many spacings of particles are not resolved by them."""
+PATCH_CELLS = 4.0
+"""Boxes cover a body's surface as far as this around what touches it [cells]."""
+ALIKE = 1.5
+"""Layers whose sides lie within so many spacings of each other are one box."""
+
+
+def withstands(body: DeformableBody, other: DeformableBody, gravity: Float) -> bool:
+    """Whether a body keeps its shape in an impact with another at their current speeds.
+
+    The force that yielding takes is the least yield stress near by over the other's smallest face.
+    What is only elastic gives way at any force, and so never withstands.
+
+    Args:
+        body: any.
+        other: that touches it, or will.
+        gravity: [3] [m/s^2].
+    """
+    a, b = body.motion, other.motion
+    if LIGHTER * b.mass > a.mass:
+        return False
+    near = np.unique(body.regions[_patch(body, other)]).tolist()
+    if not near:
+        return True
+    strength = min(body.materials[region].strength for region in near)
+    if not math.isfinite(strength):
+        return False
+    speed = float(np.linalg.norm(a.velocity - b.velocity))
+    speed += body.reach * float(np.linalg.norm(a.angular_velocity))
+    speed += other.reach * float(np.linalg.norm(b.angular_velocity))
+    energy = a.mass * b.mass / (a.mass + b.mass) * speed * speed / 2
+    edges = np.sort(other.box()[1])
+    force = strength * float(edges[0] * edges[1]) - b.mass * float(np.linalg.norm(gravity))
+    return bool(energy < force * DENT * body.spacing)
+
+
+def as_boxes(body: DeformableBody, other: DeformableBody) -> list[Box]:
+    """The part of a body in another's reach as stacked boxes that move with the body."""
+    pose, m, s = body.T_world_object, body.motion, body.spacing
+    local = body.local_positions()[_patch(body, other)]
+    boxes: list[Box] = []
+    for low, high in _layers(local, body.cell, s):
+        middle = np.eye(4)
+        middle[:3, 3] = (low + high) / 2
+        place = pose @ middle
+        boxes.append(
+            Box(
+                name=f"{body.name}:{other.name}:{len(boxes)}",
+                T_world_box=place,
+                size=high - low,
+                velocity=m.velocity_at(place[:3, 3]),
+                angular_velocity=m.angular_velocity,
+                friction=math.sqrt(body.friction * other.friction),
+            )
+        )
+    return boxes
+
+
+def by_owner(
+    contacts: Iterable[ContactTotals], owners: Mapping[str, DeformableBody]
+) -> list[ContactTotals]:
+    """Contacts with the effects of a body's boxes summed under the body's name."""
+    found: dict[tuple[str, str], ContactTotals] = {}
+    for c in contacts:
+        other = owners[c.other].name if c.other in owners else c.other
+        known = found.get((c.body, other))
+        if known is None:
+            found[c.body, other] = replace(c, other=other)
+            continue
+        found[c.body, other] = replace(
+            known,
+            impulse=known.impulse + c.impulse,
+            moment=known.moment + c.moment,
+            friction_work=known.friction_work + c.friction_work,
+            work=known.work + c.work,
+        )
+    return list(found.values())
+
+
+def _patch(body: DeformableBody, other: DeformableBody) -> NDArray[np.bool_]:
+    """Which particles [N] of a body lie in a cube about another, edges along the body's own."""
+    pose = body.T_world_object
+    centre = pose[:3, :3].T @ (other.motion.centre - pose[:3, 3])
+    half = other.reach + PATCH_CELLS * body.cell
+    inside: NDArray[np.bool_] = np.all(np.abs(body.local_positions() - centre) < half, axis=1)
+    return inside
+
+
+def _layers(local: Float, cell: float, spacing: float) -> list[tuple[Float, Float]]:
+    """Corners (low, high) of boxes about particles [N, 3], one above the other."""
+    level = np.floor(local[:, 2] / cell)
+    layers: list[tuple[Float, Float]] = []
+    for k in np.unique(level).tolist():
+        own = local[level == k]
+        low, high = own.min(axis=0) - spacing / 2, own.max(axis=0) + spacing / 2
+        if layers:
+            below_low, below_high = layers[-1]
+            apart = np.abs(np.concatenate([low - below_low, high - below_high])[[0, 1, 3, 4]])
+            if apart.max() < ALIKE * spacing:
+                low, high = np.minimum(low, below_low), np.maximum(high, below_high)
+                layers.pop()
+        layers.append((low, high))
+    return layers
+
 
 STEP = 0.005
 """Longest time between two checks of what is near what [s]."""
@@ -87,7 +323,7 @@ class HybridSimulator:
         self._names = {b.name for b in bodies}
         self._solver: Solver | None = None
         self._solved: list[str] = []
-        self._resting = Resting()
+        self._resting = RestingContacts()
         self._floors: dict[str, float] = {}
         for body in self.bodies:
             if not (np.any(body.motion.velocity) or np.any(body.motion.angular_velocity)):
@@ -95,11 +331,11 @@ class HybridSimulator:
 
     @property
     def road(self) -> list[Collider]:
-        """Colliders that carry tyres."""
+        """Colliders that support tyres."""
         return [c for c in self.colliders if c.name in self._road]
 
     def advance(self, duration: float) -> None:
-        """Go on by ``duration`` [s], at most STEP."""
+        """Advance by ``duration`` [s], at most STEP."""
         self._wake()
         self._activate(duration)
         deforming = [b for b in self.bodies if b.mode == BodyMode.DEFORMING]
@@ -127,7 +363,7 @@ class HybridSimulator:
             self._settle(body)
 
     def _activate(self, duration: float) -> None:
-        """Let all bodies deform that something comes near to, and those that these come near to."""
+        """Let all bodies in reach of others deform, and those in reach of these."""
         changed = True
         while changed:
             changed = False
@@ -165,7 +401,7 @@ class HybridSimulator:
             self._solver = None
 
     def _rigid_beside(self, deforming: list[DeformableBody]) -> list[tuple[Box, DeformableBody]]:
-        """What stands for rigid bodies that withstand a deforming one near by."""
+        """Colliders that represent rigid bodies near a deforming one."""
         return [
             (box, other)
             for body in deforming
@@ -202,7 +438,7 @@ class HybridSimulator:
     def _push_back(
         self, contacts: Iterable[ContactTotals], rigid: dict[str, DeformableBody]
     ) -> None:
-        """Give rigid bodies back what they have given to deforming ones in a step."""
+        """Apply to rigid bodies the reactions of deforming ones in a step."""
         for c in contacts:
             if c.other in rigid:
                 rigid[c.other].push(-c.impulse, -c.moment)
@@ -224,7 +460,7 @@ class HybridSimulator:
         self._solver = None
 
     def _brake_if_hit(self, body: DeformableBody) -> None:
-        """Once a vehicle was hit, its wheels lock as far as options say."""
+        """Lock the wheels of a vehicle after a hit, as options request."""
         if body.hit or body.tyres is None:
             return
         for (name, other), impulse in self.contact_log.totals().items():
@@ -234,7 +470,7 @@ class HybridSimulator:
                 return
 
     def _put_to_sleep(self, body: DeformableBody) -> bool:
-        """Let a body sleep that is held by what itself does not move; whether it is."""
+        """Put a body with still supports to sleep; returns whether it has them."""
         others = [b for b in self.bodies if b is not body and not _moves(b)]
         supports = supports_of(body, self.colliders, self.road, others, self.gravity)
         if supports is None or {c.name for c in self.colliders if c.moving}.intersection(supports):
@@ -243,7 +479,7 @@ class HybridSimulator:
         return True
 
     def _wake(self) -> None:
-        """Wake those whose supports have begun to move, and those that rest on these."""
+        """Wake bodies whose supports have begun to move, and those that rest on them."""
         asleep = [b for b in self.bodies if b.mode == BodyMode.SLEEPING]
         if not asleep:
             return
@@ -278,7 +514,7 @@ class HybridSimulator:
         if any(b.name in held and b.mode == BodyMode.DEFORMING for b in others):
             return True
         beside = self._resting.island(body)
-        fast = [b for b in others if b.name not in beside and _closing(body, b) > GENTLE]
+        fast = [b for b in others if b.name not in beside and _closing(body, b) > GENTLE_THRESHOLD]
         if self._is_near_bodies(body, fast, duration):
             return True
         asleep = body.mode == BodyMode.SLEEPING
@@ -287,13 +523,13 @@ class HybridSimulator:
                 continue
             gap, approach = body.gap_to_colliders([collider])
             # Nothing here carries a collider that moves, however slowly.
-            least = APPROACH_MIN if collider.moving else GENTLE
+            least = APPROACH_MIN if collider.moving else GENTLE_THRESHOLD
             if approach > least and gap < _touch_distance(body) + approach * duration:
                 return True
         return not asleep and self._strikes_through(body, duration)
 
     def _strikes_through(self, body: DeformableBody, duration: float) -> bool:
-        """Whether springs of a body on wheels no longer keep its floor from striking the road.
+        """Whether the floor of a body on wheels strikes the road through its springs.
 
         What comes down gently does not deform: springs and rigid contacts carry it.
         """
@@ -301,7 +537,7 @@ class HybridSimulator:
             return False
         gap, approach = body.gap_to_colliders(self.road)
         self._floors[body.name] = gap
-        return approach > GENTLE and gap < ROAD_CELLS * body.cell + approach * duration
+        return approach > GENTLE_THRESHOLD and gap < ROAD_CELLS * body.cell + approach * duration
 
     def _may_be_rigid(self, body: DeformableBody) -> bool:
         """Whether a deforming body that has settled is free, or lies on what does not deform any
@@ -319,7 +555,7 @@ class HybridSimulator:
         return self._is_free(body) if found is None else found
 
     def _deforming_with(self, body: DeformableBody) -> list[DeformableBody]:
-        """Deforming bodies near it, those near these, and so on."""
+        """Deforming bodies near a body, those near them, and so on."""
         left = [b for b in self.bodies if b.mode == BodyMode.DEFORMING and b is not body]
         found = [body]
         for at in found:
@@ -329,7 +565,7 @@ class HybridSimulator:
         return found[1:]
 
     def _touch_more(self) -> None:
-        """Let bodies that lie on something be carried by what else they have come to touch."""
+        """Add new contacts to the supports of resting bodies."""
         for body in self.bodies:
             held, near = self._resting.partners(body), body.spacing / 2
             if body.mode == BodyMode.RIGID and self._floors.get(body.name, np.inf) < near:
@@ -354,13 +590,13 @@ class HybridSimulator:
                 self._resting.begin(body, walls, others)
 
     def _is_loaded(self, body: DeformableBody) -> bool:
-        """Whether something that deforms may touch it."""
+        """Whether a deforming body may touch it."""
         return any(
             b is not body and b.mode == BodyMode.DEFORMING and _near(body, b) for b in self.bodies
         )
 
     def _lay_to_rest(self, duration: float) -> None:
-        """Put rigid bodies to sleep that have stood or lain still, all that touch together."""
+        """Put still rigid bodies to sleep, all bodies in contact together."""
         for body in self.bodies:
             if body.mode == BodyMode.RIGID and self._resting.partners(body):
                 body.note_standing(duration)
@@ -371,7 +607,7 @@ class HybridSimulator:
                     self._put_to_sleep(body)
 
     def _is_free(self, body: DeformableBody) -> bool:
-        """Whether a deforming body may go its way as a rigid one."""
+        """Whether a deforming body may continue as a rigid one."""
         if self._is_near_bodies(body, [b for b in self.bodies if b is not body], STEP):
             return False
         gap, approach = body.gap_to_colliders(self._walls(body))
@@ -384,7 +620,7 @@ class HybridSimulator:
     ) -> bool:
         for other in others:
             turning = _turning(body) + _turning(other)
-            if not _approach(body, other) and turning <= GENTLE:
+            if not _approach(body, other) and turning <= GENTLE_THRESHOLD:
                 continue
             closing = float(np.linalg.norm(body.motion.velocity - other.motion.velocity))
             near = TOUCH_CELLS * body.cell + (closing + turning) * duration
@@ -393,14 +629,14 @@ class HybridSimulator:
         return False
 
     def _walls(self, body: DeformableBody) -> list[Collider]:
-        """Colliders that it touches with its own surface, not by its tyres."""
+        """Colliders in contact with the body's own surface, not with its tyres."""
         if body.tyres is None:
             return self.colliders
         return [c for c in self.colliders if c.name not in self._road]
 
 
 def _moves(body: DeformableBody) -> bool:
-    """Whether a body moves or turns faster than what sleeps may."""
+    """Whether a body moves or turns faster than the limit for sleep."""
     m = body.motion
     speed = float(np.linalg.norm(m.velocity)) + float(np.linalg.norm(m.angular_velocity))
     return body.mode != BodyMode.SLEEPING and speed > SLEEP_SPEED
@@ -412,7 +648,7 @@ def _touch_distance(body: DeformableBody) -> float:
 
 
 def _turning(body: DeformableBody) -> float:
-    """Speed that no point of a body exceeds by its turning [m/s]."""
+    """Upper bound of the speed of a body's points due to rotation [m/s]."""
     return body.reach * float(np.linalg.norm(body.motion.angular_velocity))
 
 

@@ -1,4 +1,4 @@
-"""From a scenario's objects to bodies."""
+"""Bodies from a scenario's objects."""
 
 from __future__ import annotations
 
@@ -10,20 +10,18 @@ import numpy as np
 from ..geometry.box import box_penetration
 from ..geometry.rotation import Float
 from ..geometry.transform import apply_transform, is_rigid
-from ..physics.colliders import Collider, Solid
+from ..physics.body import Particles
+from ..physics.colliders import Collider, Solid, TriangleMesh
 from ..physics.errors import PhysicsError
-from ..physics.particles import Particles
-from ..physics.triangle_mesh import TriangleMesh
 from ..scene import Scene
 from .body import DeformableBody
 from .embedding import stretched
 from .fill import fill_object
-from .masses import centre_height
 from .playback import PlacedObject, PlacedObjects
 from .presets import ObjectPhysics, Preset
 from .rebound import fit_rebound
-from .structure import VEHICLES
-from .surroundings import clearance
+from .rigid import clearance
+from .structure import VEHICLES, centre_height
 from .tyres import Tyres, track_of
 
 SPEED_MAX = 200.0
@@ -52,7 +50,7 @@ def spawn_bodies(
     gravity: Float,
     max_particles: int,
 ) -> list[DeformableBody]:
-    """A body for each wanted object, as it is at the start.
+    """A body for each requested object, in its start state.
 
     Raises:
         PhysicsError: for an object that is not there at ``start_us``, for things that reach into
@@ -80,7 +78,7 @@ def spawn_bodies(
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where an object starts, and how fast.
+    """Start pose and velocity of an object.
 
     Attributes:
         T_world_object: [4, 4].
@@ -96,7 +94,7 @@ class Start:
 def starts_of(
     state: PlacedObjects, wanted: Mapping[str, ObjectPhysics], start_us: int
 ) -> list[Start]:
-    """Where and how fast each wanted object starts. Raises as :func:`spawn_bodies`."""
+    """Start of each requested object. Raises as :func:`spawn_bodies`."""
     subjects = _subjects(state, wanted, start_us)
     return [
         Start(
@@ -179,7 +177,7 @@ def _limit_particles(preset: Preset, subjects: Sequence[PlacedObject], most: int
 
 
 def spaced_for(preset: Preset, subjects: Sequence[PlacedObject]) -> Preset:
-    """The preset with its particles as far apart as these objects need."""
+    """The preset with the particle spacing that these objects need."""
     if all(subject.category in VEHICLES for subject in subjects):
         return replace(preset, spacing=preset.vehicle_spacing)
     return preset
@@ -190,7 +188,7 @@ def require_separation(
     boxes: Sequence[tuple[Float, Sequence[float]]],
     colliders: Sequence[Collider],
 ) -> None:
-    """Refuse a start at which bodies are inside one another or inside a collider.
+    """Refuse a start with bodies inside one another or inside a collider.
 
     What overlaps by less than PENETRATION_MAX is left to contact: tracked boxes of parked cars do.
 
@@ -304,7 +302,7 @@ def _spawn_body(
 def object_particles(
     scene: Scene, subject: PlacedObject, preset: Preset, start_us: int, *, mass: float | None = None
 ) -> Particles:
-    """What an object is filled with, object frame; without the space between wheels.
+    """Particles of an object, object frame; without the space between wheels.
 
     The centre of mass of a vehicle on wheels is as high as its class has it.
 
@@ -330,7 +328,7 @@ def _with_centre(particles: Particles, subject: PlacedObject, preset: Preset) ->
 
 
 def object_volume(scene: Scene, subject: PlacedObject, start_us: int) -> float:
-    """Volume of what an object is filled with [m^3], by voxels that only its own size sets.
+    """Filled volume of an object [m^3], by voxels that only its own size determines.
 
     Voxels on the surface stick out by half of one, so that coarser particles have more volume.
 
@@ -374,7 +372,7 @@ def _tyres(subject: PlacedObject, particles: Particles, gravity: Float, *, brake
 
 
 def _vector(given: object, otherwise: Float | None, name: str, most: float) -> Float:
-    """[3] as given, or otherwise; refused beyond ``most``."""
+    """The given vector [3] or the default; refused beyond ``most``."""
     vector = np.array(otherwise if given is None else given, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise PhysicsError(f"{name} must be 3 finite numbers, not {given!r}")

@@ -1,4 +1,4 @@
-"""What vehicles are made of: one record per class, for matter and for impacts of rigid bodies.
+"""Vehicles as matter and as impact partners: structure by class, and default masses of objects.
 
 A vehicle is a core that holds, with zones around it that give way: front and rear, sides (door,
 sill and B pillar together) and roof. Each zone has a force over its deflection, from published
@@ -14,6 +14,7 @@ from the wall at little of its speed, and be found 0.26 m shorter afterwards.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -21,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.rotation import Float
+from ..physics.body import Particles
+from ..physics.errors import ParticleError
 from ..physics.materials import Material, NeoHookean, Snow, Structure
-from ..physics.particles import Particles
 
 M = TypeVar("M", bound=Material)
 
@@ -32,7 +34,7 @@ VEHICLES = ("car", "vehicle", "van", "truck", "bus")
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleStructure:
-    """Force over deflection of a class of vehicles.
+    """Force over deflection of a vehicle class.
 
     Attributes:
         front, rear, side: force per metre of width and metre of deflection [N/m^2].
@@ -83,8 +85,8 @@ END, OUTER = 0.2875, 0.1745
 """Fractions of the length, at each end, that give way, and that are straightened again."""
 END_HEIGHT = 1.35
 """Height of the section that the ends' stresses below are for [m]: the barrier test's."""
-LEAST = 0.3
-"""Sections that are filled less high were seen too little to carry what they should [m]."""
+MIN_SECTION = 0.3
+"""Smallest filled height of a section [m]; a lower one was seen too little to carry its load."""
 OUTER_DENSITY = 0.35
 """Density of the outer part against that of the rest: engine and axles are behind it."""
 ROOF_DENSITY = 0.12
@@ -141,7 +143,7 @@ shallower, and carries along what is beside the place that is struck."""
 def vehicle_structure(
     category: str, particles: Particles, *, spacing: float, section_height: float | None = None
 ) -> tuple[tuple[Material, ...], NDArray[np.int64], Particles]:
-    """The materials of a vehicle, which of them each particle is, and particles with its masses.
+    """A vehicle's materials, each particle's material, and particles with its masses.
 
     Args:
         category: one of ``STRUCTURES``.
@@ -168,13 +170,13 @@ def vehicle_structure(
             materials.append(_roof(structure.roof * GRAVITY * particles.mass, volume, size[2]))
         elif zone == DOORS:
             height = volume / (2 * SIDE * (1 - 2 * END) * size[0] * size[1])
-            scale = SIDE_STRESS * structure.side / CAR.front * END_HEIGHT / max(height, LEAST)
+            scale = SIDE_STRESS * structure.side / CAR.front * END_HEIGHT / max(height, MIN_SECTION)
             materials.append(_scaled(RAILS_MATERIAL, scale))
         else:
             ahead, kind = divmod(zone - ENDS, len(END_MATERIALS))
             section = section_height or _end_height(particles, zones, ahead, size)
             stiffness = structure.front if ahead else structure.rear
-            scale = stiffness / CAR.front * END_HEIGHT / max(section, LEAST)
+            scale = stiffness / CAR.front * END_HEIGHT / max(section, MIN_SECTION)
             materials.append(_scaled(END_MATERIALS[kind], scale))
     light = (zones >= ENDS) & ((zones - ENDS) % len(END_MATERIALS) > 0)
     masses = particles.masses * np.where(light, OUTER_DENSITY, 1.0)
@@ -198,7 +200,7 @@ def _zones(place: Float, cells: Float, *, column: bool) -> NDArray[np.int64]:
 
 
 def _end_height(particles: Particles, zones: NDArray[np.int64], ahead: int, size: Float) -> float:
-    """Mean height [m] that is filled over the plan of one end."""
+    """Mean filled height [m] over the plan of one end."""
     first = ENDS + len(END_MATERIALS) * ahead
     end = (zones >= first) & (zones < first + len(END_MATERIALS))
     return float(particles.volumes[end].sum() / (END * size[0] * size[1]))
@@ -222,3 +224,126 @@ def _roof(force: float, volume: float, height: float) -> Snow:
         hardening=ROOF_HARDENING,
         viscosity=50.0,
     )
+
+
+# Default masses of objects.
+
+
+@dataclass(frozen=True)
+class ClassMass:
+    """Default mass of a category.
+
+    A person's mass goes by height, since a tracked box is wider and longer than who walks in it.
+
+    Attributes:
+        per_volume: mass per volume of the object's box [kg/m^3].
+        source: where the figure comes from.
+        person: whether it holds a person as high as the box.
+        besides: what comes to a person [kg].
+        stability: static stability factor, half the track over the height of the centre of mass;
+            None where it lies where the filled shape has it.
+        stability_source: where that comes from.
+    """
+
+    per_volume: float
+    source: str
+    person: bool = False
+    besides: float = 0.0
+    stability: float | None = None
+    stability_source: str = ""
+
+
+NHTSA_SSF = (
+    "sales-weighted average of model year 2003 by the abstract of Trends in the Static Stability "
+    "Factor of Passenger Cars, Light Trucks, and Vans, NHTSA DOT HS 809 868 "
+    "(https://trid.trb.org/view/763766)"
+)
+CAR_MASS = ClassMass(
+    125.0,
+    "2015 Chevrolet Malibu as tested, 3639 lb in 4.87 x 1.85 x 1.47 m (NHTSA frontal test)",
+    stability=1.41,
+    stability_source=NHTSA_SSF + ": passenger cars",
+)
+PERSON_MASS = ClassMass(
+    270.0,
+    "Hybrid III 50th percentile dummy, 78 kg in 1.75 x 0.50 x 0.33 m; otherwise by the 2.5th power "
+    "of height (L. N. Trefethen, letter to The Economist, 2013)",
+    person=True,
+)
+PERSON_KG, PERSON_HEIGHT, GROWTH = 78.0, 1.75, 2.5
+HEIGHTS = (0.6, 2.0)
+"""Of persons [m]; boxes that are lower or higher are wrong."""
+CLASS_MASSES = {
+    "car": CAR_MASS,
+    "vehicle": CAR_MASS,
+    "van": ClassMass(
+        115.0,
+        "large panel van, about 2000 kg kerb in 5.9 x 2.0 x 1.45 m of box",
+        stability=1.12,
+        stability_source=NHTSA_SSF + ": full-size vans",
+    ),
+    "truck": ClassMass(130.0, "two-axle lorry, half laden: about 11 t in 8.5 x 2.5 x 4.0 m"),
+    "bus": ClassMass(125.0, "12 m city bus, about 12 t kerb in 12 x 2.55 x 3.1 m"),
+    "pedestrian": PERSON_MASS,
+    "cyclist": ClassMass(
+        85.0,
+        "78 kg rider and 14 kg bicycle in 1.8 x 0.6 x 1.0 m of box; the rider's head is about as "
+        "high as when walking",
+        person=True,
+        besides=14.0,
+    ),
+    "motorcyclist": ClassMass(
+        100.0, "rider as for a cyclist, and 200 kg machine", person=True, besides=200.0
+    ),
+    "motorcycle": ClassMass(150.0, "200 kg machine and 78 kg rider in 2.1 x 0.8 x 1.1 m of box"),
+}
+"""Typical figures for want of better ones; give a mass where it is known."""
+OTHER = ClassMass(100.0, "between empty furniture and wood; no better guess")
+
+
+YAW_RADIUS = 0.261
+"""Radius of gyration of vehicles about the vertical, over their length: 1538.9 kg m^2 of a Ford
+Escort of 1225.9 kg and 4.298 m (CommonRoad vehicle models). The particles of a car have 0.262, a
+box of even mass 0.31."""
+
+
+def yaw_inertia(category: str, mass: float, size: Sequence[float]) -> float:
+    """Inertia of an object about the vertical [kg m^2].
+
+    Args:
+        category: of the object.
+        mass: [kg].
+        size: (length, width, ...) of its box [m].
+    """
+    if category in VEHICLES:
+        return mass * (YAW_RADIUS * size[0]) ** 2
+    return mass * (size[0] * size[0] + size[1] * size[1]) / 12
+
+
+def default_mass(category: str, size: Sequence[float], *, by_height: bool = True) -> float:
+    """Mass [kg] of an object of that category and box size (length, width, height) [m].
+
+    Args:
+        category: of the object.
+        size: of its box.
+        by_height: persons weigh by their height; False: by the volume of their box, as episodes of
+            earlier versions had it.
+
+    Raises:
+        ParticleError: for a size that is not three positive lengths.
+    """
+    edges = np.asarray(size, dtype=np.float64)
+    if edges.shape != (3,) or not (edges > 0).all():
+        raise ParticleError(f"size must be three positive lengths [m], not {size!r}")
+    known = CLASS_MASSES.get(category, OTHER)
+    if known.person and by_height:
+        height = min(max(float(edges[2]), HEIGHTS[0]), HEIGHTS[1])
+        return PERSON_KG * math.pow(height / PERSON_HEIGHT, GROWTH) + known.besides
+    return known.per_volume * float(edges.prod())
+
+
+def centre_height(category: str, track: float) -> float | None:
+    """Height of the centre of mass above the road [m] of a vehicle with that track [m], by the
+    published stability of its class; None for classes without one."""
+    stability = CLASS_MASSES.get(category, OTHER).stability
+    return None if stability is None else track / (2 * stability)

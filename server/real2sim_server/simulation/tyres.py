@@ -1,18 +1,261 @@
-"""Tyres: four patches that carry, roll and grip."""
+"""Tyres: four contact patches that carry, roll and grip, and rigid motion on them."""
+
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from .._numba import func, kernel
 from ..geometry.rotation import Float
 from ..physics.colliders import Collider
-from .rigid import RigidMotion
-from .rolling import ROLLING, STATIC_GRAVITY, UPRIGHT, press
-from .surroundings import clearance, nearest, packed
+from ..physics.contact import collider_distance
+from .rigid import RigidMotion, clearance, nearest, packed
+
+# Compiled rigid motion on tyres: forces of the road on four patches, and the body's motion.
+
+
+ROLLING = 0.015
+"""Rolling resistance of a free wheel, fraction of its load."""
+ROUNDS = 6
+"""Sweeps over the four patches in one step; their impulses act on each other."""
+UPRIGHT = 0.5
+"""Wheels carry while the body's up axis leans less than 60 degrees from the ground's normal."""
+STATIC_GRAVITY = 9.81
+"""Static loads are divided by this for the mass that a wheel carries [m/s^2]."""
+FRICTION, BRAKE, FREQUENCY, DAMPING, TRAVEL = range(5)
+"""Entries of a row of tyre parameters, see ``Tyres``."""
+
+
+@kernel
+def advance_on_wheels(
+    rotation: Any, motion: Any, mass: Any, inertia: Any, origin: Any,
+    patches: Any, static_load: Any, rest: Any, tyres: Any, rows: Any, heights: Any,
+    gravity: Any, dt: Any, steps: Any, impulse: Any,
+) -> Any:  # fmt: skip
+    """Move a rigid body by ``steps`` of ``dt`` [s], in place; symplectic Euler.
+
+    Args:
+        rotation: [3, 3] object to world, written to.
+        motion: [3, 3] rows centre, velocity and angular velocity, written to.
+        mass, inertia: of a ``RigidMotion``.
+        origin: [3] from the centre of mass to the object's origin, object frame [m].
+        patches, static_load, rest: of its tyres; [0, 3], [0], [0] without.
+        tyres: [5] their parameters.
+        rows, heights: of the colliders that carry tyres, packed.
+        gravity: [3] [m/s^2].
+        impulse: [3] what the road did is added to it [N s].
+
+    Returns:
+        What slip of the tyres dissipated [J].
+    """
+    friction_work = 0.0
+    points = np.empty_like(patches)
+    own = np.linalg.inv(inertia)
+    up, forward = np.empty(3), np.empty(3)
+    for _ in range(steps):
+        for axis in range(3):
+            motion[1, axis] += dt * gravity[axis]
+            up[axis], forward[axis] = rotation[axis, 2], rotation[axis, 0]
+        for k in range(len(patches)):
+            for axis in range(3):
+                points[k, axis] = motion[0, axis]
+                for j in range(3):
+                    points[k, axis] += rotation[axis, j] * (patches[k, j] + origin[j])
+        if len(patches):
+            friction_work += press(
+                points, up, forward, motion, mass, rotation @ own @ rotation.T,
+                static_load, rest, tyres, rows, heights, dt, impulse,
+            )  # fmt: skip
+        drift(rotation, motion, inertia, own, dt)
+    return friction_work
+
+
+@func
+def drift(rotation: Any, motion: Any, inertia: Any, inverse: Any, dt: Any) -> None:
+    """Move a body at its velocities for ``dt`` [s]; angular momentum stays."""
+    spin = motion[2].copy()
+    momentum = rotation @ (inertia @ (rotation.T @ spin))
+    angle = dt * math.sqrt(spin @ spin)
+    if angle > 1e-12:
+        x, y, z = dt * spin / angle
+        k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        turned = (np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * (k @ k)) @ rotation
+        # One step of Newton and Schulz: rounding must not add up to a skewed frame.
+        rotation[:] = 0.5 * (turned @ (3.0 * np.eye(3) - turned.T @ turned))
+    motion[0] += dt * motion[1]
+    motion[2] = rotation @ (inverse @ (rotation.T @ momentum))
+
+
+@kernel
+def press(
+    points: Any, up: Any, forward: Any, motion: Any, mass: Any, inverse: Any, static_load: Any,
+    rest: Any, tyres: Any, rows: Any, heights: Any, dt: Any, impulse: Any,
+) -> Any:  # fmt: skip
+    """What the road does over ``dt`` [s] to four patches; velocities in ``motion`` are written to.
+
+    Springs and dampers carry along the normal. Across it each patch stops its slip as far as its
+    friction circle lets it: sideways always, along the wheel as far as it is braked.
+
+    Args:
+        points: [4, 3] the patches in the world [m].
+        up, forward: [3] axes of the body.
+        motion: see ``advance_on_wheels``.
+        mass: [kg].
+        inverse: [3, 3] of the inertia, world axes.
+        impulse: [3] what the road did is added to it [N s].
+
+    Returns:
+        What slip dissipated [J].
+    """
+    count = len(points)
+    loads, normals, used = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 2))
+    v, w = vector(motion[1]), vector(motion[2])
+    before, before_spin, centre = v, w, vector(motion[0])
+    for k in range(count):
+        height, n = nearest_road(vector(points[k]), rows, heights)
+        normals[k, 0], normals[k, 1], normals[k, 2] = n
+        if dot(n, vector(up)) > UPRIGHT:
+            speed = dot(n, velocity_at(v, w, minus(vector(points[k]), centre)))
+            loads[k] = dt * spring_force(rest[k] - height, speed, static_load[k], tyres)
+    total = (0.0, 0.0, 0.0)
+    for k in range(count):
+        given = scaled(loads[k], vector(normals[k]))
+        v, w = pushed(v, w, given, minus(vector(points[k]), centre), mass, inverse)
+        total = plus(total, given)
+    friction_work = 0.0
+    for _ in range(ROUNDS):
+        for k in range(count):
+            if loads[k] > 0.0:
+                arm = minus(vector(points[k]), centre)
+                given = grip(
+                    v, w, arm, vector(normals[k]), vector(forward), loads[k], used[k], mass,
+                    inverse, tyres,
+                )  # fmt: skip
+                v, w = pushed(v, w, given, arm, mass, inverse)
+                total = plus(total, given)
+                slip = plus(velocity_at(v, w, arm), velocity_at(before, before_spin, arm))
+                friction_work -= 0.5 * dot(given, slip)
+    for axis in range(3):
+        motion[1, axis], motion[2, axis] = v[axis], w[axis]
+        impulse[axis] += total[axis]
+    return max(friction_work, 0.0)
+
+
+@func
+def nearest_road(point: Any, rows: Any, heights: Any) -> Any:
+    """Height [m] of a point over the nearest collider, infinite over none; and its normal."""
+    least, normal = math.inf, (0.0, 0.0, 1.0)
+    for c in range(len(rows)):
+        distance, n = collider_distance(rows[c], heights, point[0], point[1], point[2])
+        if distance < least:
+            least, normal = distance, n
+    return least, normal
+
+
+@func
+def spring_force(squeeze: Any, speed: Any, static_load: Any, tyres: Any) -> Any:
+    """Of spring and damper of a wheel that is squeezed beyond rest [m] and moves [m/s] up; [N]."""
+    omega = 2.0 * math.pi * tyres[FREQUENCY]
+    carried = static_load / STATIC_GRAVITY
+    if not squeeze > -STATIC_GRAVITY / (omega * omega):
+        return 0.0
+    force = static_load + carried * omega * omega * min(squeeze, 2.0 * tyres[TRAVEL])
+    force -= 2.0 * tyres[DAMPING] * omega * carried * speed
+    return max(force, 0.0)
+
+
+@func
+def grip(
+    v: Any, w: Any, arm: Any, normal: Any, forward: Any, load: Any, used: Any, mass: Any,
+    inverse: Any, tyres: Any,
+) -> Any:  # fmt: skip
+    """One patch: more impulse (3) [N s] across the road, within its friction circle."""
+    along = minus(forward, scaled(dot(forward, normal), normal))
+    along = scaled(1.0 / max(math.sqrt(dot(along, along)), 1e-9), along)
+    side = cross(normal, along)
+    slip = velocity_at(v, w, arm)
+    held = max(tyres[BRAKE] * tyres[FRICTION], ROLLING) * load
+    x = used[0] - dot(along, slip) / (1.0 / mass + bend(along, arm, inverse))
+    y = used[1] - dot(side, slip) / (1.0 / mass + bend(side, arm, inverse))
+    x = min(max(x, -held), held)
+    fraction = min(1.0, tyres[FRICTION] * load / max(math.sqrt(x * x + y * y), 1e-12))
+    x, y = fraction * x, fraction * y
+    given = plus(scaled(x - used[0], along), scaled(y - used[1], side))
+    used[0], used[1] = x, y
+    return given
+
+
+@func
+def bend(axis: Any, arm: Any, inverse: Any) -> Any:
+    """How much faster a point moves along ``axis`` by turning, for one unit of impulse there."""
+    return dot(axis, cross(times(inverse, cross(arm, axis)), arm))
+
+
+@func
+def pushed(v: Any, w: Any, impulse: Any, arm: Any, mass: Any, inverse: Any) -> Any:
+    """Velocities after an impulse (3) [N s] at an arm (3) [m] from the centre of mass."""
+    return plus(v, scaled(1.0 / mass, impulse)), plus(w, times(inverse, cross(arm, impulse)))
+
+
+@func
+def velocity_at(v: Any, w: Any, arm: Any) -> Any:
+    """Velocity (3) [m/s] at an arm (3) [m] from the centre of mass."""
+    return plus(v, cross(w, arm))
+
+
+@func
+def vector(row: Any) -> Any:
+    """Three numbers of an array as a tuple."""
+    return row[0], row[1], row[2]
+
+
+@func
+def dot(a: Any, b: Any) -> Any:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@func
+def cross(a: Any, b: Any) -> Any:
+    """Vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@func
+def plus(a: Any, b: Any) -> Any:
+    """Sum."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@func
+def minus(a: Any, b: Any) -> Any:
+    """Difference."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@func
+def scaled(factor: Any, a: Any) -> Any:
+    """Product with a number."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@func
+def times(matrix: Any, a: Any) -> Any:
+    """Product of a matrix [3, 3] and a vector."""
+    return (
+        matrix[0, 0] * a[0] + matrix[0, 1] * a[1] + matrix[0, 2] * a[2],
+        matrix[1, 0] * a[0] + matrix[1, 1] * a[1] + matrix[1, 2] * a[2],
+        matrix[2, 0] * a[0] + matrix[2, 1] * a[1] + matrix[2, 2] * a[2],
+    )
+
 
 ABOVE_MAX = 0.1
 """Tracked boxes of standing vehicles are at most this high above the road [m]."""
@@ -24,7 +267,7 @@ LIFT_MAX = 0.3
 
 @dataclass(frozen=True, eq=False)
 class TyreReaction:
-    """What the road did to a body through its tyres in one step.
+    """The road's effect on a body through its tyres in one step.
 
     Attributes:
         impulse: [3] on the body [N s].
@@ -37,7 +280,7 @@ class TyreReaction:
 
 @dataclass(frozen=True, eq=False)
 class Tyres:
-    """Four wheels of a vehicle, and the road they stand on.
+    """A vehicle's four wheels and the road below them.
 
     Attributes:
         patches: [4, 3] undersides of the wheels in the object's frame, as they stand at rest [m].
@@ -100,7 +343,7 @@ class Tyres:
         return replace(self, brake=fraction)
 
     def lifts(self, T_world_object: Float, road: Sequence[Collider]) -> Float:
-        """[4] by how far springs have given in, so that wheels stand on the road, not in it [m]."""
+        """[4] compression of the springs, so that wheels stand on the road, not in it [m]."""
         heights, normals = nearest(road, self._points(T_world_object))
         carrying = np.isfinite(heights) & (normals @ T_world_object[:3, 2] > UPRIGHT)
         squeeze = np.where(carrying, self.rest - heights, 0.0)
@@ -132,7 +375,7 @@ class Tyres:
         road: Sequence[Collider],
         duration: float,
     ) -> tuple[RigidMotion, TyreReaction]:
-        """What the road does to the body over ``duration`` [s] through its tyres.
+        """Apply the road's forces to the body through its tyres over ``duration`` [s].
 
         See ``rolling.press``.
 
@@ -162,7 +405,7 @@ class Tyres:
 
     @cached_property
     def parameters(self) -> Float:
-        """[5] what kernels take, see ``rolling``."""
+        """[5] a row of tyre parameters for kernels."""
         return np.array([self.friction, self.brake, self.frequency, self.damping, self.travel])
 
     def _points(self, T_world_object: Float) -> Float:

@@ -141,7 +141,7 @@ def test_doctor_says_what_the_solver_takes_in_both_precisions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("cuda.core")
-    from real2sim_server.physics.backends.cuda import compile as compiling
+    from real2sim_server.physics.backends.cuda import launcher as compiling
     from real2sim_server.render.backends.nvrtc.usage import Usage
 
     def compile_kernels(precision: str, architecture: str) -> tuple[bytes, dict[str, Usage]]:

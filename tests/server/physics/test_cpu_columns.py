@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from real2sim_server.physics.backends.cpu.columns import (
+from real2sim_server.physics.backends.cpu.deform import (
     BATCH,
     bring_back_nine,
     bring_back_six,

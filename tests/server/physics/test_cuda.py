@@ -23,10 +23,10 @@ from real2sim_server.physics import (
     SolverError,
     solver,
 )
-from real2sim_server.physics.backends.base import SolverDiverged
 from real2sim_server.physics.backends.cuda import backend as cuda_backend
 from real2sim_server.physics.backends.cuda.backend import CudaSolverBackend
 from real2sim_server.physics.materials import Snow, Structure
+from real2sim_server.physics.model import SolverDiverged
 from real2sim_server.physics.validation import motion
 
 from ..render.kernel_twin import COMPILER, NEEDS_COMPILER

@@ -9,11 +9,10 @@ from typing import Any
 
 import pytest
 
-from real2sim_server._nvrtc import KernelSource
+from real2sim_server._nvrtc import ARCHITECTURES, KernelSource
 from real2sim_server.physics import SolverError
-from real2sim_server.physics.backends.cuda import compile as compiling
-from real2sim_server.physics.backends.cuda import translate
-from real2sim_server.physics.backends.cuda.records import THREADS
+from real2sim_server.physics.backends.cuda import launcher, source
+from real2sim_server.physics.backends.cuda.launcher import THREADS
 from real2sim_server.physics.backends.cuda.source import KERNELS, PRECISIONS
 from real2sim_server.render.backends.nvrtc.needs import compiler_needs
 
@@ -27,11 +26,11 @@ needs_nvrtc = pytest.mark.skipif(bool(MISSING), reason=MISSING)
     ("precision", "architecture"),
     [
         pytest.param(*case, marks=[] if case == ALWAYS else [pytest.mark.slow])
-        for case in itertools.product(PRECISIONS, compiling.ARCHITECTURES)
+        for case in itertools.product(PRECISIONS, ARCHITECTURES)
     ],
 )
 def test_every_kernel_compiles_and_none_spills(precision: str, architecture: str) -> None:
-    code, usages = compiling.compile_kernels(precision, architecture)
+    code, usages = launcher.compile_kernels(precision, architecture)
     assert code[:4] == b"\x7fELF"
     assert set(usages) == set(KERNELS)
     assert {name: usage.spilled for name, usage in usages.items() if usage.spilled} == {}
@@ -55,10 +54,10 @@ def test_what_was_compiled_is_kept_by_precision_and_architecture(
     monkeypatch.setattr(KernelSource, "_compile", compile_one)
     asked = [("single", "sm_90"), ("double", "sm_90"), ("single", "sm_80"), ("single", "sm_90")]
     for one in asked:
-        assert compiling.compiled_kernels(*one) == one[1].encode()
+        assert launcher.compiled_kernels(*one) == one[1].encode()
     assert made == asked[:3]
-    monkeypatch.setattr(compiling, "solver_source", lambda precision: "another law")
-    compiling.compiled_kernels("single", "sm_90")
+    monkeypatch.setattr(launcher, "solver_source", lambda precision: "another law")
+    launcher.compiled_kernels("single", "sm_90")
     assert len(made) == 4
 
 
@@ -67,9 +66,9 @@ def test_a_source_that_is_wrong_is_refused_in_the_words_of_the_compiler(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
-    monkeypatch.setattr(compiling, "solver_source", lambda precision: "void f() { nonsense; }")
+    monkeypatch.setattr(launcher, "solver_source", lambda precision: "void f() { nonsense; }")
     with pytest.raises(SolverError, match="nonsense"):
-        compiling.compile_kernels("single", "sm_90")
+        launcher.compile_kernels("single", "sm_90")
 
 
 FACTOR = 2.5
@@ -90,7 +89,7 @@ def spread(values: Any) -> Any:
 
 
 def test_a_function_becomes_cpp_with_the_types_that_it_needs() -> None:
-    made = translate.Translator("double", "some_")
+    made = source.Translator("double", "some_")
     name, kind = made.add(shortened, (("real",) * 3, "real"))
     assert (name, kind) == ("shortened", (("real",) * 3, "real"))
     assert "double total{};" in made.text  # Begun as a whole number, it does not stay one.
@@ -99,6 +98,6 @@ def test_a_function_becomes_cpp_with_the_types_that_it_needs() -> None:
 
 
 def test_more_than_kernels_know_is_refused_with_its_place() -> None:
-    made = translate.Translator("double", "some_")
-    with pytest.raises(translate.Untranslatable, match=r"spread, line \d+: .*\[value \* 2 for"):
+    made = source.Translator("double", "some_")
+    with pytest.raises(source.Untranslatable, match=r"spread, line \d+: .*\[value \* 2 for"):
         made.add(spread, (("real",) * 3,))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.physics.backends.cuda import records as r
+from real2sim_server.physics.backends.cuda import launcher as records
 from real2sim_server.physics.backends.cuda.launcher import Launch
-from real2sim_server.physics.backends.cuda.traffic import substep_traffic
+from real2sim_server.physics.backends.cuda.memory import substep_traffic
 from real2sim_server.physics.backends.layout import arrange
 
 from ..render.kernel_twin import COMPILER, NEEDS_COMPILER
@@ -51,12 +51,17 @@ def test_what_a_substep_finds_anew_it_does_not_read() -> None:
         memory, launcher = simulation._memory, simulation._launcher
         memory.upload_step(1e-4, False, simulation._rows(1, 1e-4, []))
         sizes = memory.sizes
-        launcher.run((Launch("advance_blocks", sizes.blocks, r.SCATTERS),), memory.space)
+        launcher.run((Launch("advance_blocks", sizes.blocks, records.SCATTERS),), memory.space)
         if spoilt:
             held = torch.from_numpy(memory.values(memory.sets[simulation._current].numpy()))
-            for first, end in ((r.VELOCITY, r.ELASTIC_F), (r.STRESS, r.HISTORY)):
+            for first, end in (
+                (records.VELOCITY, records.ELASTIC_F),
+                (records.STRESS, records.HISTORY),
+            ):
                 held[first:end] = float("nan")
-        moving = Launch("advance_blocks", sizes.blocks, r.MOVES | r.DEFORMS | r.SCATTERS)
+        moving = Launch(
+            "advance_blocks", sizes.blocks, records.MOVES | records.DEFORMS | records.SCATTERS
+        )
         launcher.run((Launch("collect_fields", sizes.fields), moving), memory.space)
         ends.append(simulation.particles())
     for name in ("positions", "velocities", "gradients", "F_elastic"):

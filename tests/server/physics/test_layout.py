@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from real2sim_server.physics import Box, Capsule, Cylinder, HeightField, Plane, TriangleMesh
-from real2sim_server.physics.backends.base import pack_colliders
 from real2sim_server.physics.backends.layout import distances
-from real2sim_server.physics.contact.collider_distance import collider_distance
+from real2sim_server.physics.contact import collider_distance
+from real2sim_server.physics.model import pack_colliders
 
 from .shapes import half_pipe
 

@@ -10,16 +10,17 @@ import pytest
 
 from real2sim_proto.operations import MaterialName
 from real2sim_server.physics import Body, MaterialError, Plane, box_particles
-from real2sim_server.physics.constitutive.law import VON_MISES, ConstitutiveLaw
-from real2sim_server.physics.constitutive.material_row import LAW, MATERIAL_ROW, PLASTIC
+from real2sim_server.physics import materials as registry
 from real2sim_server.physics.materials import (
     MATERIALS,
+    VON_MISES,
+    ConstitutiveLaw,
     Material,
     Structure,
     named_material,
     register_material,
 )
-from real2sim_server.physics.materials import material as registry
+from real2sim_server.physics.stress import LAW, MATERIAL_ROW, PLASTIC
 from real2sim_server.physics.validation.check import placed
 
 from .scenes import solve

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from real2sim_server.physics.numerics.device import square_root
-from real2sim_server.physics.numerics.matrices import eigen_symmetric, least_minor
+from real2sim_server.physics.numerics import eigen_symmetric, least_minor, square_root
 
 SIX = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
 

@@ -21,11 +21,9 @@ from real2sim_server.physics import (
     ball_particles,
     box_particles,
 )
-from real2sim_server.physics.backends.base import pack_colliders
-from real2sim_server.physics.backends.reference.distance import (
-    collider_distance as plain_distance,
-)
-from real2sim_server.physics.contact.collider_distance import collider_distance
+from real2sim_server.physics.backends.reference_laws import collider_distance as plain_distance
+from real2sim_server.physics.contact import collider_distance
+from real2sim_server.physics.model import pack_colliders
 
 from .scenes import at, cube, solve
 from .shapes import BOX_FACES, box_corners, box_surface, half_pipe

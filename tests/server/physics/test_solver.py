@@ -22,8 +22,7 @@ from real2sim_server.physics import (
     box_particles,
     model,
 )
-from real2sim_server.physics.contact.node import resolve_node_pair
-from real2sim_server.physics.contact.surface import face_score
+from real2sim_server.physics.contact import face_score, resolve_node_pair
 
 from .scenes import SOFT, at, cube, ground, solve
 

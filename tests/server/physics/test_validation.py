@@ -14,9 +14,8 @@ from real2sim_server.cli.validate import validate
 from real2sim_server.physics import PhysicsError
 from real2sim_server.physics.validation import CASES, Check, ReferenceCurve
 from real2sim_server.physics.validation import table as table_module
-from real2sim_server.physics.validation.page import render_page
-from real2sim_server.physics.validation.table import run_table
-from real2sim_server.simulation.experiments import published, theory
+from real2sim_server.physics.validation.table import render_page, run_table
+from real2sim_server.simulation.experiments import crash_tests
 
 SLOW_ON_CPU = {
     "two_discs",
@@ -92,7 +91,7 @@ def fine(backend):
 def small_table(monkeypatch):
     cases = {"failing": failing, "breaking": breaking, "fine": fine}
     monkeypatch.setattr(table_module, "CASES", cases)
-    monkeypatch.setattr(theory, "THEORY", {})
+    monkeypatch.setattr(crash_tests, "THEORY", {})
 
 
 @pytest.mark.usefixtures("small_table")
@@ -129,7 +128,7 @@ def test_the_page_shows_every_line_with_plots_that_are_whole():
 
 
 def test_published_crash_figures_run_where_they_are_named(monkeypatch, tmp_path):
-    monkeypatch.setattr(published, "PUBLISHED", {"malibu": fine, "pair": fine})
+    monkeypatch.setattr(crash_tests, "PUBLISHED", {"malibu": fine, "pair": fine})
     validate(cases="published", json=tmp_path / "table.json")
     figures = json.loads((tmp_path / "table.json").read_text())
     assert [case["name"] for case in figures["cases"]] == ["malibu", "pair"]

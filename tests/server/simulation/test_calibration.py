@@ -19,10 +19,11 @@ from real2sim_server.simulation.calibration import (
     BoxTrack,
     MarkedPoints,
     ObservedImages,
+    Simulated,
     calibrate_object,
+    drawn,
+    observations_of,
 )
-from real2sim_server.simulation.calibration.observations import Simulated, drawn
-from real2sim_server.simulation.calibration.requested import observations_of
 from real2sim_server.simulation.embedding import Embedding
 from real2sim_server.simulation.playback import Playback
 from real2sim_server.simulation.presets import ObjectPhysics
@@ -117,7 +118,7 @@ def test_marked_points_tell_stiffness_friction_and_speed(scene, state, truth):
 
 def test_boxes_tell_speed_but_no_yield_stress(scene, state, truth):
     found = calibrated(scene, state, boxes_of(truth), "speed", "yield_stress")
-    assert found.untold == ["yield_stress"]
+    assert found.undetermined == ["yield_stress"]
     assert found.factors["yield_stress"] == 1.0
     assert within(found, "speed")
     assert found.factors["speed"] == pytest.approx(TRUE["speed"], rel=0.06)

@@ -10,22 +10,29 @@ import torch
 
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.geometry.rotation import quaternion_to_matrix
-from real2sim_server.physics.particles import box_particles
+from real2sim_server.physics.body import box_particles
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.simulation.breakages import find_breakages
-from real2sim_server.simulation.damage import (
+from real2sim_server.simulation.breakage import (
     BreakageLog,
-    DamagedVehicle,
     fragment_cloud,
+    in_wheels,
+    parts_of,
     with_underside,
 )
-from real2sim_server.simulation.damage.appearance import CLEARANCE, HANGS_STILL, SH_0
-from real2sim_server.simulation.damage.crumple import HEIGHTS, crumple
-from real2sim_server.simulation.damage.parts import in_wheels, parts_of
-from real2sim_server.simulation.damage.sheet import BRIGHTEST, FLATTER
+from real2sim_server.simulation.damage import (
+    BRIGHTEST,
+    CLEARANCE,
+    FLATTER,
+    HANGS_STILL,
+    HEIGHTS,
+    SH_0,
+    DamagedVehicle,
+    crumple,
+)
 from real2sim_server.simulation.embedding import Embedding, deform_cloud
 from real2sim_server.simulation.playback import Playback
 from real2sim_server.simulation.result import ObjectResult, SimulationResult
+from real2sim_server.simulation.rollout import find_breakages
 
 SIZE = (4.6, 1.8, 1.5)
 SPACING = 0.15

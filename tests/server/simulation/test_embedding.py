@@ -11,7 +11,7 @@ from real2sim_server.geometry.rotation import quaternion_to_matrix
 from real2sim_server.physics import Body, FixedCorotated, Solver, SolverOptions, box_particles
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.simulation.damage.appearance import _split
+from real2sim_server.simulation.damage import _split
 from real2sim_server.simulation.embedding import (
     Deformed,
     Embedding,

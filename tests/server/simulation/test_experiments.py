@@ -15,9 +15,8 @@ from real2sim_server.edit.state import ScenarioState
 from real2sim_server.geometry.box import box_penetration
 from real2sim_server.physics import PhysicsError
 from real2sim_server.simulation.experiments import FilmPlan, set_up, views
-from real2sim_server.simulation.experiments.film import FilmView, draw, look_at
-from real2sim_server.simulation.experiments.film_plan import obstacle_cloud
-from real2sim_server.simulation.experiments.viewing import visibility_of
+from real2sim_server.simulation.experiments.film import FilmView, draw, look_at, obstacle_cloud
+from real2sim_server.simulation.experiments.setups import visibility_of
 from real2sim_server.simulation.playback import Playback
 from real2sim_server.simulation.rollout import simulate
 

@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.physics.particles import box_particles
-from real2sim_server.simulation.experiments.crash_tests import CrashPulse, barrier_test
-from real2sim_server.simulation.experiments.published import (
+from real2sim_server.physics.body import box_particles
+from real2sim_server.simulation.experiments.crash_tests import (
     MALIBU_CRUSH,
     MALIBU_DYNAMIC,
     MALIBU_PEAK,
     MALIBU_SPEED,
     MALIBU_TIME,
     PUBLISHED,
+    CrashPulse,
+    barrier_test,
     malibu_checks,
 )
 from real2sim_server.simulation.structure import STRUCTURES, vehicle_structure

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from real2sim_server.physics.body import Particles
 from real2sim_server.physics.colliders import Box, Collider, Plane
 from real2sim_server.physics.materials import FixedCorotated
-from real2sim_server.physics.particles import Particles
 from real2sim_server.simulation import ObjectPhysics, SimulateOptions
 from real2sim_server.simulation.body import DeformableBody
 from real2sim_server.simulation.rebound import first_touch, fit_rebound

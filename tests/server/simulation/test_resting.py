@@ -9,7 +9,7 @@ from real2sim_server.physics import Box, Foam, Plane, box_particles
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
 from real2sim_server.simulation.presets import preset_of
-from real2sim_server.simulation.resting import Resting
+from real2sim_server.simulation.resting import RestingContacts
 from real2sim_server.simulation.rigid import rotation_of
 from real2sim_server.simulation.simulator import STEP, HybridSimulator
 from real2sim_server.simulation.tyres import Tyres
@@ -166,6 +166,6 @@ def test_what_a_wall_is_still_stopping_has_not_come_to_rest_against_it():
     wall = Plane(name="wall", point=(SIDE / 2, 0, 0), normal=(-1, 0, 0))
     body = box("body", at(0, 0, 0), velocity=(0.2, 0.0, 0.0))
     body.acceleration = np.array([-10.0, 0.0, 0.0])
-    assert Resting().begin(body, [wall], []) is False
+    assert RestingContacts().begin(body, [wall], []) is False
     body.acceleration = np.array([0.0, -4.0, 0.0])
-    assert Resting().begin(body, [wall], []) is True
+    assert RestingContacts().begin(body, [wall], []) is True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from real2sim_server.simulation.experiments.theory import THEORY
+from real2sim_server.simulation.experiments.crash_tests import THEORY
 
 SLOW = {"thin_post"}
 

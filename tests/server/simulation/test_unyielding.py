@@ -9,10 +9,9 @@ from real2sim_server.physics import Box, FixedCorotated, Foam, Plane, box_partic
 from real2sim_server.physics.materials import Structure
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
-from real2sim_server.simulation.simulator import STEP, HybridSimulator
+from real2sim_server.simulation.simulator import STEP, HybridSimulator, as_boxes, withstands
 from real2sim_server.simulation.structure import vehicle_structure
 from real2sim_server.simulation.tyres import Tyres
-from real2sim_server.simulation.unyielding import as_boxes, withstands
 
 FOAM = Foam(young=4e5, poisson=0.3, yield_stress=3e4, plastic_viscosity=2e3, viscosity=400)
 FRAME = Structure(young=1e6, poisson=0.0, critical_compression=0.03)

@@ -14,8 +14,7 @@ from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
 from real2sim_server.physics.solver import Solver, SolverOptions
 from real2sim_server.simulation.experiments.crash_tests import CAR_SIZE, MALIBU_MASS, whole_car
-from real2sim_server.simulation.masses import YAW_RADIUS, yaw_inertia
-from real2sim_server.simulation.structure import STRUCTURES, stiffness_of
+from real2sim_server.simulation.structure import STRUCTURES, YAW_RADIUS, stiffness_of, yaw_inertia
 from real2sim_server.world import World
 from real2sim_server.world.collision.face_pulse import advance_face_pulse, face_contact
 from real2sim_server.world.collision.manifold import contact_impulse, contact_manifold, corners

@@ -1,7 +1,11 @@
-"""Ways to solve, one module each, behind one Protocol."""
+"""Solver backends, one module or folder each, behind one Protocol."""
 
-from .base import Measure, Model, ParticleArrays, Simulation, SolverBackend
-from .select import BACKENDS, select_backend
+from __future__ import annotations
+
+import functools
+
+from ..errors import SolverError
+from ..model import Measure, Model, ParticleArrays, Simulation, SolverBackend
 
 __all__ = [
     "BACKENDS",
@@ -12,3 +16,31 @@ __all__ = [
     "SolverBackend",
     "select_backend",
 ]
+
+BACKENDS = ("cpu", "cuda", "reference")
+
+
+@functools.cache
+def select_backend(name: str = "auto") -> SolverBackend:
+    """Return the backend with this name.
+
+    Args:
+        name: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``: a GPU is used only on
+            request, because its last bits differ from the CPU's.
+
+    Raises:
+        SolverError: for an unknown name, or for ``cuda`` where no device is usable.
+    """
+    if name in ("auto", "cpu"):
+        from .cpu.backend import CpuSolverBackend
+
+        return CpuSolverBackend()
+    if name == "cuda":
+        from .cuda.backend import CudaSolverBackend
+
+        return CudaSolverBackend()
+    if name == "reference":
+        from .reference import ReferenceSolverBackend
+
+        return ReferenceSolverBackend()
+    raise SolverError(f"unknown backend {name!r}; allowed are 'auto' and {list(BACKENDS)}")

@@ -18,18 +18,9 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ..colliders import Collider, HeightField, Solid
-from ..contact.collider_distance import (
-    AXES,
-    COUNT_X,
-    COUNT_Y,
-    FIRST_HEIGHT,
-    KIND,
-    PLANE,
-    POINT,
-    SPACING,
-)
+from ..contact import AXES, COUNT_X, COUNT_Y, FIRST_HEIGHT, KIND, PLANE, POINT, SPACING
 from ..errors import ParticleError
-from .base import is_thin, pack_colliders
+from ..model import is_thin, pack_colliders
 
 Int = NDArray[np.int64]
 

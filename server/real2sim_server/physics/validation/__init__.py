@@ -5,22 +5,34 @@ Every case is a function of the backend's name and returns checks: measured, exp
 
 from collections.abc import Callable
 
-from .bending import cantilever, loaded_beam
 from .check import Check, ReferenceCurve
-from .contact import (
+from .elasticity import (
+    bar_on_wall,
+    cantilever,
+    confined_compression,
+    hertz,
+    loaded_beam,
+    stiff_discs,
+    two_discs,
+    vibrating_bar,
+)
+from .motion import (
+    affine_patch,
     braking,
     collinear_bars,
+    free_fall,
     frictionless_slide,
+    gradients,
     incline,
+    invariants,
     oblique_impact,
+    reproducibility,
     rest,
     restitution,
     rolling_ball,
+    scale_invariance,
+    spin,
 )
-from .elasticity import bar_on_wall, confined_compression, vibrating_bar
-from .gradients import gradients
-from .impact import hertz, stiff_discs, two_discs
-from .motion import affine_patch, free_fall, invariants, reproducibility, scale_invariance, spin
 
 Case = Callable[[str], list[Check]]
 """Takes the name of a backend."""

@@ -1,4 +1,4 @@
-"""One line of the validation table."""
+"""Checks of the validation table, and the small setups that cases share."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..body import Body
+from ..body import Body, box_particles
 from ..colliders import Collider
 from ..materials import Material
-from ..particles import box_particles
 from ..solver import Solver, SolverOptions
 
 
@@ -32,7 +31,7 @@ class ReferenceCurve:
 
 @dataclass(frozen=True)
 class Check:
-    """What was measured against what theory says.
+    """A measured value against theory.
 
     Attributes:
         name: what it is, with its case.

@@ -1,9 +1,14 @@
-"""Elastic bodies: waves, bending, stiffness, contact of balls."""
+"""Elastic bodies with known answers: waves, bending, stiffness, impacts and Hertz contact."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
+from ...geometry.rotation import Float
+from ..body import Body, Particles, ball_particles, box_particles
 from ..colliders import Box, Plane
 from ..materials import FixedCorotated
 from ..solver import Solver
@@ -147,3 +152,246 @@ def _pushes(solver: Solver) -> np.ndarray:
     impulses = np.array([np.abs(c.impulse) for c in solver.contacts])
     mean: np.ndarray = impulses.sum(axis=0) / 2
     return mean
+
+
+# A clamped beam: deflection and frequency (Euler and Bernoulli).
+
+LENGTH, HEIGHT, DX = 2.0, 0.2, 0.05
+MATERIAL = FixedCorotated(young=1e6, poisson=0.0, density=1000)
+BENDING = MATERIAL.young * HEIGHT**4 / 12
+"""E I [N m^2]."""
+SHEARING = 5 / 6 * MATERIAL.shear_modulus * HEIGHT**2
+"""k G A [N]."""
+LINE_DENSITY = MATERIAL.density * HEIGHT**2
+"""Mass per length [kg/m]."""
+
+
+def cantilever(backend: str) -> list[Check]:
+    """First mode of a beam, (1.875^2 / 2 pi) sqrt(E I / rho A L^4)."""
+    still = _beam()
+    x = still.particles.positions[:, 0]
+    velocity = np.zeros((len(x), 3))
+    velocity[:, 2] = 0.05 * np.clip(x / LENGTH, 0, None) ** 2
+    gradient = np.zeros((len(x), 3, 3))
+    gradient[:, 2, 0] = 0.1 * np.clip(x, 0, None) / LENGTH**2
+    body = replace(still, particle_velocities=velocity, particle_gradients=gradient)
+    exact = 1.875104**2 / (2 * np.pi) * math.sqrt(BENDING / LINE_DENSITY) / LENGTH**2
+    solver = solve([body], [_clamp()], backend=backend, dx=DX)
+    times, heights = _follow_tip(solver, x > LENGTH - 0.1, 0.01 / exact, 0.6 / exact)
+    falls = (heights[1:] < 0) & (heights[:-1] >= 0) & (times[1:] > 0.2 / exact)
+    i = int(np.flatnonzero(falls)[0])
+    fraction = heights[i] / (heights[i] - heights[i + 1])
+    half = times[i] + fraction * (times[i + 1] - times[i])
+    oscillation = heights.max() * np.sin(2 * np.pi * exact * times)
+    curve = ReferenceCurve(
+        times.tolist(), heights.tolist(), oscillation.tolist(), "time [s]", "tip [m]"
+    )
+    return [Check("cantilever: frequency", 0.5 / half, exact, 0.05 * exact, "Hz", curve)]
+
+
+def loaded_beam(backend: str, *, length: float | None = None) -> list[Check]:
+    """A weight on the tip bends the beam by P L^3 / 3 E I, its own by what a line load does.
+
+    Let go at rest it oscillates about that bend: the mean from rest to the lowest point. Shear adds
+    (P + q L / 2) L / k G A with k = 5/6 (Timoshenko). On the reference, which is slow, the beam is
+    half as long by default.
+    """
+    L = length or (LENGTH / 2 if backend == "reference" else LENGTH)
+    tip_mass, gravity, piece = LINE_DENSITY * L / 2, 0.025 * (LENGTH / L) ** 3, 0.05
+    beam = _beam(L)
+    x = beam.particles.positions[:, 0]
+    tip = x > L - piece
+    masses = np.where(tip, beam.particles.masses + tip_mass / tip.sum(), beam.particles.masses)
+    body = replace(beam, particles=replace(beam.particles, masses=masses))
+    a = L - piece / 2
+    point = tip_mass * gravity * a**3 / (3 * BENDING)
+    shape = a**2 * (6 * L**2 - 4 * L * a + a**2) / (24 * BENDING)
+    shear = (tip_mass * a + LINE_DENSITY * (L * a - a**2 / 2)) * gravity / SHEARING
+    exact = point + LINE_DENSITY * gravity * shape + shear
+    # Rayleigh's estimate is near enough to know when to expect the lowest point.
+    swinging = tip_mass + 33 / 140 * LINE_DENSITY * L
+    half = math.pi * math.sqrt(swinging * a**3 / (3 * BENDING))
+    solver = solve([body], [_clamp()], backend=backend, dx=DX, gravity=(0, 0, -gravity))
+    times, heights = _follow_tip(solver, tip, half / 60, 1.15 * half)
+    lowest = int(np.argmin(heights))
+    bend = -float(np.trapezoid(heights[: lowest + 1], times[: lowest + 1]) / times[lowest])
+    oscillation = -exact * (1 - np.cos(np.pi * times / times[lowest]))
+    curve = ReferenceCurve(
+        times.tolist(), heights.tolist(), oscillation.tolist(), "time [s]", "tip [m]"
+    )
+    return [Check("cantilever: bend under load", bend, exact, 0.05 * exact, "m", curve)]
+
+
+def _beam(length: float = LENGTH) -> Body:
+    return block(
+        MATERIAL,
+        size=(length + 0.2, HEIGHT, HEIGHT),
+        spacing=DX / 2,
+        at=(length / 2 - 0.1, 0, 0),
+    )
+
+
+def _clamp() -> Box:
+    """Holds all of the beam at x < 0."""
+    return Box(
+        name="clamp",
+        T_world_box=placed(-1.0),
+        size=(2, 4, 4),
+        friction=math.inf,
+        separable=False,
+    )
+
+
+def _follow_tip(
+    solver: Solver, tip: np.ndarray, every: float, duration: float
+) -> tuple[Float, Float]:
+    """Times and mean heights of the tip from its start."""
+    start = float(solver.particles().positions[tip, 2].mean())
+    times, heights = [0.0], [0.0]
+    while solver.time < duration:
+        solver.step(every)
+        times.append(solver.time)
+        heights.append(float(solver.particles().positions[tip, 2].mean()) - start)
+    return np.array(times), np.array(heights)
+
+
+# Elastic bodies in collision.
+
+_HERTZ_POWER = 1.5 * 1.07
+"""Hertz's indentation is close to sin(pi t)^(1.07), its force to the power 3/2 of that."""
+
+
+def two_discs(backend: str) -> list[Check]:
+    """Sulsky's discs on her 40 x 40 cells, and on half as many (Sulsky et al. 1994).
+
+    They touch when their surfaces do, rebound and part; what is lost shrinks with the cells.
+    """
+    radius, speed, finest = 0.2, 0.1, 0.025
+    fine, first_contact, start = _disc_run(backend, finest)
+    coarse, _, _ = _disc_run(backend, 2 * finest)
+    exact = (math.hypot(0.6, 0.6) - 2 * radius) / (2 * math.sqrt(2) * speed)
+    kept, kept_coarse = fine[0], coarse[0]
+    return [
+        Check("two discs: kinetic energy at the start, 1 m thick", start, 2.513, 0.02 * 2.513, "J"),
+        # Half a cell, as surfaces are that well known, and one check of the contacts.
+        Check("two discs: touch", first_contact, exact, 0.5 * finest / (2.83 * speed) + 0.02, "s"),
+        Check("two discs: kinetic energy gained", max(kept - 1, 0.0), 0, 1e-9),
+        Check("two discs: more is kept on smaller cells", float(kept > kept_coarse), 1, 0),
+        Check("two discs: parted", float(fine[1] > 2 * radius), 1, 0),
+    ]
+
+
+def _disc_run(backend: str, dx: float) -> tuple[tuple[float, float], float, float]:
+    """((kinetic energy kept, distance at the end), time of contact, initial energy / thickness)."""
+    thickness = 0.1
+    particles = disc_particles(0.2, thickness, spacing=dx / 2, density=1000)
+    material = FixedCorotated(young=1000, poisson=0.3, density=1000)
+    bodies = [
+        Body(
+            name=name,
+            particles=particles.moved(placed(0.5 + 0.3 * side, 0.5 + 0.3 * side)),
+            material=material,
+            velocity=(-0.1 * side, -0.1 * side, 0),
+        )
+        for name, side in (("left", -1), ("right", 1))
+    ]
+    solver = solve(bodies, backend=backend, dx=dx)
+    start = float(solver.measure.kinetic.sum())
+    first_contact = math.nan
+    while solver.time < 3.5:
+        solver.step(0.02)
+        if math.isnan(first_contact) and solver.contacts:
+            first_contact = solver.time
+    m = solver.measure
+    centre = m.momentum / m.mass[:, None]
+    # Of the discs as wholes: what still rings in them is not lost, but not kept either.
+    kept = float((m.mass * (centre**2).sum(1)).sum()) / 2 / start
+    apart = float(np.linalg.norm(m.centre[1] - m.centre[0]))
+    return (kept, apart), first_contact, start / thickness
+
+
+def stiff_discs(backend: str) -> list[Check]:
+    """Two discs of 1 GPa that meet at 114 m/s swap velocities (Nairn's two-disc example).
+
+    Up to what goes on ringing in them, for they meet at a seventh of the speed of sound.
+    """
+    diameter, dx = 0.05, 0.0025
+    material = FixedCorotated(young=1e9, poisson=0.33, density=1500)
+    speed = 0.07 * math.sqrt(material.young / material.density)
+    particles = disc_particles(diameter / 2, 2 * dx, spacing=dx / 2, density=1500)
+    bodies = [
+        Body(
+            name=name,
+            particles=particles.moved(placed(side * (diameter / 2 + 0.5 * dx))),
+            material=material,
+            velocity=(-side * speed, 0, 0),
+        )
+        for name, side in (("left", -1), ("right", 1))
+    ]
+    solver = solve(bodies, backend=backend, dx=dx)
+    solver.step(4e-4)
+    v = solver.measure.momentum[:, 0] / solver.measure.mass / speed
+    return [
+        Check("stiff discs: left goes as right came", float(v[0]), -1, 0.2),
+        Check("stiff discs: right goes as left came", float(v[1]), 1, 0.2),
+        Check("stiff discs: momentum", float(v.sum()), 0, 1e-9),
+    ]
+
+
+def hertz(backend: str) -> list[Check]:
+    """A ball on a rigid wall: t_c = 2.87 (m^2 / (R E*^2 v))^(1/5) (Johnson 1985, 11.24)."""
+    material = FixedCorotated(young=1e6, poisson=0.3, density=1000)
+    radius, speed, dx = 0.5, 0.5, 0.05
+    particles = ball_particles(radius, spacing=dx / 2, density=1000)
+    body = Body(
+        name="ball",
+        particles=particles.moved(placed(0, 0, radius + 0.1 * dx)),
+        material=material,
+        velocity=(0, 0, -speed),
+    )
+    solver = solve([body], [Plane(name="wall", friction=0)], backend=backend, dx=dx)
+    stiffness = material.young / (1 - material.poisson**2)
+    exact = 2.87 * (particles.mass**2 / (radius * stiffness**2 * speed)) ** 0.2
+    times, impulses = [0.0], [0.0]
+    while solver.time < 1.4 * exact:
+        solver.step(exact / 40)
+        times.append(solver.time)
+        impulses.append(float(solver.contacts[0].impulse[2]) if solver.contacts else 0.0)
+    J = np.array(impulses) / impulses[-1]
+    # The force law is symmetric: the middle 98 % of the impulse take 0.85 of the contact.
+    inner = float(np.interp(0.99, J, times) - np.interp(0.01, J, times))
+    force = np.diff(impulses).max() / (exact / 40)
+    depth = (15 * particles.mass * speed**2 / (16 * math.sqrt(radius) * stiffness)) ** 0.4
+    peak = 4 / 3 * stiffness * math.sqrt(radius) * depth**1.5
+    fraction = _hertz_fraction(0.01)
+    t = np.array(times[1:])
+    middle = float(np.interp(0.5, J, times))
+    phase = np.clip((t - middle) / exact + 0.5, 0, 1)
+    curve = ReferenceCurve(
+        t.tolist(),
+        (np.diff(impulses) / np.diff(times)).tolist(),
+        (peak * np.sin(np.pi * phase) ** _HERTZ_POWER).tolist(),
+        "time [s]",
+        "force of the wall [N]",
+    )
+    return [
+        Check("hertz: contact time", inner / fraction, exact, 0.1 * exact, "s"),
+        Check("hertz: peak force", float(force), peak, 0.15 * peak, "N", curve),
+    ]
+
+
+def _hertz_fraction(tail: float) -> float:
+    """Fraction of the contact time in which all but ``tail`` at each end of the impulse passes."""
+    t = np.linspace(0, 1, 2001)
+    J = np.cumsum(np.sin(np.pi * t) ** _HERTZ_POWER)
+    J /= J[-1]
+    return float(np.interp(1 - tail, J, t) - np.interp(tail, J, t))
+
+
+def disc_particles(radius: float, thickness: float, *, spacing: float, density: float) -> Particles:
+    """A disc across z, centred on the origin; volumes sum to the disc's."""
+    lattice = box_particles([2 * radius, 2 * radius, thickness], spacing=spacing, density=density)
+    inside = (lattice.positions[:, :2] ** 2).sum(axis=1) < radius**2
+    disc = lattice.take(inside)
+    volumes = np.full(len(disc), math.pi * radius**2 * thickness / len(disc))
+    return replace(disc, volumes=volumes, masses=density * volumes)

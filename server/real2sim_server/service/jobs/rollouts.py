@@ -27,18 +27,26 @@ from ...edit import ObjectState, ScenarioState
 from ...edit.compose import composed_background, contact_shadows
 from ...geometry.rotation import Float, quaternion_to_matrix
 from ...geometry.transform import transform_from
-from ...physics.colliders import Box, Capsule, Collider, Cylinder, HeightField, Plane, Solid
-from ...physics.triangle_mesh import TriangleMesh, TriangleSurface
+from ...physics.colliders import (
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    HeightField,
+    Plane,
+    Solid,
+    TriangleMesh,
+    TriangleSurface,
+)
 from ...render import Instance
 from ...scene import Scene, SceneObject
+from ...simulation.background import ground_collider
 from ...simulation.ego import EGO, with_ego
 from ...simulation.experiments.setups import set_up
-from ...simulation.ground import ground_collider
 from ...simulation.playback import PlacedObjects, Playback
-from ...simulation.presets import ObjectPhysics
+from ...simulation.presets import ObjectPhysics, with_values
 from ...simulation.result import ENERGIES, SimulationResult
 from ...simulation.rollout import SimulateOptions, simulate
-from ...simulation.values import with_values
 from ..http.problems import ServiceError
 
 NEARBY_DISTANCE = 25.0

@@ -15,9 +15,13 @@ from real2sim_proto.jobs import CalibrateRequest, JobInfo, SimulateRequest
 from ...edit import ScenarioState
 from ...render import Instance
 from ...scene import Scene
-from ...simulation.calibration import ObjectCalibration, Observation, calibrate_object
-from ...simulation.calibration.calibrate import CalibrationCancelled
-from ...simulation.calibration.requested import observations_of
+from ...simulation.calibration import (
+    CalibrationCancelled,
+    ObjectCalibration,
+    Observation,
+    calibrate_object,
+    observations_of,
+)
 from ...simulation.result import SimulationResult
 from ..http.idempotency import IdempotentRequest
 from ..http.problems import ServiceError

@@ -1,26 +1,432 @@
-"""Experiments set up on the vehicles of a scene: the paper's three, and crash tests."""
+"""Experiments on the vehicles of a scene: the paper's three, and crash tests on its street."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...geometry.box import box_penetration
 from ...geometry.rotation import Float
-from ...physics.colliders import Collider, Plane
+from ...geometry.transform import apply_transform
+from ...physics.colliders import Box, Collider, HeightField, Plane
 from ...physics.errors import PhysicsError
 from ...physics.materials import FixedCorotated
-from ...scene import Scene
+from ...scene import Camera, Scene
+from ..background import ground_collider
 from ..playback import PlacedObject, PlacedObjects
 from ..presets import ObjectPhysics, preset_of
 from ..rollout import SimulateOptions
 from ..spawn import object_particles, spaced_for
 from ..structure import VEHICLES
-from .crashes import CRASHES
-from .setup import Experiment, Request, beside, level, others_near, scene_road, viewer
-from .viewing import in_view, visibility_of
+
+# Viewpoints of the recording vehicle: a side that no camera saw cannot be shown.
+
+VIEWS_MAX = 24
+"""Recorded frames that are considered."""
+DEPTH_MIN = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """Visibility of an object over the recording.
+
+    Attributes:
+        direction: [3] towards the cameras, object frame, each view weighed by the solid angle the
+            object took up; its length grows with how well it was seen.
+        front, rear: solid angles of views that came from ahead and from behind, summed up.
+    """
+
+    direction: Float
+    front: float
+    rear: float
+
+    @property
+    def whole(self) -> float:
+        """All views together."""
+        return self.front + self.rear
+
+
+def visibility_of(scene: Scene, subject: PlacedObject) -> Visibility:
+    """Visibility of ``subject`` in all cameras of the scene."""
+    times = [int(t) for t in scene.frame_times_us if subject.trajectory.covers(int(t))]
+    total, front, rear = np.zeros(3), 0.0, 0.0
+    for t_us in times[:: max(len(times) // VIEWS_MAX, 1)]:
+        pose, ego = subject.trajectory.transform(t_us), scene.ego.transform(t_us)
+        for camera in scene.rig.cameras:
+            if not in_view(camera, ego, pose[:3, 3], farthest=np.inf):
+                continue
+            eye = camera.pose(ego)[:3, 3]
+            towards = (eye - pose[:3, 3]) @ pose[:3, :3]
+            distance = float(np.linalg.norm(towards))
+            angle = subject.scaled_size[1] * subject.scaled_size[2] / distance**2
+            total += angle * towards / distance
+            cosine = towards[0] / distance
+            front, rear = front + angle * max(cosine, 0.0), rear + angle * max(-cosine, 0.0)
+    return Visibility(total, front, rear)
+
+
+def in_view(
+    camera: Camera, T_world_vehicle: Float, point: Float, *, farthest: float, nearest: float = 0.0
+) -> bool:
+    """Whether a point of the world is on the camera's image, between two depths [m]."""
+    x, y, z = (camera.viewmat(T_world_vehicle) @ np.append(point, 1.0))[:3]
+    if not max(nearest, DEPTH_MIN) < z < farthest:
+        return False
+    u = camera.K[0, 0] * x / z + camera.K[0, 2]
+    v = camera.K[1, 1] * y / z + camera.K[1, 2]
+    return bool(0 < u < camera.width and 0 < v < camera.height)
+
+
+# Experiments, and the parts of a scene they need.
+
+SIDEWAYS, SLANT_MIN = 2.0, 0.25
+"""Near views stand at most so many times as far to the side as the recording saw it from, and at
+least so far."""
+ROAD_FRICTION = 0.7
+CLEARED = 11.0
+"""What takes no part is not shown this near to what happens [m]."""
+FROM_AHEAD = 0.18
+"""By how much a view from the side is from ahead as well."""
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A simulation and its camera.
+
+    Attributes:
+        name: of the experiment.
+        options: what to simulate.
+        subjects: objects that are shown.
+        focus: [3] point of the world that the near camera faces [m].
+        side: [3] direction from the focus to a near-by viewer, unit.
+        distance: of that viewer [m].
+        without: objects that are not shown.
+        slow: how many times slower films show it than it was.
+        follows: subject that the near-by viewer moves along with; None: he stays.
+    """
+
+    name: str
+    options: SimulateOptions
+    subjects: tuple[str, ...]
+    focus: Float
+    side: Float
+    distance: float
+    without: frozenset[str] = frozenset()
+    slow: float = 1.0
+    follows: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """Input of an experiment's setup.
+
+    Attributes:
+        scene, state: the scene, and its objects.
+        chosen: vehicles that may take part, the best seen first; as ``named`` if they were.
+        start_us: scene time [us].
+        preset: of the materials.
+        speed: [m/s]; None for the experiment's own.
+        grids: that objects will be given, see ``ObjectPhysics.grid``.
+    """
+
+    scene: Scene
+    state: PlacedObjects
+    chosen: tuple[PlacedObject, ...]
+    named: bool
+    start_us: int
+    preset: str
+    speed: float | None
+    grids: tuple[int, ...] = ()
+
+
+def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
+    """The scene's ground around all objects there at ``t_us`` and around the ego's path."""
+    there = [
+        o.trajectory.pose(t_us)[0][None, :2] for o in state.visible if o.trajectory.covers(t_us)
+    ]
+    places = np.concatenate([scene.ego.positions[:, :2], *there])
+    return ground_collider(scene.ground, places, friction=ROAD_FRICTION)
+
+
+def level(direction: Float) -> Float:
+    """The horizontal unit vector of a direction."""
+    flat = np.array([direction[0], direction[1], 0.0])
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+
+
+def viewer(
+    scene: Scene, subject: PlacedObject, pose: Float, *, slant: float, rise: float = 0.4
+) -> Float:
+    """Direction [3] to a viewer on the recorded side and end.
+
+    Args:
+        slant: how much to the side, against along the subject; less for a side hardly seen.
+        rise: how much up.
+    """
+    x, y, _ = visibility_of(scene, subject).direction
+    slant = min(slant, max(SIDEWAYS * abs(y) / max(abs(x), 1e-9), SLANT_MIN))
+    along = (1.0 if x >= 0 else -1.0) * level(pose[:3, 0])
+    side = (1.0 if y >= 0 else -1.0) * slant * level(np.cross([0, 0, 1], pose[:3, 0]))
+    direction: Float = level(along + side) + np.array([0.0, 0.0, rise])
+    return direction
+
+
+def beside(
+    scene: Scene,
+    subject: PlacedObject,
+    pose: Float,
+    *,
+    ahead: float = FROM_AHEAD,
+    rise: float = 0.35,
+) -> Float:
+    """Direction [3] to a viewer on the recorded side.
+
+    Args:
+        ahead: how much ahead, against to the side; little where what it runs into is broad, so that
+            it hides nothing.
+        rise: how much up.
+    """
+    forward = level(pose[:3, 0])
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    seen = 1.0 if visibility_of(scene, subject).direction[1] >= 0 else -1.0
+    direction: Float = seen * left + ahead * forward + np.array([0.0, 0.0, rise])
+    return direction
+
+
+def others_near(request: Request, options: SimulateOptions, focus: Float) -> frozenset[str]:
+    """Uninvolved objects that come near: they would drive through the experiment."""
+    times = options.start_us + np.linspace(0, options.duration * 1e6, 5).astype(np.int64)
+    return frozenset(
+        s.object_id
+        for s in request.state.visible
+        if s.object_id not in options.objects
+        and any(
+            np.linalg.norm(s.trajectory.pose(int(t))[0] - focus) < CLEARED
+            for t in times
+            if s.trajectory.covers(int(t))
+        )
+    )
+
+
+# Crash tests: frontal, T-bone, pole, roof.
+#
+
+AHEAD = 14.0
+"""From where the recording begins to where a crash takes place, along its path [m]."""
+GAP = 1.2
+"""To what is hit, at the start [m]."""
+BARRIER = (0.8, 2.4, 1.0)
+"""Depth, width, height of the block of a frontal crash [m]."""
+POLE, POLE_HEIGHT = 0.25, 2.6
+"""Of a lamp post: width and height [m]."""
+OFF_CENTRE = 0.12
+"""Of the width: where a pole meets a front, beside its middle."""
+ASIDE = 0.8
+"""Where a T-bone is looked at, from the middle of what is struck towards what strikes it [m]."""
+TURNED_OVER = np.radians(158.0)
+"""About its length, of a vehicle that falls on the edge of its roof (SAE J996 has 25 degrees of
+roll)."""
+FALL = 0.4
+"""Of the lowest corner above the road at the start of a roof crash [m]; it is falling by then."""
+FRAME_RATE, SLOW = 60.0, 4.0
+"""Frames a second, and how many times slower a film shows them than they were."""
+
+
+def frontal(request: Request) -> Experiment:
+    """One vehicle squarely into a block of concrete, at 15 m/s."""
+    subject = _best(request)
+    speed = 15.0 if request.speed is None else request.speed
+    pose, forward = _on_the_road(request, subject)
+    nose = pose[:3, 3] + subject.scaled_size[0] / 2 * forward
+    block = _standing_box(
+        "barrier", BARRIER, nose + (GAP + BARRIER[0] / 2) * forward, forward, request
+    )
+    focus = nose + (GAP - 0.9) * forward
+    side = beside(request.scene, subject, pose)
+    return _experiment(
+        request, "frontal", subject, speed * forward, [block], focus=focus, side=side
+    )
+
+
+def pole(request: Request) -> Experiment:
+    """One vehicle with its front into a post, at 12 m/s."""
+    subject = _best(request)
+    speed = 12.0 if request.speed is None else request.speed
+    pose, forward = _on_the_road(request, subject)
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    seen_side = np.sign(visibility_of(request.scene, subject).direction[1]) or 1.0
+    nose = pose[:3, 3] + subject.scaled_size[0] / 2 * forward
+    place = nose + (GAP + POLE / 2) * forward
+    place = place + seen_side * OFF_CENTRE * subject.scaled_size[1] * left
+    post = _standing_box("pole", (POLE, POLE, POLE_HEIGHT), place, forward, request)
+    # From ahead, where what a post leaves of a front is seen on both of its sides.
+    side = beside(request.scene, subject, pose, ahead=1.0, rise=0.65)
+    return _experiment(request, "pole", subject, speed * forward, [post], focus=nose, side=side)
+
+
+def t_bone(request: Request) -> Experiment:
+    """One vehicle into the middle of a standing vehicle's side, at 15 m/s."""
+    speed = 15.0 if request.speed is None else request.speed
+    runner = _best(request)
+    others = [s for s in _candidates(request) if s is not runner]
+    if not others:
+        raise PhysicsError("two vehicles are needed; name two with objects")
+    struck = _seen_best(request, others)
+    own, forward = _on_the_road(request, runner)
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    # The side that was seen is the one that is struck.
+    ahead = left if visibility_of(request.scene, struck).direction[1] >= 0 else -left
+    reach = runner.scaled_size[0] / 2 + GAP + struck.scaled_size[1] / 2
+    target = np.eye(4)
+    target[:3, :3] = np.stack([ahead, np.cross([0, 0, 1.0], ahead), [0, 0, 1.0]], axis=1)
+    target[:3, 3] = own[:3, 3] + reach * forward
+    target[2, 3] = _height(request, struck, target)
+    objects = {
+        runner.object_id: ObjectPhysics(T_world_object=own, velocity=speed * forward),
+        struck.object_id: ObjectPhysics(T_world_object=target, velocity=(0.0, 0.0, 0.0)),
+    }
+    # Along the struck side and past the runner, going along with the struck one: the dent is seen
+    # between them when they have parted.
+    side = ahead - 0.6 * forward + np.array([0.0, 0.0, 0.5])
+    focus = target[:3, 3] - ASIDE * forward
+    plan = _made(request, "t_bone", objects, [], focus=focus, side=side, distance=6.5)
+    return replace(plan, follows=struck.object_id)
+
+
+def roof(request: Request) -> Experiment:
+    """One vehicle upside down on the edge of its roof, as after a fall of 1.5 m."""
+    speed = 5.4 if request.speed is None else request.speed
+    subject = _best(request)
+    own, forward = _on_the_road(request, subject)
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    seen = 1.0 if visibility_of(request.scene, subject).direction[1] >= 0 else -1.0
+    # Turned over, the side that was seen is on the other side, and its edge comes down first.
+    turn = -seen * TURNED_OVER
+    side = forward - seen * 1.1 * left + np.array([0.0, 0.0, 0.08])
+    c, s = np.cos(turn), np.sin(turn)
+    own[:3, :3] = own[:3, :3] @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    half = np.array(subject.scaled_size) / 2
+    corners = half * (np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1)
+    lowest = float(apply_transform(own, corners)[:, 2].min())
+    road = request.scene.ground.height(own[0, 3], own[1, 3])
+    own[2, 3] += road + FALL - lowest
+    objects = {
+        subject.object_id: ObjectPhysics(T_world_object=own, velocity=(0.0, 0.0, -speed)),
+    }
+    focus = np.array([*own[:2, 3], road + half[2]])
+    return _made(request, "roof", objects, [], focus=focus, side=side, distance=6.3)
+
+
+CRASHES = {"frontal": frontal, "t_bone": t_bone, "pole": pole, "roof": roof}
+
+
+def _best(request: Request) -> PlacedObject:
+    """The first named vehicle, else the best recorded car."""
+    candidates = _candidates(request)
+    return candidates[0] if request.named else _seen_best(request, candidates)
+
+
+def _candidates(request: Request) -> list[PlacedObject]:
+    """The named vehicles, else all cars at the start; they are moved anyway."""
+    if request.named:
+        return list(request.chosen)
+    there = [
+        s
+        for s in request.state.visible
+        if s.category in VEHICLES and s.trajectory.covers(request.start_us)
+    ]
+    return [s for s in there if s.category == "car"] or there
+
+
+def _seen_best(request: Request, candidates: list[PlacedObject]) -> PlacedObject:
+    """The car with the best recorded front and side; unseen sides cannot be shown."""
+
+    def seen(subject: PlacedObject) -> float:
+        visibility = visibility_of(request.scene, subject)
+        return visibility.front * abs(float(visibility.direction[1]))
+
+    return max(candidates, key=seen)
+
+
+def _on_the_road(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
+    """Its pose [4, 4], moved to where crashes take place, and where it faces there [3]."""
+    pose = subject.trajectory.transform(request.start_us)
+    path = request.scene.ego.positions
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    before = float(np.interp(request.start_us, request.scene.ego.times_us, along))
+    place = [np.interp(before + AHEAD, along, path[:, k]) for k in range(2)]
+    moved = np.array(pose)
+    moved[:2, 3] = place
+    moved[2, 3] = _height(request, subject, moved)
+    return moved, level(pose[:3, 0])
+
+
+def _height(request: Request, subject: PlacedObject, pose: Float) -> float:
+    """Of its centre where it stands on the ground at the place of ``pose`` as it does now [m]."""
+    ground = request.scene.ground
+    x, y, z = subject.trajectory.transform(request.start_us)[:3, 3]
+    return float(z - ground.height(x, y) + ground.height(pose[0, 3], pose[1, 3]))
+
+
+def _standing_box(
+    name: str, size: tuple[float, float, float], at: Float, forward: Float, request: Request
+) -> Box:
+    """A box on the ground, across ``forward``."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([forward, np.cross([0, 0, 1.0], forward), [0, 0, 1.0]], axis=1)
+    pose[:2, 3] = at[:2]
+    pose[2, 3] = request.scene.ground.height(at[0], at[1]) + size[2] / 2
+    return Box(name=name, T_world_box=pose, size=size, friction=0.4)
+
+
+def _experiment(
+    request: Request,
+    name: str,
+    subject: PlacedObject,
+    velocity: Float,
+    obstacles: list[Collider],
+    *,
+    focus: Float,
+    side: Float,
+) -> Experiment:
+    """One vehicle on the road into obstacles."""
+    own, _ = _on_the_road(request, subject)
+    objects = {subject.object_id: ObjectPhysics(T_world_object=own, velocity=velocity)}
+    return _made(request, name, objects, obstacles, focus=focus, side=side, distance=6.0)
+
+
+def _made(
+    request: Request,
+    name: str,
+    objects: dict[str, ObjectPhysics],
+    obstacles: list[Collider],
+    *,
+    focus: Float,
+    side: Float,
+    distance: float,
+) -> Experiment:
+    road = scene_road(request.scene, request.state, request.start_us)
+    options = SimulateOptions(
+        preset=request.preset,
+        objects=objects,
+        colliders=[road, *obstacles],
+        start_us=request.start_us,
+        duration=1.0,
+        frame_rate=FRAME_RATE,
+    )
+    return Experiment(
+        name,
+        options,
+        tuple(objects),
+        focus,
+        side,
+        distance,
+        without=others_near(request, options, focus),
+        slow=SLOW,
+    )
+
 
 WALL_GAP = 0.5
 """Between the vehicle and the wall at the start [m]: contact after 1 s at 0.5 m/s."""
@@ -204,7 +610,7 @@ def _pair(request: Request) -> Experiment:
 def _way_aside(
     pair: Sequence[tuple[Float, Float]], placed: Sequence[tuple[Float, Float]], forward: Float
 ) -> Float:
-    """Shortest way [3] sideways that frees the boxes of a pair of all that are placed [m]."""
+    """Shortest sideways shift [3] that frees a pair's boxes of all placed ones [m]."""
     side = np.cross([0.0, 0.0, 1.0], forward)
     for k in range(ASIDE_TRIES):
         shift: Float = ASIDE_STEP * ((k + 1) // 2) * (1 if k % 2 else -1) * side
@@ -250,7 +656,7 @@ def _drop(request: Request) -> Experiment:
 
 
 def _reach(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
-    """How far an object's particles reaches back and forth along its own axes, [3] and [3] [m].
+    """Extent of an object's particles back and forth along its own axes, [3] and [3] [m].
 
     Tracked boxes are not that exact: particles reaches up to a voxel out of them.
     """

@@ -9,8 +9,7 @@ from typing import Self
 from real2sim_proto.episode import ContactSpec, EgoSpec
 
 from ...edit import ObjectState
-from ...simulation.masses import default_mass, yaw_inertia
-from ...simulation.structure import STRUCTURES, stiffness_of
+from ...simulation.structure import STRUCTURES, default_mass, stiffness_of, yaw_inertia
 from ..driving import vehicle_parameters
 from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion

@@ -11,9 +11,8 @@ import numpy as np
 from ...geometry.rotation import Float
 from ...scene import GaussianCloud
 from ...simulation import impact as crash
-from ...simulation.damage import Breakage, BreakageLog, DamagedVehicle
-from ...simulation.damage.appearance import HANGS_STILL
-from ...simulation.damage.parts import Part
+from ...simulation.breakage import Breakage, BreakageLog, Part
+from ...simulation.damage import HANGS_STILL, DamagedVehicle
 from .impact import Impact
 
 HARD = 5.0

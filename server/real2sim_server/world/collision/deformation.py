@@ -29,7 +29,8 @@ from ...physics.errors import PhysicsError
 from ...render.types import Instance
 from ...scene import GaussianCloud, Scene
 from ...simulation import impact as crash
-from ...simulation.damage import BreakageLog, DamagedVehicle, fragment_cloud
+from ...simulation.breakage import BreakageLog, fragment_cloud
+from ...simulation.damage import DamagedVehicle
 from ...simulation.embedding import Deformed, Embedding, deform_cloud, replaced_rows, stretched
 from ...simulation.structure import VEHICLES
 from .damage import DamageHistory, VehicleDamage

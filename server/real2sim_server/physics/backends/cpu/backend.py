@@ -4,20 +4,317 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
 from ....geometry.rotation import Float
 from ...colliders import Collider
-from ..base import Model
-from ..blocks import BlockSimulation
-from ..layout import CHUNKS, Int, Layout
-from ..particle import COLUMNS, ParticleState, Workspace
+from ...model import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
+from ...stress import LAW
+from ..layout import BLOCK, CHUNKS, COLLIDER_MARGIN, Int, Layout, arrange
+from . import particle as columns
 from .deform import SCRATCH
-from .kernels import advance
-from .measure import measure_blocks
+from .kernels import advance, measure_blocks
+from .particle import COLUMNS, NODES, TILE, ParticleState, StepParameters, Workspace
+
+# Loading, sorting, sums, contact totals and saving of particles in blocks.
+
+
+@dataclass(frozen=True, eq=False)
+class _Saved:
+    """All that changes, bit by bit; layouts are never written to and may be shared."""
+
+    state: ParticleState
+    blocks: Int
+    order: Int
+    layout: Layout
+    by_collider: Float
+    by_thin: Float
+    by_body: Float
+    totals: tuple[Float, Float]
+
+
+class WorkspaceShapes(NamedTuple):
+    """Shapes of :class:`Workspace` for one layout."""
+
+    tiles: tuple[int, ...]
+    moments: tuple[int, ...]
+    velocity: tuple[int, ...]
+    offset: tuple[int, ...]
+    by_collider: tuple[int, ...]
+    by_thin: tuple[int, ...]
+    by_body: tuple[int, ...]
+
+
+class BlockSimulation:
+    """A model in motion. Particles are kept sorted by block; see ``layout``."""
+
+    def __init__(self, model: Model, colliders: Sequence[Collider]) -> None:
+        self._model = model
+        self._dtype = model.dtype
+        self._space: dict[str, Any] = {}
+        bodies = model.bodies
+        self._totals = (
+            np.zeros((bodies, len(colliders), TOTALS)),
+            np.zeros((bodies, bodies, TOTALS)),
+        )
+        self._moved = 0.0
+        # Of few bits, which sort in linear time.
+        self._laws = model.table[model.material, LAW].astype(np.int16)
+        self._set_params(colliders)
+        self._load(model.start)
+        self._arrange(colliders)
+        self._substeps(0, self._dtype(0))
+
+    def _substeps(self, steps: int, dt: Any) -> tuple[int, bool]:
+        """Make up to ``steps`` substeps; how many, and whether particles must be sorted now.
+
+        No steps at all find the stress and energy of the particles as they stand.
+        """
+        raise NotImplementedError
+
+    def _measure_blocks(self) -> tuple[Float, Int]:
+        """Rows of sums [R, COLUMNS], see ``cpu.particle``, and the block [R] of each."""
+        raise NotImplementedError
+
+    def _load_state(self, state: ParticleState) -> ParticleState:
+        """The state where the backend computes."""
+        raise NotImplementedError
+
+    def _sort_state(self, state: ParticleState, xi: Any, order: Int) -> ParticleState:
+        """The state with other positions from the host, in another order."""
+        raise NotImplementedError
+
+    def _copy_state(self, state: ParticleState) -> ParticleState:
+        """A copy where the backend computes."""
+        raise NotImplementedError
+
+    def _fetch(self, array: Any) -> Any:
+        """An array on the host; not to be written to."""
+        raise NotImplementedError
+
+    def _make_work(self, layout: Layout) -> Workspace:
+        """Work space for a layout, contact totals at zero."""
+        raise NotImplementedError
+
+    def _allocate(self, size: int) -> Any:
+        """Uninitialised numbers [size] where the backend computes."""
+        raise NotImplementedError
+
+    def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
+        """Make ``steps`` substeps; sorts particles whenever one has left its block's reach."""
+        if any(c.moving for c in colliders):
+            for step in range(steps):
+                self._follow([c.after(step * dt) for c in colliders], dt)
+                self._run(1, dt, colliders)
+            return
+        self._run(steps, dt, colliders)
+
+    def _run(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
+        step = self._dtype(dt)
+        while steps > 0:
+            done, needs_resort = self._substeps(steps, step)
+            steps -= done
+            if needs_resort:
+                self._arrange(colliders)
+
+    def _follow(self, colliders: Sequence[Collider], dt: float) -> None:
+        """Take over new poses; arrange anew before a collider is out of the margin."""
+        self._set_params(colliders)
+        self._moved += dt * max(c.fastest_point for c in colliders)
+        if self._moved > COLLIDER_MARGIN / 2 * self._model.dx:
+            self._arrange(colliders)
+
+    def measure(self) -> Measure:
+        """Sums in float64, added up in the order of blocks."""
+        layout, bodies = self._layout, self._model.bodies
+        rows, block = self._measure_blocks()
+        # The middle one of the fields around a block is its own.
+        body = layout.field_body[layout.block_fields[block, 13]]
+        sums = np.zeros((bodies, columns.SUMS))
+        np.add.at(sums, body, rows[:, : columns.SUMS])
+        mass = sums[:, columns.MASS]
+        return Measure(
+            mass=mass,
+            centre=sums[:, columns.CENTRE : columns.MOMENTUM] / mass[:, None],
+            momentum=sums[:, columns.MOMENTUM : columns.SPIN],
+            angular_momentum=sums[:, columns.SPIN : columns.KINETIC],
+            kinetic=sums[:, columns.KINETIC],
+            elastic=sums[:, columns.ELASTIC],
+            max_speed=float(np.sqrt(rows[:, columns.SPEED_SQUARE].max())),
+            max_wave_speed=float(np.sqrt(rows[:, columns.WAVE_SQUARE].max())),
+            min_volume_ratio=float(rows[:, columns.VOLUME_RATIO].min()),
+        )
+
+    def particles(self) -> ParticleArrays:
+        """A copy in the model's order, float64."""
+        s, n = self._state, len(self._order)
+        cells = self._blocks * BLOCK + self._fetch(s.xi).astype(np.float64)
+        elastic = self._unsorted(s.F).reshape(n, 3, 3)
+        total = elastic.copy()
+        if len(s.F_total):
+            plastic = self._model.plastic
+            total[plastic] = self._unsorted(s.F_total).reshape(n, 3, 3)[plastic]
+        return ParticleArrays(
+            positions=self._in_model_order(cells * self._model.dx),
+            velocities=self._unsorted(s.v),
+            gradients=self._unsorted(s.L).reshape(n, 3, 3),
+            F_elastic=elastic,
+            F_total=total,
+            history=self._unsorted(s.history),
+        )
+
+    def contacts(self) -> tuple[Float, Float]:
+        """Totals of all arrangements so far."""
+        self._flush()
+        return self._totals[0].copy(), self._totals[1].copy()
+
+    def save(self) -> _Saved:
+        """Copy all that changes."""
+        return _Saved(
+            self._copy_state(self._state),
+            self._blocks.copy(),
+            self._order,
+            self._layout,
+            np.array(self._fetch(self._work.by_collider)),
+            np.array(self._fetch(self._work.by_thin)),
+            np.array(self._fetch(self._work.by_body)),
+            (self._totals[0].copy(), self._totals[1].copy()),
+        )
+
+    def restore(self, saved: _Saved) -> None:
+        """Go back, to the bit."""
+        self._state = self._copy_state(saved.state)
+        self._blocks, self._order = saved.blocks.copy(), saved.order
+        self._layout = saved.layout
+        self._work = self._make_work(saved.layout)
+        for held, kept in (
+            (self._work.by_collider, saved.by_collider),
+            (self._work.by_thin, saved.by_thin),
+            (self._work.by_body, saved.by_body),
+        ):
+            if kept.size:
+                held[:] = kept
+        self._totals = (saved.totals[0].copy(), saved.totals[1].copy())
+        # Where colliders stood when the layout was made is not kept, so count from its margin.
+        self._moved = np.inf
+
+    def _load(self, start: ParticleArrays) -> None:
+        """Particles in the model's order, each in the block of its first node."""
+        model, dtype = self._model, self._dtype
+        n = len(start.positions)
+        plastic = bool(model.plastic.any())
+        cells = start.positions / model.dx
+        self._blocks = _block_of(cells)
+        self._order = np.arange(n)
+        state = ParticleState(
+            xi=(cells - self._blocks * BLOCK).astype(dtype),
+            v=start.velocities.astype(dtype),
+            L=start.gradients.reshape(n, 9).astype(dtype),
+            F=start.F_elastic.reshape(n, 9).astype(dtype),
+            F_total=start.F_total.reshape(n, 9).astype(dtype)[: n if plastic else 0],
+            tau=np.zeros((n, 6), dtype),
+            energy=np.zeros(n, dtype),
+            history=start.history.astype(dtype),
+            mass=model.masses.astype(dtype),
+            volume=model.volumes.astype(dtype),
+            material=model.material.astype(np.int32),
+        )
+        self._state = self._load_state(state)
+
+    def _arrange(self, colliders: Sequence[Collider]) -> None:
+        """Sort the particles by block and find neighbours."""
+        s = self._state
+        at = self._fetch(s.xi)
+        if not (np.isfinite(at).all() and np.isfinite(self._fetch(s.v)).all()):
+            raise SolverDiverged
+        if hasattr(self, "_work"):
+            self._flush()
+        shift = _block_of(at)
+        # More than a few blocks in one go is no motion but a solver that diverges.
+        if np.abs(shift).max() > 1 << 10:
+            raise SolverDiverged
+        xi = (at - (shift * BLOCK).astype(self._dtype)).astype(self._dtype)
+        blocks = self._blocks + shift
+        bodies = self._model.body[self._order]
+        laws = self._laws[self._order]
+        order, self._layout = arrange(blocks, bodies, laws, self._model.dx, colliders)
+        self._state = self._sort_state(s, xi, order)
+        self._blocks, self._order = blocks[order], self._order[order]
+        self._work = self._make_work(self._layout)
+        self._moved = 0.0
+
+    def _shapes(self, layout: Layout) -> WorkspaceShapes:
+        blocks, fields = len(layout.block_coordinates), len(layout.field_coordinates)
+        bodies = self._model.bodies
+        return WorkspaceShapes(
+            tiles=(blocks, TILE, 4),
+            moments=(int(layout.block_moment.max(initial=-1)) + 1, TILE, 4),
+            velocity=(fields, NODES, 4),
+            offset=(fields, NODES, 4),
+            by_collider=(len(layout.contact_collider), TOTALS),
+            by_thin=(len(layout.thin_collider), TOTALS),
+            by_body=(fields if bodies > 1 else 0, bodies, TOTALS),
+        )
+
+    def _array(self, name: str, shape: tuple[int, ...]) -> Any:
+        """Uninitialised work space that is kept from layout to layout."""
+        size = int(np.prod(shape))
+        held = self._space.get(name)
+        if held is None or held.size < size:
+            held = self._space[name] = self._allocate(size + size // 4)
+        return held[:size].reshape(shape)
+
+    def _flush(self) -> None:
+        """Move the contact sums of this layout to the totals, in the order of fields."""
+        layout, work = self._layout, self._work
+        field = np.repeat(np.arange(len(layout.field_body)), np.diff(layout.contact_start))
+        np.add.at(
+            self._totals[0],
+            (layout.field_body[field], layout.contact_collider),
+            self._fetch(work.by_collider),
+        )
+        if work.by_collider.size:
+            work.by_collider[:] = 0
+        if work.by_thin.size:
+            block = np.repeat(np.arange(len(layout.thin_start) - 1), np.diff(layout.thin_start))
+            # The middle one of the fields around a block is its own.
+            body = layout.field_body[layout.block_fields[block, 13]]
+            np.add.at(self._totals[0], (body, layout.thin_collider), self._fetch(work.by_thin))
+            work.by_thin[:] = 0
+        if work.by_body.size:
+            np.add.at(self._totals[1], layout.field_body, self._fetch(work.by_body))
+            work.by_body[:] = 0
+
+    def _set_params(self, colliders: Sequence[Collider]) -> None:
+        rows, heights = pack_colliders(colliders, self._model.dx)
+        model, dtype = self._model, self._dtype
+        self._params = StepParameters(
+            table=model.table.astype(dtype),
+            dx=dtype(model.dx),
+            gravity=np.asarray(model.gravity, dtype),
+            friction=model.friction,
+            collider_rows=rows,
+            heights=heights,
+        )
+
+    def _unsorted(self, values: Any) -> Float:
+        return self._in_model_order(self._fetch(values))
+
+    def _in_model_order(self, values: Any) -> Float:
+        out = np.empty(values.shape, np.float64)
+        out[self._order] = values
+        return out
+
+
+def _block_of(cells: Any) -> Int:
+    """Block [N, 3] of the first node of particles at ``cells`` [N, 3]."""
+    blocks: Int = np.floor((cells - 0.5) / BLOCK).astype(np.int64)
+    return blocks
+
 
 PARTICLES_PER_THREAD = 5000
 """With fewer, threads gain little, and wait long for each other where others compute as well."""

@@ -20,9 +20,9 @@ from torch import Tensor
 from ....geometry.rotation import Float
 from ....render.backends.nvrtc.needs import unmet_need
 from ...colliders import Collider
-from ...contact.collider_distance import AXES, POINT, SPEED, SPIN
+from ...contact import AXES, POINT, SPEED, SPIN
 from ...errors import ParticleError, SolverError
-from ..base import Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
+from ...model import Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
 from ..layout import (
     BLOCK,
     BODY_BITS,
@@ -30,10 +30,9 @@ from ..layout import (
     COORDINATE_BITS,
     COORDINATE_LIMIT,
 )
-from . import records as r
+from . import launcher as records
 from .launcher import CudaLauncher, Launch, Launcher
-from .memory import SolverMemory
-from .sequences import advancing, arranging, flushing, measuring, substeps
+from .memory import SolverMemory, advancing, arranging, flushing, measuring, substeps
 
 INTERVAL = 16
 """Substeps that are queued at once: the solver checks as often, and sequences of launches that come
@@ -97,7 +96,7 @@ class CudaSimulation:
         done = 0
         while done == 0:
             begin = [Launch("begin_run", 1), *self._arranged(0)]
-            done = self._told([*begin, *advancing(self._sizes, r.DEFORMS)], 1)
+            done = self._launch([*begin, *advancing(self._sizes, records.DEFORMS)], 1)
 
     @property
     def _sizes(self) -> Any:
@@ -120,7 +119,7 @@ class CudaSimulation:
         fastest = max((c.fastest_point for c in colliders), default=0.0)
         done = 0
         while done < steps:
-            done = self._told(self._planned(done, steps, dt, fastest), steps)
+            done = self._launch(self._planned(done, steps, dt, fastest), steps)
 
     def measure(self) -> Measure:
         """Sums and bounds as the device had them at the end of the last substep."""
@@ -151,7 +150,7 @@ class CudaSimulation:
                 for axis in (2, 1, 0)
             ]
         )
-        cells = (blocks - COORDINATE_LIMIT) * BLOCK + values[r.XI : r.VELOCITY]
+        cells = (blocks - COORDINATE_LIMIT) * BLOCK + values[records.XI : records.VELOCITY]
 
         def in_order(rows: Float) -> Float:
             out = np.empty((rows.shape[1], rows.shape[0]))
@@ -159,18 +158,18 @@ class CudaSimulation:
             return out
 
         n = self._sizes.particles
-        elastic = in_order(values[r.ELASTIC_F : r.STRESS]).reshape(n, 3, 3)
+        elastic = in_order(values[records.ELASTIC_F : records.STRESS]).reshape(n, 3, 3)
         total = elastic.copy()
-        if memory.numbers > r.TOTAL_F:
+        if memory.numbers > records.TOTAL_F:
             plastic = self._model.plastic
-            total[plastic] = in_order(values[r.TOTAL_F :]).reshape(n, 3, 3)[plastic]
+            total[plastic] = in_order(values[records.TOTAL_F :]).reshape(n, 3, 3)[plastic]
         return ParticleArrays(
             positions=in_order(cells * self._model.dx),
-            velocities=in_order(values[r.VELOCITY : r.GRADIENT]),
-            gradients=in_order(values[r.GRADIENT : r.ELASTIC_F]).reshape(n, 3, 3),
+            velocities=in_order(values[records.VELOCITY : records.GRADIENT]),
+            gradients=in_order(values[records.GRADIENT : records.ELASTIC_F]).reshape(n, 3, 3),
             F_elastic=elastic,
             F_total=total,
-            history=in_order(values[r.HISTORY : r.MASS])[:, 0],
+            history=in_order(values[records.HISTORY : records.MASS])[:, 0],
         )
 
     def contacts(self) -> tuple[Float, Float]:
@@ -191,7 +190,7 @@ class CudaSimulation:
 
     def restore(self, saved: _Saved) -> None:
         """Go back, to the bit. Lists are made anew with particles in the blocks that they had."""
-        memory, first = self._memory, r.HELD.itemsize
+        memory, first = self._memory, records.HELD.itemsize
         # The device goes on with the set that it had current last.
         memory.sets[self._current].copy_(saved.particles)
         memory.report[first:].copy_(saved.totals[first:])
@@ -208,7 +207,7 @@ class CudaSimulation:
         """Launches of the substeps from ``done`` on, with sorting where it may be needed."""
         speed = math.sqrt(_largest(self._memory.measured(self._report)[:, 12]))
         stride = CAUTION * speed * dt / self._model.dx
-        reach = float(self._memory.measured(self._report)[:, r.REACH].max())
+        reach = float(self._memory.measured(self._report)[:, records.REACH].max())
         margin = COLLIDER_MARGIN / 2 * self._model.dx
         launches = [Launch("begin_run", 1, done)]
         while done < steps:
@@ -232,19 +231,19 @@ class CudaSimulation:
         self._moved = 0.0
         return launches
 
-    def _told(self, launches: list[Launch], steps: int) -> int:
+    def _launch(self, launches: list[Launch], steps: int) -> int:
         """Have launches done and measured; how many substeps are done."""
         ending = [*measuring(self._sizes), *flushing(self._sizes)]
         self._launcher.run((*launches, *ending), self._memory.space)
         self._report = self._memory.read_report()
         held = self._memory.held(self._report)
         fault = int(held["fault"])
-        if fault & r.DIVERGED:
+        if fault & records.DIVERGED:
             raise SolverDiverged
-        if fault & r.TOO_FAR:
+        if fault & records.TOO_FAR:
             raise self._too_far()
-        if fault & r.OVERFLOW:
-            self._memory.grow({name: int(held[name]) for name in r.CAPACITIES})
+        if fault & records.OVERFLOW:
+            self._memory.grow({name: int(held[name]) for name in records.CAPACITIES})
             self._keep, self._stale = self._kept, True
             return int(held["done"])
         self._stale = bool(held["stop_after"])
@@ -285,17 +284,17 @@ class CudaSimulation:
         memory.words(raw, 0)[:] = model.material
         memory.words(raw, 1)[:] = np.arange(n)
         values = memory.values(raw)
-        values[r.XI : r.VELOCITY] = (cells - blocks * BLOCK).T
-        values[r.VELOCITY : r.GRADIENT] = start.velocities.T
-        values[r.GRADIENT : r.ELASTIC_F] = start.gradients.reshape(n, 9).T
-        values[r.ELASTIC_F : r.STRESS] = start.F_elastic.reshape(n, 9).T
-        values[r.HISTORY], values[r.MASS], values[r.VOLUME] = (
+        values[records.XI : records.VELOCITY] = (cells - blocks * BLOCK).T
+        values[records.VELOCITY : records.GRADIENT] = start.velocities.T
+        values[records.GRADIENT : records.ELASTIC_F] = start.gradients.reshape(n, 9).T
+        values[records.ELASTIC_F : records.STRESS] = start.F_elastic.reshape(n, 9).T
+        values[records.HISTORY], values[records.MASS], values[records.VOLUME] = (
             start.history,
             model.masses,
             model.volumes,
         )
-        if memory.numbers > r.TOTAL_F:
-            values[r.TOTAL_F :] = start.F_total.reshape(n, 9).T
+        if memory.numbers > records.TOTAL_F:
+            values[records.TOTAL_F :] = start.F_total.reshape(n, 9).T
         return raw
 
 

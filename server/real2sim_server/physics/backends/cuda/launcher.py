@@ -1,4 +1,4 @@
-"""What the solver asks of a device, and the device that is a GPU."""
+"""The solver's interface to a device: compiled kernels, their records, and launches on a GPU."""
 
 from __future__ import annotations
 
@@ -11,9 +11,95 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .compile import compiled_kernels
-from .records import THREADS
-from .source import KERNELS
+from ...._nvrtc import KernelSource
+from ....render.backends.nvrtc.usage import Usage, usage_of
+from ...errors import SolverError
+from .source import FOLDER, KERNELS, SOURCE, solver_source
+
+# The kernels' structures as NumPy types: ``kernels/space.h``, field by field.
+
+THREADS = 128
+PIECE = 1024
+NODES, TILE, AROUND = 64, 512, 27
+COLUMNS, REACH = 16, 15
+DIGITS = 256
+DIVERGED, TOO_FAR, OVERFLOW = 1, 2, 4
+XI, VELOCITY, GRADIENT, ELASTIC_F, STRESS, ENERGY = 0, 3, 6, 15, 24, 30
+HISTORY, MASS, VOLUME, TOTAL_F = 31, 32, 33, 34
+"""First of the numbers of a particle that a name stands for."""
+MOVES, DEFORMS, SCATTERS = 1 << 16, 1 << 17, 1 << 18
+BY_LAW, FLIPPED = 15, 16
+BLOCKS, FIELDS, LISTS = range(3)
+
+LAYOUT = (
+    *("block_key", "field_key", "block_start", "block_fields", "block_near", "field_blocks"),
+    *("field_near", "group_start", "contact_start", "contact_collider", "contact_field"),
+    *("pair_start", "pair_field", "thin_start", "thin_collider", "thin_block"),
+    *("tiles", "moments", "velocity", "offset"),
+    *("by_collider", "by_pair", "by_thin", "touched", "rows"),
+)
+"""Arrays that grow with what particles touch."""
+CAPACITIES = ("blocks", "fields", "contacts", "pairs", "thins")
+_COUNTS = (
+    *("particles", "pitch", "plastic", "bodies", "colliders", "sort_blocks"),
+    *("block_capacity", "field_capacity", "contact_capacity", "pair_capacity", "thin_capacity"),
+    "unused",
+)
+SPACE = np.dtype(
+    [
+        ("sets", np.uint64, (2,)),
+        ("keys", np.uint64, (2,)),
+        ("order", np.uint64, (2,)),
+        *((name, np.uint64) for name in ("digit_counts", "counts", "sums")),
+        *((name, np.uint64) for name in LAYOUT),
+        *((name, np.uint64) for name in ("table", "friction", "heights", "step", "held")),
+        *((name, np.uint64) for name in ("measured", "collider_totals", "body_totals")),
+        ("dx", np.float64),
+        ("gravity", np.float64, (3,)),
+        *((name, np.uint32) for name in _COUNTS),
+    ]
+)
+STEP = np.dtype([("dt", np.float64), ("moving", np.uint32), ("unused", np.uint32)])
+HELD = np.dtype(
+    [
+        *((name, np.uint32) for name in ("current", "stop_after", "fault", "done")),
+        *((name, np.uint32) for name in ("blocks", "fields", "groups", "contacts", "pairs")),
+        ("thins", np.uint32),
+        ("unused", np.uint32, (6,)),
+    ]
+)
+
+
+def compiled_kernels(precision: str, architecture: str) -> bytes:
+    """The cubin for ``single`` or ``double`` and an architecture (``sm_90``), kept on the disk.
+
+    Raises:
+        SolverError: it does not compile; the message has NVRTC's words.
+    """
+    return _source(precision).kept(architecture)
+
+
+def compile_kernels(precision: str, architecture: str) -> tuple[bytes, dict[str, Usage]]:
+    """Cubin, which is kept on the disk, and what each kernel takes.
+
+    Raises:
+        SolverError: see :func:`compiled_kernels`.
+    """
+    code, log = _source(precision).compiled(architecture)
+    return code, usage_of(log)
+
+
+def _source(precision: str) -> KernelSource:
+    return KernelSource(
+        name=SOURCE.name,
+        kept_as=f"solver-{precision}",
+        text=solver_source(precision),
+        folder=FOLDER,
+        fma=True,  # As the CPU's kernels do.
+        diag_suppress=39,  # A law that is none divides by zero on purpose.
+        error=SolverError,
+    )
+
 
 GRAPHS = 32
 """Sequences of launches that are kept as graphs, of each simulation."""
@@ -56,11 +142,11 @@ class Launcher(Protocol):
         ...
 
     def host_memory(self, nbytes: int) -> Tensor:
-        """[nbytes] uint8 that the device can copy from and to without help."""
+        """[nbytes] uint8 of pinned host memory."""
         ...
 
     def wait(self) -> None:
-        """Return when all that was queued is done."""
+        """Wait for all queued work."""
         ...
 
 

@@ -1,8 +1,8 @@
-"""Memory of one simulation on the device: two sets of particles, lists, work space, a report."""
+"""Memory of one simulation on the device, and the sequences of kernels that work on it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,129 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....geometry.rotation import Float
-from ...contact.collider_distance import THIN
-from ..base import TOTALS, Model
-from . import records as r
-from .launcher import Launcher
-from .sequences import Sizes
+from ...contact import THIN
+from ...model import TOTALS, Model
+from . import launcher as records
+from .launcher import Launch, Launcher
+
+# Sequences of kernel launches; they do not depend on what particles do.
+
+KEY_BYTES = 8
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of launches: fixed for a simulation, and the capacity of its lists.
+
+    Attributes:
+        particles, bodies, colliders: numbers of each.
+        obstructed: whether there are thin colliders, which particles touch themselves.
+        laws: how many constitutive laws its particles follow.
+        sort_blocks: blocks of threads that share the list of particles when it is sorted.
+        blocks, fields, contacts, pairs, thins: room on the device, see ``kernels/space.h``.
+    """
+
+    particles: int
+    bodies: int
+    colliders: int
+    obstructed: bool
+    laws: int
+    sort_blocks: int
+    blocks: int
+    fields: int
+    contacts: int
+    pairs: int
+    thins: int
+
+    @property
+    def listed(self) -> int:
+        """Longest list that is summed up."""
+        return max(self.particles, records.AROUND * self.blocks, 3 * self.fields + self.blocks)
+
+
+def arranging(sizes: Sizes, *, keep: bool, step: int) -> list[Launch]:
+    """Sort particles and make all lists, for colliders as they stand in a substep.
+
+    Args:
+        sizes: of the simulation.
+        keep: particles stay in the blocks that they are in.
+        step: number of the substep.
+    """
+    by_particle = _groups(sizes.particles)
+    launches = [Launch("find_keys", by_particle, int(keep))]
+    passes = [records.BY_LAW] if sizes.laws > 1 else []
+    # Of one body all keys end alike.
+    passes += range(0 if sizes.bodies > 1 else 1, KEY_BYTES)
+    for number, one in enumerate(passes):
+        argument = one | (records.FLIPPED if number % 2 else 0)
+        launches += [
+            Launch("count_digits", sizes.sort_blocks, argument),
+            Launch("sum_digits", records.DIGITS),
+            Launch("scatter_digits", sizes.sort_blocks, argument),
+        ]
+    launches.append(Launch("reorder", by_particle, records.FLIPPED if len(passes) % 2 else 0))
+    launches.append(Launch("mark_blocks", by_particle))
+    launches += _summing(records.BLOCKS, sizes.particles)
+    launches.append(Launch("fill_blocks", by_particle))
+    met = records.AROUND * sizes.blocks
+    launches.append(Launch("mark_fields", _groups(met)))
+    launches += _summing(records.FIELDS, met)
+    launches.append(Launch("fill_fields", _groups(met)))
+    launches.append(Launch("link_fields", _groups(records.AROUND * sizes.fields)))
+    longest = _groups(max(sizes.fields, sizes.blocks))
+    launches.append(Launch("mark_lists", longest, step))
+    launches += _summing(records.LISTS, 3 * sizes.fields + sizes.blocks)
+    launches.append(Launch("fill_lists", longest, step))
+    launches.append(Launch("find_near", _groups(sizes.blocks)))
+    return launches
+
+
+def substeps(sizes: Sizes, first: int, end: int) -> list[Launch]:
+    """Substeps of these numbers: one launch, and two for each; more where colliders are thin."""
+    groups = _groups(sizes.fields * records.NODES)
+    launches = advancing(sizes, records.SCATTERS | first)
+    for step in range(first, end):
+        does = records.MOVES | records.DEFORMS | (records.SCATTERS if step + 1 < end else 0)
+        launches.append(Launch("collect_fields", groups, step))
+        launches += advancing(sizes, does | step)
+    return launches
+
+
+def advancing(sizes: Sizes, does: int) -> list[Launch]:
+    """Advance the particles of all blocks through the requested parts."""
+    launches = [Launch("advance_blocks", sizes.blocks, does)]
+    if sizes.obstructed:
+        launches.append(Launch("advance_obstructed", sizes.blocks, does))
+    return launches
+
+
+def flushing(sizes: Sizes) -> list[Launch]:
+    """Bring what contacts did to the totals of bodies."""
+    rows = sizes.contacts + sizes.pairs + sizes.thins
+    totals = sizes.bodies * (sizes.bodies + sizes.colliders)
+    return [
+        Launch("sum_contacts", _groups(rows * 16)),
+        Launch("add_totals", _groups(totals * 8)),
+    ]
+
+
+def measuring(sizes: Sizes) -> list[Launch]:
+    """Sums and bounds of the particles."""
+    return [Launch("measure_blocks", sizes.blocks), Launch("measure_bodies", sizes.bodies)]
+
+
+def _summing(which: int, length: int) -> list[Launch]:
+    pieces = -(-length // records.PIECE)
+    return [
+        Launch("add_pieces", pieces, which),
+        Launch("sum_pieces", 1, which),
+        Launch("spread_sums", pieces, which),
+    ]
+
+
+def _groups(threads: int) -> int:
+    return max(1, -(-threads // records.THREADS))
+
 
 SORT_BLOCKS = 512
 """At most so many blocks of threads share the list of particles."""
@@ -24,7 +142,7 @@ _U4, _U8, _F8 = 4, 8, 8
 
 
 class SolverMemory:
-    """What a simulation has on the device.
+    """Device memory of a simulation.
 
     Attributes:
         sizes: what there is room for.
@@ -40,7 +158,7 @@ class SolverMemory:
         n, bodies = len(model.masses), model.bodies
         self._real = np.dtype(model.dtype).itemsize
         self.pitch = -(-n // 64) * 64
-        self.numbers = r.TOTAL_F + (9 if model.plastic.any() else 0)
+        self.numbers = records.TOTAL_F + (9 if model.plastic.any() else 0)
         guess = n // 32 + 64
         self.sizes = Sizes(
             particles=n,
@@ -48,7 +166,7 @@ class SolverMemory:
             colliders=colliders,
             obstructed=bool((rows[:, THIN] > 0).any()),
             laws=len(np.unique(model.table[model.material, 0])),
-            sort_blocks=max(1, min(SORT_BLOCKS, n // (16 * r.THREADS))),
+            sort_blocks=max(1, min(SORT_BLOCKS, n // (16 * records.THREADS))),
             blocks=guess,
             fields=2 * guess,
             contacts=64,
@@ -59,16 +177,16 @@ class SolverMemory:
         self.sets = [self._zeros(set_bytes), self._zeros(set_bytes)]
         self._places = [
             0,
-            r.HELD.itemsize,
-            r.HELD.itemsize + bodies * r.COLUMNS * _F8,
-            r.HELD.itemsize + bodies * (r.COLUMNS + colliders * TOTALS) * _F8,
+            records.HELD.itemsize,
+            records.HELD.itemsize + bodies * records.COLUMNS * _F8,
+            records.HELD.itemsize + bodies * (records.COLUMNS + colliders * TOTALS) * _F8,
         ]
-        totals = bodies * (r.COLUMNS + (colliders + bodies) * TOTALS) * _F8
-        self.report = self._zeros(r.HELD.itemsize + totals)
-        self._told = launcher.host_memory(len(self.report))
+        totals = bodies * (records.COLUMNS + (colliders + bodies) * TOTALS) * _F8
+        self.report = self._zeros(records.HELD.itemsize + totals)
+        self._host_report = launcher.host_memory(len(self.report))
         self._staged = launcher.host_memory(0)
         self._spaces: dict[str, Tensor] = {}
-        self._space = self._zeros(r.SPACE.itemsize)
+        self._space = self._zeros(records.SPACE.itemsize)
         fixed = {
             "table": np.ascontiguousarray(model.table, model.dtype),
             "friction": np.ascontiguousarray(model.friction, np.float64),
@@ -86,7 +204,7 @@ class SolverMemory:
 
     def grow(self, wanted: dict[str, int]) -> None:
         """Make room for so many of each, and a quarter more; lists must be made anew."""
-        held = {name: getattr(self.sizes, name) for name in r.CAPACITIES}
+        held = {name: getattr(self.sizes, name) for name in records.CAPACITIES}
         more: dict[str, Any] = {n: c + c // 4 for n, c in wanted.items() if c > held[n]}
         self.sizes = replace(self.sizes, **more)
         for name, nbytes in self._bytes().items():
@@ -106,29 +224,29 @@ class SolverMemory:
 
     def upload_step(self, dt: float, moving: bool, rows: Float) -> None:
         """What the next substeps take, in one copy from memory of its own."""
-        step = np.zeros(1, r.STEP)
+        step = np.zeros(1, records.STEP)
         step["dt"], step["moving"] = dt, moving
-        nbytes = r.STEP.itemsize + rows.nbytes
+        nbytes = records.STEP.itemsize + rows.nbytes
         self._reserve_step(nbytes)
         staged = self._step_staged.numpy()
-        staged[: r.STEP.itemsize] = step.view(np.uint8)
-        staged[r.STEP.itemsize : nbytes] = rows.reshape(-1).view(np.uint8)
+        staged[: records.STEP.itemsize] = step.view(np.uint8)
+        staged[records.STEP.itemsize : nbytes] = rows.reshape(-1).view(np.uint8)
         self._spaces["step"][:nbytes].copy_(self._step_staged[:nbytes], non_blocking=True)
 
     def read_report(self) -> NDArray[np.uint8]:
         """The report, in one copy; waits for all that was queued."""
-        self._told.copy_(self.report, non_blocking=True)
+        self._host_report.copy_(self.report, non_blocking=True)
         self._launcher.wait()
-        return self._told.numpy().copy()
+        return self._host_report.numpy().copy()
 
     def held(self, report: NDArray[np.uint8]) -> Any:
         """The Held of a report."""
-        return report[: r.HELD.itemsize].view(r.HELD)[0]
+        return report[: records.HELD.itemsize].view(records.HELD)[0]
 
     def measured(self, report: NDArray[np.uint8]) -> Float:
         """[B, COLUMNS] sums and bounds of each body in a report."""
         values: Float = report[self._places[1] : self._places[2]].view(np.float64)
-        return values.reshape(-1, r.COLUMNS)
+        return values.reshape(-1, records.COLUMNS)
 
     def totals(self, report: NDArray[np.uint8]) -> tuple[Float, Float]:
         """Totals of contacts in a report, [B, K, TOTALS] and [B, B, TOTALS]."""
@@ -164,15 +282,15 @@ class SolverMemory:
         by_particle = {f"{name}_{k}": s.particles for name in ("keys", "order") for k in (0, 1)}
         return {
             **{n: c * (_U8 if n.startswith("keys") else _U4) for n, c in by_particle.items()},
-            "digit_counts": (s.sort_blocks + 1) * r.DIGITS * _U4,
+            "digit_counts": (s.sort_blocks + 1) * records.DIGITS * _U4,
             "counts": (s.listed + 1) * _U4,
-            "sums": (s.listed // r.PIECE + 2) * _U4,
+            "sums": (s.listed // records.PIECE + 2) * _U4,
             "block_key": s.blocks * _U8,
             "field_key": s.fields * _U8,
             "block_start": (s.blocks + 1) * _U4,
-            "block_fields": s.blocks * r.AROUND * _U4,
+            "block_fields": s.blocks * records.AROUND * _U4,
             "block_near": s.blocks * _U4,
-            "field_blocks": s.fields * r.AROUND * _U4,
+            "field_blocks": s.fields * records.AROUND * _U4,
             "field_near": s.fields * _U4,
             "group_start": (s.fields + 1) * _U4,
             "contact_start": (s.fields + 1) * _U4,
@@ -183,23 +301,23 @@ class SolverMemory:
             "thin_start": (s.blocks + 1) * _U4,
             "thin_collider": s.thins * _U4,
             "thin_block": s.thins * _U4,
-            "tiles": s.blocks * r.TILE * four,
-            "moments": s.blocks * r.TILE * four,
-            "velocity": s.fields * r.NODES * four,
-            "offset": s.fields * r.NODES * four,
-            "by_collider": s.contacts * r.NODES * TOTALS * _F8,
-            "by_pair": s.pairs * r.NODES * 2 * TOTALS * _F8,
-            "by_thin": s.thins * r.THREADS * TOTALS * _F8,
+            "tiles": s.blocks * records.TILE * four,
+            "moments": s.blocks * records.TILE * four,
+            "velocity": s.fields * records.NODES * four,
+            "offset": s.fields * records.NODES * four,
+            "by_collider": s.contacts * records.NODES * TOTALS * _F8,
+            "by_pair": s.pairs * records.NODES * 2 * TOTALS * _F8,
+            "by_thin": s.thins * records.THREADS * TOTALS * _F8,
             "touched": rows * 2 * TOTALS * _F8,
-            "rows": s.blocks * r.COLUMNS * _F8,
+            "rows": s.blocks * records.COLUMNS * _F8,
         }
 
     def _describe(self) -> None:
         """Tell the device where everything is."""
-        space = np.zeros(1, r.SPACE)
+        space = np.zeros(1, records.SPACE)
         at = self._launcher.pointer
         for name, held in self._spaces.items():
-            if name in (r.SPACE.names or ()):
+            if name in (records.SPACE.names or ()):
                 space[name] = at(held)
         for k in (0, 1):
             space["sets"][0, k] = at(self.sets[k])
@@ -216,13 +334,13 @@ class SolverMemory:
         s = self.sizes
         space["dx"], space["gravity"] = self._model.dtype(self._model.dx), self._model.gravity
         space["particles"], space["pitch"] = s.particles, self.pitch
-        space["plastic"] = self.numbers > r.TOTAL_F
+        space["plastic"] = self.numbers > records.TOTAL_F
         space["bodies"], space["colliders"], space["sort_blocks"] = (
             s.bodies,
             s.colliders,
             s.sort_blocks,
         )
-        for name in r.CAPACITIES:
+        for name in records.CAPACITIES:
             space[f"{name[:-1]}_capacity"] = getattr(s, name)
         self.upload(self._space, space)
 
@@ -242,3 +360,62 @@ class SolverMemory:
 
     def _zeros(self, nbytes: int) -> Tensor:
         return torch.zeros(nbytes, dtype=torch.uint8, device=self._launcher.device)
+
+
+# Bytes that a substep moves between memory and multiprocessors, counted rather than measured.
+
+_KEYS, _INDEX = 8, 4
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Of one substep, every array read or written by a kernel counted whole.
+
+    Attributes:
+        particles: positions, deformation, stress, velocities of particles.
+        tiles: what blocks scatter, written and read.
+        velocities: of nodes, written once and read by each block around them.
+        indices: neighbours of blocks and fields.
+        floor: what no order of work can save: position and deformation of a particle read and
+            written, its mass, volume and material read, and a node of the grid written and read.
+    """
+
+    particles: int
+    tiles: int
+    velocities: int
+    indices: int
+    floor: int
+
+    @property
+    def moved(self) -> int:
+        """All together."""
+        return self.particles + self.tiles + self.velocities + self.indices
+
+
+def substep_traffic(
+    *, particles: int, blocks: int, fields: int, nodes: int, plastic: bool, itemsize: int = 4
+) -> Traffic:
+    """What a substep in the middle of an interval moves where nothing touches.
+
+    Args:
+        particles: number of them.
+        blocks, fields: of the layout.
+        nodes: of the grid that particles give to.
+        plastic: whether particles have a total deformation and a history of their own.
+        itemsize: bytes of a number, 4 in single precision.
+    """
+    # Position, F, mass, volume, history are read; position, velocity, gradient, F, stress, energy
+    # are written. Material is a word.
+    numbers = 3 + 9 + 3 + (3 + 3 + 9 + 9 + 6 + 1)
+    least = 2 * (3 + 9) + 2
+    if plastic:
+        numbers += 9 + 9 + 1
+        least += 2 * (9 + 1)
+    node = 4 * itemsize
+    return Traffic(
+        particles=particles * (numbers * itemsize + _INDEX),
+        tiles=2 * blocks * records.TILE * node,
+        velocities=fields * records.NODES * node + blocks * records.TILE * node,
+        indices=(blocks + fields) * (records.AROUND * _INDEX + _KEYS),
+        floor=particles * (least * itemsize + _INDEX) + 2 * nodes * node,
+    )

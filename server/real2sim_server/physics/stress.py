@@ -2,7 +2,7 @@
 
 ``stress_update`` is the one entry: it takes the trial elastic deformation gradient and gives the
 elastic part that is left after plastic flow, the Kirchhoff stress tau, the stored energy per rest
-volume and the history variable. Formulas: reference in :mod:`..materials` at each class.
+volume and the history variable. Formulas: reference in :mod:`.materials` at each class.
 """
 
 from __future__ import annotations
@@ -10,9 +10,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ..numerics.device import F32, HALF, ONE, THREE, TWO, ZERO, device_function
-from ..numerics.matrices import (
+from .numerics import (
+    F32,
+    HALF,
+    ONE,
+    THREE,
+    TWO,
+    ZERO,
     det,
+    device_function,
     eigen_symmetric,
     multiply,
     polar_rotation,
@@ -20,21 +26,15 @@ from ..numerics.matrices import (
     symmetric_times,
     times_transposed,
 )
-from .material_row import (
-    COROTATED,
-    CRUSH,
-    DRUCKER_PRAGER,
-    LAMBDA,
-    LAW,
-    MU,
-    NEO_HOOKEAN,
-    SNOW,
-    VISCOPLASTIC,
-    VON_MISES,
-    A,
-    B,
-    C,
-)
+
+# A material as kernels read it: one row of numbers.
+
+COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW, CRUSH = range(7)
+"""Codes of constitutive laws in column LAW; see ``materials.CONSTITUTIVE_LAWS``."""
+LAW, MU, LAMBDA, VISCOSITY, A, B, C, PLASTIC = range(8)
+"""Columns. A, B and C are read by law. VISCOSITY above 0 damps; PLASTIC above 0 keeps F_total."""
+MATERIAL_ROW = 8
+
 
 SQRT_TWO_THIRDS = F32(math.sqrt(2 / 3))
 STRETCH_MIN = F32(0.05)
@@ -54,7 +54,7 @@ def stress_update(F: Any, history: Any, row: Any, dt: Any) -> Any:
     Args:
         F: trial deformation gradient, nine numbers.
         history: plastic memory; hardening [Pa], volume correction, or plastic volume ratio.
-        row: the material, see :mod:`.material_row`.
+        row: the material, a row with the columns above.
         dt: time since the last call [s]; 0 leaves rate-dependent flow out.
     """
     law = row[LAW]

@@ -1,8 +1,5 @@
 """What happens to one particle, on any device: transfer, deformation, and what it adds to sums."""
 
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
-# ruff: noqa: PLR0917
-
 from __future__ import annotations
 
 import math
@@ -11,17 +8,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..constitutive.material_row import LAMBDA, MU, PLASTIC, VISCOSITY
-from ..constitutive.stress import (
+from ...contact import resolve_particle_collider
+from ...numerics import F32, FOUR, HALF, ZERO, det, device_function
+from ...stress import (
+    LAMBDA,
+    MU,
+    PLASTIC,
+    VISCOSITY,
     add_viscosity,
     advance_gradient,
     stress_update,
     wave_hardening,
 )
-from ..contact.particle import resolve_particle_collider
-from ..numerics.device import F32, FOUR, HALF, ZERO, device_function
-from ..numerics.matrices import det
-from .layout import BLOCK
+from ..layout import BLOCK
+
+# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# ruff: noqa: PLR0917
+
 
 SIDE = 8
 """Nodes along an edge of a tile: a block and two nodes below and above."""

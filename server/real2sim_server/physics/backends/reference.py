@@ -1,24 +1,29 @@
-"""One substep in plain torch, as a pure function: slow, obvious, differentiable."""
+"""The reference backend: plain torch, float64, slow, obvious and differentiable.
 
-# The substep passes its pieces on by position, as kernels do.
-# ruff: noqa: PLR0917
+Other backends are tested against it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...colliders import Collider, Solid
-from ...constitutive import material_row
-from ...contact.node import ON_FACE, THIN_MARGIN
-from ...contact.surface import CRUSHED, FLAT_MOMENT, INSIDE, OPPOSED, STICKS, SURFACE
-from ..base import is_thin
-from .distance import collider_distance, first_touch
-from .stress import stress_update
+from ...geometry.rotation import Float
+from .. import stress
+from ..colliders import Collider, Solid
+from ..contact import CRUSHED, FLAT_MOMENT, INSIDE, ON_FACE, OPPOSED, STICKS, SURFACE, THIN_MARGIN
+from ..model import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, is_thin
+from .reference_laws import collider_distance, first_touch, stress_update, wave_hardening
+
+# One substep as a pure function; it passes its pieces by position, as kernels do.
+
+# ruff: noqa: PLR0917
+
 
 OFFSETS = torch.cartesian_prod(*[torch.arange(3)] * 3)
 """[27, 3] offsets of a particle's nodes from the first."""
@@ -51,7 +56,7 @@ class TorchState:
 
 @dataclass(frozen=True, eq=False)
 class TorchParameters:
-    """What holds for a run; gradients flow to masses, rows, friction and gravity.
+    """Constants of a run; gradients flow to masses, rows, friction and gravity.
 
     Attributes:
         mass, volume: [N].
@@ -73,7 +78,7 @@ class TorchParameters:
 
 @dataclass(frozen=True, eq=False)
 class NodeContact:
-    """What contact did to a body's nodes in one substep.
+    """Effect of contact on a body's nodes in one substep.
 
     Attributes:
         body: who was touched.
@@ -132,7 +137,7 @@ def _update_stress(
     dt: float,
 ) -> TorchState:
     F, tau, energy, history = stress_update(F, state.history, params.rows, dt)
-    eta = params.rows[:, material_row.VISCOSITY] * torch.linalg.det(F)
+    eta = params.rows[:, stress.VISCOSITY] * torch.linalg.det(F)
     tau = tau + eta[:, None, None] * (L + L.mT)
     return TorchState(x, v, L, F, F_total, tau, energy, history)
 
@@ -185,7 +190,7 @@ def _to_grid(
 
 
 def surface_offset(centroid: Tensor) -> Tensor:
-    """Where surfaces lie, from centroid offsets [cells]; see ``contact.surface``."""
+    """Where surfaces lie, from centroid offsets [cells]; see :mod:`..contact`."""
     return _interpolate(SURFACE_TABLE, centroid / 1.5)
 
 
@@ -206,7 +211,7 @@ def _depth(moment: Tensor, n: Tensor) -> Tensor:
 
 
 def coulomb(v: Tensor, n: Tensor, friction: Tensor, separable: bool) -> Tensor:
-    """Relative velocities [U, 3] after a contact; see ``contact.surface``."""
+    """Relative velocities [U, 3] after a contact; see :mod:`..contact`."""
     approach = (v * n).sum(-1, keepdim=True)
     t = v - approach * n
     square = t.square().sum(-1, keepdim=True)
@@ -264,7 +269,7 @@ def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _face_score(size: Tensor, fraction: Tensor) -> Tensor:
-    """How well first moments tell normals; see ``contact.surface``."""
+    """How well first moments tell normals; see :mod:`..contact`."""
     flat = _interpolate(FLAT_TABLE, fraction).clamp(min=1e-3)
     return (size / flat).clamp(max=1) ** 2 * size
 
@@ -304,7 +309,7 @@ def _resolve_collider_contact(
 def _distance_behind(
     solid: Collider, nodes: Tensor, moment: Tensor, dx: float
 ) -> tuple[Tensor, Tensor]:
-    """Distance [U] of nodes to the face that the body looks at; see ``contact.node``."""
+    """Distance [U] of nodes to the face that the body looks at, as ``resolve_node_collider``."""
     volume = moment[:, 3:]
     out = dx * moment[:, :3] / torch.where(volume > 0, volume, torch.ones_like(volume))
     distance, n = collider_distance(solid, nodes + out)
@@ -321,10 +326,11 @@ def _resolve_thin_colliders(
     dt: float,
     contacts: list[NodeContact],
 ) -> Tensor:
-    """Velocities [N, 3] of particles once thin colliders have had their say, body after body.
+    """Velocities [N, 3] of particles after contact with thin colliders, body after body.
 
-    See ``contact.particle``. On the CPU a particle is asked about those near its block alone, and
-    twice where they are several; asking about one more that it does not touch changes nothing.
+    See ``contact.resolve_particle_collider``. On the CPU a particle is asked about those near its
+    block alone, and twice where they are several; asking about one more that it does not touch
+    changes nothing.
     """
     thin = [(k, c) for k, c in enumerate(colliders) if is_thin(c, params.dx)]
     half = params.volume ** (1 / 3) / 2
@@ -356,3 +362,126 @@ def _material_velocity(collider: Collider, points: Tensor) -> Tensor:
     spin = torch.as_tensor(collider.angular_velocity).expand_as(arm)
     velocity: Tensor = torch.as_tensor(collider.velocity) + torch.linalg.cross(spin, arm)
     return velocity
+
+
+class ReferenceSolverBackend:
+    """Solver to compare others with, and to differentiate; see :func:`substep`."""
+
+    name = "reference"
+
+    def start(self, model: Model, colliders: Sequence[Collider]) -> ReferenceSimulation:
+        """Load a model; it always works in float64."""
+        return ReferenceSimulation(model, colliders)
+
+
+def torch_model(model: Model) -> tuple[TorchState, TorchParameters]:
+    """A model as tensors: where a differentiable rollout starts."""
+    start = model.start
+    table = torch.from_numpy(model.table)
+    params = TorchParameters(
+        mass=torch.from_numpy(model.masses),
+        volume=torch.from_numpy(model.volumes),
+        rows=table[torch.from_numpy(model.material)],
+        body=torch.from_numpy(model.body),
+        friction=torch.from_numpy(model.friction),
+        dx=model.dx,
+        gravity=torch.from_numpy(model.gravity),
+    )
+    n = len(start.positions)
+    state = TorchState(
+        x=torch.from_numpy(start.positions),
+        v=torch.from_numpy(start.velocities),
+        L=torch.from_numpy(start.gradients),
+        F=torch.from_numpy(start.F_elastic),
+        F_total=torch.from_numpy(start.F_total),
+        tau=torch.zeros(n, 3, 3, dtype=torch.float64),
+        energy=torch.zeros(n, dtype=torch.float64),
+        history=torch.from_numpy(start.history),
+    )
+    return with_stress(state, params), params
+
+
+class ReferenceSimulation:
+    """A model in motion; every substep makes a new state."""
+
+    def __init__(self, model: Model, colliders: Sequence[Collider]) -> None:
+        self._model = model
+        self._state, self._params = torch_model(model)
+        bodies = model.bodies
+        self._by_collider = np.zeros((bodies, len(colliders), TOTALS))
+        self._by_body = np.zeros((bodies, bodies, TOTALS))
+
+    def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
+        """Make ``steps`` substeps."""
+        with torch.no_grad():
+            for step in range(steps):
+                if not torch.isfinite(self._state.x).all():
+                    raise SolverDiverged
+                now = [c.after(step * dt) for c in colliders]
+                self._state, contacts = substep(self._state, self._params, now, dt)
+                for contact in contacts:
+                    self._record(contact)
+
+    def _record(self, contact: NodeContact) -> None:
+        totals = self._by_body if contact.by_body else self._by_collider
+        moment = torch.linalg.cross(contact.at, contact.impulse)
+        fraction = 0.5 if contact.by_body else 1.0
+        friction_work = -fraction * (contact.impulse * contact.slip).sum()
+        work = (contact.impulse * contact.velocity).sum()
+        row = torch.cat([contact.impulse.sum(0), moment.sum(0), torch.stack([friction_work, work])])
+        totals[contact.body, contact.other] += row.numpy()
+
+    def measure(self) -> Measure:
+        """Sums over each body."""
+        s, r = self._state, self._params
+        D = self._model.dx**2 / 4
+        axial = torch.stack(
+            [
+                s.L[:, 2, 1] - s.L[:, 1, 2],
+                s.L[:, 0, 2] - s.L[:, 2, 0],
+                s.L[:, 1, 0] - s.L[:, 0, 1],
+            ],
+            dim=1,
+        )
+        m = r.mass[:, None]
+        kinetic = r.mass / 2 * (s.v.square().sum(1) + D * s.L.square().sum((1, 2)))
+        mass = self._sum(r.mass)
+        J = torch.linalg.det(s.F)
+        stiffening = torch.maximum(s.F.square().sum((1, 2)) / 3, 1 / J.clamp(min=1e-2))
+        modulus = (r.rows[:, stress.LAMBDA] + 2 * r.rows[:, stress.MU]) * stiffening
+        modulus = modulus * wave_hardening(s.history, r.rows)
+        return Measure(
+            mass=mass,
+            centre=self._sum(m * s.x) / mass[:, None],
+            momentum=self._sum(m * s.v),
+            angular_momentum=self._sum(m * (torch.linalg.cross(s.x, s.v) + D * axial)),
+            kinetic=self._sum(kinetic),
+            elastic=self._sum(r.volume * s.energy),
+            max_speed=float(s.v.norm(dim=1).max()),
+            max_wave_speed=float((modulus * r.volume / r.mass).max().sqrt()),
+            min_volume_ratio=float(J.min()),
+        )
+
+    def _sum(self, values: torch.Tensor) -> Float:
+        shape = (self._model.bodies, *values.shape[1:])
+        total = torch.zeros(shape, dtype=torch.float64)
+        return total.index_add(0, self._params.body, values).numpy()
+
+    def particles(self) -> ParticleArrays:
+        """A copy of the state."""
+        s = self._state
+        arrays = (s.x, s.v, s.L, s.F, s.F_total, s.history)
+        return ParticleArrays(*(a.detach().numpy().copy() for a in arrays))
+
+    def contacts(self) -> tuple[Float, Float]:
+        """Totals since the start."""
+        return self._by_collider.copy(), self._by_body.copy()
+
+    def save(self) -> Any:
+        """The state; it is never written to."""
+        return self._state, self._by_collider.copy(), self._by_body.copy()
+
+    def restore(self, saved: Any) -> None:
+        """Go back."""
+        self._state = saved[0]
+        self._by_collider, self._by_body = saved[1].copy(), saved[2].copy()

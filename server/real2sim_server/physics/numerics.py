@@ -1,10 +1,62 @@
-"""3x3 matrices as tuples of nine numbers, row by row; symmetric ones xx, yy, zz, xy, xz, yz."""
+"""Scalar and tuple functions that the kernels of every backend use, and their decorators."""
 
 from __future__ import annotations
 
+import functools
+import math
 from typing import Any
 
-from .device import HALF, ONE, TINY, ZERO, device_function, square_root
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, overload, register_jitable
+
+from .._numba import func, kernel
+
+FASTMATH = {"contract", "nsz", "arcp"}
+"""Fused multiply-add and reciprocals; NaN and infinity keep their meaning, and show."""
+
+device_function: Any = register_jitable(fastmath=FASTMATH, error_model="numpy")
+"""Decorator of functions that kernels of every backend may call; Python may call them, too."""
+
+F32 = np.float32
+ZERO, HALF, ONE, TWO, THREE, FOUR = (F32(v) for v in (0, 0.5, 1, 2, 3, 4))
+THREE_QUARTERS, THREE_HALVES = F32(0.75), F32(1.5)
+TINY = F32(1e-30)
+
+
+def square_root(x: Any) -> Any:
+    """Square root of a number that is not negative.
+
+    In kernels an instruction of the processor, which loops over lanes become vector code with;
+    ``math.sqrt`` calls the C library for the sake of negative numbers.
+    """
+    return math.sqrt(x)
+
+
+@intrinsic
+def _root(typingctx, x):
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = context.get_value_type(signature.args[0])
+        name = f"llvm.sqrt.f{32 if kind == ir.FloatType() else 64}"
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(kind, [kind]), name
+        )
+        return builder.call(function, arguments)
+
+    return (x(x), generate) if isinstance(x, types.Float) else None
+
+
+@overload(square_root)
+def _square_root(x):
+    def root(x):
+        return _root(x)
+
+    return root
+
+
+# 3x3 matrices as tuples of nine numbers, row by row; symmetric ones as xx, yy, zz, xy, xz, yz.
 
 POLAR_STEPS = 16
 JACOBI_SWEEPS = 8
@@ -202,3 +254,27 @@ def recompose(values: Any, vectors: Any) -> Any:
         a * v[0] * v[6] + b * v[1] * v[7] + c * v[2] * v[8],
         a * v[3] * v[6] + b * v[4] * v[7] + c * v[5] * v[8],
     )
+
+
+# Quadratic B-splines.
+
+
+@device_function
+def spline_weights(f: Any) -> Any:
+    """Weights of the three nodes at offsets 0, 1, 2 for a particle at ``f`` in [0.5, 1.5).
+
+    f is the distance to the first node in cells. Jiang et al. 2016, MPM course, eq. 123.
+    """
+    left = THREE_HALVES - f
+    right = f - HALF
+    middle = right - HALF
+    return HALF * left * left, THREE_QUARTERS - middle * middle, HALF * right * right
+
+
+# Decorators of the CPU's kernels.
+
+inner: Any = functools.partial(func, fastmath=FASTMATH)
+"""Compiles functions that only entry points call; they are kept as part of those."""
+
+entry: Any = functools.partial(kernel, nogil=True, fastmath=FASTMATH)
+"""Compiles what Python calls: kept on disk, without the interpreter's lock."""

@@ -1,1 +1,0 @@
-"""The reference backend: plain torch, float64, differentiable; the oracle of the others."""

@@ -1,0 +1,647 @@
+"""Damaged vehicles as they are drawn: their Gaussians moved, folded, lit and broken.
+
+Particles report how far each place moved; this module derives how sheet metal looks. The same code
+serves simulated rollouts, REST and the closed loop.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..geometry.rotation import Float
+from ..scene import GaussianCloud
+from .breakage import Part, in_wheels, parts_of
+from .embedding import Deformed, Embedding, deform_cloud, replaced_rows
+
+# Crumpled sheet: flat facets between sharp ridges, in an irregular pattern.
+#
+# Sheet neither stretches nor bends in two directions at once, so a dent bends it along lines. Its
+# height above the smooth surface is linear in each facet. Facets are where the skin cuts the
+# tetrahedra of a lattice tilted in the vehicle, which needs no coordinates on the skin.
+
+CELLS = (0.5, 0.22)
+"""Sizes of facets and of the dents in them [m]."""
+HEIGHTS = (0.2, 0.04)
+"""Largest heights of their corners [m]."""
+HIGHEST = sum(HEIGHTS)
+STREAK = np.array([0.45, 0.45, 0.05])
+"""Length, width and height of scrapes [m]: what moves on a road scrapes along it."""
+SCRAPED_FROM, SCRAPE_EDGE = (0.68, 0.66), 0.1
+"""Of a field from 0 to 1, from where on paint is gone or smeared, and how soon wholly."""
+MAX_SCRAPE = (0.5, 0.3)
+"""Greatest share of paint that is gone, and that is smeared."""
+TABLE = 16
+"""Heights repeat after so many cells, more than a vehicle is long."""
+
+
+def crumple(points: Float, seed: int) -> tuple[Float, Float]:
+    """[G] height [m] and [G, 3] its gradient at points [G, 3] [m]."""
+    random = np.random.default_rng(seed)
+    height, slope = np.zeros(len(points)), np.zeros((len(points), 3))
+    for cell, most in zip(CELLS, HEIGHTS, strict=True):
+        turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
+        corners = random.uniform(-most, most, (TABLE,) * 3)
+        values, slopes = _piecewise(points @ turn / cell, corners)
+        height += values
+        slope += slopes @ turn.T / cell
+    return height, slope
+
+
+def scrapes(points: Float, seed: int) -> Float:
+    """[G, 2] how much of the paint at points [G, 3] [m] is scraped off, and how much is smeared
+    with what scraped it, where sheet is pushed in as deep as can be; from 0 to 1."""
+    random = np.random.default_rng(seed + 1)
+    found = np.zeros((len(points), 2))
+    for k, least in enumerate(SCRAPED_FROM):
+        corners = random.uniform(0.0, 1.0, (TABLE,) * 3)
+        values, _ = _piecewise(points / STREAK, corners)
+        found[:, k] = MAX_SCRAPE[k] * np.clip((values - least) / SCRAPE_EDGE, 0.0, 1.0)
+    return found
+
+
+def _piecewise(places: Float, corners: Float) -> tuple[Float, Float]:
+    """[G] values and [G, 3] slopes at places [G, 3] of a lattice of unit cells, linear in each of
+    the six tetrahedra of a cell between values at its ``corners`` [T, T, T]."""
+    corner = np.floor(places).astype(np.int64)
+    inside = places - corner
+    order = np.argsort(-inside, axis=1, kind="stable")
+    each = np.arange(len(places))
+
+    def value() -> Float:
+        x, y, z = (corner % len(corners)).T
+        found: Float = corners[x, y, z]
+        return found
+
+    values = value()
+    slopes = np.zeros(places.shape)
+    before = values.copy()
+    for k in range(3):
+        axis = order[:, k]
+        corner[each, axis] += 1
+        after = value()
+        slopes[each, axis] = after - before
+        values += inside[each, axis] * (after - before)
+        before = after
+    return values, slopes
+
+
+# Sheet metal under compression: it keeps its length and buckles out of plane.
+#
+# Particles are a tenth of a metre apart and only give a place's shortening. Sheet shortened by a
+# fraction 1 - s folds: with folds every ``wavelength`` of its own length and flat flanks, a chord
+# of s per unit length gives flanks at the angle acos(s) and an amplitude of wavelength / 4 sqrt(1 -
+# s^2). Flanks keep their length, so their Gaussians leave no gaps, and they turn, so that light
+# falls on them as on folds. A bonnet has one fold, at half its length, by design.
+
+WAVELENGTHS = (0.36, 0.17)
+"""Of folds and of the creases between them, along the sheet [m]."""
+SHARES = (0.8, 0.35)
+"""Of the shortening that each takes up."""
+IRREGULAR = 1.7
+"""By how much folds wander from straight lines [rad]."""
+ELASTIC = 0.03
+"""Shortening that leaves no fold."""
+KEPT = 0.5
+"""Of the largest shortening so far that stays folded when the body behind it springs back."""
+STEEPEST = 0.75
+"""Largest shortening by folds: flanks at 66 degrees."""
+SKIN = (0.25, 0.7)
+"""Distance from the middle of the particles about a point, in spacings, from which on it is inside
+and on the skin."""
+AROUND, NEIGHBOURS = 3.0, 64
+"""Particles about a point that say where outside is: within so many spacings, so many at most."""
+BONNET_BEHIND, BONNET_UP = 0.2, 0.55
+"""A bonnet is in this fraction of the length from the front, where the skin faces up so much."""
+BONNET_HEIGHT = 0.72
+"""Highest place of a bonnet, as a fraction of the vehicle's height."""
+ACROSS_BONNET = 0.35
+"""Of a bonnet's shortening that goes into folds besides."""
+BONNET_MOST = 0.32
+"""Height by which a bonnet rises at most [m]."""
+SKY, SIDE = 0.45, 0.55
+"""Shares of light from all of the sky and from one side."""
+GROUND = 0.3
+"""Of the sky's light that reaches what faces down."""
+SLANT, HEIGHT = 0.6, 0.8
+"""Of light from one side: how far beside the normal at rest, and how high it stands."""
+AHEAD = np.array([0.45, 0.4, 0.0])
+"""Where it comes from for what faces up."""
+DARKEST, BRIGHTEST = 0.35, 1.7
+DENT = (0.03, 0.14)
+"""Depths from which on sheet that was pushed in is crumpled, and wholly so [m]."""
+HOLLOW = 0.4
+"""Light that the lowest facets of a deep dent lose to its rim and to the others."""
+FLATTER = 0.4
+"""Of the height of facets by which what is drawn is moved; it is lit by all of their slope, as what
+is drawn is too coarse to show it otherwise."""
+OCCLUDED = 0.4
+"""Light that is lost at the bottom of a deep fold."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoldedSheet:
+    """Positions and looks of points on a sheet.
+
+    Attributes:
+        deformed: positions, F and rotation of each point.
+        light: [G] light on it against what fell on it before.
+        scraped: [G, 2] how much of the paint is gone, and how much is smeared; 0 to 1.
+    """
+
+    deformed: Deformed
+    light: Float
+    scraped: Float
+
+
+class Sheet:
+    """The skin of a vehicle.
+
+    Args:
+        points: [G, 3] in the vehicle's frame [m].
+        rest: [N, 3] particles at rest in the same frame [m].
+        spacing: of the particles [m].
+        size: (length, width, height) of the vehicle [m].
+        smooth: [G] points that never fold, as wheels and glass.
+        seed: of where folds are.
+    """
+
+    def __init__(
+        self,
+        points: Float,
+        rest: Float,
+        *,
+        spacing: float,
+        size: Sequence[float],
+        smooth: NDArray[np.bool_],
+        seed: int,
+    ) -> None:
+        self.normals, depth = _outward(points, rest, spacing)
+        skin = np.clip((depth - SKIN[0]) / (SKIN[1] - SKIN[0]), 0.0, 1.0)
+        self._foldable = skin * ~smooth
+        self._points = points
+        self._along = _phases(points, seed)
+        self._crumple, self._crumple_slope = crumple(points, seed)
+        self._scrapes = scrapes(points, seed)
+        place = points / np.asarray(size) + 0.5
+        bonnet = (self.normals[:, 2] > BONNET_UP) & (place[:, 2] < BONNET_HEIGHT)
+        bonnet &= (place[:, 0] > 1 - BONNET_BEHIND) & ~smooth
+        self.bonnet = bonnet
+        self._bonnet_length = BONNET_BEHIND * size[0]
+        self._hinge = np.clip((place[:, 0] - 1 + BONNET_BEHIND) / BONNET_BEHIND, 0.0, 1.0)
+
+    def shortening(self, F: Float) -> Float:
+        """[G, 3] fraction by which sheet is shortened along the vehicle's axes."""
+        shorter: Float = np.clip(1 - np.linalg.norm(F, axis=1) - ELASTIC, 0.0, STEEPEST)
+        return shorter
+
+    def fold(self, body: Deformed, most: Float, rows: NDArray[np.int64]) -> FoldedSheet:
+        """The sheet on a body.
+
+        Args:
+            body: how R points move with the particles around them.
+            most: [R, 3] their largest shortening so far, of this instant too.
+            rows: [R] which points; all of a bonnet or none.
+        """
+        at_rest, foldable = self.normals[rows], self._foldable[rows]
+        shortened = np.maximum(self.shortening(body.F), KEPT * most) * foldable[:, None]
+        # A sheet is shortened along itself only.
+        shortened = shortened * (1 - at_rest**2)
+        normals = _turned(body.rotations, at_rest)
+        raised, hump = self._bonnet_rise(shortened, rows)
+        shortened[self.bonnet[rows], 0] *= ACROSS_BONNET
+        pressed = self._pressed(body, rows) * np.minimum(4 * foldable, 1.0)
+        offset, deepest = FLATTER * pressed * self._crumple[rows], np.zeros(len(normals))
+        tilted = _faces(body.F, at_rest)
+        slope = self._crumple_slope[rows]
+        slope = slope - (slope * at_rest).sum(axis=1)[:, None] * at_rest
+        tilted -= pressed[:, None] * _turned(body.rotations, slope)
+        F = body.F.copy()
+        for axis in range(3):
+            along = F[:, :, axis] / np.maximum(np.linalg.norm(F[:, :, axis], axis=1), 1e-6)[:, None]
+            for k, (wavelength, share) in enumerate(zip(WAVELENGTHS, SHARES, strict=True)):
+                sine = np.sqrt(1 - (1 - share * shortened[:, axis]) ** 2)
+                wave, slope = _triangle(self._along[axis, k, rows])
+                offset += wavelength / 4 * sine * wave
+                tilted -= (sine * slope)[:, None] * along
+                deepest += sine * (1 - wave) / 2
+        tilted -= hump[:, None] * F[:, :, 0]
+        tilted /= np.maximum(np.linalg.norm(tilted, axis=1), 1e-9)[:, None]
+        up = np.zeros((len(normals), 3))
+        up[:, 2] = raised
+        positions = body.positions + offset[:, None] * normals + up
+        tilt = _between(normals, tilted)
+        F = tilt @ _lengthened(F, shortened)
+        towards = _lit_from(at_rest)
+        light = _light(tilted, towards) / _light(at_rest, towards)
+        light *= 1 - OCCLUDED * np.clip(deepest, 0.0, 1.0)
+        light *= 1 - HOLLOW * pressed * (1 - self._crumple[rows] / HIGHEST) / 2
+        scraped = self._scrapes[rows] * pressed[:, None]
+        light = np.where(foldable > 0, np.clip(light, DARKEST, BRIGHTEST), 1.0)
+        return FoldedSheet(Deformed(positions, F, tilt @ body.rotations), light, scraped)
+
+    def _pressed(self, body: Deformed, rows: NDArray[np.int64]) -> Float:
+        """[R] how far points were pushed in, from 0 to 1 (the greatest visible depth)."""
+        depth = -((body.positions - self._points[rows]) * self.normals[rows]).sum(axis=1)
+        pressed: Float = np.clip((depth - DENT[0]) / (DENT[1] - DENT[0]), 0.0, 1.0)
+        return pressed
+
+    def _bonnet_rise(self, shortened: Float, rows: NDArray[np.int64]) -> tuple[Float, Float]:
+        """[R] height by which the bonnet is raised, [R] and its slope."""
+        raised, slope = np.zeros(len(shortened)), np.zeros(len(shortened))
+        bonnet = self.bonnet[rows]
+        if not bonnet.any():
+            return raised, slope
+        by = float(np.quantile(shortened[bonnet, 0], 0.6))
+        sine = np.sqrt(1 - (1 - by) ** 2)
+        rise = min(self._bonnet_length / 2 * sine, BONNET_MOST)
+        hinge = self._hinge[rows]
+        ridge = 1 - np.abs(2 * hinge - 1)
+        slope = np.where(hinge < 0.5, 1.0, -1.0) * 2 * rise / self._bonnet_length
+        return rise * ridge * bonnet, slope * bonnet
+
+
+def _outward(points: Float, rest: Float, spacing: float) -> tuple[Float, Float]:
+    """[G, 3] normals, away from the particles about each point, and how far away [spacings]."""
+    from scipy.spatial import cKDTree
+
+    nearest = np.arange(1, min(NEIGHBOURS, len(rest)) + 1)
+    distance, index = cKDTree(rest).query(points, k=nearest)
+    weights = np.maximum(1 - (distance / (AROUND * spacing)) ** 2, 1e-6)
+    middle = (weights[:, None] @ rest[index])[:, 0] / weights.sum(axis=1, keepdims=True)
+    away = points - middle
+    depth = np.linalg.norm(away, axis=1)
+    return away / np.maximum(depth, 1e-9)[:, None], depth / spacing
+
+
+def _phases(points: Float, seed: int) -> Float:
+    """[3, 2, G] phases of folds and creases along each axis; they wander with the other axes."""
+    random = np.random.default_rng(seed)
+    shifts = random.uniform(0, 2 * np.pi, (3, len(WAVELENGTHS), 3))
+    phases = np.zeros((3, len(WAVELENGTHS), len(points)))
+    for axis in range(3):
+        one, two = (axis + 1) % 3, (axis + 2) % 3
+        for k, wavelength in enumerate(WAVELENGTHS):
+            a, b, c = shifts[axis, k]
+            slanted = points[:, axis] + (0.0, 0.6)[k] * (points[:, one] + points[:, two])
+            wander = np.sin(points[:, one] / (0.23 * (2 - k)) + b)
+            wander = wander + np.sin(points[:, two] / (0.17 * (2 - k)) + c)
+            phases[axis, k] = 2 * np.pi * slanted / wavelength + a + IRREGULAR / 2 * wander
+    return phases
+
+
+def _triangle(phase: Float) -> tuple[Float, Float]:
+    """A wave in [-1, 1] with flat flanks and slightly rounded edges, and its slope in [-1, 1]."""
+    sharp = 0.94
+    wave = np.arcsin(sharp * np.sin(phase)) / np.arcsin(sharp)
+    slope = sharp * np.cos(phase) / np.sqrt(1 - (sharp * np.sin(phase)) ** 2)
+    return wave, slope
+
+
+def _lengthened(F: Float, shortened: Float) -> Float:
+    """F with the length back that folding takes up."""
+    factors = 1 / np.maximum(1 - shortened, 1 - STEEPEST)
+    longer: Float = F * factors[:, None, :]
+    return longer
+
+
+def _turned(rotations: Float, vectors: Float) -> Float:
+    turned: Float = (rotations @ vectors[:, :, None])[:, :, 0]
+    return turned
+
+
+def _faces(F: Float, normals: Float) -> Float:
+    """[G, 3] unit ``normals`` of surfaces after the map F [G, 3, 3]."""
+    faces = np.linalg.solve(F.transpose(0, 2, 1), normals[:, :, None])[:, :, 0]
+    found: Float = faces / np.maximum(np.linalg.norm(faces, axis=1), 1e-9)[:, None]
+    return found
+
+
+def _between(first: Float, second: Float) -> Float:
+    """[G, 3, 3] smallest rotations that turn unit vectors ``first`` [G, 3] to ``second``."""
+    axis = np.cross(first, second)
+    cosine = np.clip((first * second).sum(axis=1), -0.99, 1.0)
+    cross = np.zeros((len(first), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
+    cross -= cross.transpose(0, 2, 1)
+    turned: Float = np.eye(3) + cross + cross @ cross / (1 + cosine)[:, None, None]
+    return turned
+
+
+def _lit_from(normals: Float) -> Float:
+    """[G, 3] direction of the light on surfaces with unit ``normals`` [G, 3] at rest.
+
+    What a surface shows at rest is how it was lit when it was seen, whichever side that was. So
+    light comes from above and beside each surface, never along it: however it is turned, it gets
+    lighter or darker.
+    """
+    x, y = normals[:, 0], normals[:, 1]
+    beside = np.stack([x - y, x + y, np.zeros(len(x))], axis=1) * np.sqrt(0.5)
+    towards = SLANT * beside + (1 - np.hypot(x, y))[:, None] * AHEAD
+    towards[:, 2] = HEIGHT
+    found: Float = towards / np.linalg.norm(towards, axis=1)[:, None]
+    return found
+
+
+def _light(normals: Float, towards: Float) -> Float:
+    """[G] light on surfaces with unit ``normals`` [G, 3]."""
+    sky = SKY * (GROUND + (1 - GROUND) * (1 + normals[:, 2]) / 2)
+    light: Float = sky + SIDE * np.maximum((normals * towards).sum(axis=1), 0.0)
+    return light
+
+
+SH_0 = 0.28209479177387814
+GLASS_DARKER = 0.7
+"""Glass is what is darker than so much of the vehicle's paint, within a pane's place."""
+OTHER_HUE = 0.05
+"""Or what differs by so much in a channel's share of the light: glass that shows the sky."""
+LEANING = 0.12
+"""Of the width, by which side windows lean inwards."""
+OF_GLASS = 0.1
+"""A windscreen differs from paint by so much."""
+SILLS = 0.3
+"""Below this fraction of a vehicle's height there are wheels and shadow."""
+OTHER_COLOUR = 0.22
+"""A lamp is what differs by so much from the colour of most of the vehicle, within its place."""
+LAMP_DARKER, LAMP_SHARE = 0.6, 0.6
+"""And is not darker than so much of it, as grilles are; the most unlike of these, this share."""
+LAMP_LEFT, PANE_LEFT = 0.22, 0.35
+"""Light that comes from the hole where a lamp or a pane was."""
+CRACKED = np.array([0.62, 0.67, 0.68])
+"""What laminated glass shows where it is crazed."""
+CRAZED = 0.55
+"""Of a cracked windscreen that is crazed."""
+BARE, SMEAR = np.array([0.55, 0.56, 0.57]), np.array([0.1, 0.1, 0.1])
+"""Metal under scraped paint; rubber, plastic and dirt that scraping leaves."""
+DROOP, DROOP_TIME = 0.16, 0.35
+"""Angle by which a loose bumper hangs down at one end [rad], and in what time [s]."""
+HANGS_STILL = 3 * DROOP_TIME
+"""After so long a loose bumper has come to rest [s]: it would sink by less than 0.1 mm more."""
+LOOSE = 0.25
+"""How far its loose end stands off, against how far it hangs down."""
+CLEARANCE = 0.04
+"""Of a loose bumper above the road [m]."""
+MIN_DISPLACEMENT = 8e-3
+"""Particles that have moved less than this leave Gaussians where they are [m]: a body hit hard
+bends elastically by several millimetres all along, and the slowest impact that deforms at all
+dents by more than twice as much."""
+CARRIED_ROUNDS, CARRIED_SCALE = 5, 0.01
+"""How often weights are found anew, and what counts as little [m], where it is found how a vehicle
+has moved as a whole."""
+SPLIT = 1.5
+"""Gaussians stretched by more are drawn as two, side by side."""
+
+
+class DamagedVehicle:
+    """An object whose Gaussians follow its particles.
+
+    Args:
+        cloud: its Gaussians at rest, object frame.
+        rest: [N, 3] particles at rest, object frame [m].
+        spacing: of the particles [m].
+        category, size: of the object.
+        object_id: by which folds differ from vehicle to vehicle.
+    """
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        rest: Float,
+        *,
+        spacing: float,
+        category: str,
+        size: Sequence[float],
+        object_id: str,
+    ) -> None:
+        self._cloud, self._size = cloud, size
+        points = cloud.means.detach().cpu().numpy().astype(np.float64)
+        self._points, self._rest = points, rest
+        self._embedding = Embedding(rest, points, spacing=spacing)
+        self._parts = {part.name: part for part in parts_of(category, size)}
+        colours = np.clip(cloud.sh[:, 0].detach().cpu().numpy() * SH_0 + 0.5, 0.0, 1.0)
+        self._brightness = colours.mean(axis=1)
+        painted = self._painted()
+        self._paint = float(np.median(self._brightness[painted]))
+        hues = colours / np.maximum(3 * self._brightness, 0.05)[:, None]
+        self._other_hue = np.abs(hues - np.median(hues[painted], axis=0)).max(axis=1)
+        self._unlike_paint = np.abs(colours - np.median(colours[painted], axis=0)).max(axis=1)
+        self._rows = {name: self._rows_of(part) for name, part in self._parts.items()}
+        glass = np.zeros(len(points), dtype=bool)
+        for name, part in self._parts.items():
+            if part.kind in ("pane", "windscreen"):
+                glass[self._rows[name]] = True
+        self._seed = zlib.crc32(object_id.encode())
+        self._sheet = Sheet(
+            points,
+            rest,
+            spacing=spacing,
+            size=size,
+            smooth=glass | in_wheels(points, size),
+            seed=self._seed,
+        )
+
+    def shortening(self, displacements: Float) -> Float:
+        """[G, 3] by what fraction the sheet at each Gaussian is shorter along the vehicle's axes,
+        with particles displaced [N, 3] [m]; the largest so far goes into :meth:`cloud`."""
+        shorter = np.zeros((len(self._points), 3))
+        rows = np.flatnonzero(self._embedding.near(_moved(displacements)))
+        shorter[rows] = self._sheet.shortening(self._embedding.gradients(displacements, rows))
+        return shorter
+
+    def cloud(
+        self, displacements: Float, most: Float, broken: Mapping[str, float]
+    ) -> GaussianCloud:
+        """The drawn Gaussians; those that nothing moved stay unchanged, bit for bit.
+
+        Args:
+            displacements: [N, 3] of its particles from rest [m].
+            most: [G, 3] largest shortening so far.
+            broken: names of parts that have broken, and how long ago [s].
+        """
+        changed = self._embedding.near(_moved(displacements)) | (most > 0).any(axis=1)
+        if (changed & self._sheet.bonnet).any():
+            changed |= self._sheet.bonnet
+        rows = np.flatnonzero(changed)
+        body = self._embedding.follow(displacements, rows)
+        # Only what differs from how the vehicle as a whole has moved is seen as damage.
+        turn, shift = _carried(self._rest, displacements)
+        folded = self._sheet.fold(_without(body, turn, shift), most[rows], rows)
+        index = torch.from_numpy(rows).to(self._cloud.device)
+        part = deform_cloud(self._cloud.select(index), _with(folded.deformed, turn, shift))
+        light = np.ones(len(self._points))
+        light[rows] = folded.light
+        for name in broken:
+            kind = self._parts[name].kind
+            if kind in ("lamp", "pane"):
+                light[self._rows[name]] *= LAMP_LEFT if kind == "lamp" else PANE_LEFT
+        moved = replaced_rows(self._cloud, index, part)
+        sh = _lit(_scraped(moved.sh, index, folded.scraped), light)
+        if "windscreen" in broken:
+            sh = self._crazed(sh)
+        means = moved.means
+        for name, age in broken.items():
+            if self._parts[name].kind == "bumper":
+                means = self._drooped(name, means, age)
+        return _split(replace(moved, means=means, sh=sh), rows, body.F)
+
+    def _rows_of(self, part: Part) -> NDArray[np.int64]:
+        """Gaussians of a part: all at its place, without the paint around it."""
+        inside = part.holds(self._points)
+        if part.kind == "pane" and part.outward[1]:
+            inside |= self._leaning(part)
+        if part.kind == "windscreen":
+            # It shows the sky, brighter than paint at times; nothing else faces ahead up there.
+            inside &= self._unlike_paint > OF_GLASS
+        elif part.kind == "pane":
+            dark = self._brightness < max(GLASS_DARKER * self._paint, 0.12)
+            inside &= dark | (self._other_hue > OTHER_HUE)
+        elif part.kind == "lamp":
+            bright = self._brightness > LAMP_DARKER * self._paint
+            inside &= bright & (self._unlike_paint > OTHER_COLOUR)
+            if inside.any():
+                least = np.quantile(self._unlike_paint[inside], 1 - LAMP_SHARE)
+                inside &= self._unlike_paint >= least
+        return np.flatnonzero(inside)
+
+    def _leaning(self, part: Part) -> NDArray[np.bool_]:
+        """[G] what belongs to side windows, which lean inwards further up, between the screens."""
+        low, high = np.array(part.low), np.array(part.high)
+        inwards = LEANING * self._size[1]
+        low[1], high[1] = (low[1] - inwards, high[1]) if low[1] > 0 else (low[1], high[1] + inwards)
+        high[0] = min(high[0], self._parts["windscreen"].low[0])
+        if "rear window" in self._parts:
+            low[0] = max(low[0], self._parts["rear window"].high[0])
+        return replace(part, low=tuple(low), high=tuple(high)).holds(self._points)
+
+    def _painted(self) -> NDArray[np.bool_]:
+        """[G] whether a Gaussian is neither glass nor below the sills; all where none is left."""
+        height = self._points[:, 2] / self._size[2] + 0.5
+        painted: NDArray[np.bool_] = height > SILLS
+        for part in self._parts.values():
+            if part.kind in ("pane", "windscreen"):
+                painted = painted & ~part.holds(self._points)
+        return painted if painted.any() else np.ones(len(painted), dtype=bool)
+
+    def _drooped(self, name: str, means: torch.Tensor, age: float) -> torch.Tensor:
+        """A bumper that hangs by one end; which one differs from vehicle to vehicle."""
+        rows = self._rows[name]
+        if not len(rows):
+            return means
+        places = means[rows].detach().cpu().numpy().astype(np.float64)
+        side = 1.0 if (self._seed >> 3) % 2 else -1.0
+        arm = places[:, 1] * side
+        arm = arm - arm.min()
+        fallen = 1 - np.exp(-3 * min(age, HANGS_STILL) / DROOP_TIME)
+        sunk = np.tan(DROOP) * fallen * arm
+        sunk = np.minimum(sunk, places[:, 2] + self._size[2] / 2 - CLEARANCE)
+        sunk = np.maximum(sunk, 0.0)
+        places[:, 2] -= sunk
+        # It comes off forwards as well, where it is loose.
+        places[:, 0] += np.sign(places[:, 0].mean()) * LOOSE * sunk
+        moved = means.clone()
+        moved[rows] = torch.from_numpy(places.astype(np.float32)).to(means.device)
+        return moved
+
+    def _crazed(self, sh: torch.Tensor) -> torch.Tensor:
+        """Cracks all over the screen, denser along rays."""
+        rows = self._rows["windscreen"]
+        if not len(rows):
+            return sh
+        points = self._points[rows]
+        middle = points.mean(axis=0) + np.array([0.0, 0.2, 0.0])
+        angle = np.arctan2(points[:, 2] - middle[2], points[:, 1] - middle[1])
+        rays = 0.5 + 0.5 * np.cos(11 * angle + 2 * np.sin(3 * angle))
+        random = np.random.default_rng(self._seed).uniform(size=len(rows))
+        weight = np.where(random < CRAZED * (0.4 + rays), 0.65, 0.12)
+        weights = torch.from_numpy(weight.astype(np.float32))[:, None, None].to(sh.device)
+        target = torch.zeros_like(sh[rows])
+        colour = torch.from_numpy(((CRACKED - 0.5) / SH_0).astype(np.float32)).to(sh.device)
+        target[:, 0] = colour
+        cracked = sh.clone()
+        cracked[rows] = (1 - weights) * sh[rows] + weights * target
+        return cracked
+
+
+def _moved(displacements: Float) -> NDArray[np.bool_]:
+    """[N] whether particles have moved by more than MIN_DISPLACEMENT."""
+    moved: NDArray[np.bool_] = np.linalg.norm(displacements, axis=1) > MIN_DISPLACEMENT
+    return moved
+
+
+def _carried(rest: Float, displacements: Float) -> tuple[Float, Float]:
+    """Turn [3, 3] and shift [3] of most of a body's particles [N, 3]; what is crushed has little
+    weight."""
+    places = rest + displacements
+    weights = np.ones(len(rest))
+    for _ in range(CARRIED_ROUNDS):
+        share = (weights / weights.sum())[:, None]
+        before, after = (share * rest).sum(axis=0), (share * places).sum(axis=0)
+        left, _, right = np.linalg.svd((places - after).T @ (share * (rest - before)))
+        left[:, 2] *= np.sign(np.linalg.det(left @ right))
+        turn = left @ right
+        shift = after - turn @ before
+        off = np.linalg.norm(places - rest @ turn.T - shift, axis=1)
+        weights = 1 / (off + CARRIED_SCALE)
+    return turn, shift
+
+
+def _without(body: Deformed, turn: Float, shift: Float) -> Deformed:
+    """A body's points before it was turned and shifted."""
+    return Deformed((body.positions - shift) @ turn, turn.T @ body.F, turn.T @ body.rotations)
+
+
+def _with(body: Deformed, turn: Float, shift: Float) -> Deformed:
+    """A body's points after it was turned and shifted."""
+    return Deformed(body.positions @ turn.T + shift, turn @ body.F, turn @ body.rotations)
+
+
+def _lit(sh: torch.Tensor, light: Float) -> torch.Tensor:
+    """Harmonics of Gaussians whose colours are multiplied by ``light`` [G]."""
+    factor = torch.from_numpy(light.astype(np.float32)).to(sh.device)
+    lit = sh * factor[:, None, None]
+    lit[:, 0] += ((factor - 1) * 0.5 / SH_0)[:, None]
+    return lit
+
+
+def _scraped(sh: torch.Tensor, rows: torch.Tensor, scraped: Float) -> torch.Tensor:
+    """Harmonics with the paint of ``rows`` [R] scraped and smeared by ``scraped`` [R, 2]."""
+    found = sh.clone()
+    for colour, share in zip((BARE, SMEAR), scraped.T, strict=True):
+        weight = torch.from_numpy(share.astype(np.float32))[:, None, None].to(sh.device)
+        target = torch.zeros_like(found[rows])
+        target[:, 0] = torch.from_numpy(((colour - 0.5) / SH_0).astype(np.float32)).to(sh.device)
+        found[rows] = (1 - weight) * found[rows] + weight * target
+    return found
+
+
+def _split(cloud: GaussianCloud, changed: NDArray[np.int64], F: Float) -> GaussianCloud:
+    """The cloud with those Gaussians split in two that were stretched far, so that none is a needle
+    and nothing opens between them; F [R, 3, 3] is of those that were ``changed`` [R]."""
+    stretch = np.linalg.norm(F, axis=1).max(axis=1)
+    rows = torch.from_numpy(changed[stretch > SPLIT]).to(cloud.device)
+    if not len(rows):
+        return cloud
+    part = cloud.select(rows)
+    longest = part.scales.argmax(dim=1)
+    axes = _axes(part.quats)
+    each = torch.arange(len(rows), device=cloud.device)
+    along = axes[each, :, longest] * part.scales[each, longest][:, None] * 0.6
+    scales = part.scales.clone()
+    scales[each, longest] *= 0.7
+    means, sizes = cloud.means.clone(), cloud.scales.clone()
+    means[rows], sizes[rows] = part.means + along, scales
+    other = replace(part, means=part.means - along, scales=scales)
+    return GaussianCloud.concatenate([replace(cloud, means=means, scales=sizes), other])
+
+
+def _axes(quats: torch.Tensor) -> torch.Tensor:
+    """[K, 3, 3] axes of Gaussians, as columns."""
+    from ..geometry.rotation import quaternion_to_matrix
+
+    matrices = quaternion_to_matrix(quats.detach().cpu().numpy())
+    return torch.from_numpy(matrices.astype(np.float32)).to(quats.device)
