@@ -38,7 +38,7 @@ from ..scene.io import load_scene, read_packed
 from ..sweeps.episode import observation_of
 from ..sweeps.pictures import draw_frames
 from ..world import World
-from ..world.draws import Draws
+from ..world.common import Draws
 from ..world.path import LoggedPath
 
 Figures = dict[str, Any]

@@ -17,8 +17,7 @@ from ..console import CommandError
 from ..geometry.rotation import quaternion_yaw
 from ..geometry.transform import transform_from
 from ..scene import Trajectory
-from ..world.ego.route import command_ahead
-from ..world.path import LoggedPath
+from ..world.path import LoggedPath, command_ahead
 from .posed_images import PosedImage
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from ..edit import ObjectState, ScenarioState
 from ..edit.tracks import PackedTracks
 from ..geometry.box_kernels import boxes_overlap
 from ..scene import Ground, Scene, Trajectory
+from .common import WorldError
 from .ego.motion import Motion
-from .errors import WorldError
 from .path import Float, LoggedPath, PathPoint
 from .traffic.idm import highest_speed
 

@@ -8,7 +8,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec, SensorSpec
 
 from ..scene import Scene
-from .errors import WorldError
+from .common import WorldError
 
 
 @dataclass(frozen=True)

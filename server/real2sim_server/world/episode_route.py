@@ -15,8 +15,7 @@ from ..scene import Scene
 from .beyond_log import Prolonged, at_start_again, driven_route, tracks_beyond_log
 from .ego.motion import Motion
 from .episode import EpisodeClock
-from .path import LoggedPath, PathPoint
-from .seam import Seam
+from .path import LoggedPath, LoopTransform, PathPoint
 
 
 class PutBack(NamedTuple):
@@ -33,7 +32,7 @@ class PutBack(NamedTuple):
     way: float
     motion: Motion
     point: PathPoint
-    seam: Seam
+    seam: LoopTransform
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,4 +81,4 @@ class EpisodeRoute:
         way = laps * self.lap_length
         again = at_start_again(motion, point, self.route, point.s - way)
         near = self.route.nearest(again.x, again.y, near_s=point.s - way)
-        return PutBack(laps, way, again, near, Seam.between(motion[:3], again[:3]))
+        return PutBack(laps, way, again, near, LoopTransform.between(motion[:3], again[:3]))

@@ -15,11 +15,9 @@ from scipy.spatial import cKDTree
 from .._records import made_quickly
 from ..scene.lane import Lane
 from ..scene.lane_graph import LaneGraph
-from .agents import Agents, agent_fields
+from .agents import Agents, Event, agent_fields
 from .ego.motion import Motion
-from .ego.route import Command
-from .events import Event
-from .path import Float
+from .path import Command, Float
 from .storyboard.program import ShownSignal
 
 RADIUS = 60.0

@@ -19,7 +19,7 @@ from real2sim_proto.episode import (
 )
 
 from ..edit import ObjectState
-from .draws import Draws
+from .common import Draws
 from .ego.motion import Motion
 from .path import LoggedPath, PathPoint
 from .traffic.idm import desired_speed

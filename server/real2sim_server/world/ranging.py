@@ -27,7 +27,7 @@ from ..scene import Beams, Lidar, LidarError, Radar, RadarError
 from ..scene.lidar_catalogue import catalogue_lidar, lidar_of
 from ..scene.radar import catalogue_radar
 from .agents import Agents, rows_of
-from .errors import WorldError
+from .common import WorldError
 
 
 @dataclass(frozen=True, eq=False)

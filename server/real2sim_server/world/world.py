@@ -24,8 +24,9 @@ from ..edit.tracks import PackedTracks
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
-from .agents import Agents
+from .agents import Agents, Event, Strides
 from .beyond_log import lanes_route
+from .boxes import ego_box
 from .collision.contact_state import ContactState, StepMotion
 from .collision.deformation import Deformation, DeformationTracker
 from .collision.impact import Impact
@@ -33,21 +34,16 @@ from .collision.obstacles import obstacle_grid
 from .collision.overlaps import overlapping_rows
 from .collision.step_contacts import StepContacts, contacts_of_impacts, contacts_of_overlaps
 from .collision.sweep import StepStart
-from .draws import Draws
-from .ego.box import ego_box
+from .common import Draws, WorldError, copy_with
 from .ego.controller import EgoController, Plan, emergency_brake
 from .ego.motion import Motion, logged_motion
 from .ego.reference import PlannedTrajectory
-from .ego.route import command_ahead, route_ahead
 from .ego.suspension import LEVEL, sprung, tilted
 from .episode import episode_clock, takes_effect_us
 from .episode_route import EpisodeRoute
-from .errors import WorldError
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
-from .events import Event
-from .evolve import evolved
 from .observation import LanePiece, Observation, lanes_around
-from .path import Float, LoggedPath, PathPoint
+from .path import Float, LoggedPath, LoopTransform, PathPoint, command_ahead, route_ahead
 from .placement import placed
 from .randomization import (
     RandomizedIdm,
@@ -57,10 +53,8 @@ from .randomization import (
 )
 from .ranging import Mounted, StepWay, Wake, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score
-from .seam import Seam
 from .storyboard.program import ShownSignal
 from .storyboard.run import StoryboardRun, begin_storyboard
-from .strides import Strides
 from .traffic import ObservedEgo, Surroundings, Traffic
 from .traffic.spawner import begin_spawner
 
@@ -158,7 +152,7 @@ class World:
         self._edit_events: tuple[Event, ...] = ()
         self._pending: PendingStep | None = None
         self._context = scoring_context(scene, spec, self._clock, self._path, self._path_point.s)
-        self._seam: Seam | None = None
+        self._seam: LoopTransform | None = None
         self.instant = self._instant(StepContacts())
         self.accumulator: MetricAccumulator = scoring.begin_accumulator(self.instant, self._context)
 
@@ -280,7 +274,7 @@ class World:
             self._pending = None
             contacts = self._overlap_contacts(start) if contacts is None else contacts
             if contacts.touching != self._contacts.touching:
-                self._contacts = evolved(self._contacts, touching=contacts.touching)
+                self._contacts = copy_with(self._contacts, touching=contacts.touching)
             self.instant = self._instant(contacts, plan, seam)
             self.accumulator = scoring.update_accumulator(
                 self.accumulator, self.instant, self._context
@@ -432,7 +426,7 @@ class World:
 
     def fork(self) -> World:
         """A world that goes on from here on its own; it shares everything that never changes."""
-        return evolved(self)
+        return copy_with(self)
 
     # --- phases of a step -------------------------------------------------------------------
 
@@ -693,7 +687,7 @@ class World:
         self,
         contacts: StepContacts,
         plan: PlannedTrajectory | None = None,
-        seam: Seam | None = None,
+        seam: LoopTransform | None = None,
     ) -> Instant:
         height = float(self.T_world_vehicle[2, 3])
         laps = self.lap * self._episode_route.lap_length if self.lap else 0.0

@@ -9,7 +9,7 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
 from real2sim_server.world import World, WorldError
-from real2sim_server.world.draws import Draws
+from real2sim_server.world.common import Draws
 from real2sim_server.world.recording.recording import (
     digest,
     first_difference,

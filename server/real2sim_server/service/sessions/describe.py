@@ -25,7 +25,7 @@ from ...world import (
     plan_in_world,
 )
 from ...world.ego.reference import PlannedTrajectory
-from ...world.ego.route import whole_route
+from ...world.path import whole_route
 from ..library.views import camera_infos, edited_objects
 from .sensors import MAX_IMAGE_BYTES
 from .session import Session

@@ -26,9 +26,8 @@ from ..ego.gear import can_reverse
 from ..ego.legs import may_lead_backwards
 from ..ego.motion import Motion
 from ..ego.reference import SinglePose
-from ..ego.route import WAYPOINT_SPACING, WAYPOINTS
 from ..ego.suspension import LEVEL, BodyAttitude, sprung_side_by_side, tilted
-from ..path import Float
+from ..path import WAYPOINT_SPACING, WAYPOINTS, Float
 from ..scoring.hazard import ego_at_fault
 from ..traffic.idm import Idm
 from ..world import World

@@ -13,12 +13,11 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from ..._numba import PARALLEL_LOOPS, func, kernel
 from ...scene.ground_kernels import pose_at
+from ..boxes import REAR_OVERHANG, first_contacts
 from ..collision.sweep import COARSE
-from ..collision.sweep_kernels import first_contacts
 from ..driving import HOLD, PlanarState
 from ..driving.curve import NO_POSE
 from ..driving.entries import advance_vehicle, plan_curve, world_poses
-from ..ego.box import REAR_OVERHANG
 from ..path import nearest_point, waypoints
 from ..scoring.road import off_road
 from .traffic_kernels import advance_objects, bodies_of, remainder

@@ -5,8 +5,8 @@ from __future__ import annotations
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import AgentsSpec, ResetSpec
 
+from ..common import WorldError
 from ..driving import KINDS, PLANNING_AHEAD
-from ..errors import WorldError
 
 TRACKERS = tuple(name for name, kind in KINDS.items() if kind not in PLANNING_AHEAD)
 FREE = frozenset({"seed", "start_us", "dt_us", "horizon", "sensors", "privileged", "scoring"})

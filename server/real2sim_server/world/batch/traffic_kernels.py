@@ -16,8 +16,7 @@ import numpy as np
 
 from ..._numba import func
 from ...edit.track_kernels import poses_at
-from ..broad_phase_kernels import heading
-from ..ego.box import REAR_OVERHANG
+from ..boxes import REAR_OVERHANG, heading
 from ..path import nearest_point, next_in_strip, point_at, sharpest_turn
 from ..traffic.idm import BACK_TO_LANE, HARDEST, STANDSTILL
 

@@ -11,8 +11,8 @@ from real2sim_proto.episode import ContactSpec, EgoSpec
 from ...edit import ObjectState
 from ...simulation.masses import default_mass, yaw_inertia
 from ...simulation.structure import STRUCTURES, stiffness_of
+from ..boxes import REAR_OVERHANG
 from ..driving import vehicle_parameters
-from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
 from ..traffic.driver import AgentPose, Surroundings
 from .rigid_body import BodyProperties, BodyState

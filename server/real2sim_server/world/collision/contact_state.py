@@ -10,9 +10,8 @@ from typing import NamedTuple
 from real2sim_proto.episode import EgoSpec, ResetSpec
 
 from ..agents import Agents, rows_in
-from ..broad_phase_kernels import may_meet_any, may_overlap
+from ..boxes import REAR_OVERHANG, may_meet_any, may_overlap
 from ..driving import Command
-from ..ego.box import REAR_OVERHANG
 from ..ego.controller import EgoController
 from ..ego.motion import Motion
 from ..path import Float

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from ...geometry.rotation import Float, yaw_quaternion
+from ..boxes import first_contacts
 from .rigid_body import BodyProperties, BodyState
-from .sweep_kernels import first_contacts
 
 SLOWEST = 0.05
 """Bodies that move less than this against each other in a substep cannot do so unseen [m]."""

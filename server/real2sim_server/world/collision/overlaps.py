@@ -17,8 +17,7 @@ from ...edit import ObjectState
 from ...geometry.box_kernels import boxes_overlap
 from ...geometry.rotation import quaternion_yaw
 from ..agents import Agents
-from ..broad_phase_kernels import within_reach
-from ..ego.box import REAR_OVERHANG, ego_box
+from ..boxes import REAR_OVERHANG, ego_box, within_reach
 from ..ego.motion import Motion
 from ..path import Float
 from ..scoring.hazard import side_of_contact

@@ -10,8 +10,8 @@ from typing import NamedTuple
 from real2sim_proto.episode import ContactSpec, EgoSpec
 
 from ..agents import Agents
+from ..boxes import REAR_OVERHANG
 from ..driving import Command
-from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
 from ..scoring.hazard import side_of_contact
 from ..scoring.instant import Side

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..agents import Agents
-from ..events import Event
+from ..agents import Agents, Event
 from ..scoring.instant import ContactRecord
 from .impact import Impact
 from .overlaps import BACKGROUND, EgoContacts

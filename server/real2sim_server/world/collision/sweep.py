@@ -19,7 +19,7 @@ from real2sim_proto.episode import EgoSpec, ResetSpec
 from ...geometry.rotation import quaternion_yaw
 from ...scene.obstacles import CELL
 from ..agents import Agents, rows_in
-from ..ego.box import REAR_OVERHANG
+from ..boxes import REAR_OVERHANG, first_contacts, first_occupied, holds_any
 from ..ego.motion import Motion
 from ..path import Float
 from ..scoring.hazard import side_of_contact
@@ -28,7 +28,6 @@ from .manifold import contact_manifold, corners
 from .obstacles import ObstacleGrid
 from .overlaps import BACKGROUND, EgoContacts, OverlapContact
 from .rigid_body import BodyProperties, BodyState
-from .sweep_kernels import first_contacts, first_occupied, holds_any
 
 Size = tuple[float, float, float]
 Box = tuple[float, float, float, float, float]

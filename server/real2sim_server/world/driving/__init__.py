@@ -14,10 +14,17 @@ from .entries import (
     plan_curve,
     prepare_schedule,
 )
-from .state import Command, PlanarState
 from .trackers import HOLD, ILQR, KINDS, LQR, PLANNING_AHEAD, PURSUIT
-from .vehicle import GRAVITY, VehicleParameters, wheel_load
-from .vehicle_models import VEHICLE_MODELS, VehicleModel, vehicle_parameters
+from .vehicle import (
+    GRAVITY,
+    VEHICLE_MODELS,
+    Command,
+    PlanarState,
+    VehicleModel,
+    VehicleParameters,
+    vehicle_parameters,
+    wheel_load,
+)
 
 __all__ = [
     "GRAVITY",

@@ -7,19 +7,20 @@ import math
 import numpy as np
 
 from ..._numba import func, kernel
-from .actuators import (
+from .curve import PlanCurve, at, curve_through, heading
+from .trackers import HOLD, tracker_command, tracker_schedule
+from .vehicle import (
+    Command,
+    PlanarState,
+    VehicleParameters,
     actuator_outputs,
     delay_line,
     delay_substeps,
     delayed_commands,
+    foreseen_state,
     push_command,
+    step_vehicle,
 )
-from .curve import PlanCurve, at, curve_through, heading
-from .foresight import foreseen_state
-from .state import Command, PlanarState
-from .trackers import HOLD, tracker_command, tracker_schedule
-from .vehicle import VehicleParameters
-from .vehicle_models import step_vehicle
 
 SUBSTEP_US = 10_000
 

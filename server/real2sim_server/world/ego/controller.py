@@ -14,10 +14,9 @@ from real2sim_proto.plans import Control, Gear, PoseCommand, TrajectoryPlan
 from ..._records import made_quickly
 from ...edit.tracks import sample
 from ...scene import Trajectory
+from ..common import WorldError, copy_with
 from ..driving import Command
-from ..errors import WorldError
-from ..evolve import evolved
-from ..seam import Seam
+from ..path import LoopTransform
 from .gear import advance_in_gear, can_reverse
 from .motion import Motion, advance_motion, constant_law, teleported
 from .reference import PlannedTrajectory, Pose, SinglePose
@@ -42,7 +41,7 @@ class Controller(Protocol):
     def command(self, motion: Motion, t: float) -> Command:
         """What it would do in a motion, ``t`` seconds after it began."""
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """The controller of an ego that was put back over the seam."""
 
 
@@ -79,7 +78,7 @@ class ConstantCommand:
     def _backwards(self, motion: Motion) -> bool:
         return self.gear == "reverse" if self.gear is not None else motion.reversing
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """Itself: a command has no place."""
         return self
 
@@ -99,7 +98,7 @@ class Teleport:
         """Brakes: a teleported vehicle has no controller."""
         return Command(-EMERGENCY_BRAKING, motion.steering)
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """The pose beyond the seam."""
         x, y, yaw = seam.poses(np.array([self.pose]))[0].tolist()
         return replace(self, pose=(x, y, yaw))
@@ -123,7 +122,7 @@ class PendingPlan:
         """The plan where it is a trajectory."""
         return self.plan if isinstance(self.plan, PlannedTrajectory) else None
 
-    def put_back(self, seam: Seam) -> PendingPlan:
+    def put_back(self, seam: LoopTransform) -> PendingPlan:
         """The plan of an ego that was put back over the seam."""
         if isinstance(self.plan, PlannedTrajectory):
             return replace(self, plan=replace(self.plan, poses=seam.poses(self.plan.poses)))
@@ -191,7 +190,7 @@ class EgoController:
             )
         kept = tuple(p for p in self.pending if p.from_us < from_us)
         pending = (*kept, PendingPlan(from_us, plan_in_world(plan, motion)))
-        return evolved(self, pending=pending)
+        return copy_with(self, pending=pending)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[EgoController, Motion]:
         """Controller and vehicle ``us`` later than ``t_us``."""
@@ -205,7 +204,7 @@ class EgoController:
             t_us = until
         return current, motion
 
-    def put_back(self, seam: Seam) -> EgoController:
+    def put_back(self, seam: LoopTransform) -> EgoController:
         """The controller and its plans of an ego that was put back over the seam."""
         controller = self.controller.put_back(seam) if self.controller is not None else None
         pending = tuple(plan.put_back(seam) for plan in self.pending)

@@ -14,8 +14,8 @@ from typing import Any
 
 from real2sim_proto.episode import EgoSpec
 
+from ..common import cache_by_identity
 from ..driving import GRAVITY, HOLD, VEHICLE_MODELS, Command
-from ..per_object import per_object
 from .motion import ControlLaw, Motion, advance_motion, commanded, constant_law
 
 SHIFT_BRAKING = 6.0
@@ -31,7 +31,7 @@ def can_reverse(spec: EgoSpec) -> bool:
     return spec.max_reverse_speed > 0 and VEHICLE_MODELS[spec.dynamics].backwards is not None
 
 
-@per_object
+@cache_by_identity
 @lru_cache(maxsize=256)
 def backwards_spec(spec: EgoSpec) -> EgoSpec:
     """The mirror image of a vehicle with a reverse gear."""

@@ -16,8 +16,7 @@ from real2sim_proto.episode import EgoSpec
 
 from ..._records import made_quickly
 from ..driving import NO_POSE, curve_at, placed_poses, plan_curve, vehicle_parameters
-from ..path import Float
-from ..seam import Seam
+from ..path import Float, LoopTransform
 from .motion import ControlLaw, Motion
 
 Pose = tuple[float, float, float]
@@ -136,7 +135,7 @@ class SinglePose(NamedTuple):
         way = ways_along(np.array([self[1:], pose]))
         return way.item() / ((at_us - self.at_us) * 1e-6)
 
-    def put_back(self, seam: Seam) -> SinglePose:
+    def put_back(self, seam: LoopTransform) -> SinglePose:
         """For a vehicle that was put back over the seam."""
         return SinglePose(self.at_us, *seam.poses(np.array([self[1:]]))[0].tolist())
 
@@ -183,7 +182,7 @@ class ReferenceTrajectory:
         _, x, y, yaw, _, _ = self._curve[0][-1].tolist()
         return x, y, yaw
 
-    def put_back(self, seam: Seam) -> ReferenceTrajectory:
+    def put_back(self, seam: LoopTransform) -> ReferenceTrajectory:
         """The curve of a vehicle that was put back over the seam."""
         knots = self._curve[0].copy()
         knots[:, 1:4] = seam.poses(knots[:, 1:4])

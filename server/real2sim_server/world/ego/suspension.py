@@ -18,9 +18,9 @@ import numpy as np
 
 from real2sim_proto.episode import EgoSpec, SuspensionSpec
 
+from ..common import cache_by_identity
 from ..driving import GRAVITY, PlanarState, VehicleParameters, vehicle_parameters, wheel_load
 from ..path import Float
-from ..per_object import per_object
 from .motion import Motion
 
 
@@ -155,7 +155,7 @@ def tilted(T_world_vehicle: Float, attitude: BodyAttitude, ego: EgoSpec) -> Floa
     return T_world_body
 
 
-@per_object
+@cache_by_identity
 @lru_cache(maxsize=256)
 def suspension_of(ego: EgoSpec) -> Suspension:
     """The springs of a vehicle that has some."""

@@ -12,7 +12,7 @@ from real2sim_proto.episode import EgoSpec
 
 from ..._records import made_quickly
 from ..driving import KINDS, LQR, MOVING, Command
-from ..seam import Seam
+from ..path import LoopTransform
 from .gear import advance_in_gear, backwards_spec, can_reverse, command_in_gear, mirrored
 from .legs import Leg, legs_of
 from .motion import Motion, advance_motion, commanded, teleported
@@ -51,7 +51,7 @@ class ControlledTracker:
         """What to do in a motion, ``t`` seconds after the reference began."""
         return commanded(motion, self.reference.control_law(self.kind), self.spec, since=t)
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """The tracker of a vehicle that was put back over the seam."""
         return replace(self, reference=self.reference.put_back(seam))
 
@@ -84,7 +84,7 @@ class PerfectTracker:
         """What an LQR would do; for vehicles that were pushed."""
         return commanded(motion, self.reference.control_law(LQR), self.spec, since=t)
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """The tracker of a vehicle that was put back over the seam."""
         return replace(self, reference=self.reference.put_back(seam))
 
@@ -144,7 +144,7 @@ class GearedTracker:
         since = t - leg.begin_us * 1e-6
         return command_in_gear(motion, law, self.spec, since=since, backwards=leg.backwards)
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """The tracker of a vehicle that was put back over the seam."""
         legs = [replace(leg, reference=leg.reference.put_back(seam)) for leg in self.legs]
         return replace(self, legs=tuple(legs))

@@ -33,7 +33,7 @@ from ..._npy import read_entries
 from ...edit import AssetLookup, EditError, ScenarioState, pack_state, unpack_state
 from ...scene import Scene
 from .. import scoring
-from ..errors import WorldError
+from ..common import WorldError
 from ..evaluation import reactive
 from ..scoring import (
     Instant,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ..ego.reference import PlannedTrajectory
+from ..path import LoopTransform
 from ..scoring import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
 from ..scoring.instant import Side
-from ..seam import Seam
 from ..storyboard.program import ShownSignal
 
 MAX_WAY_M = 1e6
@@ -78,7 +78,9 @@ def read_instant(row: Mapping[str, Any]) -> tuple[Instant, str]:
         contacts=tuple(_contact(c) for c in _list(row["contacts"])),
         secondary=_integer(row["secondary"]),
         plan=_plan(row["plan"]) if "plan" in row else None,
-        seam=Seam(*_numbers(row["seam"], (3,), "seam").tolist()) if "seam" in row else None,
+        seam=LoopTransform(*_numbers(row["seam"], (3,), "seam").tolist())
+        if "seam" in row
+        else None,
         signals=tuple(_signal(s) for s in _list(row.get("signals", []))),
     )
     return instant, _text(row["digest"])

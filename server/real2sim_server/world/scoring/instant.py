@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ..._records import made_quickly
 from ..ego.reference import PlannedTrajectory
-from ..path import Float
-from ..seam import Seam
+from ..path import Float, LoopTransform
 from ..storyboard.program import ShownSignal
 from .road import DENSITY, RoadMap, in_lane, off_road
 
@@ -115,7 +114,7 @@ class Instant:
     contacts: tuple[ContactRecord, ...] = ()
     secondary: int = 0
     plan: PlannedTrajectory | None = None
-    seam: Seam | None = None
+    seam: LoopTransform | None = None
     signals: tuple[ShownSignal, ...] = ()
 
 

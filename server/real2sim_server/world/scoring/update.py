@@ -9,17 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from ..common import copy_with
 from ..ego.reference import PlannedTrajectory
-from ..evolve import evolved
-from ..path import Float
-from ..seam import Seam
+from ..path import Float, LoopTransform
 from .comfort import ComfortAccumulator, Feasibility, RowWindow, Window, plans_agree, windowed_sum
 from .hazard import NO_LIGHTS, ego_at_fault, fault_class, time_to_collision
 from .instant import ContactRecord, EgoSample, Instant, ScoringContext
 from .metric import METRICS, MetricAccumulator
 
 
-def put_back(accumulator: MetricAccumulator, seam: Seam) -> MetricAccumulator:
+def put_back(accumulator: MetricAccumulator, seam: LoopTransform) -> MetricAccumulator:
     """The accumulator beyond the seam, so that no step is longer or turns more than it was driven.
 
     Distances along the route go on and need nothing; the plan before the seam is not compared with
@@ -39,12 +38,12 @@ def put_back(accumulator: MetricAccumulator, seam: Seam) -> MetricAccumulator:
     )
 
 
-def _moved(ego: EgoSample, seam: Seam) -> EgoSample:
+def _moved(ego: EgoSample, seam: LoopTransform) -> EgoSample:
     x, y = seam.place(ego.x, ego.y)
     return ego._replace(x=x, y=y, yaw=ego.yaw + seam.turn, path_yaw=ego.path_yaw + seam.turn)
 
 
-def _turned(comfort: ComfortAccumulator, seam: Seam) -> ComfortAccumulator:
+def _turned(comfort: ComfortAccumulator, seam: LoopTransform) -> ComfortAccumulator:
     return replace(comfort, window=RowWindow(comfort.samples + np.array([0.0, seam.turn])))
 
 
@@ -128,7 +127,7 @@ def update_accumulator(
     tail_first = accumulator.tail_first + (max(gain, 0.0) if backing else 0.0)
     limit = context.limit_at(ego)
     distance = accumulator.distance + way
-    return evolved(
+    return copy_with(
         accumulator,
         **_compared_plans(accumulator, instant.plan),
         steps=accumulator.steps + 1,
@@ -199,7 +198,7 @@ def _with_contacts(
         return (
             accumulator
             if secondary == accumulator.secondary
-            else evolved(accumulator, secondary=secondary)
+            else copy_with(accumulator, secondary=secondary)
         )
     at_fault, contacts = dict(accumulator.at_fault), dict(accumulator.contacts)
     hit = set(accumulator.hit)
@@ -220,7 +219,7 @@ def _with_contacts(
             kind = fault_class(record.category)
             at_fault[kind] = at_fault.get(kind, 0) + 1
         hit.add(name)
-    return evolved(
+    return copy_with(
         accumulator,
         at_fault=at_fault,
         contacts=contacts,
@@ -255,7 +254,7 @@ def _with_pushes(
     contact that lasts, in which an engine may push against a wall, adds no more."""
     pushing = [c for c in instant.contacts if c.impulse != (0.0, 0.0)]
     if not pushing:
-        return evolved(accumulator, pushes={}) if accumulator.pushes else accumulator
+        return copy_with(accumulator, pushes={}) if accumulator.pushes else accumulator
     kept = max(round(CRASH_S / context.dt), 1)
     pushes: dict[str, tuple[tuple[float, float], ...]] = {}
     impulse, delta_v = accumulator.impulse, accumulator.delta_v
@@ -266,7 +265,7 @@ def _with_pushes(
         strength = math.hypot(sum(x for x, _ in pushes[name]), sum(y for _, y in pushes[name]))
         delta_v = max(delta_v, strength / context.ego_mass)
         impulse += math.hypot(*record.impulse)
-    return evolved(accumulator, pushes=pushes, impulse=impulse, delta_v=delta_v)
+    return copy_with(accumulator, pushes=pushes, impulse=impulse, delta_v=delta_v)
 
 
 def _compared_plans(

@@ -17,7 +17,7 @@ from real2sim_proto.storyboard import (
 )
 from real2sim_proto.storyboard_conditions import ElementType, Trigger
 
-from ..errors import WorldError
+from ..common import WorldError
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ from real2sim_proto.storyboard_actions import (
     SignalStateAction,
 )
 
-from ..errors import WorldError
-from ..evolve import evolved
+from ..common import WorldError, copy_with
 from ..traffic.driver import Surroundings
 from .begin_actions import Beginning, begun
 from .conditions import Facts, Memory, fires
@@ -305,9 +304,9 @@ class Progress:
             actor = self.entities[action.entity].put(
                 self._places().of(action.position), self._network
             )
-            self.entities[action.entity] = evolved(actor, visible=True)
+            self.entities[action.entity] = copy_with(actor, visible=True)
         elif isinstance(action, DeleteEntityAction):
-            self.entities[action.entity] = evolved(self.entities[action.entity], visible=False)
+            self.entities[action.entity] = copy_with(self.entities[action.entity], visible=False)
         elif isinstance(action, SignalStateAction):
             self._states[action.signal] = action.state
         elif isinstance(action, SignalPhaseAction):
@@ -362,7 +361,7 @@ def _without(actor: EntityState, tokens: set[int], network: RoadNetwork) -> Enti
     if actor.lateral is not None and actor.lateral.token in tokens:
         changes |= {"lateral": None, "drift": 0.0}
     if changes:
-        actor = evolved(actor, **changes)
+        actor = copy_with(actor, **changes)
     if actor.trajectory is not None and actor.trajectory.token in tokens:
-        actor = evolved(actor, trajectory=None).on_lane(network)
+        actor = copy_with(actor, trajectory=None).on_lane(network)
     return actor

@@ -15,7 +15,7 @@ from ...scene.errors import SceneError
 from ...scene.lane import LANE_KINDS
 from ...scene.lane_graph import LaneGraph
 from ...scene.road import Road
-from ..errors import WorldError
+from ..common import WorldError
 from ..path import Float, LoggedPath
 from ..traffic.idm import STRAIGHT, lane_beside
 

@@ -31,11 +31,9 @@ from ...edit.compose import figure_of
 from ...scene import Scene, Trajectory
 from ...scene.lane_graph import LaneGraph
 from ...scene.scene import MAX_OBJECTS
-from ..draws import Draws
-from ..ego.box import REAR_OVERHANG
+from ..boxes import REAR_OVERHANG
+from ..common import Draws, WorldError, copy_with
 from ..ego.motion import Motion
-from ..errors import WorldError
-from ..evolve import evolved
 from ..traffic.driver import ScriptedEntity, Surroundings, recorded_pose
 from .program import PLACING, Program, ShownSignal, program_of, shown_at
 from .progress import COMPLETE, ElementChange, Memories, Progress
@@ -372,7 +370,7 @@ class StoryboardRun:
             elapsed = (t_us - start_us) * 1e-6
             progress.pass_instant(t_us, elapsed, first=k == 0)
             progress.move(elapsed, (next_us - t_us) * 1e-6, first=k == 0)
-        moved = evolved(
+        moved = copy_with(
             self,
             entities=MappingProxyType(progress.entities),
             memories=progress.memories,
@@ -424,7 +422,7 @@ class StoryboardRun:
             for a in self.entities.values()
             if a.subject is not None
         }
-        return evolved(self, drivers=MappingProxyType(drivers))
+        return copy_with(self, drivers=MappingProxyType(drivers))
 
 
 def _resolved(board: Storyboard) -> Storyboard:
@@ -462,7 +460,7 @@ def _first(
     if entity.kind == "new":
         placed = any(e.entity == entity.name and e.action.kind in PLACING for e in board.init)
         there = EntityState.put(actor, Place(0.0, 0.0, 0.0), network)
-        return evolved(there, visible=placed)
+        return copy_with(there, visible=placed)
     assert subject is not None
     track = subject.trajectory
     t_us = min(max(surroundings.t_us, track.start_us), track.end_us)
@@ -474,7 +472,7 @@ def _first(
         pose.yaw,
     )
     speed = pose.velocity[0] * cos + pose.velocity[1] * sin
-    return evolved(actor, speed=speed, visible=True).put(place, network)
+    return copy_with(actor, speed=speed, visible=True).put(place, network)
 
 
 def _nothing_yet(program: Program) -> Memories:

@@ -21,7 +21,7 @@ from real2sim_proto.storyboard_actions import (
     WorldPosition,
 )
 
-from ..errors import WorldError
+from ..common import WorldError
 from ..path import Float
 from .roads import Place
 

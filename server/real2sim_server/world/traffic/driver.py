@@ -17,8 +17,7 @@ from ...geometry.rotation import quaternion_yaw
 from ...scene import Ground
 from ...scene.lane_graph import LaneGraph
 from ..agents import Agents, rows_of
-from ..broad_phase_kernels import headings
-from ..ego.box import REAR_OVERHANG
+from ..boxes import REAR_OVERHANG, headings
 from ..ego.motion import Motion
 from ..path import Float, LoggedPath, PathPoint
 

@@ -18,8 +18,7 @@ from ...geometry.rotation import quaternion_yaw
 from ...scene import Ground, Trajectory
 from ...scene.scene import MAX_OBJECTS
 from ..agents import Agents
-from ..draws import Draws
-from ..errors import WorldError
+from ..common import Draws, WorldError
 from ..path import LoggedPath
 from .driver import AgentDriver, Surroundings, level_quaternion
 from .idm import Idm, highest_speed, lane_beside

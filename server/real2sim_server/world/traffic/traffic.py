@@ -27,8 +27,7 @@ from ...edit import ObjectState
 from ...edit.tracks import PackedTracks
 from ...geometry.transform import transform_from
 from ..agents import Agents, rows_of
-from ..errors import WorldError
-from ..evolve import evolved
+from ..common import WorldError, copy_with
 from ..path import Float
 from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import (
@@ -179,7 +178,7 @@ class Traffic:
         """
         base = tracks.at(t_us)
         if not (self.drivers or self.spawner or self.storyboard or self._assigns_drivers):
-            return evolved(self, agents=base)
+            return copy_with(self, agents=base)
         before = surroundings()
         if aims := self._aims:
             before = replace(before, aims=aims)
