@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..world import World
-from ..world.scoring.hazard import STOPPED
+from ..world.scoring.instant import STOPPED
 from ..world.storyboard.run import object_ids_of
 from .gap_kernels import least_margin
 from .gaps import signed_gaps

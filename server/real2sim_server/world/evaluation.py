@@ -14,11 +14,11 @@ from ..edit.tracks import sample
 from ..scene import Scene
 from .agents import Agents, Event
 from .boxes import REAR_OVERHANG, headings
-from .collision.step_contacts import StepContacts
+from .collision.contact_state import StepContacts
 from .collision.sweep import StepStart
 from .common import cache_by_identity
 from .ego.motion import Motion, logged_motion
-from .ego.reference import PlannedTrajectory
+from .ego.plan import PlannedTrajectory
 from .episode import EpisodeClock
 from .path import LoggedPath, LoopTransform, PathPoint
 from .scoring import EgoSample, ObjectSamples, ScoringContext

@@ -25,32 +25,36 @@ from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
 from .agents import Agents, Event, Strides
-from .beyond_log import lanes_route
 from .boxes import ego_box
-from .collision.contact_state import ContactState, StepMotion
+from .collision.bodies import Impact
+from .collision.contact import obstacle_grid
+from .collision.contact_state import (
+    ContactState,
+    StepContacts,
+    StepMotion,
+    contacts_of_impacts,
+    contacts_of_overlaps,
+)
 from .collision.deformation import Deformation, DeformationTracker
-from .collision.impact import Impact
-from .collision.obstacles import obstacle_grid
-from .collision.overlaps import overlapping_rows
-from .collision.step_contacts import StepContacts, contacts_of_impacts, contacts_of_overlaps
-from .collision.sweep import StepStart
+from .collision.sweep import StepStart, overlapping_rows
 from .common import Draws, WorldError, copy_with
 from .ego.controller import EgoController, Plan, emergency_brake
-from .ego.motion import Motion, logged_motion
-from .ego.reference import PlannedTrajectory
-from .ego.suspension import LEVEL, sprung, tilted
-from .episode import episode_clock, takes_effect_us
-from .episode_route import EpisodeRoute
+from .ego.motion import LEVEL, Motion, logged_motion, sprung, tilted
+from .ego.plan import PlannedTrajectory
+from .episode import (
+    EpisodeRoute,
+    RandomizedIdm,
+    episode_clock,
+    estimate_error,
+    lanes_route,
+    latency_jitter_us,
+    placed,
+    randomized_start,
+    takes_effect_us,
+)
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .observation import LanePiece, Observation, lanes_around
 from .path import Float, LoggedPath, LoopTransform, PathPoint, command_ahead, route_ahead
-from .placement import placed
-from .randomization import (
-    RandomizedIdm,
-    estimate_error,
-    latency_jitter_us,
-    randomized_start,
-)
 from .ranging import Mounted, StepWay, Wake, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score
 from .storyboard.program import ShownSignal

@@ -20,8 +20,8 @@ from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.world import boxes, path, warm_up
 from real2sim_server.world.driving import entries
-from real2sim_server.world.ego.reference import PlannedTrajectory
-from real2sim_server.world.scoring import comfort, hazard, road
+from real2sim_server.world.ego.plan import PlannedTrajectory
+from real2sim_server.world.scoring import comfort, instant, road
 from real2sim_server.world.scoring.comfort import ComfortAccumulator, plans_agree
 from real2sim_server.world.warm_up import warm_up_planning
 
@@ -264,7 +264,7 @@ def test_the_first_meeting_is_that_of_boxes_moved_step_by_step(seed, everywhere)
     ego = (0.3, -0.2, float(rng.uniform(-4, 4)), 6.0, 0.2, -0.8)
 
     nobody = np.zeros(len(sizes), np.bool_)
-    found = hazard.first_overlap_step(ego, SIZE, 1.35, everywhere, others, nobody)
+    found = instant.first_overlap_step(ego, SIZE, 1.35, everywhere, others, nobody)
     assert found == first_meeting_by_sampling(ego, everywhere, others)
 
 
@@ -273,7 +273,7 @@ def test_objects_that_are_ignored_are_not_met():
     ego = (0.0, 0.0, 0.0, 5.0, 0.0, -0.5)
 
     found = [
-        hazard.first_overlap_step(ego, SIZE, 1.35, False, others, np.array([ignored]))
+        instant.first_overlap_step(ego, SIZE, 1.35, False, others, np.array([ignored]))
         for ignored in (False, True)
     ]
     assert found == [7, -1]
@@ -394,7 +394,7 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         path,
         boxes,
         road,
-        hazard,
+        instant,
         comfort,
         boxes,
     )

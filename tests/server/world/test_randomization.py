@@ -17,12 +17,7 @@ from real2sim_server.world.recording.recording import (
     recording_of_bytes,
     to_bytes,
 )
-from real2sim_server.world.recording.replay import (
-    Entry,
-    Replayer,
-    action_payload,
-    reset_payload,
-)
+from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
 
 COAST = Control(acceleration=0.0, steering=0.0)
 CONTROL = {"action": "control", "privileged": True}

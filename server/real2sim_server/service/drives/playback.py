@@ -13,7 +13,7 @@ from real2sim_proto.plans import PLAN
 from ...datasets.drive import EpisodeDrive
 from ...geometry.rotation import matrix_to_quaternion
 from ...world import World, plan_in_world
-from ...world.ego.reference import PlannedTrajectory
+from ...world.ego.plan import PlannedTrajectory
 from ...world.recording.recording import Recording
 
 

@@ -24,7 +24,7 @@ from ...world import (
     metrics_version,
     plan_in_world,
 )
-from ...world.ego.reference import PlannedTrajectory
+from ...world.ego.plan import PlannedTrajectory
 from ...world.path import whole_route
 from ..library.views import camera_infos, edited_objects
 from .sensors import MAX_IMAGE_BYTES

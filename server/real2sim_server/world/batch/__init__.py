@@ -4,7 +4,6 @@
 :mod:`.subset` names; the same plans lead to the same motions, contacts and ends.
 """
 
-from .batch_world import BatchWorld
-from .subset import check_batchable
+from .batch_world import BatchWorld, check_batchable
 
 __all__ = ["BatchWorld", "check_batchable"]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
-from ..ego.reference import PlannedTrajectory
+from ..ego.plan import PlannedTrajectory
 from ..path import LoopTransform
 from ..scoring import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
 from ..scoring.instant import Side

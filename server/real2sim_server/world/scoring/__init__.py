@@ -10,13 +10,14 @@ from .metric import (
     MetricAccumulator,
     MetricValue,
     Score,
+    begin_accumulator,
     metric,
     metric_versions,
     metrics_version,
     scores_of,
+    update_accumulator,
 )
 from .metrics import running_metrics
-from .update import begin_accumulator, update_accumulator
 
 __all__ = [
     "METRICS",

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .hazard import fault_class
-from .instant import ScoringContext
+from .instant import ScoringContext, fault_class
 from .metric import (
     LEAST_ROUTE,
     METRICS,

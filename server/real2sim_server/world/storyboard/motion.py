@@ -15,8 +15,8 @@ from real2sim_proto.storyboard_actions import (
 )
 
 from ..common import copy_with
-from ..traffic.idm import acceleration as idm_acceleration
-from ..traffic.idm import advance_along, leading_agent
+from ..traffic.driver import acceleration as idm_acceleration
+from ..traffic.driver import advance_along, leading_agent
 from .roads import Place
 from .view import EntityState, Moved, Shifted, View, across, ahead_on_way, coasting
 

@@ -28,8 +28,7 @@ from ...scene import Ground
 from ..boxes import REAR_OVERHANG
 from ..common import WorldError, copy_with
 from ..traffic.driver import AgentPose, ObservedEgo, Surroundings, level_quaternion
-from .roads import Place, RoadNetwork, RoadPoint, Way, straight
-from .trajectory import Trajectory, course_of
+from .roads import Place, RoadNetwork, RoadPoint, Trajectory, Way, course_of, straight
 
 ACROSS = math.radians(45.0)
 """Who heads further away than this from either direction of its lane goes straight on instead."""

@@ -20,8 +20,7 @@ from ...scene.scene import MAX_OBJECTS
 from ..agents import Agents
 from ..common import Draws, WorldError
 from ..path import LoggedPath
-from .driver import AgentDriver, Surroundings, level_quaternion
-from .idm import Idm, highest_speed, lane_beside
+from .driver import AgentDriver, Idm, Surroundings, highest_speed, lane_beside, level_quaternion
 
 PREFIX = DRAWN_PREFIX
 """Of the ids of spawned objects; no id on the wire may hold a colon, so none is taken."""

@@ -29,18 +29,17 @@ from ...geometry.transform import transform_from
 from ..agents import Agents, rows_of
 from ..common import WorldError, copy_with
 from ..path import Float
-from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import (
     AgentDriver,
     ConstantVelocity,
     External,
+    Idm,
     Replay,
     Script,
     ScriptedEntity,
     Surroundings,
 )
-from .idm import Idm
-from .lane_changer import LaneChanger
+from .idm_drivers import CutIn, HardBrake, JunctionCrossing, LaneChanger
 from .spawner import PREFIX as SPAWNED
 from .spawner import Spawner
 
