@@ -8,17 +8,17 @@ import numpy as np
 from numba import prange
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from ..._numba import PARALLEL_LOOPS, func, kernel
-from ...edit.track_kernels import poses_at
-from ...scene.ground_kernels import pose_at
-from ..boxes import REAR_OVERHANG, first_contacts, heading
-from ..collision.sweep import COARSE
-from ..driving import HOLD, PlanarState
-from ..driving.curve import NO_POSE
-from ..driving.entries import advance_vehicle, plan_curve, world_poses
-from ..path import nearest_point, next_in_strip, point_at, sharpest_turn, waypoints
-from ..scoring.road import off_road
-from ..traffic.driver import BACK_TO_LANE, HARDEST, STANDSTILL
+from .._numba import PARALLEL_LOOPS, func, kernel
+from ..edit.track_kernels import poses_at
+from ..scene.ground_kernels import pose_at
+from .boxes import REAR_OVERHANG, first_contacts, heading
+from .collision.sweep import COARSE
+from .driving import HOLD, PlanarState
+from .driving.curve import NO_POSE
+from .driving.entries import advance_vehicle, plan_curve, world_poses
+from .path import nearest_point, next_in_strip, point_at, sharpest_turn, waypoints
+from .scoring.road import off_road
+from .traffic.driver import BACK_TO_LANE, HARDEST, STANDSTILL
 
 # Objects of one world of a batch: the recorded ones, and those that IDM drives.
 #

@@ -13,25 +13,12 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import AgentsSpec, IdmDriver, ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 
-from ...edit import ObjectState, ScenarioState, compose, things_of
-from ...geometry.transform import transform_from
-from ...render.types import Instance
-from ...scene import Ground, Scene
-from ..agents import Agents
-from ..collision.contact_state import ContactState
-from ..collision.sweep import EgoContacts, StepStart
-from ..common import WorldError
-from ..driving import HOLD, KINDS, PLANNING_AHEAD, vehicle_parameters
-from ..ego.controller import EgoController
-from ..ego.motion import LEVEL, BodyAttitude, Motion, sprung_side_by_side, tilted
-from ..ego.plan import SinglePose, can_reverse, may_lead_backwards
-from ..path import WAYPOINT_SPACING, WAYPOINTS, Float, LoggedPath
-from ..scoring import ScoringContext
-from ..scoring.instant import ego_at_fault
-from ..traffic.driver import Idm, desired_speed
-from ..traffic.traffic import DRIVEN, MOVING
-from ..world import World
-from .kernels import (
+from ..edit import ObjectState, ScenarioState, compose, things_of
+from ..geometry.transform import transform_from
+from ..render.types import Instance
+from ..scene import Ground, Scene
+from .agents import Agents
+from .batch_kernels import (
     BEYOND,
     DRIVES,
     LEFT,
@@ -46,6 +33,19 @@ from .kernels import (
     routes_ahead,
     step_worlds,
 )
+from .collision.contact_state import ContactState
+from .collision.sweep import EgoContacts, StepStart
+from .common import WorldError
+from .driving import HOLD, KINDS, PLANNING_AHEAD, vehicle_parameters
+from .ego.controller import EgoController
+from .ego.motion import LEVEL, BodyAttitude, Motion, sprung_side_by_side, tilted
+from .ego.plan import SinglePose, can_reverse, may_lead_backwards
+from .path import WAYPOINT_SPACING, WAYPOINTS, Float, LoggedPath
+from .scoring import ScoringContext
+from .scoring.instant import ego_at_fault
+from .traffic.driver import Idm, desired_speed
+from .traffic.traffic import DRIVEN, MOVING
+from .world import World
 
 # Which episodes can be stepped in batches.
 
