@@ -234,7 +234,7 @@ def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) ->
             continue
         world = _world(scene, seed, len(found) % INSTANTS, options)
         # Where the first draw is not free the world draws another.
-        if all(abs(world.drawn[name]) >= FAR_SHARE * w for name, w in least.items()):
+        if all(abs(world.sampled[name]) >= FAR_SHARE * w for name, w in least.items()):
             found.append(world)
         if len(found) == count:
             return found

@@ -1,4 +1,4 @@
-"""Poses of all objects at one instant."""
+"""Poses and walking phases of all objects at one instant, and events of a step."""
 
 from __future__ import annotations
 
@@ -64,7 +64,10 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
     ]
 
 
-# How people walk whom a driver, a storyboard or a crash has led away from their trajectories.
+# --- Strides -------------------------------------------------------------------------------------
+
+# Pedestrians who left their recorded trajectories (led by a driver or a storyboard, or hit) walk
+# with strides that follow from their motion.
 
 LED = 1e-3
 """Who is this near to where the trajectory leads walks as that says [m], and as near in the entries
@@ -135,7 +138,7 @@ def _walking_speed(transform: Float, velocity: Float) -> float:
     return math.hypot(velocity[0], velocity[1]) if transform[2, 2] > UPRIGHT else 0.0
 
 
-# Events of a step.
+# --- Events --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -149,7 +152,7 @@ class Event:
     and ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
     Of ``storyboard``: ``element``, ``element_type`` and ``change``, see
     :class:`.storyboard.progress.ElementChange`.
-    Of ``looped``: ``lap``, and ``x``, ``y`` [m], ``turn`` [rad] of the :class:`.seam.Seam`.
+    Of ``looped``: ``lap``, and ``x``, ``y`` [m], ``turn`` [rad] of the :class:`.path.LoopTransform`.
     """
 
     type: EventType

@@ -1,4 +1,9 @@
-"""Worlds of one scene side by side, as a structure of arrays."""
+"""Many worlds of one scene that step together as a structure of arrays, for learning.
+
+A step costs microseconds. :class:`BatchWorld` acts like a :class:`.world.World` at each of its
+places, within the part of the closed loop that :func:`check_batchable` accepts: the same plans
+lead to the same motions, contacts and ends.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +52,7 @@ from .traffic.driver import Idm, desired_speed
 from .traffic.traffic import DRIVEN, MOVING
 from .world import World
 
-# Which episodes can be stepped in batches.
+# --- Supported episodes --------------------------------------------------------------------------
 
 TRACKERS = tuple(name for name, kind in KINDS.items() if kind not in PLANNING_AHEAD)
 FREE = frozenset({"seed", "start_us", "dt_us", "horizon", "sensors", "privileged", "scoring"})
@@ -91,8 +96,9 @@ def check_batchable(spec: ResetSpec) -> None:
         )
 
 
-# What all worlds of a batch share, as compiled code takes it: arrays alone, since parallel loops
-# take no tuples within tuples.
+# --- Tables --------------------------------------------------------------------------------------
+
+# Compiled code takes them as plain arrays, since parallel loops take no nested tuples.
 
 Longs = NDArray[np.int64]
 

@@ -1,4 +1,6 @@
-"""A step of many worlds, each on one core, by the functions that step a single one."""
+"""Compiled step of many worlds, each on one core, by the functions that step a single world."""
+
+# ruff: noqa: PLR0917 - kernels take arrays by position
 
 from __future__ import annotations
 
@@ -20,15 +22,11 @@ from .path import nearest_point, next_in_strip, point_at, sharpest_turn, waypoin
 from .scoring.road import off_road
 from .traffic.driver import BACK_TO_LANE, HARDEST, STANDSTILL
 
-# Objects of one world of a batch: the recorded ones, and those that IDM drives.
-#
-# A driver is a number for each object: NONE, while its place is recorded; DRIVES; LEFT, when it has
-# come to the end of its path. Its state is where it is along its path, its offset from it [m] and its
-# speed [m/s].
+# --- Objects -------------------------------------------------------------------------------------
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
+# Recorded ones, and those that IDM drives. A driver is a number for each object: NONE while its
+# position is recorded; DRIVES; LEFT after the end of its path. Its state is the distance along its
+# path, the offset from it [m] and the speed [m/s].
 
 NONE, DRIVES, LEFT = 0, 1, 2
 
@@ -151,10 +149,6 @@ def remainder(value, period):
     return value - period * np.rint(value / period)
 
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
-
 STATE = len(PlanarState._fields)
 S, OFFSET, PATH_X, PATH_Y, PATH_Z, PATH_YAW, BEYOND = range(7)
 """Columns of ``places``: along and beside the route, the nearest point of it, and how far the worst
@@ -184,11 +178,11 @@ def step_worlds(
         frame_is_vehicle: whether poses are those of the vehicle's frame.
         vehicle: the members of VehicleParameters.
         limits: acceleration or braking at most, steering rate, steering and wheelbase.
-        tracks, road: see :mod:`.tables`.
+        tracks, road: see :mod:`.batch`.
         motions, poses, places: [W, STATE], [W, 4, 4], [W, PLACES], of the egos.
         objects: [W, K, 10] float64, positions, quaternions, velocities of objects.
         present: [W, K] bool, which of them are in the world.
-        drivers: [W, K] int8 and driving: [W, K, 3] float64, see :mod:`.traffic_kernels`.
+        drivers: [W, K] int8 and driving: [W, K, 3] float64, see :data:`NONE`.
         new_motions ... new_driving: the same after the step, written.
         near: [W] bool, written: whether the ego may have met an object within the step.
     """

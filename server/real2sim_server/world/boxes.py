@@ -1,4 +1,6 @@
-"""Broad phase of the ego box against boxes of objects, and headings, each in one call."""
+"""Boxes on the plane: broad phase, headings, and the first contact of moving boxes."""
+
+# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
 from __future__ import annotations
 
@@ -8,8 +10,6 @@ import numpy as np
 
 from .._numba import kernel
 from .path import Float
-
-# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
 
 @kernel
@@ -137,22 +137,19 @@ def heading(quaternion):
     return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-# First contact of boxes that move and turn through a step, each in one call.
-#
-# Conservative advancement (Mirtich 1996): two boxes that are ``d`` apart, no point of which moves
-# faster than ``u`` against the other, cannot touch before ``d / u``. The largest gap along a normal
-# of a side is never more than ``d``, so time goes on by gap over speed until the gap is gone.
+# --- First contact -------------------------------------------------------------------------------
 
-# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
-
+# Conservative advancement (Mirtich 1996): two boxes are ``d`` apart, and no point of them moves
+# faster than ``u`` relative to the other. They cannot touch before ``d / u``. The largest gap along
+# a side's normal never exceeds ``d``, so time advances by gap over speed until the gap is closed.
 
 WAY = 5
 """Columns of a way: fraction of the step, centre x, y [m], yaw [rad], height of the bottom [m]."""
 
-LEAST_OVERLAP = 1e-9
+MIN_OVERLAP = 1e-9
 """Boxes that overlap by no more than this only touch [m]."""
 
-MOST_PIECES = 64
+MAX_PIECES = 64
 """Parts of a piece in which boxes above one another are looked at again."""
 
 
@@ -219,12 +216,12 @@ def first_contacts(way, size, rows, start, end, sizes, slack, tolerance):
                         sizes[k, 1],
                     )
                     step = max(gap, tolerance)
-                    if gap < -LEAST_OVERLAP:
+                    if gap < -MIN_OVERLAP:
                         low = low_p + (low_q - low_p) * t
                         if low < height and low + sizes[k, 2] > 0.0:
                             first[k] = f + (g - f) * t
                             break
-                        step = max(tolerance, speed / MOST_PIECES)
+                        step = max(tolerance, speed / MAX_PIECES)
                     if t == 1.0:
                         break
                     t = min(t + step / speed, 1.0) if speed > 0.0 else 1.0
@@ -239,7 +236,7 @@ def first_contacts(way, size, rows, start, end, sizes, slack, tolerance):
                     sizes[k, 0],
                     sizes[k, 1],
                 )
-                touching[k] = gap < -LEAST_OVERLAP
+                touching[k] = gap < -MIN_OVERLAP
     return first, touching
 
 
@@ -366,7 +363,7 @@ def _hits(x, y, yaw, size, spacing, origin, cell, occupied):
     return hits, sum_x / max(hits, 1), sum_y / max(hits, 1)
 
 
-# The box of the ego vehicle, which stands on the ground.
+# --- Ego box -------------------------------------------------------------------------------------
 
 REAR_OVERHANG = 0.95
 """Distance from the rear axle to the rear end of the ego box [m]. Recorders store the box size but

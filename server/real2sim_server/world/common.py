@@ -1,4 +1,4 @@
-"""Shared by all parts of the world: errors, copies of frozen records, caching and random draws."""
+"""Helpers of the whole world package: its error, copies of records, caching, random numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from real2sim_proto import ErrorCode
 
-# Errors of the world package.
+# --- Error ---------------------------------------------------------------------------------------
 
 
 class WorldError(ValueError):
@@ -30,7 +30,7 @@ class WorldError(ValueError):
         self.hint = hint
 
 
-# The next version of a record whose members never change.
+# --- Copies --------------------------------------------------------------------------------------
 
 R = TypeVar("R")
 
@@ -44,9 +44,7 @@ def copy_with(record: R, **changes: Any) -> R:
     return found
 
 
-# What is worked out once for an object that never changes, found again without its hash.
-#
-# The hash of a specification is that of all its members, and takes 3 us; a step asks several times.
+# --- Caching -------------------------------------------------------------------------------------
 
 S = TypeVar("S")
 V = TypeVar("V")
@@ -74,11 +72,11 @@ def cache_by_identity(fn: Callable[[S], V]) -> Callable[[S], V]:
     return remembered
 
 
-# Random numbers by name: each depends on the seed and on what it is for, on nothing else.
-#
-# The words come from NumPy's ``SeedSequence``, a hash of seed and key whose values are guaranteed not
-# to change; what is made of them here is arithmetic. So nothing depends on the order of draws, on
-# the number of threads, or on which of them were needed before.
+# --- Random numbers ------------------------------------------------------------------------------
+
+# Every random number has a name. It depends on the seed and that name only: not on the order of
+# calls, the number of threads or other numbers. The words come from NumPy's ``SeedSequence``, whose
+# values are guaranteed to stay the same; the rest is plain arithmetic.
 
 
 @dataclass(frozen=True)

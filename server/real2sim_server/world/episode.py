@@ -1,4 +1,4 @@
-"""Validation of a reset, and the clock of its episode."""
+"""An episode: validation of its reset, clock, route beyond the log, and randomization."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def episode_clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
     Raises:
         WorldError: TIME_OUT_OF_RANGE when start or horizon leave the log; UNKNOWN_CAMERA;
             INVALID_REQUEST when a sensor's period and the clock step do not divide, a camera
-            is listed twice, or a start is drawn for a warm-up.
+            is listed twice, or a start is sampled for a warm-up.
     """
     clock = _clock(scene, spec)
     for sensor in spec.sensors:
@@ -147,13 +147,13 @@ def _check_sensor(scene: Scene, spec: ResetSpec, sensor: SensorSpec) -> None:
         )
 
 
-# Beyond the end of the log: the route goes on, and what stood in the recording goes on standing.
-#
-# The clock of an episode may outlast the recording (``beyond_log`` of its reset). The route then goes
-# on with the bend that the recorded drive ended with, which fades into a straight line. With ``loop``
-# the ego that has reached the end of the recorded drive is put back to its start, at the same place
-# beside the route and with the same error of heading: a :class:`.seam.Seam`. Everything else stays
-# where it is, but road users that drive along the route come along.
+# --- Beyond the log ------------------------------------------------------------------------------
+
+# The clock of an episode may outlast the recording (``beyond_log`` of its reset). The route then
+# continues with the final bend of the recorded drive, which fades into a straight line. With
+# ``loop``, an ego that reaches the end of the recorded drive is put back to its start, with the
+# same offset and heading error: a :class:`.path.LoopTransform`. Road users that follow the route
+# move with it; everything else stays.
 
 BEND_FROM = 10.0
 """The bend at the end of the recorded drive is that of its last metres [m]."""
@@ -167,7 +167,7 @@ BEND_FADES = 40.0
 SPACING, FADED = 2.0, 160.0
 """Of the places behind the recorded drive, and where the rest of the way is straight [m]."""
 
-LONGEST_ROUTE = 100_000.0
+MAX_ROUTE = 100_000.0
 """[m]"""
 
 FASTEST = 15.0
@@ -200,7 +200,7 @@ def driven_route(scene: Scene, spec: ResetSpec, horizon: int) -> LoggedPath:
     reach = max(FADED, spawn.ahead + spawn.margin if spawn is not None else 0.0)
     if spec.beyond_log == "extend":
         speed = max(1.5 * highest_speed(scene.ego), FASTEST)
-        reach = min(max(horizon * spec.dt_us * 1e-6 * speed, reach), LONGEST_ROUTE)
+        reach = min(max(horizon * spec.dt_us * 1e-6 * speed, reach), MAX_ROUTE)
     return continued(recorded, reach, scene.ground)
 
 
@@ -317,10 +317,10 @@ def _prolonged(trajectory: Trajectory, start_us: int, end_us: int) -> Trajectory
     return Trajectory(times, p, q)
 
 
-# The route of an episode, and what becomes of ego and objects beyond the log's end.
+# --- Route of an episode -------------------------------------------------------------------------
 
 
-class PutBack(NamedTuple):
+class LoopReset(NamedTuple):
     """An ego back at the start of a loop.
 
     Attributes:
@@ -375,7 +375,7 @@ class EpisodeRoute:
             return state.tracks
         return tracks_beyond_log(state, self.until_us, self._prolonged, left=left)
 
-    def put_back(self, motion: Motion, point: PathPoint) -> PutBack | None:
+    def put_back(self, motion: Motion, point: PathPoint) -> LoopReset | None:
         """The ego of a loop, back at its start once it is at its end; None before."""
         laps = max(math.floor(point.s / self.lap_length), 0)
         if laps == 0:
@@ -383,16 +383,16 @@ class EpisodeRoute:
         way = laps * self.lap_length
         again = at_start_again(motion, point, self.route, point.s - way)
         near = self.route.nearest(again.x, again.y, near_s=point.s - way)
-        return PutBack(laps, way, again, near, LoopTransform.between(motion[:3], again[:3]))
+        return LoopReset(laps, way, again, near, LoopTransform.between(motion[:3], again[:3]))
 
 
-# What the seed of an episode draws: its start, traffic parameters, ego estimate, latency.
-#
+# --- Randomization -------------------------------------------------------------------------------
+
 # Every value has a name, such as ``start.lateral`` or ``agents.car_3.headway``, under which it is
-# drawn (see :mod:`.draws`) and reported.
+# sampled (see :class:`.common.Draws`) and reported.
 
 START_ATTEMPTS = 16
-"""Starts drawn before the recorded one is taken, where all of them are inside an object."""
+"""Starts sampled before the recorded one is taken, where all of them are inside an object."""
 
 
 def randomized_start(
@@ -403,7 +403,7 @@ def randomized_start(
     *,
     is_free: Callable[[Motion], bool],
 ) -> tuple[Motion, dict[str, float]]:
-    """The motion at the start of an episode, and what was drawn for it by name.
+    """The motion at the start of an episode, and what was sampled for it by name.
 
     Args:
         recorded: the ego in the log at that time.
@@ -417,25 +417,25 @@ def randomized_start(
         return recorded, {}
     near = path.nearest(recorded.x, recorded.y)
     for attempt in range(START_ATTEMPTS):
-        drawn = {name: draws.around(width, name, attempt) for name, width in widths.items()}
-        motion = _shifted(recorded, path, near, drawn)
+        sampled = {name: draws.around(width, name, attempt) for name, width in widths.items()}
+        motion = _shifted(recorded, path, near, sampled)
         if is_free(motion):
-            drawn["start.speed"] = motion.speed - recorded.speed
-            return motion, {name: drawn[name] for name in widths}
+            sampled["start.speed"] = motion.speed - recorded.speed
+            return motion, {name: sampled[name] for name in widths}
     return recorded, dict.fromkeys(widths, 0.0)
 
 
 def _shifted(
-    recorded: Motion, path: LoggedPath, near: PathPoint, drawn: Mapping[str, float]
+    recorded: Motion, path: LoggedPath, near: PathPoint, sampled: Mapping[str, float]
 ) -> Motion:
-    x, y, _, yaw = path.at(near.s + drawn.get("start.longitudinal", 0.0))
-    offset = near.offset + drawn.get("start.lateral", 0.0)
-    speed = max(recorded.speed + drawn.get("start.speed", 0.0), 0.0)
+    x, y, _, yaw = path.at(near.s + sampled.get("start.longitudinal", 0.0))
+    offset = near.offset + sampled.get("start.lateral", 0.0)
+    speed = max(recorded.speed + sampled.get("start.speed", 0.0), 0.0)
     turns = speed / recorded.speed if recorded.speed > 0 else 0.0
     return recorded._replace(
         x=x - offset * math.sin(yaw),
         y=y + offset * math.cos(yaw),
-        yaw=yaw + (recorded.yaw - near.yaw) + drawn.get("start.heading", 0.0),
+        yaw=yaw + (recorded.yaw - near.yaw) + sampled.get("start.heading", 0.0),
         speed=speed,
         yaw_rate=recorded.yaw_rate * turns,
     )
@@ -461,16 +461,16 @@ class RandomizedIdm:
     def driver_of(
         self, subject: ObjectState, spec: IdmDriver
     ) -> tuple[IdmDriver, dict[str, float]]:
-        """The parameters of an object's driver, and those that were drawn by name."""
-        drawn: dict[str, float] = {}
+        """The parameters of an object's driver, and those that were sampled by name."""
+        sampled: dict[str, float] = {}
         for name, width in self.widths.items():
             value = getattr(spec, name)
             if name == "desired_speed":
                 value = desired_speed(subject, spec)
             key = f"agents.{subject.object_id}.{name}"
-            drawn[key] = value * (1.0 + self.draws.around(width, key))
-        named = {key.rpartition(".")[2]: value for key, value in drawn.items()}
-        return spec.model_copy(update=named), drawn
+            sampled[key] = value * (1.0 + self.draws.around(width, key))
+        named = {key.rpartition(".")[2]: value for key, value in sampled.items()}
+        return spec.model_copy(update=named), sampled
 
 
 class EstimateError(NamedTuple):
@@ -521,11 +521,13 @@ def estimate_error(
 
 
 def latency_jitter_us(longest_us: int, draws: Draws, step: int) -> int:
-    """The wait that is added to the latency of the plan for a step [us]; 0 where none is drawn."""
+    """The wait that is added to the latency of the plan for a step [us]; 0 where none is sampled."""
     return int(draws.uniform("latency", step)[0] * (longest_us + 1)) if longest_us else 0
 
 
-# Where an edit of a running episode puts road users: beside the ego's route, from now on.
+# --- Placement -----------------------------------------------------------------------------------
+
+# An edit of a running episode places road users beside the ego's route, from now on.
 
 
 def placed(

@@ -24,7 +24,7 @@ RADIUS = 60.0
 """Places of centre lines are shown so far from the vehicle [m]."""
 SPACING = 5.0
 """Between places along a lane, at most [m]."""
-MOST_LANES, MOST_PLACES = 32, 32
+MAX_LANES, MAX_PLACES = 32, 32
 """The nearest lanes, and of each the places nearest to its own nearest one."""
 
 
@@ -87,7 +87,7 @@ def lanes_around(graph: LaneGraph, x: float, y: float) -> tuple[LanePiece, ...]:
     inside = set(near.tolist())
     return tuple(
         LanePiece(lanes[known.lane[k]], known.values[_run(int(k), known.lane, inside)])
-        for k in order[np.sort(first)[:MOST_LANES]]
+        for k in order[np.sort(first)[:MAX_LANES]]
     )
 
 
@@ -98,9 +98,9 @@ def _run(nearest: int, lane: NDArray[np.int64], inside: set[int]) -> slice:
         return 0 <= k < len(lane) and lane[k] == lane[nearest] and k in inside
 
     low = high = nearest
-    while high - low + 1 < MOST_PLACES and (reaches(low - 1) or reaches(high + 1)):
+    while high - low + 1 < MAX_PLACES and (reaches(low - 1) or reaches(high + 1)):
         low -= reaches(low - 1)
-        if high - low + 1 < MOST_PLACES:
+        if high - low + 1 < MAX_PLACES:
             high += reaches(high + 1)
     return slice(low, high + 1)
 

@@ -1,4 +1,4 @@
-"""The recorded way of the ego vehicle as a curve that everything else is measured along."""
+"""The recorded path of the ego vehicle, which everything else is measured along."""
 
 from __future__ import annotations
 
@@ -405,7 +405,7 @@ def _apart(positions: Float) -> list[int]:
     return kept
 
 
-# The seam of a loop: where the ego was put back, as a rigid motion of the plane.
+# --- Loops ---------------------------------------------------------------------------------------
 
 
 class LoopTransform(NamedTuple):
@@ -444,7 +444,7 @@ class LoopTransform(NamedTuple):
         )
 
 
-# Where the recorded drive goes from here: waypoints and a turn command.
+# --- Route ---------------------------------------------------------------------------------------
 
 ROUTE_SPACING, ROUTE_POINTS = 1.0, 4096
 """Of a whole route: way from point to point [m], and how many points it has at most."""

@@ -29,7 +29,7 @@ from .world import World
 
 
 @dataclass(frozen=True, eq=False)
-class MetThings:
+class RayTargets:
     """Background, objects and fragments at an instant.
 
     Attributes:
@@ -43,7 +43,7 @@ class MetThings:
     object_ids: Sequence[str]
 
 
-def met_things(world: World) -> MetThings:
+def ray_targets(world: World) -> RayTargets:
     """What there is for rays to meet: with surfaces for LiDARs where the scene has them, objects
     deformed by impacts as images show them, and no shadows."""
     scene, agents = world.scene, world.agents
@@ -59,7 +59,7 @@ def met_things(world: World) -> MetThings:
         fragments = world.deformation.fragments(world.t_us)
         found += [(fragment, None) for fragment in fragments]
     instances, attributes = zip(*found, strict=True)
-    return MetThings(instances, attributes, ids)
+    return RayTargets(instances, attributes, ids)
 
 
 def _deform(
@@ -78,18 +78,18 @@ def _deform(
             found[k] = (deformed, None)
 
 
-def sweep_request(world: World, lidar: Lidar, things: MetThings) -> CastRequest:
+def sweep_request(world: World, lidar: Lidar, targets: RayTargets) -> CastRequest:
     """The sweep that ends at the instant of ``world``."""
     offsets = lidar.beams.slots[0]
     times = world.t_us + offsets
-    wake, agents = world.wake, world.agents
-    ego = wake.ego_poses(times, t_us=world.t_us, now=world.T_world_body, twist=world.twist)
+    history, agents = world.motion_history, world.agents
+    ego = history.ego_poses(times, t_us=world.t_us, now=world.T_world_body, twist=world.twist)
     still = not np.any(offsets)
-    moved: list[Float | None] = [None] * len(things.instances)
-    for k, object_id in enumerate(things.object_ids, start=1):
+    moved: list[Float | None] = [None] * len(targets.instances)
+    for k, object_id in enumerate(targets.object_ids, start=1):
         if not still:
-            moved[k] = wake.object_poses(object_id, times, t_us=world.t_us, now=agents)
-    met = SweepScene(things.instances, tuple(moved), things.attributes, incidence_of(world.scene))
+            moved[k] = history.object_poses(object_id, times, t_us=world.t_us, now=agents)
+    met = SweepScene(targets.instances, tuple(moved), targets.attributes, incidence_of(world.scene))
     return met.request(lidar, ego @ lidar.T_vehicle_lidar)
 
 
@@ -97,18 +97,18 @@ SEED_BYTES = 7
 
 
 def sweep_cloud(
-    world: World, mounted: MountedLidar, things: MetThings, caster: CastBackend
+    world: World, mounted: MountedLidar, targets: RayTargets, caster: CastBackend
 ) -> Cloud:
     """The sweep of a LiDAR that ends at the instant of ``world``; the same bits again for the same
     episode."""
     return measured_sweep(
-        sweep_request(world, mounted.lidar, things),
+        sweep_request(world, mounted.lidar, targets),
         mounted,
         caster,
         t_us=world.t_us,
         seed=sensor_seed(world, mounted.name),
         T_world_vehicle=world.T_world_body,
-        T_world_told=world.T_world_estimate,
+        T_world_estimate=world.T_world_estimate,
     )
 
 
@@ -130,7 +130,7 @@ def recorded_cloud(
         t_us=t_us,
         seed=0,
         T_world_vehicle=T_world_vehicle,
-        T_world_told=T_world_vehicle,
+        T_world_estimate=T_world_vehicle,
     )
 
 
@@ -142,7 +142,7 @@ def measured_sweep(
     t_us: int,
     seed: int,
     T_world_vehicle: Float,
-    T_world_told: Float,
+    T_world_estimate: Float,
 ) -> Cloud:
     """What a LiDAR makes of the rays of a sweep.
 
@@ -153,7 +153,7 @@ def measured_sweep(
         t_us: when the last one is fired [us].
         seed: of noise and losses.
         T_world_vehicle: [4, 4], where the vehicle is then.
-        T_world_told: [4, 4], where it takes itself to be.
+        T_world_estimate: [4, 4], where it takes itself to be.
     """
     spec, lidar = mounted.spec, mounted.lidar
     echo = caster.cast(request)
@@ -172,7 +172,7 @@ def measured_sweep(
         frame=spec.frame,
         compensated=spec.compensated,
         T_vehicle_sensor=lidar.T_vehicle_lidar,
-        T_world_sensor=T_world_told @ lidar.T_vehicle_lidar,
+        T_world_sensor=T_world_estimate @ lidar.T_vehicle_lidar,
         columns=columns,
         codec=spec.codec,
     )
@@ -241,13 +241,13 @@ def _points(
 
 
 def scan_cloud(
-    world: World, mounted: MountedRadar, things: MetThings, caster: CastBackend
+    world: World, mounted: MountedRadar, targets: RayTargets, caster: CastBackend
 ) -> Cloud:
     """The scan of a radar at the instant of ``world``; the same bits again for the same episode."""
     radar, spec = mounted.radar, mounted.spec
-    request = sweep_request(world, radar.rays, things)
+    request = sweep_request(world, radar.rays, targets)
     echo = caster.cast(request)
-    patches = _patches(world, request, echo, things)
+    patches = _patches(world, request, echo, targets)
     found = radar_detections(patches, radar, seed=sensor_seed(world, mounted.name))
     columns: dict[str, NDArray[Any]] = {
         "points": in_frame(found.points, spec.frame, radar.T_vehicle_radar)
@@ -269,7 +269,7 @@ def scan_cloud(
     )
 
 
-def _patches(world: World, request: CastRequest, echo: Echo, things: MetThings) -> Patches:
+def _patches(world: World, request: CastRequest, echo: Echo, targets: RayTargets) -> Patches:
     lidar = request.lidar
     hit = echo.hit
     distance = echo.range[hit].astype(np.float64)
@@ -277,7 +277,7 @@ def _patches(world: World, request: CastRequest, echo: Echo, things: MetThings) 
     T_world_sensor = request.T_world_lidar[-1]
     rays = directions @ T_world_sensor[:3, :3].T
     points = rays * distance[:, None] + T_world_sensor[:3, 3]
-    owner, normals, semantic, centres, velocities = _owners(world, things, echo.member[hit])
+    owner, normals, semantic, centres, velocities = _owners(world, targets, echo.member[hit])
     on_ground = np.abs(points[:, 2] - world.ground.height_at(points[:, :2])) < TOLERANCE
     semantic = np.where((semantic == STATIC) & on_ground, GROUND, semantic).astype(np.uint8)
     cosine = np.abs(np.einsum("ni,ni->n", normals, rays))
@@ -294,17 +294,17 @@ def _patches(world: World, request: CastRequest, echo: Echo, things: MetThings) 
 
 
 def _owners(
-    world: World, things: MetThings, members: NDArray[np.int32]
+    world: World, targets: RayTargets, members: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], Float, NDArray[np.uint8], Float, Float]:
     """Of each ray: the number of the instance that it meets, the normal there in the world, its
     class; and for each instance its centre and its velocity and turn [6] in the world."""
-    counts = [len(instance.cloud) for instance in things.instances]
+    counts = [len(instance.cloud) for instance in targets.instances]
     firsts = np.cumsum([0, *counts])
     owner = np.searchsorted(firsts, members, side="right") - 1
     normals = np.zeros((len(members), 3))
     centres, velocities = np.zeros((len(counts), 3)), np.zeros((len(counts), 6))
     semantic = np.zeros(len(members), np.uint8)
-    for k, instance in enumerate(things.instances):
+    for k, instance in enumerate(targets.instances):
         own = owner == k
         pose = instance.T_world_object
         if pose is not None:
@@ -312,8 +312,8 @@ def _owners(
         if own.any():
             normals[own] = _normals(instance, members[own] - firsts[k])
             semantic[own] = instance.semantic
-    velocities[1 : len(things.object_ids) + 1, :3] = world.agents.velocities
-    velocities[1 : len(things.object_ids) + 1, 5] = _turns(world, things.object_ids)
+    velocities[1 : len(targets.object_ids) + 1, :3] = world.agents.velocities
+    velocities[1 : len(targets.object_ids) + 1, 5] = _turns(world, targets.object_ids)
     return owner, normals, semantic, centres, velocities
 
 
@@ -335,10 +335,12 @@ def _turns(world: World, object_ids: Any) -> Float:
     step = world.spec.dt_us
     times = np.array([world.t_us - step, world.t_us], np.float64)
     rates = np.zeros(len(object_ids))
-    if not world.wake.ways:
+    if not world.motion_history.segments:
         return rates
     for k, object_id in enumerate(object_ids):
-        before, after = world.wake.object_poses(object_id, times, t_us=world.t_us, now=world.agents)
+        before, after = world.motion_history.object_poses(
+            object_id, times, t_us=world.t_us, now=world.agents
+        )
         turn = after[:3, :3] @ before[:3, :3].T
         rates[k] = np.arctan2(turn[1, 0], turn[0, 0]) / (step * 1e-6)
     return rates
@@ -362,10 +364,10 @@ def _of_sensor(world: World, T_world_sensor: Float) -> Float:
 
 def clouds_of(world: World, due: Sequence[Mounted], caster: CastBackend) -> list[Cloud]:
     """What ``due`` sensors measure at the instant of ``world``, in their order."""
-    things = met_things(world)
+    targets = ray_targets(world)
     return [
-        sweep_cloud(world, mounted, things, caster)
+        sweep_cloud(world, mounted, targets, caster)
         if isinstance(mounted, MountedLidar)
-        else scan_cloud(world, mounted, things, caster)
+        else scan_cloud(world, mounted, targets, caster)
         for mounted in due
     ]

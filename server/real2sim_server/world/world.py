@@ -55,7 +55,7 @@ from .episode import (
 from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
 from .observation import LanePiece, Observation, lanes_around
 from .path import Float, LoggedPath, LoopTransform, PathPoint, command_ahead, route_ahead
-from .ranging import Mounted, StepWay, Wake, mounted_sensors
+from .ranging import MotionHistory, MotionSegment, Mounted, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score
 from .storyboard.program import ShownSignal
 from .storyboard.run import StoryboardRun, begin_storyboard
@@ -91,9 +91,9 @@ class World:
         terminated, truncated, reason: how the episode ended: ``collision``, ``horizon``,
             ``deadline``, ``wall_clock``.
         lap: times that the ego has been put back to the start of the route.
-        drawn: what the seed has drawn for the start and for objects so far, by name.
+        sampled: values sampled for the start and for objects so far, by name.
         ranging: LiDARs and radars of the episode.
-        wake: the way that all has come, as far back as a sweep looks.
+        motion_history: of ego and objects, as far back as a sweep looks.
         strides: of people who are not where their trajectories lead.
     """
 
@@ -125,7 +125,7 @@ class World:
         self.lap = 0
         self._clock = episode_clock(scene, spec)
         self.ranging = mounted_sensors(spec.lidars, spec.radars, spec.dt_us)
-        self.wake = Wake.of(self.ranging.longest_us)
+        self.motion_history = MotionHistory.of(self.ranging.longest_us)
         self.strides = Strides()
         self.t_us = self._clock.at(self.steps)
         # Until then the ego moves as recorded.
@@ -136,7 +136,7 @@ class World:
         self._tracks = self._tracks_of(state)
         self.ground = scene.ground
         first = self._first_storyboard()
-        self.motion, drawn = self._first_motion(first)
+        self.motion, sampled = self._first_motion(first)
         self._path_point: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._ego_pose()
         self._attitude, self.T_world_body = LEVEL, self.T_world_vehicle
@@ -144,9 +144,9 @@ class World:
         self._controller = EgoController(spec, scene.ego)
         self.traffic = self._first_traffic(first)
         if first is not None:
-            drawn |= dict(first.drawn)
-        self._start_drawn = drawn
-        self._step_drawn: Mapping[str, float] = drawn | dict(self.traffic.drawn)
+            sampled |= dict(first.sampled)
+        self._start_sampled = sampled
+        self._step_sampled: Mapping[str, float] = sampled | dict(self.traffic.sampled)
         self._off_route = self._off_road = False
         self._contacts = self._initial_contacts()
         if deformation is None and self._contacts.exchanges_momentum and spec.contact.dents:
@@ -202,9 +202,9 @@ class World:
         return self.t_us < self._warm_up_end_us
 
     @property
-    def drawn(self) -> dict[str, float]:
-        """What the seed has drawn for the start and for objects so far, by name."""
-        return self._start_drawn | dict(self.traffic.drawn)
+    def sampled(self) -> dict[str, float]:
+        """Values sampled for the start and for objects so far, by name."""
+        return self._start_sampled | dict(self.traffic.sampled)
 
     @property
     def T_world_estimate(self) -> Float:
@@ -245,7 +245,7 @@ class World:
                 named or with times that are over; the world is as before.
         """
         self._check_running()
-        drawn_before = self.traffic.drawn
+        sampled_before = self.traffic.sampled
         jitter_us = latency_jitter_us(
             self.spec.randomization.latency_us if plan is not None else 0, self._draws, self.steps
         )
@@ -261,12 +261,18 @@ class World:
         self.strides = self.strides.after(
             self.scene, self.agents, since_us=since_us, t_us=self.t_us
         )
-        ways = (body, self.T_world_body), (start.agents, self.agents)
-        self.wake = self.wake.after(StepWay(since_us, self.t_us, *ways))
-        self._step_drawn = _newly_drawn(self.traffic.drawn, drawn_before, jitter_us)
+        spans = (body, self.T_world_body), (start.agents, self.agents)
+        self.motion_history = self.motion_history.after(MotionSegment(since_us, self.t_us, *spans))
+        self._step_sampled = _newly_sampled(self.traffic.sampled, sampled_before, jitter_us)
         contacts = self._apply_impacts(moved.impacts, start.agents)
-        told = self._storyboard_events()
-        events = (*self._edit_events, *loop_events, *late_events, *reaction_events, *told)
+        storyboard_events = self._storyboard_events()
+        events = (
+            *self._edit_events,
+            *loop_events,
+            *late_events,
+            *reaction_events,
+            *storyboard_events,
+        )
         self._pending = PendingStep(start, trajectory, events, contacts, self._seam)
         self._edit_events = ()
 
@@ -368,7 +374,7 @@ class World:
             reason=self.reason,
             warming_up=self.warming_up,
             lap=self.lap,
-            drawn=self._step_drawn,
+            drawn=self._step_sampled,
             truth=truth,
             signals=self._signals(),
             lanes=self._lanes_around(motion),
@@ -620,7 +626,7 @@ class World:
             pose = self.ground.pose_on(motion.x, motion.y, motion.yaw)
             return set(overlapping_rows(ego_box(pose, size), size, others))
 
-        # Boxes of a recording may overlap slightly; a drawn start must not touch anybody else.
+        # Boxes of a recording may overlap slightly; a sampled start must not touch anybody else.
         return randomized_start(
             recorded,
             self._path,
@@ -708,9 +714,9 @@ class World:
         )
 
 
-def _newly_drawn(
+def _newly_sampled(
     now: Mapping[str, float], before: Mapping[str, float], jitter_us: int
 ) -> Mapping[str, float]:
-    """What has been drawn in a step, by name."""
-    drawn = {} if now is before else {k: v for k, v in now.items() if k not in before}
-    return drawn | {"latency_us": float(jitter_us)} if jitter_us else drawn
+    """What has been sampled in a step, by name."""
+    sampled = {} if now is before else {k: v for k, v in now.items() if k not in before}
+    return sampled | {"latency_us": float(jitter_us)} if jitter_us else sampled

@@ -116,7 +116,7 @@ def test_what_is_drawn_is_in_the_first_observation_alone(begun):
     assert set(world.observe().drawn) == {f"start.{name}" for name in START["start"]}
     world.step(COAST)
     assert world.observe().drawn == {}
-    assert set(world.drawn) == {f"start.{name}" for name in START["start"]}
+    assert set(world.sampled) == {f"start.{name}" for name in START["start"]}
 
 
 def test_a_start_is_not_drawn_for_a_warm_up(begun):
@@ -130,7 +130,7 @@ def test_a_start_is_not_drawn_for_a_warm_up(begun):
 def test_parameters_of_idm_are_drawn_for_each_object(begun, moving):
     cars = {"a": moving(30, 0, z=0.8, speed=6.0), "b": moving(60, 0, z=0.8, speed=6.0)}
     spec = {"agents": {"default": "idm"}}
-    drawn = begun(4, {"traffic": {"headway": 0.3, "desired_speed": 0.2}}, spec=spec, **cars).drawn
+    drawn = begun(4, {"traffic": {"headway": 0.3, "desired_speed": 0.2}}, spec=spec, **cars).sampled
     assert set(drawn) == {f"agents.{c}.{n}" for c in "ab" for n in ("headway", "desired_speed")}
     assert 1.05 <= drawn["agents.a.headway"] <= 1.95
     assert 4.8 <= drawn["agents.a.desired_speed"] <= 7.2
@@ -140,8 +140,8 @@ def test_parameters_of_idm_are_drawn_for_each_object(begun, moving):
 def test_what_is_drawn_for_an_object_does_not_depend_on_the_others(begun, moving):
     a, b = moving(30, 0, z=0.8, speed=6.0), moving(60, 0, z=0.8, speed=6.0)
     spec, ranges = {"agents": {"default": "idm"}}, {"traffic": {"headway": 0.3}}
-    alone = begun(4, ranges, spec=spec, b=b).drawn["agents.b.headway"]
-    assert begun(4, ranges, spec=spec, a=a, b=b).drawn["agents.b.headway"] == alone
+    alone = begun(4, ranges, spec=spec, b=b).sampled["agents.b.headway"]
+    assert begun(4, ranges, spec=spec, a=a, b=b).sampled["agents.b.headway"] == alone
 
 
 # --- ego estimate ---------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
             "truncated": world.truncated,
             "reason": world.reason,
             "lap": world.lap,
-            "drawn": world.drawn,
+            "drawn": world.sampled,
         }
     )
 

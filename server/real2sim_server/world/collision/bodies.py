@@ -1,4 +1,4 @@
-"""Ego and objects as rigid bodies, and objects that physics moves after an impact."""
+"""Ego and objects as rigid bodies on the plane, and the impacts between them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from ..ego.motion import Motion
 from ..scoring.instant import Side
 from ..traffic.driver import AgentPose, Surroundings
 
-# Rigid bodies on the plane: state, impulses, and sliding to rest.
+# --- Rigid bodies --------------------------------------------------------------------------------
+
+# State, impulses, and sliding to rest.
 
 SLIDING_SLIP = 0.1
 """Slip angle from which on a tyre of a sliding car gives all its friction [rad]."""
@@ -292,7 +294,7 @@ def is_rolling(motion: Motion, spec: EgoSpec) -> bool:
     return abs(motion.lateral_speed) < 0.2 and abs(motion.yaw_rate - steered) < 0.1
 
 
-# Impacts: what two bodies exchanged in one step of the clock.
+# --- Impacts -------------------------------------------------------------------------------------
 
 MUTUAL_STIFFNESS = 405e3
 """Of two cars in series, where impacts are sudden: 405 +- 139 kN/m (Bonugli et al. 2017) [N/m]."""

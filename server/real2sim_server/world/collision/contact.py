@@ -1,4 +1,4 @@
-"""Contact manifold of two boxes on the plane, and the impulse that they exchange there."""
+"""Contact of two boxes on the plane: manifold, impulse, impacts that take time, and obstacles."""
 
 from __future__ import annotations
 
@@ -246,14 +246,14 @@ def contact_impulse(
     return ContactImpulse(jn * nx + jt * tx, jn * ny + jt * ty, -normal)
 
 
-# Impacts that take time: what two bodies in contact have exchanged so far, and what comes next.
-#
-# While they approach, a force pushes them apart that grows with the depth to which their structures
-# are crushed; once they do not, a part of it remains until the impulse of restitution is given
-# (Poisson's hypothesis). So collinear impacts exchange what a sudden impulse would, over the time
-# that their masses and structures take. Crush is never given back: who comes again meets what is
-# already crushed, which yields no further before as much force acts on it; and two whose boxes still
-# overlap when it is over do not push each other until they come nearer than they were then.
+# --- Impacts that take time ----------------------------------------------------------------------
+
+# While two bodies approach, a force pushes them apart that grows with the crush of their
+# structures. Afterwards part of it remains until the impulse of restitution is reached (Poisson's
+# hypothesis). A collinear impact therefore exchanges the impulse of an instantaneous one, over the
+# time that masses and structures take. Crush is permanent: a later impact meets the crushed
+# structure, which yields no further below the force reached before. Two boxes that still overlap
+# after an impact do not push each other until they come closer than they were then.
 
 SPREAD = 0.5
 """By how much wider than the place of contact a structure is that yields there [m]."""
@@ -261,9 +261,9 @@ KEPT = 0.38
 """Of the largest crush that stays: 0.26 of 0.68 m in the barrier test of the 2015 Malibu."""
 SQUARE = 1e-6
 """Faces across a normal lie so well across it, as a sine."""
-LEAST_LENGTH = 1.0
+MIN_LENGTH = 1.0
 """Of a body that has been crushed [m]."""
-LEAST_WIDTH = 0.1
+MIN_WIDTH = 0.1
 """Of a place of contact [m]."""
 
 
@@ -365,7 +365,7 @@ def contact_width(bodies: Bodies, width: float, nx: float, ny: float) -> float:
     face = _face_width(first, nx, ny)
     if second is not None:
         face = min(face, _face_width(second, nx, ny))
-    return min(max(width, LEAST_WIDTH) + SPREAD, face)
+    return min(max(width, MIN_WIDTH) + SPREAD, face)
 
 
 def advance_pulse(
@@ -440,12 +440,14 @@ def shortened(
     front, rear, _ = body[1].stiffness
     own = stiffness / (front if ahead > 0 else rear)
     mean = KEPT * own * (pulse.depth - pulse.kept) * min(pulse.width / body[1].width, 1.0)
-    left = body[1].length - LEAST_LENGTH
+    left = body[1].length - MIN_LENGTH
     mean = max(min(mean, left), 0.0)
     return (mean, 0.0) if ahead > 0 else (0.0, mean)
 
 
-# Obstacles of the background: a grid whose occupied cells hold walls, poles, parked cars.
+# --- Obstacles of the background -----------------------------------------------------------------
+
+# Occupied cells of a grid hold walls, poles and parked cars.
 
 BREADTH = 1.0
 """How far to the sides of a contact it is looked for how broad an obstacle is [m]."""

@@ -284,7 +284,9 @@ def _impacted_objects(traffic: Traffic) -> dict[str, ImpactedObject]:
     return {i: d for i, d in traffic.drivers.items() if isinstance(d, ImpactedObject)}
 
 
-# Contacts of a step: events for the planner, records for the scores.
+# --- Contacts of a step --------------------------------------------------------------------------
+
+# Events for the planner, records for the scores.
 
 
 class StepContacts(NamedTuple):

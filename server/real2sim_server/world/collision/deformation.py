@@ -1,9 +1,9 @@
-"""Deformation of objects after impacts: what is drawn of them, solved by the MPM on demand.
+"""Deformation of objects after impacts: drawn on demand, solved by the MPM.
 
-The impulse stays the authority for motion: it costs microseconds, so an episode without cameras
-never waits for the MPM, and every device computes the same. The deformation is solved when a
-picture needs it, from the impact alone, and so is the same after a crash of the worker, in a fork,
-and in a recording.
+The impulse alone decides the motion: it costs microseconds, so an episode without cameras never
+waits for the MPM, and every device computes the same. An image that shows a deformed object solves
+the deformation, from the impact alone. The result is the same after a crash of the worker, in a
+fork and in a recording.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ from ...simulation.embedding import Deformed, Embedding, deform_cloud, replaced_
 from ...simulation.structure import VEHICLES
 from .bodies import BodyState, Impact, ImpactParticipant
 
-# What impacts break and fold of a vehicle in the closed loop, followed through their frames.
+# --- Damage --------------------------------------------------------------------------------------
+
+# Parts of a vehicle that impacts break and fold, followed through their frames.
 
 HARD = 5.0
 """Fragments fly as far as they do from a limit passed once, per so much approach speed [m/s]."""
@@ -164,7 +166,7 @@ NEVER_DEFORMED = frozenset({"pedestrian", "person", "cyclist", "motorcyclist", "
 FRICTION = 0.4
 """Of bodywork on bodywork."""
 
-LEAST_MOVED = 5e-3
+MIN_MOVED = 5e-3
 """Particles that have moved less than this leave Gaussians where they are [m]."""
 
 REACH = 2.5
@@ -361,7 +363,7 @@ class _UndeformedObject:
         if self._pieces is None:
             means = self.cloud.means.detach().cpu().numpy().astype(np.float64)
             self._pieces = _pieces(means, self.body.rest.positions)
-        moved = np.linalg.norm(displacements, axis=1) > LEAST_MOVED
+        moved = np.linalg.norm(displacements, axis=1) > MIN_MOVED
         near = [p for p in self._pieces if p.touches(self.body, moved)]
         if not near:
             return self.cloud

@@ -38,7 +38,9 @@ from .solver_state import (
     pair_impulse,
 )
 
-# Bodies that pass through a corner of one another between two substeps.
+# --- Corners -------------------------------------------------------------------------------------
+
+# Bodies that pass through a corner of each other between two substeps.
 
 SLOWEST = 0.05
 """Bodies that move less than this against each other in a substep cannot do so unseen [m]."""

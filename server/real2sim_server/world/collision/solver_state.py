@@ -1,4 +1,4 @@
-"""What the substeps of a step with collisions work on: bodies, contacts and what they exchanged."""
+"""State of the substeps of a step with collisions: bodies, contacts and exchanged impulses."""
 
 from __future__ import annotations
 
@@ -233,16 +233,17 @@ def make_dynamic(state: SolverState, impacted_now: set[str]) -> None:
     state.dynamic |= impacted_now
 
 
-# An impact all along a face: strips of structure that yield each on their own.
+# --- Impact along a face -------------------------------------------------------------------------
+
+# Strips of structure yield independently. Force acts only where two bodies still approach each
+# other, and grows with the depth of penetration there, as on the points around a vehicle in SMAC
+# (McHenry 1971). Where one turns away, force remains on the part that the other still runs into and
+# moves along the face with it; at the centre of the whole contact it would end as soon as that
+# centre stops.
 #
-# Force acts only where two bodies still come nearer to each other, and there grows with how deep they
-# are in one another, as on the points around a vehicle in SMAC (McHenry 1971). So where one turns
-# away, force stays on the part that the other still runs into, and moves along the face with it; at
-# the middle of all contact it would be over as soon as that middle stops.
-#
-# The force of vehicles is progressive: what is outermost folds at little force, which grows with how
-# fast it is folded, and rails behind it carry the published stiffness. So an impact of 10 m/s lasts
-# longer than one of 30.
+# The force of vehicles is progressive: the outermost structure folds at little force, which grows
+# with the folding speed, and the rails behind it carry the published stiffness. An impact at 10 m/s
+# therefore lasts longer than one at 30.
 
 STRIPS = 16
 SHALLOW, DEEPENING, RATE = 0.2, 0.35, 0.015
@@ -431,10 +432,10 @@ def _chord(shape: list[Corner], across: float) -> tuple[float, float]:
     return (min(found), max(found)) if found else (0.0, 0.0)
 
 
-# Impacts that take time, among all bodies of a step: when they begin, go on and end.
-#
-# What two bodies exchange in an instant is in ``pulse``; here are the contacts that have begun, the
-# record of what was exchanged, and how much shorter the bodies are afterwards.
+# --- Impacts under way ---------------------------------------------------------------------------
+
+# Contacts that have begun, the record of their impulses, and how much shorter the bodies are
+# afterwards. :mod:`.contact` computes what two bodies exchange in an instant.
 
 
 def exchange(state: SolverState, a: str, b: str, manifold: ContactManifold, h: float) -> bool:

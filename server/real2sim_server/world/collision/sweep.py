@@ -1,9 +1,8 @@
-"""Contacts of the ego within a step where no momentum is exchanged: boxes swept from the instant
-before to the instant after.
+"""Contacts of the ego where no momentum is exchanged: at an instant, and within a step.
 
-The motion of the ego in between is its controller's, looked at every 50 ms; other objects move
-straight from instant to instant and turn evenly. Boxes are seen from above, and are above one
-another where their heights do not overlap.
+Within a step, boxes are swept from the instant before to the instant after. The ego moves as its
+controller does, sampled every 50 ms; other objects move straight from instant to instant and turn
+evenly. Boxes are seen from above; boxes whose heights do not overlap do not touch.
 """
 
 from __future__ import annotations
@@ -30,9 +29,7 @@ from ..scoring.instant import ContactRecord, side_of_contact
 from .bodies import BodyProperties, BodyState, ego_body, ego_properties
 from .contact import ObstacleGrid, contact_manifold, corners
 
-# Contacts of the ego at an instant where no momentum is exchanged: overlaps of boxes.
-#
-# What begins and ends between two instants is found by :mod:`.sweep`.
+# --- Overlaps at an instant ----------------------------------------------------------------------
 
 BACKGROUND = "background"
 """Name and category of what is not an object."""

@@ -1,7 +1,7 @@
-"""The family of compiled trackers: what ``EgoSpec.tracker`` names, but ``perfect``.
+"""Compiled trackers: every value of ``EgoSpec.tracker`` except ``perfect``.
 
-A tracker is two compiled functions, see :class:`Tracker`; a new one is a module with these and a
-line of :data:`TRACKERS`.
+A tracker is two compiled functions, see :class:`Tracker`. A new tracker needs these two functions
+and an entry in :data:`TRACKERS`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .vehicle import (
     wrapped,
 )
 
-# Linear-quadratic regulators along and across a plan.
+# --- Linear-quadratic regulators along and across the plan ---------------------------------------
 
 TIME = 0.6
 """Time scale of the regulator along the plan [s]: (r/q)^(1/4) of its weights."""
@@ -169,7 +169,7 @@ def _steering_of(curvature, speed, vehicle):
     return steady_steering(vehicle.model, rolling, curvature, speed, vehicle)
 
 
-# Pure pursuit: aim at where the plan will be.
+# --- Pure pursuit --------------------------------------------------------------------------------
 
 LOOKAHEAD = 0.4
 """The controller aims at where the plan is this much later [s]."""
@@ -288,15 +288,15 @@ def _arc_length(ahead, left):
     return math.hypot(ahead, left) * stretch
 
 
-# Iterative LQR: the commands that follow the plan best over the next seconds, within limits.
-#
-# Gauss-Newton (Li & Todorov 2004) with the kinematic bicycle over 1.5 s in steps of 0.1 s, on the
-# state (x, y, yaw, speed, road-wheel angle, acceleration) and the inputs (acceleration asked for,
-# steering rate). Limits are held in the rollout of each iteration. A schedule is one state a row,
+# --- Iterative LQR -------------------------------------------------------------------------------
+
+# Gauss-Newton (Li & Todorov 2004) with the kinematic bicycle over 1.5 s in steps of 0.1 s. The
+# state is (x, y, yaw, speed, road-wheel angle, acceleration), the inputs are (requested
+# acceleration, steering rate). Each rollout respects the limits. A schedule has one state a row,
 # [STEPS + 1, 6], and one pair of inputs a row, [STEPS, 2].
 #
-# The acceleration follows what is asked for with the lag that is known of engine and brakes. The lag
-# of the steering gear needs no state: angle and rate of the wheels say what to ask of it.
+# The acceleration follows its request with the known lag of engine and brakes. The lag of the
+# steering gear needs no state: the angle and rate of the wheels determine the request.
 
 STEP = 0.1
 STEPS = 15
@@ -555,7 +555,7 @@ class Tracker(NamedTuple):
     """Makes the vehicle follow a plan; both are made by :func:`real2sim_server._numba.func`.
 
     Attributes:
-        command: ``command(state, curve, t, vehicle, schedule)``, the :class:`.state.Command` of a
+        command: ``command(state, curve, t, vehicle, schedule)``, the :class:`.vehicle.Command` of a
             substep, ``t`` seconds after the plan began; ``schedule`` is what was prepared (it may
             be empty) and the seconds since then. State and time are those at which the command
             reaches the wheels; lags that it has to allow for are ``vehicle.known_steering_lag``
@@ -570,7 +570,7 @@ class Tracker(NamedTuple):
 
 
 @func
-def _no_schedule(_state, _curve, _since, _vehicle):  # type: ignore[no-untyped-def]
+def _no_schedule(_state, _curve, _since, _vehicle):
     return np.empty((0, 0)), np.empty((0, 0))
 
 

@@ -1,4 +1,8 @@
-"""Constants of the controlled vehicle."""
+"""The controlled vehicle: its constants, state, models and actuators.
+
+A vehicle model is two compiled functions, see :class:`VehicleModel`. A new model needs these two
+functions and an entry in :data:`VEHICLE_MODELS`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ from real2sim_proto.episode import EgoSpec
 from ..._numba import func
 from ..common import cache_by_identity
 
-# State of the vehicle, and commands to it.
+# --- State ---------------------------------------------------------------------------------------
 
 GENTLE_BRAKING = 2.0
 """Deceleration after a plan's end [m/s^2]."""
@@ -87,7 +91,7 @@ class VehicleParameters(NamedTuple):
     """A car as two axles that carry a mass, with the limits of what moves and steers it.
 
     Attributes:
-        model: number of its model, see :mod:`.vehicle_models`.
+        model: number of its model, see :data:`VEHICLE_MODELS`.
         wheelbase: [m].
         mass: [kg].
         inertia: about the vertical axis through the centre of mass [kg m^2].
@@ -135,7 +139,7 @@ class VehicleParameters(NamedTuple):
     tracker_version: int
 
 
-# Compiled functions chosen by number.
+# --- Dispatch ------------------------------------------------------------------------------------
 
 
 def choice(functions: Sequence[Any]) -> Any:
@@ -148,14 +152,14 @@ def choice(functions: Sequence[Any]) -> Any:
     if not rest:
 
         @func
-        def last(_number, *args):  # type: ignore[no-untyped-def]
+        def last(_number, *args):
             return first(*args)
 
         return last
     others = choice(rest)
 
     @func
-    def chosen(number, *args):  # type: ignore[no-untyped-def]
+    def chosen(number, *args):
         if number == 0:
             return first(*args)
         return others(number - 1, *args)
@@ -163,7 +167,7 @@ def choice(functions: Sequence[Any]) -> Any:
     return chosen
 
 
-# The kinematic bicycle: wheels go where they point.
+# --- Kinematic bicycle ---------------------------------------------------------------------------
 
 
 @func
@@ -230,7 +234,7 @@ def sinc(angle):
     return math.sin(angle) / angle
 
 
-# The dynamic bicycle: two axles whose tyres slip, with load transfer and a friction limit.
+# --- Tyres of the dynamic bicycle ----------------------------------------------------------------
 
 _wheel_load = func(wheel_load)
 
@@ -352,7 +356,7 @@ def _integrated(state, rate, h):
     )
 
 
-# The dynamic bicycle: two axles on tyres that slip; rolls where it is slow.
+# --- Dynamic bicycle -----------------------------------------------------------------------------
 
 
 @func
@@ -397,18 +401,15 @@ def understeer_steering(rolling, curvature, speed, vehicle):
     return rolling + vehicle.understeer * speed**2 * curvature
 
 
-# The family of vehicle models: what ``EgoSpec.dynamics`` names.
-#
-# A model is two compiled functions, see :class:`VehicleModel`; a new one is a module with these and
-# a line of :data:`VEHICLE_MODELS`.
+# --- Models --------------------------------------------------------------------------------------
 
 
 class VehicleModel(NamedTuple):
     """How a vehicle moves; both are made by :func:`real2sim_server._numba.func`.
 
     Attributes:
-        step: ``step(state, command, vehicle, h)``, the :class:`.state.PlanarState` ``h`` seconds
-            later (at most 10 ms) under a :class:`.state.Command` that has reached the wheels, for
+        step: ``step(state, command, vehicle, h)``, the :class:`PlanarState` ``h`` seconds
+            later (at most 10 ms) under a :class:`Command` that has reached the wheels, for
             :class:`.vehicle.VehicleParameters`; holds their limits.
         steady_steering: ``steady_steering(rolling, curvature, speed, vehicle)``, the road-wheel
             angle [rad] that keeps a curvature [1/m] at a speed [m/s], where wheels that only roll
@@ -471,7 +472,9 @@ def vehicle_parameters(spec: EgoSpec) -> VehicleParameters:
     )
 
 
-# What lies between a command and the wheels: dead times, then lags of the first order.
+# --- Actuators -----------------------------------------------------------------------------------
+
+# Dead times, followed by first-order lags, lie between a command and the wheels.
 
 
 @func
@@ -570,10 +573,10 @@ def _first_order_lag(value, wanted, h, lag):
     return value - (wanted - value) * math.expm1(-h / lag)
 
 
-# Where the vehicle will be when a command that is given now reaches its wheels.
-#
-# Trackers that know of dead times decide for that state (a Smith predictor without model error), so
-# that a loop with dead time is as stable as the one without.
+# --- Prediction ----------------------------------------------------------------------------------
+
+# Trackers that know the dead times decide for the state in which their command will take effect (a
+# Smith predictor without model error), so that dead time does not make the loop less stable.
 
 
 @func

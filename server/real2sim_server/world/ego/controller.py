@@ -1,4 +1,4 @@
-"""From plans to motion: the controller of the plan in effect, and of the log before any plan."""
+"""Controllers of the ego: they follow the plan in effect, or the log before any plan."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .plan import (
     mirrored,
 )
 
-# Controllers that make the vehicle follow a planned trajectory.
+# --- Trackers ------------------------------------------------------------------------------------
 
 
 @made_quickly

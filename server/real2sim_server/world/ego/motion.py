@@ -1,4 +1,4 @@
-"""The controlled vehicle: a bicycle on the plane, referred to its rear axle."""
+"""Motion of the controlled vehicle: a bicycle on the plane at its rear axle, and its suspension."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Motion(NamedTuple):
 
     Attributes:
         pending: commands on their way to the wheels, newest first; one for each 10 ms of delay.
-        reversing: whether the reverse gear is engaged, see :mod:`.gear`.
+        reversing: whether the reverse gear is engaged, see :mod:`.plan`.
     """
 
     x: float
@@ -197,13 +197,13 @@ def _steering_of(speed: float, yaw_rate: float, spec: EgoSpec) -> float:
     return min(max(angle, -spec.max_steer), spec.max_steer)
 
 
-# Pitch and roll of the ego's body on its springs, which its cameras see.
+# --- Suspension ----------------------------------------------------------------------------------
+
+# Load transfer between axles or sides compresses the springs; the body follows as a damped
+# oscillator and moves the cameras. Dynamics and contact ignore it: tyres get the load transfer at
+# once, and boxes in contact stay level. A body at constant velocity comes to rest level.
 #
-# Load that goes from one axle or side to the other compresses springs; the body follows as a damped
-# oscillator. Dynamics and contact do not know of it: tyres get the load transfer at once, and boxes
-# in contact stay level. A body at constant velocity comes to rest level.
-#
-# Axes are the vehicle's: pitch is about y, positive nose down; roll is about x, positive to the
+# The axes are the vehicle's: pitch is about y, positive nose down; roll is about x, positive to the
 # right.
 
 

@@ -1,4 +1,4 @@
-"""A planned trajectory that a vehicle is to follow."""
+"""Planned trajectories: the reference to follow, its legs of one gear each, and reverse gear."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FEW, CLEARLY = 40, 1e-6
 """Poses up to so many are looked at one by one; a way [m] that no rounding turns round."""
 
 
-LONGEST_GAP_US = 1_000_000
+MAX_GAP_US = 1_000_000
 """A plan of a single pose goes on from the one before where their poses are this near in time."""
 
 
@@ -134,14 +134,14 @@ class SinglePose(NamedTuple):
     def before(self, start_us: int, at_us: int) -> tuple[float, float, float, float]:
         """As :func:`.driving.plan_curve` takes it for a plan that begins at ``start_us`` and whose
         pose is for ``at_us``; none where it is too old to say how fast that plan goes."""
-        if not 0 < at_us - self.at_us <= LONGEST_GAP_US:
+        if not 0 < at_us - self.at_us <= MAX_GAP_US:
             return NO_POSE
         return (self.at_us - start_us) * 1e-6, self.x, self.y, self.yaw
 
     def speed_to(self, at_us: int, pose: Float) -> float | None:
         """Mean speed along the headings [m/s] to the pose [3] of the next plan; None where that is
         not one to go on to."""
-        if not 0 < at_us - self.at_us <= LONGEST_GAP_US:
+        if not 0 < at_us - self.at_us <= MAX_GAP_US:
             return None
         way = ways_along(np.array([self[1:], pose]))
         return way.item() / ((at_us - self.at_us) * 1e-6)
@@ -215,7 +215,7 @@ class ReferenceTrajectory:
         return x, y, vx, vy, yaw
 
 
-# Legs of a planned trajectory: its parts that are driven in one gear each.
+# --- Legs ----------------------------------------------------------------------------------------
 
 CUSP, ON_AGAIN = 0.05, 0.02
 """A plan turns back where it goes the other way for this far, and goes on forwards again for this;
@@ -320,12 +320,12 @@ def _is_behind(pose: Float, motion: Motion) -> bool:
     return ahead < (NEAR if motion.reversing else -NEAR)
 
 
-# Reverse gear: a vehicle that drives backwards is its mirror image driving forwards.
-#
-# Turned round by half a turn, with speeds, accelerations and steering angles of the opposite sign, a
-# vehicle on its rear axle obeys the same equations. So dynamics and trackers know driving forwards
-# alone, and here is what goes with the gear: it changes at rest only, it has a top speed of its own,
-# and commands on their way through actuators were given in the gear of then.
+# --- Reverse gear --------------------------------------------------------------------------------
+
+# A vehicle turned by half a turn, with speeds, accelerations and steering angles of opposite sign,
+# obeys the same equations on its rear axle. Dynamics and trackers therefore only know forward
+# driving. The gear changes at rest only and has its own top speed; commands still in the actuators
+# belong to the gear in which they were given.
 
 SHIFT_BRAKING = 6.0
 """Deceleration of a vehicle that still rolls on when its plan has turned back already, where it can

@@ -1,7 +1,7 @@
-"""An episode as an MCAP file, for Foxglove, Rerun and whatever else reads it.
+"""An episode as an MCAP file, for Foxglove, Rerun and other readers.
 
-Messages are JSON with Foxglove's well-known schemas where there is one. The recording itself is
-attached, so nothing is lost: :func:`recording_in` gets it back.
+Messages are JSON, with Foxglove's well-known schemas where they exist. The recording itself is
+attached, so nothing is lost: :func:`recording_in` reads it back.
 
 Needs the ``mcap`` extra.
 """
@@ -30,10 +30,10 @@ from ..ranging import Cloud
 from ..scoring import Instant
 from .recording import Recording, RecordingError, recording_of_bytes, to_bytes
 
-# Point clouds in recordings, and as Foxglove's messages.
+# --- Point clouds --------------------------------------------------------------------------------
 
 SUFFIX = "cloud"
-MOST_BYTES = 64 << 20
+MAX_CLOUD_BYTES = 64 << 20
 
 NUMERIC_TYPES = {"uint8": 1, "int8": 2, "uint16": 3, "int16": 4, "int32": 6, "float32": 7}
 """Of foxglove.PackedElementField."""
@@ -66,7 +66,7 @@ def foxglove_cloud(data: bytes, where: str, stamp: dict[str, int]) -> dict[str, 
         RecordingError: it is no cloud.
     """
     try:
-        kept = decode(data, max_bytes=MOST_BYTES)
+        kept = decode(data, max_bytes=MAX_CLOUD_BYTES)
         pose, columns = _pose(kept), [(str(name), column) for name, column in kept["columns"]]
         fields, table = _packed(columns)
     except (CodecError, KeyError, TypeError, ValueError, IndexError) as error:

@@ -56,9 +56,10 @@ from ..storyboard.program import ShownSignal
 from ..world import World
 from .replay import KINDS, Entry, Replayer, recorded_spec
 
-# Parts of a recording as plain values, and back; everything is checked where it comes in.
-#
-# Kernels that score look at no index twice, so shapes, lengths and values must be right before.
+# --- Plain values --------------------------------------------------------------------------------
+
+# Everything is checked here where it is read: the kernels that score check no index, so shapes,
+# lengths and values must be right before.
 
 MAX_WAY_M = 1e6
 """Length of a route or lane [m]: they are cut into pieces of less than a metre."""
@@ -366,7 +367,7 @@ def record(
         scores=tuple(s.fields() for s in scores),
         metrics=metrics_version(),
         state=pack_state(state) if state is not None else None,
-        drawn=world.drawn,
+        drawn=world.sampled,
     )
 
 

@@ -1,4 +1,4 @@
-"""An episode as a log of requests, and its replay, bit for bit."""
+"""An episode as a log of requests, replayed bit for bit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from ...edit import ScenarioState
 from ...scene import Scene
 from ..world import World
 
-# The spec of an episode as a log holds it, also one that an earlier version has written.
+# --- Stored specs --------------------------------------------------------------------------------
+
+# Logs of earlier versions are read too.
 
 BEFORE: Mapping[str, Any] = {
     "ego": {
@@ -183,7 +185,7 @@ class Replayer:
 
 
 def recorded_spec(reset: Entry) -> ResetSpec:
-    """How a recorded episode runs, see :func:`~.stored_spec.stored_spec`."""
+    """How a recorded episode runs, see :func:`stored_spec`."""
     return stored_spec(decode(reset.payload)["spec"])
 
 

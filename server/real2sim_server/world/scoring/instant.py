@@ -1,4 +1,6 @@
-"""What the scores need to know of one instant, and of the episode."""
+"""Inputs of the scores: samples of an instant, context of the episode, time to collision, fault."""
+
+# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
 from __future__ import annotations
 
@@ -287,10 +289,9 @@ def _dense(line: Float) -> Float:
     return np.stack(points, axis=1)
 
 
-# Time to collision, the side and the fault of contacts, and red lights that the ego crossed.
+# --- Hazards -------------------------------------------------------------------------------------
 
-# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
-
+# Time to collision, side and fault of contacts, and red lights that the ego crossed.
 
 HORIZON, STEP = 3.0, 0.1
 STEPS = 31

@@ -1,4 +1,7 @@
-"""The family of metrics: each a function of the accumulator, registered under name and version."""
+"""The metric registry, and the accumulator from which every metric is computed.
+
+A metric is a function of the accumulator, registered under a name and a version.
+"""
 
 from __future__ import annotations
 
@@ -123,10 +126,7 @@ class MetricAccumulator:
         return sum(self.contacts.values())
 
 
-SHORT_ROUTE = 5.0
-"""Ways up to this are no measure of progress to NAVSIM and AlpaSim [m]."""
-
-LEAST_ROUTE = 1.0
+MIN_ROUTE = 1.0
 """A recorded drive that gets no farther stands still [m]; one that does is measured against here,
 also where it is short: standing still where somebody drove is no progress."""
 
@@ -137,58 +137,6 @@ def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> 
     begin = min(context.warmup_steps, last)
     step = min(begin + accumulator.steps, last)
     return context.expert_s[step] - context.expert_s[begin]
-
-
-def progress_along_route(accumulator: MetricAccumulator) -> float:
-    """Way along the route [m]; not what was driven tail first, which is no way to drive there, nor
-    what was left out by a short cut."""
-    driven = accumulator.s - accumulator.tail_first - accumulator.cut
-    return max(driven - accumulator.start_s, 0.0)
-
-
-def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Fraction of the recorded way, at most 1; 1 where the recorded drive stands still."""
-    expert = expert_progress(accumulator, context)
-    if expert < LEAST_ROUTE:
-        return 1.0
-    return min(progress_along_route(accumulator) / expert, 1.0)
-
-
-def whole_route(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Way of the recorded drive along the route up to the horizon [m]."""
-    return context.route_end_s - accumulator.start_s
-
-
-def route_completion(
-    accumulator: MetricAccumulator, context: ScoringContext, fraction: float = 1.0
-) -> float:
-    """How much of a ``fraction`` of the recorded way up to the horizon was reached; 1 where the
-    recorded drive stands still."""
-    whole = whole_route(accumulator, context)
-    if whole < LEAST_ROUTE:
-        return 1.0
-    return min(max(accumulator.furthest - accumulator.start_s, 0.0) / (fraction * whole), 1.0)
-
-
-def assumed_progress(accumulator: MetricAccumulator, context: ScoringContext) -> tuple[str, ...]:
-    """What is taken for granted where the recorded drive is short; nothing where it is not."""
-    expert = expert_progress(accumulator, context)
-    if expert < LEAST_ROUTE:
-        return (f"progress 1: the recorded drive stands still ({expert:.1f} m)",)
-    if expert <= SHORT_ROUTE:
-        return (
-            f"progress is measured though the recorded drive is short ({expert:.1f} m); NAVSIM and "
-            "AlpaSim take it as 1",
-        )
-    return ()
-
-
-def assumed_route(accumulator: MetricAccumulator, context: ScoringContext) -> tuple[str, ...]:
-    """What is taken for granted where the recorded drive up to the horizon stands still."""
-    whole = whole_route(accumulator, context)
-    if whole >= LEAST_ROUTE:
-        return ()
-    return (f"route completed: the recorded drive stands still ({whole:.1f} m)",)
 
 
 Aspect = Literal[
@@ -249,7 +197,7 @@ def _seen_in_part(
 ) -> list[str]:
     """Of what the score looks at, what this episode does not show."""
     found = []
-    if "progress" in sees and expert_progress(accumulator, context) < LEAST_ROUTE:
+    if "progress" in sees and expert_progress(accumulator, context) < MIN_ROUTE:
         found.append("progress (the recorded drive stands still)")
     if "road" in sees:
         found.append(
@@ -455,7 +403,9 @@ def metrics_version() -> str:
     return " ".join(f"{name}@{version}" for name, version in metric_versions().items())
 
 
-# From instant to instant: the accumulator of a running episode and of a recording alike.
+# --- Updates -------------------------------------------------------------------------------------
+
+# Running episodes and recordings use the same code.
 
 
 def put_back(accumulator: MetricAccumulator, seam: LoopTransform) -> MetricAccumulator:

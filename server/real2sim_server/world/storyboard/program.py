@@ -1,4 +1,4 @@
-"""A storyboard prepared for running: its elements as one list, its conditions numbered."""
+"""A storyboard prepared for running: a flat list of elements, and numbered conditions."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from real2sim_proto.storyboard_conditions import (
 from ..common import WorldError
 from .view import (
     EntityState,
-    Places,
+    PositionResolver,
     View,
     box_corners_of,
     closing_speed,
@@ -310,7 +310,7 @@ class ShownSignal(NamedTuple):
     stop_line: tuple[float, float, float] | None
 
 
-# Whether conditions of a storyboard hold.
+# --- Conditions ----------------------------------------------------------------------------------
 
 EQUAL = 1e-6
 """Numbers that differ by less are equal."""
@@ -321,8 +321,8 @@ STANDING = 0.01
 INSTANT = 1e-9
 
 
-class Memory(NamedTuple):
-    """What a condition keeps from instant to instant.
+class ConditionState(NamedTuple):
+    """State of a condition between instants.
 
     Attributes:
         before: outcome of its test at the last one; None: it is new.
@@ -337,8 +337,8 @@ class Memory(NamedTuple):
 
 
 @dataclass(eq=False)
-class Facts:
-    """What conditions ask about, at one instant.
+class ConditionContext:
+    """What conditions are evaluated on, at one instant.
 
     Attributes:
         view: entities and roads.
@@ -347,24 +347,26 @@ class Facts:
         variables: parameters and variables.
         signals: state of each traffic signal.
         phases: phase of each controller.
-        memories: of conditions, by their number; written into.
+        condition_states: of conditions, by their number; written into.
     """
 
     view: View
-    places: Places
+    places: PositionResolver
     states: Callable[[str, str, str], bool]
     variables: Mapping[str, Any]
     signals: Mapping[str, str]
     phases: Mapping[str, str]
-    memories: dict[int, Memory] = field(default_factory=dict)
+    condition_states: dict[int, ConditionState] = field(default_factory=dict)
 
 
-def fires(trigger: Trigger, numbers: tuple[tuple[int, ...], ...], facts: Facts) -> bool:
-    """Whether a trigger fires: all conditions of one of its groups. Each condition is looked at,
+def is_triggered(
+    trigger: Trigger, numbers: tuple[tuple[int, ...], ...], context: ConditionContext
+) -> bool:
+    """Whether a trigger fires: all conditions of one of its groups hold. Evaluates every condition,
     so that none misses an edge."""
     outcomes = [
         [
-            _counts(condition, number, facts)
+            _counts(condition, number, context)
             for condition, number in zip(group.conditions, row, strict=True)
         ]
         for group, row in zip(trigger.groups, numbers, strict=True)
@@ -372,25 +374,25 @@ def fires(trigger: Trigger, numbers: tuple[tuple[int, ...], ...], facts: Facts) 
     return any(all(group) for group in outcomes)
 
 
-def _counts(condition: Condition, number: int, facts: Facts) -> bool:
-    memory = facts.memories.get(number, Memory())
+def _counts(condition: Condition, number: int, context: ConditionContext) -> bool:
+    previous = context.condition_states.get(number, ConditionState())
     test = condition.test
-    now, since = _TESTS[type(test)](test, facts, memory.since)
-    before = memory.before
+    now, since = _TESTS[type(test)](test, context, previous.since)
+    before = previous.before
     edge = {
         "none": now,
         "rising": before is False and now,
         "falling": before is True and not now,
         "rising_or_falling": before is not None and before != now,
     }[condition.edge]
-    delay, past, elapsed = float(condition.delay), memory.past, facts.view.elapsed
+    delay, past, elapsed = float(condition.delay), previous.past, context.view.elapsed
     outcome = edge
     if delay > 0.0:
         past = (*past, (elapsed, edge)) if not past or past[-1][1] != edge else past
         old = [k for k, (t, _) in enumerate(past) if t <= elapsed - delay + INSTANT]
         outcome = bool(old) and past[old[-1]][1]
         past = past[old[-1] :] if old else past
-    facts.memories[number] = Memory(now, past, since)
+    context.condition_states[number] = ConditionState(now, past, since)
     return bool(outcome)
 
 
@@ -415,19 +417,25 @@ Outcome = tuple[bool, Mapping[str, float]]
 
 
 def _of_entities(
-    test: Any, facts: Facts, since: Mapping[str, float], holds: Callable[[EntityState], bool]
+    test: Any,
+    context: ConditionContext,
+    since: Mapping[str, float],
+    holds: Callable[[EntityState], bool],
 ) -> Outcome:
-    outcomes = [holds(facts.view.entities[name]) for name in test.entities]
+    outcomes = [holds(context.view.entities[name]) for name in test.entities]
     return (any(outcomes) if test.of == "any" else all(outcomes)), since
 
 
 def _lasting(
-    test: Any, facts: Facts, since: Mapping[str, float], holds: Callable[[EntityState], bool]
+    test: Any,
+    context: ConditionContext,
+    since: Mapping[str, float],
+    holds: Callable[[EntityState], bool],
 ) -> Outcome:
     """What has held for `duration`; ``since`` is when it began for each entity."""
-    now, began, outcomes = facts.view.elapsed, dict(since), []
+    now, began, outcomes = context.view.elapsed, dict(since), []
     for name in test.entities:
-        if not holds(facts.view.entities[name]):
+        if not holds(context.view.entities[name]):
             began.pop(name, None)
             outcomes.append(False)
             continue
@@ -436,112 +444,124 @@ def _lasting(
     return (any(outcomes) if test.of == "any" else all(outcomes)), began
 
 
-def _simulation_time(test: SimulationTime, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    return _compared(facts.view.elapsed, test.rule, float(test.value)), since
+def _simulation_time(
+    test: SimulationTime, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return _compared(context.view.elapsed, test.rule, float(test.value)), since
 
 
-def _time_to_collision(test: TimeToCollision, facts: Facts, since: Mapping[str, float]) -> Outcome:
+def _time_to_collision(
+    test: TimeToCollision, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
     def holds(actor: EntityState) -> bool:
         if test.entity is not None:
-            other: Any = facts.view.entities[test.entity]
+            other: Any = context.view.entities[test.entity]
         else:
             assert test.position is not None
-            other = facts.places.of(test.position)
-        distance = _distance(actor, other, test, facts)
+            other = context.places.of(test.position)
+        distance = _distance(actor, other, test, context)
         closing = closing_speed(actor, other, test.measure)
         time = distance / closing if closing > INSTANT else math.inf
         return _compared(time, test.rule, float(test.value))
 
-    return _of_entities(test, facts, since, holds)
+    return _of_entities(test, context, since, holds)
 
 
-def _time_headway(test: TimeHeadway, facts: Facts, since: Mapping[str, float]) -> Outcome:
+def _time_headway(
+    test: TimeHeadway, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
     def holds(actor: EntityState) -> bool:
-        distance = _distance(actor, facts.view.entities[test.entity], test, facts)
+        distance = _distance(actor, context.view.entities[test.entity], test, context)
         time = distance / abs(actor.speed) if abs(actor.speed) > INSTANT else math.inf
         return _compared(time, test.rule, float(test.value))
 
-    return _of_entities(test, facts, since, holds)
+    return _of_entities(test, context, since, holds)
 
 
-def _relative_distance(test: RelativeDistance, facts: Facts, since: Mapping[str, float]) -> Outcome:
+def _relative_distance(
+    test: RelativeDistance, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
     def holds(actor: EntityState) -> bool:
-        distance = _distance(actor, facts.view.entities[test.entity], test, facts)
+        distance = _distance(actor, context.view.entities[test.entity], test, context)
         return _compared(distance, test.rule, float(test.value))
 
-    return _of_entities(test, facts, since, holds)
+    return _of_entities(test, context, since, holds)
 
 
-def _to_place(test: Distance, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    place = facts.places.of(test.position)
+def _to_place(test: Distance, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    place = context.places.of(test.position)
     return _of_entities(
         test,
-        facts,
+        context,
         since,
-        lambda a: _compared(_distance(a, place, test, facts), test.rule, float(test.value)),
+        lambda a: _compared(_distance(a, place, test, context), test.rule, float(test.value)),
     )
 
 
-def _distance(actor: EntityState, other: Any, test: Any, facts: Facts) -> float:
+def _distance(actor: EntityState, other: Any, test: Any, context: ConditionContext) -> float:
     return distance_to(
         actor,
         other,
         test.measure,
         test.frame,
         freespace=test.freespace,
-        network=facts.view.network,
+        network=context.view.network,
     )
 
 
-def _reach_position(test: ReachPosition, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    place = facts.places.of(test.position)
+def _reach_position(
+    test: ReachPosition, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    place = context.places.of(test.position)
     return _of_entities(
         test,
-        facts,
+        context,
         since,
         lambda a: math.hypot(place.x - a.x, place.y - a.y) <= float(test.tolerance),
     )
 
 
-def _speed(test: Speed, facts: Facts, since: Mapping[str, float]) -> Outcome:
+def _speed(test: Speed, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
     def part(actor: EntityState) -> float:
         return actor.drift if test.direction == "lateral" else actor.speed
 
     def holds(actor: EntityState) -> bool:
         value = part(actor)
         if test.relative_to is not None:
-            value -= part(facts.view.entities[test.relative_to])
+            value -= part(context.view.entities[test.relative_to])
         return _compared(value, test.rule, float(test.value))
 
-    return _of_entities(test, facts, since, holds)
+    return _of_entities(test, context, since, holds)
 
 
-def _acceleration(test: Acceleration, facts: Facts, since: Mapping[str, float]) -> Outcome:
+def _acceleration(
+    test: Acceleration, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
     def holds(actor: EntityState) -> bool:
         value = actor.acceleration if test.direction is not None else abs(actor.acceleration)
         return _compared(value, test.rule, float(test.value))
 
-    return _of_entities(test, facts, since, holds)
+    return _of_entities(test, context, since, holds)
 
 
-def _collision(test: Collision, facts: Facts, since: Mapping[str, float]) -> Outcome:
+def _collision(test: Collision, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
     def holds(actor: EntityState) -> bool:
         if not actor.visible:
             return False
         own = corners(actor)
         if test.entity is not None:
-            other = facts.view.entities[test.entity]
+            other = context.view.entities[test.entity]
             return other.visible and overlapping(own, corners(other))
-        return any(overlapping(own, box) for box in _others(actor, test.category, facts))
+        return any(overlapping(own, box) for box in _others(actor, test.category, context))
 
-    return _of_entities(test, facts, since, holds)
+    return _of_entities(test, context, since, holds)
 
 
 def _others(
-    actor: EntityState, category: str | None, facts: Facts
+    actor: EntityState, category: str | None, context: ConditionContext
 ) -> list[list[tuple[float, float]]]:
     """Outlines of entities as they are now, and of all other objects at the start of the step."""
-    entities = facts.view.entities
+    entities = context.view.entities
     found = [
         corners(other)
         for other in entities.values()
@@ -551,7 +571,7 @@ def _others(
         and _near(actor, other.x, other.y, other.size[0])
     ]
     known = {a.subject.object_id for a in entities.values() if a.subject is not None}
-    around = facts.view.surroundings
+    around = context.view.surroundings
     for row, subject in zip(around.bodies.tolist(), around.others.objects, strict=False):
         x, y, yaw, length, width, _, _ = row
         if subject.object_id in known or not _near(actor, x, y, length):
@@ -565,66 +585,76 @@ def _near(actor: EntityState, x: float, y: float, length: float) -> bool:
     return math.hypot(x - actor.x, y - actor.y) < 2.0 * (actor.size[0] + length)
 
 
-def _traversed(test: TraversedDistance, facts: Facts, since: Mapping[str, float]) -> Outcome:
+def _traversed(
+    test: TraversedDistance, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
     began, outcomes = dict(since), []
     for name in test.entities:
-        travelled = facts.view.entities[name].travelled
+        travelled = context.view.entities[name].travelled
         outcomes.append(travelled - began.setdefault(name, travelled) >= float(test.value))
     return (any(outcomes) if test.of == "any" else all(outcomes)), began
 
 
-def _stand_still(test: StandStill, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    return _lasting(test, facts, since, lambda a: abs(a.speed) < STANDING)
+def _stand_still(
+    test: StandStill, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return _lasting(test, context, since, lambda a: abs(a.speed) < STANDING)
 
 
-def _offroad(test: Offroad, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    network = facts.view.network
-    return _lasting(test, facts, since, lambda a: network.locate(a.x, a.y, a.h) is None)
+def _offroad(test: Offroad, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    network = context.view.network
+    return _lasting(test, context, since, lambda a: network.locate(a.x, a.y, a.h) is None)
 
 
-def _end_of_road(test: EndOfRoad, facts: Facts, since: Mapping[str, float]) -> Outcome:
+def _end_of_road(test: EndOfRoad, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
     def at_end(actor: EntityState) -> bool:
-        way = actor.way if actor.way is not None else actor.on_lane(facts.view.network).way
+        way = actor.way if actor.way is not None else actor.on_lane(context.view.network).way
         assert way is not None
         near = way.path.nearest(actor.x, actor.y).s
         return near >= way.length - STANDING
 
-    return _lasting(test, facts, since, at_end)
+    return _lasting(test, context, since, at_end)
 
 
-def _angle(test: Angle, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    base = facts.places.origin[2]
+def _angle(test: Angle, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    base = context.places.origin[2]
     if test.entity is not None:
-        base = facts.view.entities[test.entity].h
+        base = context.view.entities[test.entity].h
 
     def holds(actor: EntityState) -> bool:
         off = math.remainder(actor.h - base - float(test.angle), math.tau)
         return abs(off) <= float(test.tolerance)
 
-    return _of_entities(test, facts, since, holds)
+    return _of_entities(test, context, since, holds)
 
 
 def _element_state(
-    test: StoryboardElementState, facts: Facts, since: Mapping[str, float]
+    test: StoryboardElementState, context: ConditionContext, since: Mapping[str, float]
 ) -> Outcome:
-    return facts.states(test.element_type, test.element, test.state), since
+    return context.states(test.element_type, test.element, test.state), since
 
 
-def _variable(test: VariableValue, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    if test.variable not in facts.variables:
+def _variable(
+    test: VariableValue, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    if test.variable not in context.variables:
         return False, since
-    return _compared(facts.variables[test.variable], test.rule, test.value), since
+    return _compared(context.variables[test.variable], test.rule, test.value), since
 
 
-def _signal_state(test: SignalState, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    return facts.signals.get(test.signal) == test.state, since
+def _signal_state(
+    test: SignalState, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return context.signals.get(test.signal) == test.state, since
 
 
-def _signal_phase(test: SignalPhase, facts: Facts, since: Mapping[str, float]) -> Outcome:
-    return facts.phases.get(test.controller) == test.phase, since
+def _signal_phase(
+    test: SignalPhase, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return context.phases.get(test.controller) == test.phase, since
 
 
-_TESTS: Mapping[type[Any], Callable[[Any, Facts, Mapping[str, float]], Outcome]] = {
+_TESTS: Mapping[type[Any], Callable[[Any, ConditionContext, Mapping[str, float]], Outcome]] = {
     SimulationTime: _simulation_time,
     TimeToCollision: _time_to_collision,
     TimeHeadway: _time_headway,

@@ -1,4 +1,4 @@
-"""A storyboard within one step of the clock: elements begin and end, entities move on."""
+"""One step of a storyboard: elements start and stop, actions begin, entities move."""
 
 from __future__ import annotations
 
@@ -50,11 +50,22 @@ from .motion import (
     gentle_duration,
     lane_offset,
 )
-from .program import Element, Facts, Memory, Program, Start, fires, phase_start, shown_at
+from .program import (
+    ConditionContext,
+    ConditionState,
+    Element,
+    Program,
+    Start,
+    is_triggered,
+    phase_start,
+    shown_at,
+)
 from .roads import Place, RoadNetwork, RoadPoint, Trajectory, Way, course_of, path_through
-from .view import ACROSS, EntityState, Places, View, across, ahead_on_way
+from .view import ACROSS, EntityState, PositionResolver, View, across, ahead_on_way
 
-# How private actions begin: each gives the entity with what moves it from now on.
+# --- Private actions -----------------------------------------------------------------------------
+
+# Each action gives its entity the controller that moves it from now on.
 
 BESIDE_ROUTE = 10.0
 """An entity teleported within this distance of its assigned route keeps the route [m]."""
@@ -75,7 +86,7 @@ class Beginning:
     """
 
     view: View
-    places: Places
+    places: PositionResolver
     token: int
     version: int
 
@@ -393,7 +404,7 @@ class Memories(NamedTuple):
         status: of each element.
         times: that each event has begun.
         running: tokens of the actions that run: by number of the element, of each entity.
-        conditions: memory of each.
+        conditions: previous of each.
         variables: parameters and variables.
         signal_starts, signal_states: what actions have set of traffic signals.
         token: of the next action.
@@ -404,7 +415,7 @@ class Memories(NamedTuple):
     status: tuple[int, ...]
     times: tuple[int, ...]
     running: Mapping[int, Mapping[str, int]]
-    conditions: Mapping[int, Memory]
+    conditions: Mapping[int, ConditionState]
     variables: Mapping[str, Any]
     signal_starts: Mapping[str, float]
     signal_states: Mapping[str, str]
@@ -418,7 +429,7 @@ class Progress:
 
     Args:
         program: what runs.
-        entities, memories: before the step.
+        entities, condition_states: before the step.
         network: roads.
         surroundings: of the step.
     """
@@ -427,23 +438,26 @@ class Progress:
         self,
         program: Program,
         entities: Mapping[str, EntityState],
-        memories: Memories,
+        condition_states: Memories,
         network: RoadNetwork,
         surroundings: Surroundings,
     ) -> None:
         self._program, self._network, self._surroundings = program, network, surroundings
         self.entities = dict(entities)
-        self._status, self._times = list(memories.status), list(memories.times)
-        self._running = {k: dict(v) for k, v in memories.running.items()}
-        self._conditions = dict(memories.conditions)
-        self._variables = dict(memories.variables)
-        self._starts, self._states = dict(memories.signal_starts), dict(memories.signal_states)
-        self._token, self._over = memories.token, memories.over
-        self._before, self._fresh = memories.fresh, set[tuple[int, str]]()
+        self._status, self._times = list(condition_states.status), list(condition_states.times)
+        self._running = {k: dict(v) for k, v in condition_states.running.items()}
+        self._conditions = dict(condition_states.conditions)
+        self._variables = dict(condition_states.variables)
+        self._starts, self._states = (
+            dict(condition_states.signal_starts),
+            dict(condition_states.signal_states),
+        )
+        self._token, self._over = condition_states.token, condition_states.over
+        self._before, self._fresh = condition_states.fresh, set[tuple[int, str]]()
         self.changes: list[ElementChange] = []
 
     @property
-    def memories(self) -> Memories:
+    def condition_states(self) -> Memories:
         """As they are now."""
         return Memories(
             tuple(self._status),
@@ -470,8 +484,8 @@ class Progress:
         self._fresh, self._now = set(), t_us
         self._end_actions()
         if not self._over:
-            facts = self._facts(elapsed, first=first)
-            self._facts_now, self._elapsed = facts, elapsed
+            context = self._context(elapsed, first=first)
+            self._context_now, self._elapsed = context, elapsed
             self._pass_whole()
         self._before = frozenset(self._fresh)
 
@@ -658,21 +672,21 @@ class Progress:
         elif isinstance(now, int | float) and isinstance(value, int | float):
             self._variables[action.variable] = now + value if action.rule == "add" else now * value
 
-    # --- facts ----------------------------------------------------------------------------------
+    # --- context ----------------------------------------------------------------------------------
 
     def _fires(self, start: Start) -> bool:
-        return fires(start.trigger, start.numbers, self._facts_now)
+        return is_triggered(start.trigger, start.numbers, self._context_now)
 
-    def _facts(self, elapsed: float, *, first: bool) -> Facts:
+    def _context(self, elapsed: float, *, first: bool) -> ConditionContext:
         signals, phases = shown_at(self._program.board, elapsed, self._starts, self._states)
-        return Facts(
+        return ConditionContext(
             view=self._view(elapsed, first=first),
             places=self._places(),
             states=self._is_in,
             variables=self._variables,
             signals=signals,
             phases=phases,
-            memories=self._conditions,
+            condition_states=self._conditions,
         )
 
     def _is_in(self, type_: str, name: str, state: str) -> bool:
@@ -684,8 +698,8 @@ class Progress:
     def _view(self, elapsed: float, *, first: bool) -> View:
         return View(elapsed, first, self.entities, self._network, self._surroundings)
 
-    def _places(self) -> Places:
-        return Places(self.entities, self._network, self._program.board.origin)
+    def _places(self) -> PositionResolver:
+        return PositionResolver(self.entities, self._network, self._program.board.origin)
 
 
 def _without(actor: EntityState, tokens: set[int], network: RoadNetwork) -> EntityState:

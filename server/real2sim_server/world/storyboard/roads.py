@@ -1,4 +1,4 @@
-"""Roads and lanes as a storyboard asks for them: places by road and lane, and ways to drive."""
+"""Roads, lanes and curves of a storyboard: positions, routes and trajectories."""
 
 from __future__ import annotations
 
@@ -326,7 +326,9 @@ def _refused(error: SceneError) -> WorldError:
     )
 
 
-# Curves that entities follow: polylines, clothoids, NURBS.
+# --- Trajectories --------------------------------------------------------------------------------
+
+# Polylines, clothoids, NURBS.
 
 SAMPLE = 0.1
 """Way between samples of clothoids and NURBS [m]; chords of theirs are off by 0.1 mm at curvatures

@@ -38,14 +38,14 @@ from ..traffic.driver import ScriptedEntity, Surroundings, recorded_pose
 from .program import PLACING, Program, ShownSignal, program_of, shown_at
 from .progress import COMPLETE, ElementChange, Memories, Progress
 from .roads import GraphNetwork, Place, RoadNetwork, RouteNetwork
-from .view import EntityState, Places, observed
+from .view import EntityState, PositionResolver, observed
 
 TRIES = 1000
 """Of a draw that has to fall within a range."""
 
 
 def drawn_values(board: Storyboard, draws: Draws | None) -> tuple[Storyboard, Mapping[str, float]]:
-    """The storyboard with drawn values of the parameters that have a stochastic distribution, and
+    """The storyboard with sampled values of the parameters that have a stochastic distribution, and
     those that are numbers by name. Without ``draws`` as it is.
 
     Raises:
@@ -287,7 +287,7 @@ class StoryboardRun:
         ego_put: whether it has put the ego somewhere at the start.
         ego: name of the ego among the entities; None: it takes no part.
         elapsed: time since the episode began [s].
-        drawn: what the seed has drawn, by name.
+        sampled: what the seed has sampled, by name.
     """
 
     program: Program
@@ -299,7 +299,7 @@ class StoryboardRun:
     ego_put: bool
     ego: str | None
     elapsed: float
-    drawn: Mapping[str, float]
+    sampled: Mapping[str, float]
 
     @classmethod
     def begin(
@@ -325,7 +325,7 @@ class StoryboardRun:
         Raises:
             WorldError: INVALID_REQUEST, what it asks for cannot be.
         """
-        board, drawn = drawn_values(board, draws)
+        board, sampled = drawn_values(board, draws)
         board = _resolved(board)
         if network is None:
             lanes = board.roads if isinstance(board.roads, RouteLanes) else RouteLanes()
@@ -350,7 +350,7 @@ class StoryboardRun:
         )
         run = cls(
             program, network, MappingProxyType(progress.entities), progress.memories,
-            MappingProxyType({}), (), put, ego, 0.0, drawn,
+            MappingProxyType({}), (), put, ego, 0.0, sampled,
         )  # fmt: skip
         return run._with_drivers(surroundings)
 
@@ -409,7 +409,7 @@ class StoryboardRun:
         states, _ = shown_at(
             board, self.elapsed, self.memories.signal_starts, self.memories.signal_states
         )
-        places = Places(self.entities, self.network, board.origin)
+        places = PositionResolver(self.entities, self.network, board.origin)
         lines = {h.signal_id: h.stop_line for h in board.signals}
         return tuple(
             ShownSignal(name, state, places.of(line)[:3] if (line := lines.get(name)) else None)

@@ -398,7 +398,7 @@ def _to_segment(p: tuple[float, float], a: tuple[float, float], b: tuple[float, 
     return math.hypot(p[0] - a[0] - u * dx, p[1] - a[1] - u * dy)
 
 
-class Places:
+class PositionResolver:
     """Turns positions into places at one instant.
 
     Attributes:
@@ -513,13 +513,13 @@ def _beside(entity: EntityState, axes: float, dx: float, dy: float, h: float) ->
 
 
 _RESOLVE: Mapping[type[Any], Any] = {
-    WorldPosition: Places._world,
-    RelativeWorldPosition: Places._relative_world,
-    RelativeObjectPosition: Places._relative_object,
-    RoadPosition: Places._road,
-    LanePosition: Places._lane,
-    RelativeRoadPosition: Places._relative_road,
-    RelativeLanePosition: Places._relative_lane,
-    RoutePosition: Places._route,
-    TrajectoryPosition: Places._trajectory,
+    WorldPosition: PositionResolver._world,
+    RelativeWorldPosition: PositionResolver._relative_world,
+    RelativeObjectPosition: PositionResolver._relative_object,
+    RoadPosition: PositionResolver._road,
+    LanePosition: PositionResolver._lane,
+    RelativeRoadPosition: PositionResolver._relative_road,
+    RelativeLanePosition: PositionResolver._relative_lane,
+    RoutePosition: PositionResolver._route,
+    TrajectoryPosition: PositionResolver._trajectory,
 }

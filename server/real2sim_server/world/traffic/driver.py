@@ -1,4 +1,4 @@
-"""Drivers of other road users: their Protocol; replay, plans from outside, and storyboards."""
+"""Drivers of other road users: their Protocol, replay, external plans, storyboards, and IDM."""
 
 from __future__ import annotations
 
@@ -370,7 +370,9 @@ class Script(Protocol):
         """The script one step later."""
 
 
-# The intelligent driver model on a path, its leading object, and MOBIL, which changes lanes.
+# --- Intelligent driver model --------------------------------------------------------------------
+
+# IDM on a path behind a leading object, and MOBIL, which decides lane changes.
 
 
 class Leader(NamedTuple):

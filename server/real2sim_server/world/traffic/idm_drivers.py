@@ -1,4 +1,4 @@
-"""Along the lanes of a map by the intelligent driver model, changing lanes by MOBIL."""
+"""Drivers based on IDM: along the lanes of a map with MOBIL, and adversarial ones."""
 
 from __future__ import annotations
 
@@ -327,10 +327,11 @@ def _eased(progress: float) -> float:
     return u * u * u * (10 - 15 * u + 6 * u * u)
 
 
-# Road users that make it hard for the ego: they cut in, brake, or cross.
-#
-# After the side, front and stationary scenarios of NeuroNCAP (Ljungbergh et al. 2024) and the
-# attacking agents of HUGSIM (Zhou et al. 2024), with closed rules instead of sampled trajectories.
+# --- Adversarial drivers -------------------------------------------------------------------------
+
+# They cut in, brake or cross, after the side, front and stationary scenarios of NeuroNCAP
+# (Ljungbergh et al. 2024) and the attacking agents of HUGSIM (Zhou et al. 2024), with closed rules
+# instead of sampled trajectories.
 
 PACE = 1.0
 """Time constant with which a car beside the ego closes up to its place [s]."""

@@ -64,7 +64,7 @@ class Spawner:
     Attributes:
         spec: how many, where.
         lanes: where they drive.
-        desired: speed that theirs are drawn around [m/s].
+        desired: speed that theirs are sampled around [m/s].
         draws: of the episode.
         ground: what they stand on.
         number: how many have appeared so far.
@@ -163,8 +163,8 @@ class Spawner:
                 added.append(made)
         return spawner, added
 
-    def drawn(self, made: Idm) -> dict[str, float]:
-        """What was drawn for a spawned object, by name."""
+    def sampled(self, made: Idm) -> dict[str, float]:
+        """What was sampled for a spawned object, by name."""
         name = f"agents.{made.subject.object_id}"
         return {f"{name}.desired_speed": made.desired, f"{name}.lane_position": made.s}
 
