@@ -152,7 +152,7 @@ class Event:
     and ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
     Of ``storyboard``: ``element``, ``element_type`` and ``change``, see
     :class:`.storyboard.progress.ElementChange`.
-    Of ``looped``: ``lap``, and ``x``, ``y`` [m], ``turn`` [rad] of the :class:`.path.LoopTransform`.
+    Of ``looped``: ``lap``, and ``x``, ``y`` [m], ``turn`` [rad] of :class:`.path.LoopTransform`.
     """
 
     type: EventType

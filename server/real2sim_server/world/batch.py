@@ -272,9 +272,9 @@ class BatchStep:
 class BatchWorld:
     """W worlds of one scene and one reset; each place runs an episode of its own.
 
-    What a world of the batch does is what a :class:`..world.World` does, see :mod:`.subset` for
-    the part of it that is known here: same motions, objects, contacts, ends. Worlds know nothing
-    of each other, and no result depends on the number of threads.
+    Each behaves like a :class:`.world.World` within the supported part, see
+    :func:`check_batchable`: same motions, objects, contacts and ends. Worlds are independent of each
+    other, and no result depends on the number of threads.
 
     Attributes:
         scene: shared, immutable.

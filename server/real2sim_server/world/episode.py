@@ -521,7 +521,7 @@ def estimate_error(
 
 
 def latency_jitter_us(longest_us: int, draws: Draws, step: int) -> int:
-    """The wait that is added to the latency of the plan for a step [us]; 0 where none is sampled."""
+    """The wait added to the latency of the plan for a step [us]; 0 where none is sampled."""
     return int(draws.uniform("latency", step)[0] * (longest_us + 1)) if longest_us else 0
 
 

@@ -1,4 +1,4 @@
-"""LiDARs and radars of an episode: as its reset names them, their recent motion, and their clouds."""
+"""LiDARs and radars of an episode: as its reset names them, their motion, and their clouds."""
 
 from __future__ import annotations
 

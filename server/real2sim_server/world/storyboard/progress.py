@@ -397,14 +397,14 @@ class ElementChange(NamedTuple):
     change: str
 
 
-class Memories(NamedTuple):
-    """What a storyboard keeps between steps, apart from entities.
+class ProgressState(NamedTuple):
+    """State of a storyboard between steps, apart from its entities.
 
     Attributes:
         status: of each element.
         times: that each event has begun.
         running: tokens of the actions that run: by number of the element, of each entity.
-        conditions: previous of each.
+        conditions: state of each.
         variables: parameters and variables.
         signal_starts, signal_states: what actions have set of traffic signals.
         token: of the next action.
@@ -425,11 +425,11 @@ class Memories(NamedTuple):
 
 
 class Progress:
-    """What becomes of a storyboard in a step. It is made for the step, and read out at its end.
+    """One step of a storyboard: made for the step and read at its end.
 
     Args:
         program: what runs.
-        entities, condition_states: before the step.
+        entities, state: before the step.
         network: roads.
         surroundings: of the step.
     """
@@ -438,28 +438,25 @@ class Progress:
         self,
         program: Program,
         entities: Mapping[str, EntityState],
-        condition_states: Memories,
+        state: ProgressState,
         network: RoadNetwork,
         surroundings: Surroundings,
     ) -> None:
         self._program, self._network, self._surroundings = program, network, surroundings
         self.entities = dict(entities)
-        self._status, self._times = list(condition_states.status), list(condition_states.times)
-        self._running = {k: dict(v) for k, v in condition_states.running.items()}
-        self._conditions = dict(condition_states.conditions)
-        self._variables = dict(condition_states.variables)
-        self._starts, self._states = (
-            dict(condition_states.signal_starts),
-            dict(condition_states.signal_states),
-        )
-        self._token, self._over = condition_states.token, condition_states.over
-        self._before, self._fresh = condition_states.fresh, set[tuple[int, str]]()
+        self._status, self._times = list(state.status), list(state.times)
+        self._running = {k: dict(v) for k, v in state.running.items()}
+        self._conditions = dict(state.conditions)
+        self._variables = dict(state.variables)
+        self._starts, self._states = dict(state.signal_starts), dict(state.signal_states)
+        self._token, self._over = state.token, state.over
+        self._before, self._fresh = state.fresh, set[tuple[int, str]]()
         self.changes: list[ElementChange] = []
 
     @property
-    def condition_states(self) -> Memories:
-        """As they are now."""
-        return Memories(
+    def state(self) -> ProgressState:
+        """The state after the step so far."""
+        return ProgressState(
             tuple(self._status),
             tuple(self._times),
             self._running,

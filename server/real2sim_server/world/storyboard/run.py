@@ -36,7 +36,7 @@ from ..common import Draws, WorldError, copy_with
 from ..ego.motion import Motion
 from ..traffic.driver import ScriptedEntity, Surroundings, recorded_pose
 from .program import PLACING, Program, ShownSignal, program_of, shown_at
-from .progress import COMPLETE, ElementChange, Memories, Progress
+from .progress import COMPLETE, ElementChange, Progress, ProgressState
 from .roads import GraphNetwork, Place, RoadNetwork, RouteNetwork
 from .view import EntityState, PositionResolver, observed
 
@@ -281,7 +281,7 @@ class StoryboardRun:
         program: what runs.
         network: roads.
         entities: entities by name.
-        memories: elements, conditions, variables.
+        state: elements, conditions, variables.
         drivers: of the objects that it moves, by object id.
         changes: of elements, in the step that led here.
         ego_put: whether it has put the ego somewhere at the start.
@@ -293,7 +293,7 @@ class StoryboardRun:
     program: Program
     network: RoadNetwork
     entities: Mapping[str, EntityState]
-    memories: Memories
+    state: ProgressState
     drivers: Mapping[str, ScriptedEntity]
     changes: tuple[ElementChange, ...]
     ego_put: bool
@@ -349,7 +349,7 @@ class StoryboardRun:
             entry.entity == ego and entry.action.kind in {"speed", *PLACING} for entry in board.init
         )
         run = cls(
-            program, network, MappingProxyType(progress.entities), progress.memories,
+            program, network, MappingProxyType(progress.entities), progress.state,
             MappingProxyType({}), (), put, ego, 0.0, sampled,
         )  # fmt: skip
         return run._with_drivers(surroundings)
@@ -361,7 +361,7 @@ class StoryboardRun:
         if self.ego is not None and not entities[self.ego].scripted:
             dt = surroundings.dt if self.elapsed > 0.0 else 0.0
             entities[self.ego] = observed(entities[self.ego], surroundings.ego, dt)
-        progress = Progress(self.program, entities, self.memories, self.network, surroundings)
+        progress = Progress(self.program, entities, self.state, self.network, surroundings)
         count = math.ceil(surroundings.dt_us / TICK_US)
         start_us, now_us = surroundings.start_us, surroundings.t_us
         for k in range(count):
@@ -373,7 +373,7 @@ class StoryboardRun:
         moved = copy_with(
             self,
             entities=MappingProxyType(progress.entities),
-            memories=progress.memories,
+            state=progress.state,
             changes=tuple(progress.changes),
             elapsed=(now_us + surroundings.dt_us - start_us) * 1e-6,
         )
@@ -383,9 +383,9 @@ class StoryboardRun:
     def over(self) -> bool:
         """Whether it has been stopped; without a stop trigger, whether all its stories are
         complete."""
-        program, status = self.program, self.memories.status
-        if self.memories.over or (program.stop is not None and program.board.version >= 2):
-            return self.memories.over
+        program, status = self.program, self.state.status
+        if self.state.over or (program.stop is not None and program.board.version >= 2):
+            return self.state.over
         return bool(program.stories) and all(status[s.number] == COMPLETE for s in program.stories)
 
     @property
@@ -407,7 +407,7 @@ class StoryboardRun:
         if not board.signals and not board.controllers:
             return ()
         states, _ = shown_at(
-            board, self.elapsed, self.memories.signal_starts, self.memories.signal_states
+            board, self.elapsed, self.state.signal_starts, self.state.signal_states
         )
         places = PositionResolver(self.entities, self.network, board.origin)
         lines = {h.signal_id: h.stop_line for h in board.signals}
@@ -475,10 +475,10 @@ def _first(
     return copy_with(actor, speed=speed, visible=True).put(place, network)
 
 
-def _nothing_yet(program: Program) -> Memories:
+def _nothing_yet(program: Program) -> ProgressState:
     count = len(program.elements)
     board = program.board
-    return Memories(
+    return ProgressState(
         (0,) * count, (0,) * count, {}, {}, {**board.parameters, **board.variables}, {}, {}, 1,
         over=False, fresh=frozenset(),
     )  # fmt: skip
