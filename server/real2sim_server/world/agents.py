@@ -19,7 +19,7 @@ from ..geometry.rotation import Float
 from ..scene import Figure, Scene, Stride
 
 Agents = PlacedObjects[ObjectState]
-"""Where all objects are at one instant."""
+"""Poses of all objects at one instant."""
 
 
 def rows_of(agents: Agents) -> dict[str, int]:
@@ -37,7 +37,7 @@ def rows_in(before: Agents, after: Agents) -> NDArray[np.int64]:
 
 @lru_cache(maxsize=64)
 def _all_rows(count: int) -> NDArray[np.int64]:
-    """Shared by all who ask: nobody writes into it."""
+    """Shared between callers: never written to."""
     return np.arange(count)
 
 
@@ -70,10 +70,10 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
 # with strides that follow from their motion.
 
 LED = 1e-3
-"""Who is this near to where the trajectory leads walks as that says [m], and as near in the entries
-of its rotation."""
+"""A pedestrian this close to the recorded trajectory [m], also in the entries of the rotation,
+walks with its recorded stride."""
 UPRIGHT = 0.9
-"""Cosine of the angle to the vertical beyond which nobody walks."""
+"""Cosine of the angle to the vertical beyond which a pedestrian does not walk."""
 
 Walker = tuple[int, ObjectState, Figure]
 
@@ -134,7 +134,7 @@ def _is_led(subject: ObjectState, transform: Float, t_us: int) -> bool:
 
 
 def _walking_speed(transform: Float, velocity: Float) -> float:
-    """Over the ground [m/s]; none of who lies or flies."""
+    """Speed over the ground [m/s]; 0 for pedestrians who lie or fly."""
     return math.hypot(velocity[0], velocity[1]) if transform[2, 2] > UPRIGHT else 0.0
 
 
@@ -143,7 +143,7 @@ def _walking_speed(transform: Float, velocity: Float) -> float:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened; the fields of the wire's Event.
+    """An event of a step, with the fields of the wire's Event.
 
     Data of a ``collision``: when it began (``contact_us``, simulation time, within the step before
     ``t_us``), where (``x``, ``y`` [m], world) and ``relative_speed`` there [m/s]; where momentum is

@@ -273,8 +273,8 @@ class BatchWorld:
     """W worlds of one scene and one reset; each place runs an episode of its own.
 
     Each behaves like a :class:`.world.World` within the supported part, see
-    :func:`check_batchable`: same motions, objects, contacts and ends. Worlds are independent of each
-    other, and no result depends on the number of threads.
+    :func:`check_batchable`: same motions, objects, contacts and ends. Worlds are independent of
+    each other, and no result depends on the number of threads.
 
     Attributes:
         scene: shared, immutable.

@@ -159,7 +159,7 @@ BEND_FROM = 10.0
 """The bend at the end of the recorded drive is that of its last metres [m]."""
 
 SHARPEST_BEND = 0.05
-"""More than this is noise or a turn at a junction, which the road does not go on with [1/m]."""
+"""More than this is noise or a turn at a junction, which the road does not continue [1/m]."""
 
 BEND_FADES = 40.0
 """Way along which a bend falls to 1/e [m]."""
@@ -181,7 +181,7 @@ STANDING = 2.0
 
 
 def driven_route(scene: Scene, spec: ResetSpec, horizon: int) -> LoggedPath:
-    """The way that an episode is measured along: the recorded drive and, where the episode may go
+    """The path that an episode is measured along: the recorded drive and, where the episode may go
     beyond it, its continuation.
 
     Raises:
@@ -205,7 +205,7 @@ def driven_route(scene: Scene, spec: ResetSpec, horizon: int) -> LoggedPath:
 
 
 def lanes_route(route: LoggedPath, scene: Scene, spec: ResetSpec) -> LoggedPath:
-    """The way that lanes of spawned objects run beside; it goes on where the episode's may end."""
+    """The path along which lanes of spawned objects run; it continues where the episode's ends."""
     spawn = spec.agents.spawn
     if spawn is None or spec.beyond_log != "end":
         return route
@@ -258,7 +258,7 @@ the same object as long as an episode lasts: drivers begin anew with another."""
 def tracks_beyond_log(
     state: ScenarioState, until_us: int, prolonged: Prolonged, *, left: Iterable[str] = ()
 ) -> PackedTracks[ObjectState]:
-    """Where the objects are, up to ``until_us`` [us]: what stands is there all the time.
+    """Tracks of the objects up to ``until_us`` [us]; standing objects are always present.
 
     Of standing objects whose boxes overlap, such as two tracks of one parked car, only the one
     that was recorded longest is there longer than it was recorded.
@@ -285,7 +285,7 @@ def tracks_beyond_log(
 
 
 def _from_us(subject: ObjectState, start_us: int) -> int:
-    """What an edit has put there is there from when it says."""
+    """Objects placed by an edit exist from the edit's time on."""
     return subject.trajectory.start_us if subject.edited else start_us
 
 
@@ -339,7 +339,7 @@ class LoopReset(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EpisodeRoute:
-    """Where an episode leads.
+    """Route of an episode.
 
     Attributes:
         route: that everything is measured along.
@@ -355,7 +355,7 @@ class EpisodeRoute:
 
     @classmethod
     def of(cls, scene: Scene, spec: ResetSpec, clock: EpisodeClock) -> EpisodeRoute:
-        """The one of an episode on ``scene``.
+        """The route of an episode on ``scene``.
 
         Raises:
             WorldError: INVALID_REQUEST for a loop on a recorded drive that is none.
@@ -370,13 +370,13 @@ class EpisodeRoute:
     def tracks(
         self, state: ScenarioState, *, left: Iterable[str] = ()
     ) -> PackedTracks[ObjectState]:
-        """Where the recording and edits have the objects, without those that have ``left``."""
+        """Tracks of the objects by recording and edits, without those that have ``left``."""
         if self.until_us is None:
             return state.tracks
         return tracks_beyond_log(state, self.until_us, self._prolonged, left=left)
 
     def put_back(self, motion: Motion, point: PathPoint) -> LoopReset | None:
-        """The ego of a loop, back at its start once it is at its end; None before."""
+        """The reset of a loop once the ego is at its end; None before."""
         laps = max(math.floor(point.s / self.lap_length), 0)
         if laps == 0:
             return None
@@ -392,7 +392,7 @@ class EpisodeRoute:
 # sampled (see :class:`.common.Draws`) and reported.
 
 START_ATTEMPTS = 16
-"""Starts sampled before the recorded one is taken, where all of them are inside an object."""
+"""Attempts to sample a start outside every object before the recorded one is used."""
 
 
 def randomized_start(
@@ -403,7 +403,7 @@ def randomized_start(
     *,
     is_free: Callable[[Motion], bool],
 ) -> tuple[Motion, dict[str, float]]:
-    """The motion at the start of an episode, and what was sampled for it by name.
+    """The motion at the start of an episode, and the values sampled for it by name.
 
     Args:
         recorded: the ego in the log at that time.
@@ -443,7 +443,7 @@ def _shifted(
 
 @dataclass(frozen=True)
 class RandomizedIdm:
-    """Parameters of IDM drivers as the seed draws them for each object.
+    """Parameters of IDM drivers, sampled for each object.
 
     Attributes:
         spec: widths of the factors.
@@ -461,7 +461,7 @@ class RandomizedIdm:
     def driver_of(
         self, subject: ObjectState, spec: IdmDriver
     ) -> tuple[IdmDriver, dict[str, float]]:
-        """The parameters of an object's driver, and those that were sampled by name."""
+        """The parameters of an object's driver, and the sampled ones by name."""
         sampled: dict[str, float] = {}
         for name, width in self.widths.items():
             value = getattr(spec, name)
@@ -474,7 +474,7 @@ class RandomizedIdm:
 
 
 class EstimateError(NamedTuple):
-    """How the ego's estimate of itself differs from the truth: [m], [m], [rad], [m/s]."""
+    """Error of the ego's estimate of its own state: [m], [m], [rad], [m/s]."""
 
     x: float
     y: float
@@ -533,7 +533,7 @@ def latency_jitter_us(longest_us: int, draws: Draws, step: int) -> int:
 def placed(
     operation: Operation, route: LoggedPath, s: float, ground: Ground, *, t_us: int
 ) -> Operation:
-    """The operation with what the episode alone knows: the time, and where the ego is.
+    """The operation, completed with the time and the pose of the ego.
 
     Args:
         operation: of an author.

@@ -1,4 +1,4 @@
-"""What the metrics get of a world: the context of an episode, and samples of an instant."""
+"""Inputs of the metrics from a world: context of an episode, and samples of an instant."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .scoring.road import RoadMap
 
 
 class PendingStep(NamedTuple):
-    """A step that has been made and not evaluated yet.
+    """A step that has moved and is not evaluated yet.
 
     Attributes:
         start: the world before it.
@@ -52,7 +52,7 @@ LANE_LENGTH = 5.0
 def scoring_context(
     scene: Scene, spec: ResetSpec, clock: EpisodeClock, path: LoggedPath, start_s: float
 ) -> ScoringContext:
-    """What stays the same over an episode on ``scene``."""
+    """The constant context of an episode on ``scene``."""
     times = clock.start_us + clock.dt_us * np.arange(clock.horizon + 1)
     within = times[times <= scene.end_us]
     transforms, _ = sample(scene.ego, within)

@@ -65,19 +65,19 @@ class Cloud:
 
 
 def in_frame(points: Float, frame: str, T_vehicle_sensor: Float) -> NDArray[np.float32]:
-    """Points [N, 3] of the sensor's frame in the frame that is asked for."""
+    """Points [N, 3] of the sensor's frame in the requested frame."""
     if frame == "vehicle":
         points = points @ T_vehicle_sensor[:3, :3].T + T_vehicle_sensor[:3, 3]
     return points.astype(np.float32)
 
 
 SHORTEST_US = 100_000
-"""So much is kept whatever the sensors, for a look aside."""
+"""The history is at least this long, whatever the sensors [us]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionSegment:
-    """One step of the clock.
+    """Motion during one step of the clock.
 
     Attributes:
         since_us, until_us: its instants [us].
@@ -93,11 +93,11 @@ class MotionSegment:
 
 @dataclass(frozen=True, eq=False)
 class MotionHistory:
-    """The last steps, oldest first; none before the first step.
+    """Motion of the last steps, oldest first; empty before the first step.
 
     Attributes:
-        keep_us: how far back they reach at least, where there have been so many.
-        segments: of the steps.
+        keep_us: the history covers at least this time once that many steps have passed [us].
+        segments: one per step.
     """
 
     keep_us: int
@@ -105,11 +105,11 @@ class MotionHistory:
 
     @classmethod
     def of(cls, longest_us: int) -> MotionHistory:
-        """Before the first step of an episode whose sweeps take up to ``longest_us``."""
+        """An empty history for an episode whose sweeps take up to ``longest_us``."""
         return cls(max(longest_us, SHORTEST_US))
 
     def after(self, segment: MotionSegment) -> MotionHistory:
-        """With one more step."""
+        """The history with one more step."""
         since = segment.until_us - self.keep_us
         segments, old = self.segments, 0
         while old < len(segments) and segments[old].until_us <= since:
@@ -154,7 +154,7 @@ def _ends(segment: MotionSegment, object_id: str) -> tuple[Float, Float] | None:
 def _along(
     times_us: Float, segments: Sequence[MotionSegment], ends: Sequence[tuple[Float, Float]]
 ) -> Float:
-    """Poses along segments; before the first straight on backwards."""
+    """Poses along segments, extrapolated straight backwards before the first one."""
     found = np.empty((len(times_us), 4, 4))
     for number, (segment, (before, after)) in enumerate(zip(segments, ends, strict=True)):
         inside = times_us <= segment.until_us
@@ -167,7 +167,7 @@ def _along(
 
 
 def _between(before: Float, after: Float, part: Float) -> Float:
-    """Poses [P, 4, 4] at ``part`` [P] of the segment, 0 to 1; below 0 straight on, not turned."""
+    """Poses [P, 4, 4] at fractions ``part`` [P] of a segment; below 0 extrapolated, not turned."""
     turns = matrix_to_quaternion(np.stack([before[:3, :3], after[:3, :3]]))
     places = before[:3, 3] + part[:, None] * (after[:3, 3] - before[:3, 3])
     return transform_from(places, slerp(turns[0], turns[1], np.clip(part, 0.0, 1.0)))
@@ -184,7 +184,7 @@ def _on(pose: Float, velocity: Float, yaw_rate: float, seconds: Float) -> Float:
 
 
 KEPT_LIDARS = 32
-"""Sensors whose rays are kept for the next episode."""
+"""Sensors whose rays are cached for later episodes."""
 MAX_SWEEP_US = 1_000_000
 """Of sweeps; what happened before is forgotten."""
 
@@ -278,7 +278,7 @@ class RangingSensors:
         return max((m.duration_us for m in self.lidars), default=0)
 
     def due(self, elapsed_us: int) -> tuple[Mounted, ...]:
-        """Those whose cloud is complete so long after the beginning."""
+        """The sensors whose cloud is complete this long after the start."""
         return tuple(m for m in self.all if elapsed_us % m.period_us == 0)
 
 
@@ -365,7 +365,7 @@ def _key(spec: LidarSpec) -> tuple[str, Pose | None, float | None]:
 
 @lru_cache(maxsize=KEPT_LIDARS)
 def _radar(name: str, model: RadarModel, pose: Pose | None) -> Radar:
-    """With its rays, so that they are refused here where they are none."""
+    """The sensor with its rays, which are validated here."""
     radar = Radar(name, model) if pose is None else Radar(name, model, _transform(pose))
     assert radar.rays.beams.count == model.ray_count
     return radar

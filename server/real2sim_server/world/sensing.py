@@ -1,4 +1,4 @@
-"""What LiDARs and radars measure in a world: what their rays meet, and the clouds made of it."""
+"""Measurements of LiDARs and radars in a world: the targets of their rays, and point clouds."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from .world import World
 
 @dataclass(frozen=True, eq=False)
 class RayTargets:
-    """Background, objects and fragments at an instant.
+    """Targets of rays at an instant: background, objects and fragments.
 
     Attributes:
         instances: background first, then the objects in their order, then fragments.
-        attributes: what is known of their reflectivity.
+        attributes: reflectivity, where it is known.
         object_ids: of the objects.
     """
 
@@ -44,8 +44,8 @@ class RayTargets:
 
 
 def ray_targets(world: World) -> RayTargets:
-    """What there is for rays to meet: with surfaces for LiDARs where the scene has them, objects
-    deformed by impacts as images show them, and no shadows."""
+    """The targets of rays in a world: LiDAR surfaces where the scene has them, objects deformed by
+    impacts as in images, no shadows."""
     scene, agents = world.scene, world.agents
     shown_us = min(world.t_us, scene.end_us)
     found = [met_background(scene, world.state)]
@@ -65,7 +65,7 @@ def ray_targets(world: World) -> RayTargets:
 def _deform(
     world: World, found: list[tuple[Instance, Attributes | None]], ids: Sequence[str]
 ) -> None:
-    """Put deformed objects in the place of whole ones."""
+    """Replace intact objects with deformed ones."""
     shapes = world.deformation
     assert shapes is not None
     if not shapes.has_impacts:
@@ -99,8 +99,7 @@ SEED_BYTES = 7
 def sweep_cloud(
     world: World, mounted: MountedLidar, targets: RayTargets, caster: CastBackend
 ) -> Cloud:
-    """The sweep of a LiDAR that ends at the instant of ``world``; the same bits again for the same
-    episode."""
+    """The sweep of a LiDAR that ends at the instant of ``world``, deterministic to the bit."""
     return measured_sweep(
         sweep_request(world, mounted.lidar, targets),
         mounted,
@@ -115,7 +114,7 @@ def sweep_cloud(
 def recorded_cloud(
     scene: Scene, state: ScenarioState, mounted: MountedLidar, t_us: int, caster: CastBackend
 ) -> Cloud:
-    """The sweep of a LiDAR on the recording vehicle that ends at ``t_us``, all objects as edited.
+    """The sweep of a LiDAR on the recording vehicle that ends at ``t_us``, with edits applied.
 
     Raises:
         TimeOutOfRangeError: ``t_us`` is outside the recording.
@@ -144,16 +143,16 @@ def measured_sweep(
     T_world_vehicle: Float,
     T_world_estimate: Float,
 ) -> Cloud:
-    """What a LiDAR makes of the rays of a sweep.
+    """The point cloud that a LiDAR measures in a sweep.
 
     Args:
         request: of the sweep.
         mounted: the LiDAR.
-        caster: follows the rays.
+        caster: casts the rays.
         t_us: when the last one is fired [us].
         seed: of noise and losses.
-        T_world_vehicle: [4, 4], where the vehicle is then.
-        T_world_estimate: [4, 4], where it takes itself to be.
+        T_world_vehicle: [4, 4], true pose of the vehicle then.
+        T_world_estimate: [4, 4], its estimated pose.
     """
     spec, lidar = mounted.spec, mounted.lidar
     echo = caster.cast(request)
@@ -179,14 +178,14 @@ def measured_sweep(
 
 
 def sensor_seed(world: World, name: str) -> int:
-    """Of the noise of a sensor at an instant."""
+    """Seed of the noise of a sensor at an instant."""
     words = f"{world.spec.seed}/{name}/{world.steps}"
     digest = hashlib.blake2b(words.encode(), digest_size=SEED_BYTES).digest()
     return int.from_bytes(digest, "little")
 
 
 def _returns(sweep: Sweep, echo: Echo, mounted: MountedLidar) -> dict[str, NDArray[Any]]:
-    """Columns of all returns, ray by ray, near to far: rows of a turning sensor one by one."""
+    """Columns of all returns, by ray, near to far; a spinning sensor row by row."""
     lidar = mounted.lidar
     hit = np.flatnonzero(sweep.hit.ravel())
     names = tuple(sweep.returns)
@@ -215,7 +214,7 @@ def _returns(sweep: Sweep, echo: Echo, mounted: MountedLidar) -> dict[str, NDArr
 
 
 def _rings(lidar: Lidar) -> NDArray[np.uint16]:
-    """Row of each ray of a turning sensor; 0 of others."""
+    """Row of each ray of a spinning sensor; 0 for other sensors."""
     rings = np.zeros(lidar.shape, np.uint16)
     if len(lidar.shape) > 1:
         rings[:] = np.arange(lidar.shape[0])[:, None]
@@ -243,7 +242,7 @@ def _points(
 def scan_cloud(
     world: World, mounted: MountedRadar, targets: RayTargets, caster: CastBackend
 ) -> Cloud:
-    """The scan of a radar at the instant of ``world``; the same bits again for the same episode."""
+    """The scan of a radar at the instant of ``world``, deterministic to the bit."""
     radar, spec = mounted.radar, mounted.spec
     request = sweep_request(world, radar.rays, targets)
     echo = caster.cast(request)
@@ -296,8 +295,8 @@ def _patches(world: World, request: CastRequest, echo: Echo, targets: RayTargets
 def _owners(
     world: World, targets: RayTargets, members: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], Float, NDArray[np.uint8], Float, Float]:
-    """Of each ray: the number of the instance that it meets, the normal there in the world, its
-    class; and for each instance its centre and its velocity and turn [6] in the world."""
+    """For each ray the number of the instance it hits, its class, and the world normal there;
+    for each instance its centre and its twist [6] in the world."""
     counts = [len(instance.cloud) for instance in targets.instances]
     firsts = np.cumsum([0, *counts])
     owner = np.searchsorted(firsts, members, side="right") - 1
@@ -347,7 +346,7 @@ def _turns(world: World, object_ids: Any) -> Float:
 
 
 def _at(velocities: Float, owner: NDArray[np.int64], centres: Float, points: Float) -> Float:
-    """Velocity [P, 3] in the world of the points that rays meet."""
+    """Velocity [P, 3] in the world of the points hit."""
     arms = points - centres[owner]
     own = velocities[owner]
     moving: Float = own[:, :3] + np.cross(own[:, 3:], arms)
@@ -363,7 +362,7 @@ def _of_sensor(world: World, T_world_sensor: Float) -> Float:
 
 
 def clouds_of(world: World, due: Sequence[Mounted], caster: CastBackend) -> list[Cloud]:
-    """What ``due`` sensors measure at the instant of ``world``, in their order."""
+    """Clouds of the ``due`` sensors at the instant of ``world``, in their order."""
     targets = ray_targets(world)
     return [
         sweep_cloud(world, mounted, targets, caster)

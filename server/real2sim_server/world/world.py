@@ -106,7 +106,7 @@ class World:
         revision: int = 0,
         deformation: Deformation | None = None,
     ) -> None:
-        """The world at step 0: the ego as it was recorded at the start time, on the ground.
+        """The world at step 0, with the ego as recorded at the start time, on the ground.
 
         Raises:
             WorldError: the episode cannot run as asked; see :func:`~.episode.episode_clock`.
@@ -177,23 +177,23 @@ class World:
 
     @property
     def storyboard(self) -> StoryboardRun | None:
-        """The storyboard of the episode as it is now; None where it has none."""
+        """The running storyboard of the episode; None where it has none."""
         found = self.traffic.storyboard
         return found if isinstance(found, StoryboardRun) else None
 
     @property
     def route(self) -> LoggedPath:
-        """The way that everything is measured along."""
+        """The path that everything is measured along."""
         return self._path
 
     @property
     def path_point(self) -> PathPoint:
-        """Where the ego is along the route."""
+        """Position of the ego along the route."""
         return self._path_point
 
     @property
     def contacts(self) -> ContactState:
-        """What is in contact now."""
+        """Current contacts."""
         return self._contacts
 
     @property
@@ -208,7 +208,7 @@ class World:
 
     @property
     def T_world_estimate(self) -> Float:
-        """[4, 4] float64, the body where the ego takes itself to be; ``T_world_body`` where its
+        """[4, 4] float64, the body at the ego's estimate of its pose; ``T_world_body`` where the
         estimate has no errors."""
         if self._estimate_error is None:
             return self.T_world_body
@@ -218,7 +218,7 @@ class World:
 
     @property
     def context(self) -> scoring.ScoringContext:
-        """What stays the same for the scores."""
+        """The constant context of the scores."""
         return self._context
 
     def step(
@@ -230,7 +230,7 @@ class World:
         return self.evaluate()
 
     def move(self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False) -> None:
-        """The first half of a step: all that images show. Let :meth:`evaluate` follow.
+        """The first half of a step: everything that images show. :meth:`evaluate` must follow.
 
         Order: edits made since the last step are in effect, the ego of a loop that has reached its
         end is put back to its start, then ego, objects, contact.
@@ -277,8 +277,10 @@ class World:
         self._edit_events = ()
 
     def evaluate(self) -> list[Event]:
-        """The second half, if it is still pending: contacts, scores and events. All that images
-        show stays as it is, so they may be drawn meanwhile."""
+        """The second half of a step, if it is pending: contacts, scores and events.
+
+        It changes nothing that images show, so they may be rendered at the same time.
+        """
         if self._pending is not None:
             start, plan, events, contacts, seam = self._pending
             self._pending = None
@@ -294,7 +296,7 @@ class World:
         return list(self._events)
 
     def stop(self, reason: str) -> None:
-        """End the episode where it is, without a step: ``deadline`` or ``wall_clock``. Raises
+        """End the episode without a step, by ``deadline`` or ``wall_clock``. Raises
         WorldError: EPISODE_OVER."""
         self._check_running()
         self.truncated, self.reason = True, reason
@@ -351,7 +353,7 @@ class World:
         return outcome
 
     def observe(self) -> Observation:
-        """What the policy gets at this instant, apart from images."""
+        """The observation at this instant, apart from images."""
         motion, s, truth = self.motion, self._path_point.s, None
         if self._estimate_error is not None:
             truth = (motion, self.T_world_body) if self.spec.privileged else None
@@ -396,7 +398,7 @@ class World:
         return scoring.scores_of(self.accumulator, self._context)
 
     def instances(self) -> list[Instance]:
-        """What the renderer draws at this instant; nothing is copied."""
+        """The instances to render at this instant; nothing is copied."""
         shown_us = min(self.t_us, self.scene.end_us)
         strides = self.strides.made
         drawn = compose(self.scene, self.state, self.agents, shown_us, strides=strides)
@@ -435,7 +437,7 @@ class World:
         return self.ranging.due(self.steps * self._clock.dt_us)
 
     def fork(self) -> World:
-        """A world that goes on from here on its own; it shares everything that never changes."""
+        """An independent copy of the world, which shares everything immutable."""
         return copy_with(self)
 
     # --- phases of a step -------------------------------------------------------------------
@@ -469,7 +471,7 @@ class World:
         return controller, [Event("deadline_missed", self.t_us)]
 
     def _put_back(self, controller: EgoController) -> tuple[EgoController, list[Event]]:
-        """The ego of a loop, back at the start of the recorded drive once it is at its end."""
+        """Put the ego of a loop back to the start of the recorded drive once it is at its end."""
         put = self._episode_route.put_back(self.motion, self._path_point)
         self._seam = put.seam if put is not None else None
         if put is None:
@@ -485,7 +487,7 @@ class World:
         return controller.put_back(put.seam), [Event("looped", self.t_us, data=data)]
 
     def _let_agents_react(self) -> list[Event]:
-        """Objects stop repeating the log once the ego is too far from where it was recorded."""
+        """Let objects stop repeating the log once the ego is too far from its recorded pose."""
         agents = self.spec.agents
         if agents.ego_off_log == "replay" or self.traffic.reacting:
             return []
@@ -500,7 +502,7 @@ class World:
         return [Event("agents_react", self.t_us, data={"distance": distance})]
 
     def _advance(self, controller: EgoController) -> StepMotion:
-        """Objects, then the ego, one clock step on from this instant."""
+        """Objects, then the ego, one clock step later."""
         t_us, before = self.t_us, self.agents
         end_us = t_us + self._clock.dt_us
         traffic = self.traffic.advance(self._tracks, end_us, lambda: self._surroundings(before))
@@ -516,7 +518,7 @@ class World:
         )
 
     def _commit_motion(self, moved: StepMotion) -> None:
-        """The step is made: clock, ego, objects and contacts are those at its end."""
+        """Commit the step: clock, ego, objects and contacts at its end."""
         seconds = self._clock.dt_us * 1e-6
         acceleration = (moved.motion.speed - self.motion.speed) / seconds
         self.steps += 1
@@ -560,7 +562,7 @@ class World:
         return contacts_of_impacts(impacts, self.t_us, touching=touching, before=before)
 
     def _step_start(self, controller: EgoController) -> StepStart:
-        """The world before a step, and how the ego goes on from there under its controller."""
+        """The world before a step, and the motion of the ego under its controller from there."""
         motion, t_us, at = self.motion, self.t_us, None
         if self.spec.action != "pose" and not self.warming_up:
 
@@ -583,7 +585,7 @@ class World:
         return contacts
 
     def _departure_events(self) -> list[Event]:
-        """The ego leaves the surroundings of the recorded path, or the road."""
+        """Events of an ego that leaves the surroundings of the recorded path, or the road."""
         events = []
         distance = math.dist(self._path_point.position[:2], (self.motion.x, self.motion.y))
         was_off_route, self._off_route = self._off_route, distance > OFF_ROUTE_DISTANCE
@@ -595,7 +597,7 @@ class World:
         return events
 
     def _storyboard_events(self) -> list[Event]:
-        """Elements of the storyboard that have begun and ended in the step."""
+        """Events of storyboard elements that started or stopped in the step."""
         run = self.storyboard
         return [
             Event("storyboard", c.t_us, element=c.element, element_type=c.type, change=c.change)
@@ -616,7 +618,7 @@ class World:
     # --- views of the instant ---------------------------------------------------------------
 
     def _first_motion(self, storyboard: StoryboardRun | None) -> tuple[Motion, dict[str, float]]:
-        """The ego at the start, and what the seed drew for it by name."""
+        """The ego at the start, and the values sampled for it by name."""
         recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
         if storyboard is not None and storyboard.ego_put:
             recorded = storyboard.ego_motion(recorded)
@@ -636,7 +638,7 @@ class World:
         )
 
     def _first_storyboard(self) -> StoryboardRun | None:
-        """The storyboard at the start, the ego where it was recorded."""
+        """The storyboard at the start, with the ego as recorded."""
         if self.spec.storyboard is None:
             return None
         motion = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
@@ -717,6 +719,6 @@ class World:
 def _newly_sampled(
     now: Mapping[str, float], before: Mapping[str, float], jitter_us: int
 ) -> Mapping[str, float]:
-    """What has been sampled in a step, by name."""
+    """Values sampled in a step, by name."""
     sampled = {} if now is before else {k: v for k, v in now.items() if k not in before}
     return sampled | {"latency_us": float(jitter_us)} if jitter_us else sampled

@@ -24,7 +24,7 @@ from .solver_state import CollisionStep
 from .sweep import BACKGROUND, EgoContacts, StepStart, ego_contacts, swept_contacts
 
 WIDEN = 0.3
-"""By how much places that the ego may reach are widened [m]."""
+"""Margin around the positions that the ego may reach [m]."""
 
 HeightAt = Callable[[float, float], float]
 """Height of the ground [m] at x, y [m]."""
@@ -49,7 +49,7 @@ class StepMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """What is in contact at one instant of an episode.
+    """Contacts at one instant of an episode.
 
     Attributes:
         spec: of the episode.
@@ -290,7 +290,7 @@ def _impacted_objects(traffic: Traffic) -> dict[str, ImpactedObject]:
 
 
 class StepContacts(NamedTuple):
-    """Of one step.
+    """Contacts of one step.
 
     Attributes:
         events: collisions that began.
@@ -306,7 +306,7 @@ class StepContacts(NamedTuple):
 
 
 def contacts_of_overlaps(found: EgoContacts, t_us: int) -> StepContacts:
-    """Where bodies pass through each other."""
+    """Contacts of a step in which bodies pass through each other."""
     events = (Event("collision", t_us, c.object_id, data=c.event_data()) for c in found.begun)
     return StepContacts(tuple(events), found.records, found.touching)
 
@@ -314,7 +314,7 @@ def contacts_of_overlaps(found: EgoContacts, t_us: int) -> StepContacts:
 def contacts_of_impacts(
     impacts: tuple[Impact, ...], t_us: int, *, touching: frozenset[str], before: Agents
 ) -> StepContacts:
-    """Where bodies push each other.
+    """Contacts of a step in which bodies push each other.
 
     Args:
         impacts: of the step.
@@ -354,6 +354,6 @@ def _ego_records(
 
 
 def _pair_name(impact: Impact) -> str:
-    """Name of a pair in contact; of the ego's, that of the object."""
+    """Name of a pair in contact; for the ego's contacts the name of the object."""
     name = impact.object_id or BACKGROUND
     return name if impact.other_id is None else f"{name}\n{impact.other_id}"

@@ -47,7 +47,7 @@ HARD = 5.0
 
 @dataclass(frozen=True, eq=False)
 class VehicleDamage:
-    """What impacts have done to a vehicle until an instant.
+    """Damage of a vehicle by impacts up to an instant.
 
     Attributes:
         most: [G, 3] largest shortening so far.
@@ -73,7 +73,7 @@ class VehicleDamage:
 
 @dataclass(eq=False)
 class DamageHistory:
-    """The damage of one impact, frame by frame; asking twice gives the same.
+    """The damage of one impact, frame by frame, always the same.
 
     Attributes:
         object_id: the vehicle.
@@ -298,7 +298,7 @@ class DeformationTracker:
 
 
 class _UndeformedObject:
-    """An object as it was before its first impact.
+    """An object before its first impact.
 
     Everything is found on demand and kept; a lock lets sessions on several threads share it.
     """
@@ -411,7 +411,7 @@ def _pieces(points: Float, rest: Float) -> list[_Piece]:
 
 @dataclass(eq=False)
 class _DeformedObject:
-    """An object after some impacts; without any it is as it was.
+    """An object after its impacts; unchanged without any.
 
     Attributes:
         origin: the object.

@@ -47,7 +47,7 @@ BACKGROUND = "\0"
 
 @dataclass(frozen=True, eq=False)
 class CollisionStep:
-    """A step of the clock before its collisions are solved.
+    """A step before its collisions are solved.
 
     Attributes:
         t_us, dt_us: the step [us].
@@ -143,7 +143,7 @@ class SolverState:
 
 
 def bodies_of(state: SolverState, a: str, b: str) -> Bodies:
-    """Two bodies as they are now; None for the background."""
+    """Current state of two bodies; None for the background."""
     second = None if b == BACKGROUND else (state.bodies[b], state.properties[b])
     return (state.bodies[a], state.properties[a]), second
 

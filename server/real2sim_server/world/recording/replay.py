@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -207,12 +207,6 @@ def _apply_entry(world: World, kind: str, fields: dict[str, Any]) -> None:
             world.stop(fields["reason"])
         case _:
             raise ValueError(f"a log entry of kind {kind!r}; known are {', '.join(KINDS)}")
-
-
-def replayed_worlds(replayer: Replayer, entries: Iterable[Entry]) -> Iterator[tuple[Entry, World]]:
-    """Every entry with the world after it."""
-    for entry in entries:
-        yield entry, replayer.apply(entry)
 
 
 def no_action_impact(replayer: Replayer, entries: Sequence[Entry]) -> float:
