@@ -1,0 +1,348 @@
+"""Private actions begin: each gives its entity the controller that moves it from now on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from real2sim_proto import ErrorCode
+from real2sim_proto.episode import IdmDriver
+from real2sim_proto.storyboard_actions import (
+    AcquirePositionAction,
+    AssignRouteAction,
+    ControllerAction,
+    Dynamics,
+    FollowTrajectoryAction,
+    LaneChangeAction,
+    LaneOffsetAction,
+    LateralDistanceAction,
+    LongitudinalDistanceAction,
+    SpeedAction,
+    SpeedProfileAction,
+    SynchronizeAction,
+    TeleportAction,
+    VisibilityAction,
+)
+
+from ..common import WorldError, copy_with
+from ..path import LoggedPath
+from .motion import (
+    FollowIdm,
+    FollowOffset,
+    FollowSpeed,
+    HoldOffset,
+    KeepAside,
+    KeepDistance,
+    OffsetChange,
+    SpeedChange,
+    SpeedCourse,
+    Synchronize,
+    duration,
+    gentle_duration,
+    lane_offset,
+)
+from .roads import Place, RoadPoint, Trajectory, Way, course_of, path_through
+from .view import ACROSS, EntityState, PositionResolver, View, across, ahead_on_way
+
+BESIDE_ROUTE = 10.0
+"""An entity teleported within this distance of its assigned route keeps the route [m]."""
+
+SLOWEST_DESIRED = 3.0
+"""Desired speed of an entity that stands when its controller is activated [m/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beginning:
+    """What an action may know when it begins.
+
+    Attributes:
+        view: the instant.
+        places: resolves positions then.
+        token: of the action.
+        version: of the storyboard.
+    """
+
+    view: View
+    places: PositionResolver
+    token: int
+    version: int
+
+
+def begun(actor: EntityState, action: Any, at: Beginning) -> EntityState:
+    """The entity with an action of the storyboard begun; one that takes no time is finished.
+
+    Raises:
+        WorldError: INVALID_REQUEST, a place, lane or form that it cannot go to.
+    """
+    return _BEGIN[type(action)](actor, action, at)
+
+
+def _done(actor: EntityState, at: Beginning, **changes: Any) -> EntityState:
+    return copy_with(actor, finished=actor.finished | {at.token}, **changes)
+
+
+def _dynamics(dynamics: Dynamics, at: Beginning) -> Dynamics:
+    """With the magnitude of a rate: some write braking as a negative one."""
+    if at.version < 2 or dynamics.dimension != "rate":
+        return dynamics
+    return dynamics.model_copy(update={"value": abs(float(dynamics.value))})
+
+
+def _freed(actor: EntityState) -> EntityState:
+    """Off a trajectory whose times ruled its speed, which it goes on along at its own; off one
+    that only rules its place nothing changes."""
+    if actor.trajectory is None or actor.trajectory.timing is None:
+        return actor
+    course = actor.trajectory.course
+    places = [Place(float(x), float(y), 0.0) for x, y in zip(course.x, course.y, strict=True)]
+    way = Way("trajectory", 1, True, path_through(places))
+    return copy_with(actor, trajectory=None).on_way(way)
+
+
+def _on_lane(actor: EntityState, at: Beginning) -> EntityState:
+    """Off its trajectory, on the lane where it is."""
+    if actor.trajectory is None:
+        return actor
+    return copy_with(actor, trajectory=None).on_lane(at.view.network)
+
+
+def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityState:
+    actor = _freed(actor)
+    value, dynamics = float(action.speed), _dynamics(action.dynamics, at)
+    if action.continuous and action.relative_to is not None:
+        rate = float(dynamics.value) if dynamics.dimension == "rate" else math.inf
+        rate = math.inf if dynamics.shape == "step" else rate
+        follow = FollowSpeed(at.token, action.relative_to, action.relation, value, rate)
+        return copy_with(actor, longitudinal=follow)
+    if action.relative_to is not None:
+        other = at.view.entities[action.relative_to].speed
+        value = other + value if action.relation == "delta" else other * value
+    seconds = _speed_duration(dynamics, actor.speed, value)
+    if seconds <= 0.0:
+        return _done(actor, at, speed=value, longitudinal=None)
+    change = SpeedChange(at.token, dynamics.shape, actor.speed, value, seconds)
+    return copy_with(actor, longitudinal=change)
+
+
+def _speed_duration(dynamics: Dynamics, start: float, end: float) -> float:
+    """How long it takes [s]. All forms have the mean of both speeds as their mean, which tells
+    the time that a way takes."""
+    if dynamics.dimension != "distance" or dynamics.shape == "step":
+        return duration(dynamics, end - start)
+    mean = (start + end) / 2
+    return float(dynamics.value) / mean if mean > 0 else 0.0
+
+
+def _speed_profile(actor: EntityState, action: SpeedProfileAction, at: Beginning) -> EntityState:
+    actor = _freed(actor)
+    base = at.view.entities[action.relative_to].speed if action.relative_to is not None else 0.0
+    points, time = [(0.0, actor.speed)], 0.0
+    for point in action.points:
+        time += max(float(point.time), 0.0)
+        points.append((time, base + float(point.speed)))
+    if time <= 0.0:
+        return _done(actor, at, speed=points[-1][1], longitudinal=None)
+    return copy_with(actor, longitudinal=SpeedCourse(at.token, tuple(points)))
+
+
+def _longitudinal_distance(
+    actor: EntityState, action: LongitudinalDistanceAction, at: Beginning
+) -> EntityState:
+    actor = _freed(actor)
+    other = at.view.entities[action.entity]
+    ahead = ahead_on_way(actor, other.x, other.y, at.view.network)
+    leading = ahead < 0.0 if action.place == "any" else action.place == "leading"
+    return copy_with(actor, longitudinal=KeepDistance(at.token, action, leading))
+
+
+def _synchronize(actor: EntityState, action: SynchronizeAction, at: Beginning) -> EntityState:
+    actor = _freed(actor)
+    final = None if action.final_speed is None else float(action.final_speed)
+    tolerances = (float(action.master_tolerance), float(action.tolerance))
+    steady = float(action.steady_distance or 0.0), float(action.steady_time or 0.0)
+    there, own = at.places.of(action.master_target), at.places.of(action.target)
+    control = Synchronize(
+        at.token,
+        action.master,
+        there,
+        own,
+        final,
+        action.relative,
+        tolerances,
+        steady,
+        action.limits,
+    )
+    return copy_with(actor, longitudinal=control)
+
+
+def _where(actor: EntityState, at: Beginning, what: str) -> RoadPoint:
+    here = at.view.network.locate(actor.x, actor.y, actor.h)
+    if here is None:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"{actor.name!r} is beside all lanes and cannot begin a {what}",
+            hint="let it begin on a lane; storyboard.roads says how many there are",
+        )
+    return here
+
+
+def _lane_change(actor: EntityState, action: LaneChangeAction, at: Beginning) -> EntityState:
+    actor, network = _on_lane(actor, at), at.view.network
+    here = _where(actor, at, "lane change")
+    along = math.cos(actor.h - here.h) >= 0.0
+    lane = int(action.lane)
+    if action.relative_to is not None:
+        other = at.view.entities[action.relative_to]
+        base = _where(other, at, "lane change relative to it")
+        sense = 1 if math.cos(other.h - base.h) >= 0.0 else -1
+        lane = network.neighbour(base.road, base.lane, base.s, lane * sense)
+    actor = actor.on_way(network.way(here.road, lane, here.s, along=along))
+    end = float(action.offset) * (1.0 if along else -1.0)
+    dynamics, change = _dynamics(action.dynamics, at), end - actor.offset
+    by_way = dynamics.dimension == "distance" and dynamics.shape != "step"
+    extent = float(dynamics.value) if by_way else duration(dynamics, change)
+    return _shifted(actor, dynamics.shape, end, extent, at, by_way=by_way)
+
+
+def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) -> EntityState:
+    actor = _on_lane(actor, at)
+    value, acceleration = float(action.offset), action.acceleration
+    if action.relative_to is not None:
+        if action.continuous and acceleration is None:
+            return copy_with(actor, lateral=FollowOffset(at.token, action.relative_to, value))
+        value += lane_offset(at.view.entities[action.relative_to], at.view)
+    # Who was straight on beside the road or on a route counts from its lane's middle now.
+    actor = actor.on_lane(at.view.network)
+    if action.continuous and acceleration is None:
+        return copy_with(actor, lateral=HoldOffset(at.token, value))
+    most = None if acceleration is None else float(acceleration)
+    extent = gentle_duration(action.shape, value - actor.offset, most)
+    return _shifted(actor, action.shape, value, extent, at)
+
+
+def _shifted(
+    actor: EntityState,
+    shape: Any,
+    end: float,
+    extent: float,
+    at: Beginning,
+    *,
+    by_way: bool = False,
+) -> EntityState:
+    if extent <= 0.0:
+        return _done(copy_with(actor, lateral=None, offset=end, drift=0.0).placed(), at)
+    change = OffsetChange(at.token, shape, actor.offset, end, extent, by_way)
+    return copy_with(actor, lateral=change)
+
+
+def _lateral_distance(
+    actor: EntityState, action: LateralDistanceAction, at: Beginning
+) -> EntityState:
+    actor, other = _on_lane(actor, at), at.view.entities[action.entity]
+    side = {"left": 1.0, "right": -1.0}.get(action.side, 0.0)
+    if not side:
+        side = math.copysign(1.0, across(other.h, actor.x - other.x, actor.y - other.y))
+    return copy_with(actor, lateral=KeepAside(at.token, action, side))
+
+
+def _follow_trajectory(
+    actor: EntityState, action: FollowTrajectoryAction, at: Beginning
+) -> EntityState:
+    course = course_of(action.curve, at.places.of)
+    timing, s = action.timing, float(action.offset)
+    if timing is not None and course.times is None:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"trajectory {action.name!r} is to be followed by its times and has none",
+            hint="give times to its vertices, or leave out `timing`",
+        )
+    elapsed = at.view.elapsed if timing is not None and timing.domain == "absolute" else 0.0
+    following = Trajectory(at.token, course, timing, s, elapsed)
+    longitudinal = actor.longitudinal if timing is None else None
+    actor = copy_with(
+        actor, trajectory=following, lateral=None, longitudinal=longitudinal, drift=0.0
+    )
+    if not following.begun():
+        return actor
+    if timing is not None:
+        time = elapsed * float(timing.scale) + float(timing.offset)
+        following = Trajectory(at.token, course, timing, course.way_at(time), elapsed)
+        actor = copy_with(actor, trajectory=following)
+    place = following.place()
+    return copy_with(actor, x=place.x, y=place.y, h=place.h)
+
+
+def _assign_route(actor: EntityState, action: AssignRouteAction, at: Beginning) -> EntityState:
+    places = [at.places.of(w) for w in action.route.waypoints]
+    return _done(_on_route(actor, at.view.network.route(places)), at)
+
+
+def _acquire_position(
+    actor: EntityState, action: AcquirePositionAction, at: Beginning
+) -> EntityState:
+    here = Place(actor.x, actor.y, actor.h)
+    path = at.view.network.route([here, at.places.of(action.position)])
+    moved = _on_route(actor, path)
+    return copy_with(moved, lateral=OffsetChange(
+        at.token, "linear", moved.offset, moved.offset, max(path.length - moved.s, 1e-6), True
+    ))  # fmt: skip
+
+
+def _on_route(actor: EntityState, path: LoggedPath) -> EntityState:
+    way = Way("route", 1, True, path, assigned=True)
+    return copy_with(actor, trajectory=None, lateral=None).on_way(way)
+
+
+def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> EntityState:
+    place = at.places.of(action.position)
+    put = actor.put(place, at.view.network)
+    route = actor.way
+    if at.version >= 2 and route is not None and route.assigned and _is_beside(place, route):
+        put = put.on_way(route)
+    return _done(put, at, lateral=None)
+
+
+def _is_beside(place: Place, route: Way) -> bool:
+    """Whether a place is one to drive a route from."""
+    near = route.path.nearest(place.x, place.y)
+    # Headings of a route turn between its places, which may be far apart: its points tell more.
+    (x0, y0, *_), (x1, y1, *_) = (route.path.at(near.s + ds) for ds in (-0.5, 0.5))
+    turn = math.remainder(math.atan2(y1 - y0, x1 - x0) - place.h, math.tau)
+    away = math.dist((place.x, place.y), near.position[:2])
+    return away <= BESIDE_ROUTE and abs(turn) <= ACROSS
+
+
+def _visibility(actor: EntityState, action: VisibilityAction, at: Beginning) -> EntityState:
+    return _done(actor, at, visible=action.visible)
+
+
+def _controller(actor: EntityState, action: ControllerAction, at: Beginning) -> EntityState:
+    actor = _freed(actor)
+    if not action.active:
+        return _done(actor, at, longitudinal=None)
+    desired = action.idm.desired_speed
+    desired = max(actor.speed, SLOWEST_DESIRED) if desired is None else desired
+    return _done(actor, at, longitudinal=FollowIdm(at.token, _idm(action), desired))
+
+
+def _idm(action: ControllerAction) -> IdmDriver:
+    return IdmDriver(path="route", **action.idm.model_dump())
+
+
+_BEGIN: Mapping[type[Any], Callable[[EntityState, Any, Beginning], EntityState]] = {
+    SpeedAction: _speed,
+    SpeedProfileAction: _speed_profile,
+    LaneChangeAction: _lane_change,
+    LaneOffsetAction: _lane_offset,
+    LateralDistanceAction: _lateral_distance,
+    LongitudinalDistanceAction: _longitudinal_distance,
+    SynchronizeAction: _synchronize,
+    FollowTrajectoryAction: _follow_trajectory,
+    AssignRouteAction: _assign_route,
+    AcquirePositionAction: _acquire_position,
+    TeleportAction: _teleport,
+    VisibilityAction: _visibility,
+    ControllerAction: _controller,
+}
