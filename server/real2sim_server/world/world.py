@@ -12,14 +12,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import ResetSpec, SensorSpec
 from real2sim_proto.operations import Operation
 
-from ..edit import (
-    EditError,
-    EditOutcome,
-    ObjectState,
-    ScenarioState,
-    apply_operations,
-    compose,
-)
+from ..edit import EditError, EditOutcome, ObjectState, ScenarioState, apply_operations, compose
 from ..edit.tracks import PackedTracks
 from ..render.types import Instance
 from ..scene import Scene

@@ -17,9 +17,7 @@ from real2sim_proto.storyboard_actions import (
 from ..common import WorldError, copy_with
 from ..traffic.driver import Surroundings
 from .begin_actions import Beginning, begun
-from .motion import (
-    advanced,
-)
+from .motion import advanced
 from .program import (
     ConditionContext,
     ConditionState,
