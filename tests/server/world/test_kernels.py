@@ -18,7 +18,7 @@ from real2sim_server.geometry import box_kernels
 from real2sim_server.geometry.box import box_penetration
 from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.world import boxes as box_kernels
+from real2sim_server.world import boxes as world_boxes
 from real2sim_server.world import path, warm_up
 from real2sim_server.world.driving import entries
 from real2sim_server.world.ego.plan import PlannedTrajectory
@@ -160,7 +160,7 @@ def test_all_boxes_that_overlap_are_within_reach(seed, count):
     transforms = transform_from(positions, rng.normal(size=(count, 4)))
     box = transform_from(rng.normal(size=3), rng.normal(size=4))
 
-    near = box_kernels.within_reach(box, SIZE, transforms, sizes)
+    near = world_boxes.within_reach(box, SIZE, transforms, sizes)
     distances = np.linalg.norm(positions - box[:3, 3], axis=1)
     balls = (np.linalg.norm(sizes, axis=1) + np.linalg.norm(SIZE)) / 2
     np.testing.assert_array_equal(near, np.flatnonzero(distances < balls))
@@ -178,7 +178,7 @@ def test_boxes_that_overlap_soon_may_overlap(seed):
     box = transform_from(ahead, yaw_quaternion(ego[2]))
     meets = overlapping(box, transform_from(positions, quaternions), sizes)
 
-    may = box_kernels.may_overlap(ego, SIZE, 0.1, positions, quaternions, velocities, sizes)
+    may = world_boxes.may_overlap(ego, SIZE, 0.1, positions, quaternions, velocities, sizes)
     assert may or not meets
 
 
@@ -186,15 +186,15 @@ def test_boxes_far_away_may_not_overlap():
     boxes = some_boxes(np.random.default_rng(0), 20, spread=3.0)
     boxes[0][:, 0] += 60.0
 
-    assert not box_kernels.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *boxes)
+    assert not world_boxes.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *boxes)
     nobody = [b[:0] for b in boxes]
-    assert not box_kernels.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *nobody)
+    assert not world_boxes.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *nobody)
 
 
 def test_headings_are_those_of_quaternions():
     quaternions = np.random.default_rng(0).normal(size=(50, 4))
 
-    found = box_kernels.headings(quaternions)
+    found = world_boxes.headings(quaternions)
     np.testing.assert_allclose(found, quaternion_yaw(quaternions), atol=1e-12)
 
 
@@ -393,11 +393,10 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         box_kernels,
         track_kernels,
         path,
-        boxes,
+        world_boxes,
         road,
         instant,
         comfort,
-        boxes,
     )
     kernels = [v for m in modules for v in vars(m).values() if isinstance(v, Dispatcher)]
     before = {k.__name__: len(k.signatures) for k in kernels}
