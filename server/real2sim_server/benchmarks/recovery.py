@@ -36,7 +36,7 @@ from ..scene import Camera, Scene
 from ..scene.io import load_scene, read_packed
 from ..sweeps.episode import draw_frames, observation_of
 from ..world import World
-from ..world.draws import Draws
+from ..world.common import Draws
 from ..world.path import LoggedPath
 
 Figures = dict[str, Any]
@@ -232,7 +232,7 @@ def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) ->
             continue
         world = _world(scene, seed, len(found) % INSTANTS, options)
         # Where the first draw is not free the world draws another.
-        if all(abs(world.drawn[name]) >= FAR_SHARE * w for name, w in least.items()):
+        if all(abs(world.sampled[name]) >= FAR_SHARE * w for name, w in least.items()):
             found.append(world)
         if len(found) == count:
             return found

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from ..scene import Scene
     from ..sweeps.episode import Driven
-    from ..world.events import Event
+    from ..world.agents import Event
     from ..world.recording.recording import Recording
 
 SCRIPTED = "storyboard"

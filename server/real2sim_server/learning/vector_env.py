@@ -34,7 +34,7 @@ from ..render import Backend
 from ..scene import Scene
 from ..scene.io import load_scene, read_packed
 from ..world.batch import BatchWorld
-from ..world.ego.route import WAYPOINTS
+from ..world.path import WAYPOINTS
 from .batch_images import batch_images, fitted
 
 Arrays = dict[str, NDArray[Any]]

@@ -25,8 +25,7 @@ from ..geometry.transform import transform_from
 from ..logs import DrivingLog
 from ..render import render_cameras, select_backend
 from ..scene import Scene, Trajectory
-from ..world.ego.route import command_ahead
-from ..world.path import LoggedPath
+from ..world.path import LoggedPath, command_ahead
 
 if TYPE_CHECKING:
     import torch

@@ -17,7 +17,7 @@ from real2sim_proto.storyboard_actions import (
 
 from ..edit import ObjectState, PackedTracks
 from ..scene import Ground, Scene, Trajectory
-from ..world.ego.box import REAR_OVERHANG
+from ..world.boxes import REAR_OVERHANG
 from ..world.ego.motion import Motion
 from ..world.path import LoggedPath
 from ..world.storyboard.roads import RoadNetwork, RouteNetwork, straight

@@ -21,7 +21,7 @@ from ..datasets.drive import EpisodeDrive
 from ..edit import AssetLookup
 from ..geometry.rotation import matrix_to_quaternion
 from ..world import World, plan_in_world
-from ..world.ego.reference import PlannedTrajectory
+from ..world.ego.plan import PlannedTrajectory
 from ..world.recording.recording import Recording, load_recording, to_bytes
 from .http.idempotency import IdempotentRequest
 from .http.problems import ServiceError

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .._numba import kernel
 from ..world import World
-from ..world.scoring.hazard import STOPPED
+from ..world.scoring.instant import STOPPED
 from ..world.storyboard.run import object_ids_of
 
 # --- Kernels -------------------------------------------------------------------------------------

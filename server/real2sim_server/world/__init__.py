@@ -1,10 +1,9 @@
 """The closed loop: the only package in which time passes."""
 
-from .agents import Agents, agent_fields
+from .agents import Agents, Event, agent_fields
+from .common import WorldError
 from .ego.controller import Plan, plan_in_world
 from .ego.motion import Motion
-from .errors import WorldError
-from .events import Event
 from .observation import Observation, ego_fields
 from .path import LoggedPath
 from .scoring import Score, metrics_version

@@ -1,17 +1,25 @@
-"""Poses of all objects at one instant."""
+"""Poses and walking phases of all objects at one instant, and events of a step."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from real2sim_proto.drive import EventType
+
 from ..edit import ObjectState, PlacedObjects
+from ..edit.compose import figure_of
+from ..geometry.rotation import Float
+from ..scene import Figure, Scene, Stride
 
 Agents = PlacedObjects[ObjectState]
-"""Where all objects are at one instant."""
+"""Poses of all objects at one instant."""
 
 
 def rows_of(agents: Agents) -> dict[str, int]:
@@ -29,7 +37,7 @@ def rows_in(before: Agents, after: Agents) -> NDArray[np.int64]:
 
 @lru_cache(maxsize=64)
 def _all_rows(count: int) -> NDArray[np.int64]:
-    """Shared by all who ask: nobody writes into it."""
+    """Shared between callers: never written to."""
     return np.arange(count)
 
 
@@ -54,3 +62,118 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
         }
         for subject, position, quaternion, velocity, size in poses
     ]
+
+
+# --- Strides -------------------------------------------------------------------------------------
+
+# Pedestrians who left their recorded trajectories (led by a driver or a storyboard, or hit) walk
+# with strides that follow from their motion.
+
+LED = 1e-3
+"""A pedestrian this close to the recorded trajectory [m], also in the entries of the rotation,
+walks with its recorded stride."""
+UPRIGHT = 0.9
+"""Cosine of the angle to the vertical beyond which a pedestrian does not walk."""
+
+Walker = tuple[int, ObjectState, Figure]
+
+
+@dataclass(frozen=True, eq=False)
+class Strides:
+    """Strides of people at one instant; a part of a world, so replayed and forked with it.
+
+    Attributes:
+        made: by object id, of those whom no trajectory leads.
+        objects: of the world, in their order.
+        walkers: row, object and figure of those among them that are people.
+    """
+
+    made: Mapping[str, Stride] = field(default_factory=dict)
+    objects: tuple[ObjectState, ...] = ()
+    walkers: tuple[Walker, ...] = ()
+
+    def after(self, scene: Scene, agents: Agents, *, since_us: int, t_us: int) -> Strides:
+        """One step on.
+
+        Args:
+            scene: that the objects are of.
+            agents: where everybody is now.
+            since_us, t_us: the last instant and now [us].
+        """
+        walkers = self.walkers
+        # Traffic makes a new tuple with every step, mostly of the same objects.
+        if agents.objects != self.objects:
+            walkers = _walkers(scene, agents.objects)
+        elif not walkers:
+            return self
+        made, seconds = {}, (t_us - since_us) * 1e-6
+        for row, subject, figure in walkers:
+            transform = agents.transforms[row]
+            if _is_led(subject, transform, t_us):
+                continue
+            stride = self.made.get(subject.object_id)
+            if stride is None:
+                stride = figure.stride_at(subject.trajectory, since_us)
+            speed = _walking_speed(transform, agents.velocities[row])
+            made[subject.object_id] = figure.strode(
+                stride, speed=speed / subject.scale[2], seconds=seconds
+            )
+        return Strides(made, agents.objects, walkers)
+
+
+def _walkers(scene: Scene, objects: tuple[ObjectState, ...]) -> tuple[Walker, ...]:
+    found = ((row, subject, figure_of(scene, subject)) for row, subject in enumerate(objects))
+    return tuple((row, subject, figure) for row, subject, figure in found if figure is not None)
+
+
+def _is_led(subject: ObjectState, transform: Float, t_us: int) -> bool:
+    trajectory = subject.trajectory
+    if not trajectory.covers(t_us):
+        return False
+    return bool(np.abs(trajectory.transform(t_us) - transform).max() < LED)
+
+
+def _walking_speed(transform: Float, velocity: Float) -> float:
+    """Speed over the ground [m/s]; 0 for pedestrians who lie or fly."""
+    return math.hypot(velocity[0], velocity[1]) if transform[2, 2] > UPRIGHT else 0.0
+
+
+# --- Events --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Event:
+    """An event of a step, with the fields of the wire's Event.
+
+    Data of a ``collision``: when it began (``contact_us``, simulation time, within the step before
+    ``t_us``), where (``x``, ``y`` [m], world) and ``relative_speed`` there [m/s]; where momentum is
+    exchanged also the rest of :meth:`.collision.impact.Impact.event_data`. ``object_id`` is None
+    for the background, ``other_id`` the second object where the ego had no part. Of ``left_log``
+    and ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
+    Of ``storyboard``: ``element``, ``element_type`` and ``change``, see
+    :class:`.storyboard.progress.ElementChange`.
+    Of ``looped``: ``lap``, and ``x``, ``y`` [m], ``turn`` [rad] of :class:`.path.LoopTransform`.
+    """
+
+    type: EventType
+    t_us: int
+    object_id: str | None = None
+    other_id: str | None = None
+    data: Mapping[str, float] = field(default_factory=dict)
+    element: str | None = None
+    element_type: str | None = None
+    change: str | None = None
+
+    def fields(self) -> dict[str, Any]:
+        """As a plain map for the wire."""
+        fields = {
+            "type": self.type,
+            "t_us": self.t_us,
+            "object_id": self.object_id,
+            "other_id": self.other_id,
+            "data": dict(self.data),
+        }
+        if self.element is None:
+            return fields
+        told = {"element": self.element, "element_type": self.element_type, "change": self.change}
+        return fields | told

@@ -1,14 +1,35 @@
-"""Validation of a reset, and the clock of its episode."""
+"""An episode: validation of its reset, clock, route beyond the log, and randomization."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.episode import ResetSpec, SensorSpec
+from real2sim_proto.base import Pose
+from real2sim_proto.episode import (
+    EstimateRandomization,
+    IdmDriver,
+    ResetSpec,
+    SensorSpec,
+    StartRandomization,
+    TrafficRandomization,
+)
+from real2sim_proto.operations import Operation, SetStoryboard, Spawn
 
-from ..scene import Scene
-from .errors import WorldError
+from ..edit import EditError, ObjectState, ScenarioState
+from ..edit.tracks import PackedTracks
+from ..geometry.box_kernels import boxes_overlap
+from ..geometry.rotation import yaw_quaternion
+from ..scene import Ground, Scene, Trajectory
+from .common import Draws, WorldError
+from .ego.motion import Motion
+from .path import Float, LoggedPath, LoopTransform, PathPoint
+from .traffic.driver import desired_speed, highest_speed
 
 
 @dataclass(frozen=True)
@@ -36,7 +57,7 @@ def episode_clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
     Raises:
         WorldError: TIME_OUT_OF_RANGE when start or horizon leave the log; UNKNOWN_CAMERA;
             INVALID_REQUEST when a sensor's period and the clock step do not divide, a camera
-            is listed twice, or a start is drawn for a warm-up.
+            is listed twice, or a start is sampled for a warm-up.
     """
     clock = _clock(scene, spec)
     for sensor in spec.sensors:
@@ -124,3 +145,421 @@ def _check_sensor(scene: Scene, spec: ResetSpec, sensor: SensorSpec) -> None:
             f"{spec.dt_us}",
             hint="all sensors show committed instants; choose a period of whole clock steps",
         )
+
+
+# --- Beyond the log ------------------------------------------------------------------------------
+
+# The clock of an episode may outlast the recording (``beyond_log`` of its reset). The route then
+# continues with the final bend of the recorded drive, which fades into a straight line. With
+# ``loop``, an ego that reaches the end of the recorded drive is put back to its start, with the
+# same offset and heading error: a :class:`.path.LoopTransform`. Road users that follow the route
+# move with it; everything else stays.
+
+BEND_FROM = 10.0
+"""The bend at the end of the recorded drive is that of its last metres [m]."""
+
+SHARPEST_BEND = 0.05
+"""More than this is noise or a turn at a junction, which the road does not continue [1/m]."""
+
+BEND_FADES = 40.0
+"""Way along which a bend falls to 1/e [m]."""
+
+SPACING, FADED = 2.0, 160.0
+"""Of the places behind the recorded drive, and where the rest of the way is straight [m]."""
+
+MAX_ROUTE = 100_000.0
+"""[m]"""
+
+FASTEST = 15.0
+"""A route is long enough to go on at this speed, or half as fast again as recorded [m/s]."""
+
+SHORTEST_LOOP = 20.0
+"""Recorded drives shorter than this are no loop [m]."""
+
+STANDING = 2.0
+"""Objects that cover less than this in the recording stand [m]."""
+
+
+def driven_route(scene: Scene, spec: ResetSpec, horizon: int) -> LoggedPath:
+    """The path that an episode is measured along: the recorded drive and, where the episode may go
+    beyond it, its continuation.
+
+    Raises:
+        WorldError: INVALID_REQUEST for a loop on a recorded drive that is none.
+    """
+    recorded = LoggedPath(scene.ego)
+    if spec.beyond_log == "end":
+        return recorded
+    spawn = spec.agents.spawn
+    if spec.beyond_log == "loop" and recorded.length < SHORTEST_LOOP:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"the recorded drive is {recorded.length:.1f} m long, too short to be driven in a loop",
+            hint=f"a loop takes {SHORTEST_LOOP:g} m; choose beyond_log 'extend'",
+        )
+    reach = max(FADED, spawn.ahead + spawn.margin if spawn is not None else 0.0)
+    if spec.beyond_log == "extend":
+        speed = max(1.5 * highest_speed(scene.ego), FASTEST)
+        reach = min(max(horizon * spec.dt_us * 1e-6 * speed, reach), MAX_ROUTE)
+    return continued(recorded, reach, scene.ground)
+
+
+def lanes_route(route: LoggedPath, scene: Scene, spec: ResetSpec) -> LoggedPath:
+    """The path along which lanes of spawned objects run; it continues where the episode's ends."""
+    spawn = spec.agents.spawn
+    if spawn is None or spec.beyond_log != "end":
+        return route
+    return continued(route, max(FADED, spawn.ahead + spawn.margin), scene.ground)
+
+
+def continued(path: LoggedPath, reach: float, ground: Ground) -> LoggedPath:
+    """The path and ``reach`` more metres of it, on the ground."""
+    before = path.at(max(path.length - BEND_FROM, 0.0))[3]
+    bend = (float(path.yaws[-1]) - before) / min(BEND_FROM, path.length)
+    bend = min(max(bend, -SHARPEST_BEND), SHARPEST_BEND)
+    way = SPACING * np.arange(1, round(min(reach, FADED) / SPACING) + 1)
+    yaws = path.yaws[-1] + bend * BEND_FADES * (1.0 - np.exp(-way / BEND_FADES))
+    # Along the chord of each piece, whose heading is that of its middle.
+    middles = np.concatenate([[path.yaws[-1]], yaws])
+    chords = SPACING * np.exp(0.5j * (middles[1:] + middles[:-1]))
+    plane = path.positions[-1, 0] + 1j * path.positions[-1, 1] + np.cumsum(chords)
+    if reach > FADED:
+        plane = np.append(plane, plane[-1] + (reach - FADED) * np.exp(1j * yaws[-1]))
+        yaws = np.append(yaws, yaws[-1])
+    xy = np.stack([plane.real, plane.imag], axis=1)
+    x, y, z = path.positions[-1].tolist()
+    above = z - ground.height(x, y)
+    places = np.column_stack([xy, ground.height_at(xy) + above])
+    return LoggedPath.through(
+        np.vstack([path.positions, places]),
+        np.concatenate([path.yaws, yaws]),
+        np.vstack([path.ups, np.tile([0.0, 0.0, 1.0], (len(places), 1))]),
+    )
+
+
+def at_start_again(motion: Motion, near: PathPoint, route: LoggedPath, s: float) -> Motion:
+    """The motion at distance ``s`` of the route, beside it and turned against it as it is at
+    ``near``."""
+    x, y, _, yaw = route.at(s)
+    return motion._replace(
+        x=x - near.offset * math.sin(yaw),
+        y=y + near.offset * math.cos(yaw),
+        yaw=yaw + math.remainder(motion.yaw - near.yaw, math.tau),
+    )
+
+
+# --- objects --------------------------------------------------------------------------------------
+
+Prolonged = dict[Trajectory, Trajectory]
+"""Trajectories of standing objects by what they were before they were prolonged, so that one is
+the same object as long as an episode lasts: drivers begin anew with another."""
+
+
+def tracks_beyond_log(
+    state: ScenarioState, until_us: int, prolonged: Prolonged, *, left: Iterable[str] = ()
+) -> PackedTracks[ObjectState]:
+    """Tracks of the objects up to ``until_us`` [us]; standing objects are always present.
+
+    Of standing objects whose boxes overlap, such as two tracks of one parked car, only the one
+    that was recorded longest is there longer than it was recorded.
+
+    Args:
+        state: objects after all edits.
+        until_us: end of the episode [us].
+        prolonged: of the episode; it is added to.
+        left: ids of those that have left.
+    """
+    gone = frozenset(left)
+    visible = [o for o in state.visible if o.object_id not in gone]
+    kept = _without_doubles([o for o in visible if o.trajectory.extent < STANDING])
+    for subject in visible:
+        if subject.object_id in kept and subject.trajectory not in prolonged:
+            span = (_from_us(subject, state.clock[0]), until_us)
+            prolonged.setdefault(subject.trajectory, _prolonged(subject.trajectory, *span))
+    return PackedTracks(
+        tuple(
+            replace(o, trajectory=prolonged[o.trajectory]) if o.object_id in kept else o
+            for o in visible
+        )
+    )
+
+
+def _from_us(subject: ObjectState, start_us: int) -> int:
+    """Objects placed by an edit exist from the edit's time on."""
+    return subject.trajectory.start_us if subject.edited else start_us
+
+
+def _without_doubles(standing: list[ObjectState]) -> set[str]:
+    longest = sorted(
+        standing,
+        key=lambda o: (o.trajectory.start_us - o.trajectory.end_us, o.instance_id),
+    )
+    kept: list[tuple[ObjectState, Float]] = []
+    for subject in longest:
+        pose = subject.trajectory.transform(subject.trajectory.start_us)
+        if not any(
+            boxes_overlap(pose, subject.scaled_size, other_pose, other.scaled_size)
+            for other, other_pose in kept
+        ):
+            kept.append((subject, pose))
+    return {subject.object_id for subject, _ in kept}
+
+
+def _prolonged(trajectory: Trajectory, start_us: int, end_us: int) -> Trajectory:
+    """The trajectory with its first pose from ``start_us`` on and its last one up to ``end_us``."""
+    p, q, times = trajectory.positions, trajectory.quaternions, trajectory.times_us
+    if start_us < times[0]:
+        p, q = np.vstack([p[:1], p]), np.vstack([q[:1], q])
+        times = np.concatenate([[start_us], times])
+    if end_us > times[-1]:
+        p, q = np.vstack([p, p[-1:]]), np.vstack([q, q[-1:]])
+        times = np.concatenate([times, [end_us]])
+    return Trajectory(times, p, q)
+
+
+# --- Route of an episode -------------------------------------------------------------------------
+
+
+class LoopReset(NamedTuple):
+    """An ego back at the start of a loop.
+
+    Attributes:
+        laps: that it has driven.
+        way: length of them [m].
+        motion, point: of the ego there, and along the route.
+        seam: from where it was to where it is.
+    """
+
+    laps: int
+    way: float
+    motion: Motion
+    point: PathPoint
+    seam: LoopTransform
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeRoute:
+    """Route of an episode.
+
+    Attributes:
+        route: that everything is measured along.
+        lap_length: way after which a loop begins anew; infinite where there is none [m].
+        until_us: end of the episode where objects are there beyond the log; None where they are
+            not [us].
+    """
+
+    route: LoggedPath
+    lap_length: float
+    until_us: int | None
+    _prolonged: Prolonged = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, scene: Scene, spec: ResetSpec, clock: EpisodeClock) -> EpisodeRoute:
+        """The route of an episode on ``scene``.
+
+        Raises:
+            WorldError: INVALID_REQUEST for a loop on a recorded drive that is none.
+        """
+        loops = spec.beyond_log == "loop"
+        return cls(
+            route=driven_route(scene, spec, clock.horizon),
+            lap_length=LoggedPath(scene.ego).length if loops else math.inf,
+            until_us=None if spec.beyond_log == "end" else clock.at(clock.horizon),
+        )
+
+    def tracks(
+        self, state: ScenarioState, *, left: Iterable[str] = ()
+    ) -> PackedTracks[ObjectState]:
+        """Tracks of the objects by recording and edits, without those that have ``left``."""
+        if self.until_us is None:
+            return state.tracks
+        return tracks_beyond_log(state, self.until_us, self._prolonged, left=left)
+
+    def put_back(self, motion: Motion, point: PathPoint) -> LoopReset | None:
+        """The reset of a loop once the ego is at its end; None before."""
+        laps = max(math.floor(point.s / self.lap_length), 0)
+        if laps == 0:
+            return None
+        way = laps * self.lap_length
+        again = at_start_again(motion, point, self.route, point.s - way)
+        near = self.route.nearest(again.x, again.y, near_s=point.s - way)
+        return LoopReset(laps, way, again, near, LoopTransform.between(motion[:3], again[:3]))
+
+
+# --- Randomization -------------------------------------------------------------------------------
+
+# Every value has a name, such as ``start.lateral`` or ``agents.car_3.headway``, under which it is
+# sampled (see :class:`.common.Draws`) and reported.
+
+START_ATTEMPTS = 16
+"""Attempts to sample a start outside every object before the recorded one is used."""
+
+
+def randomized_start(
+    recorded: Motion,
+    path: LoggedPath,
+    spec: StartRandomization,
+    draws: Draws,
+    *,
+    is_free: Callable[[Motion], bool],
+) -> tuple[Motion, dict[str, float]]:
+    """The motion at the start of an episode, and the values sampled for it by name.
+
+    Args:
+        recorded: the ego in the log at that time.
+        path: the recorded drive.
+        spec: ranges.
+        draws: of the episode.
+        is_free: whether a motion touches no object.
+    """
+    widths = {f"start.{name}": width for name, width in spec.model_dump().items() if width}
+    if not widths:
+        return recorded, {}
+    near = path.nearest(recorded.x, recorded.y)
+    for attempt in range(START_ATTEMPTS):
+        sampled = {name: draws.around(width, name, attempt) for name, width in widths.items()}
+        motion = _shifted(recorded, path, near, sampled)
+        if is_free(motion):
+            sampled["start.speed"] = motion.speed - recorded.speed
+            return motion, {name: sampled[name] for name in widths}
+    return recorded, dict.fromkeys(widths, 0.0)
+
+
+def _shifted(
+    recorded: Motion, path: LoggedPath, near: PathPoint, sampled: Mapping[str, float]
+) -> Motion:
+    x, y, _, yaw = path.at(near.s + sampled.get("start.longitudinal", 0.0))
+    offset = near.offset + sampled.get("start.lateral", 0.0)
+    speed = max(recorded.speed + sampled.get("start.speed", 0.0), 0.0)
+    turns = speed / recorded.speed if recorded.speed > 0 else 0.0
+    return recorded._replace(
+        x=x - offset * math.sin(yaw),
+        y=y + offset * math.cos(yaw),
+        yaw=yaw + (recorded.yaw - near.yaw) + sampled.get("start.heading", 0.0),
+        speed=speed,
+        yaw_rate=recorded.yaw_rate * turns,
+    )
+
+
+@dataclass(frozen=True)
+class RandomizedIdm:
+    """Parameters of IDM drivers, sampled for each object.
+
+    Attributes:
+        spec: widths of the factors.
+        draws: of the episode.
+    """
+
+    spec: TrafficRandomization
+    draws: Draws
+    widths: Mapping[str, float] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        widths = {name: width for name, width in self.spec.model_dump().items() if width}
+        object.__setattr__(self, "widths", widths)
+
+    def driver_of(
+        self, subject: ObjectState, spec: IdmDriver
+    ) -> tuple[IdmDriver, dict[str, float]]:
+        """The parameters of an object's driver, and the sampled ones by name."""
+        sampled: dict[str, float] = {}
+        for name, width in self.widths.items():
+            value = getattr(spec, name)
+            if name == "desired_speed":
+                value = desired_speed(subject, spec)
+            key = f"agents.{subject.object_id}.{name}"
+            sampled[key] = value * (1.0 + self.draws.around(width, key))
+        named = {key.rpartition(".")[2]: value for key, value in sampled.items()}
+        return spec.model_copy(update=named), sampled
+
+
+class EstimateError(NamedTuple):
+    """Error of the ego's estimate of its own state: [m], [m], [rad], [m/s]."""
+
+    x: float
+    y: float
+    yaw: float
+    speed: float
+
+    def applied(self, motion: Motion) -> Motion:
+        """The estimate of a motion."""
+        return motion._replace(
+            x=motion.x + self.x,
+            y=motion.y + self.y,
+            yaw=motion.yaw + self.yaw,
+            speed=motion.speed + self.speed,
+        )
+
+
+def estimate_error(
+    spec: EstimateRandomization,
+    draws: Draws,
+    step: int,
+    *,
+    before: EstimateError | None = None,
+    dt: float = 0.0,
+) -> EstimateError | None:
+    """The error at a step; None where the estimate is the truth.
+
+    Args:
+        spec: standard deviations.
+        draws: of the episode.
+        step: of the clock.
+        before: the error one step earlier.
+        dt: clock step [s].
+    """
+    deviations = (spec.position, spec.position, spec.heading, spec.speed)
+    if not any(deviations):
+        return None
+    fresh = draws.normal("estimate", step, count=4)
+    if before is None or not spec.correlation:
+        return EstimateError(*(d * n for d, n in zip(deviations, fresh, strict=True)))
+    kept = math.exp(-dt / spec.correlation)
+    new = math.sqrt(1.0 - kept * kept)
+    pairs = zip(before, deviations, fresh, strict=True)
+    return EstimateError(*(kept * b + new * d * n for b, d, n in pairs))
+
+
+def latency_jitter_us(longest_us: int, draws: Draws, step: int) -> int:
+    """The wait added to the latency of the plan for a step [us]; 0 where none is sampled."""
+    return int(draws.uniform("latency", step)[0] * (longest_us + 1)) if longest_us else 0
+
+
+# --- Placement -----------------------------------------------------------------------------------
+
+# An edit of a running episode places road users beside the ego's route, from now on.
+
+
+def placed(
+    operation: Operation, route: LoggedPath, s: float, ground: Ground, *, t_us: int
+) -> Operation:
+    """The operation, completed with the time and the pose of the ego.
+
+    Args:
+        operation: of an author.
+        route: of the ego.
+        s: where the ego is along it [m].
+        ground: of the scene.
+        t_us: now [us].
+
+    Raises:
+        EditError: INVALID_OPERATION for a storyboard, which an episode has from its start.
+    """
+    if isinstance(operation, SetStoryboard):
+        raise EditError(
+            ErrorCode.INVALID_OPERATION,
+            "an episode has its storyboard from its start; it cannot be set while it runs",
+            hint="set it of the scenario, or send it with the next reset",
+        )
+    if not isinstance(operation, Spawn):
+        return operation
+    known: dict[str, Any] = {}
+    if operation.start_us is None:
+        known["start_us"] = t_us
+    if (place := operation.place) is not None:
+        x, y, _, yaw = route.at(s + place.ahead)
+        x, y = x - place.offset * math.sin(yaw), y + place.offset * math.cos(yaw)
+        w, qx, qy, qz = yaw_quaternion(yaw + math.pi if place.oncoming else yaw).tolist()
+        pose = Pose(position=(x, y, ground.height(x, y)), quaternion=(w, qx, qy, qz))
+        known |= {"pose": pose, "place": None}
+    return operation.model_copy(update=known)

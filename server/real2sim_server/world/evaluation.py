@@ -1,4 +1,4 @@
-"""What the metrics get of a world: the context of an episode, and samples of an instant."""
+"""Inputs of the metrics from a world: context of an episode, and samples of an instant."""
 
 from __future__ import annotations
 
@@ -12,26 +12,23 @@ from real2sim_proto.episode import ResetSpec
 from ..edit import ObjectState
 from ..edit.tracks import sample
 from ..scene import Scene
-from .agents import Agents
-from .broad_phase_kernels import headings
-from .collision.step_contacts import StepContacts
+from .agents import Agents, Event
+from .boxes import REAR_OVERHANG, headings
+from .collision.contact_state import StepContacts
 from .collision.sweep import StepStart
-from .ego.box import REAR_OVERHANG
+from .common import cache_by_identity
 from .ego.motion import Motion, logged_motion
-from .ego.reference import PlannedTrajectory
+from .ego.plan import PlannedTrajectory
 from .episode import EpisodeClock
-from .events import Event
-from .path import LoggedPath, PathPoint
-from .per_object import per_object
+from .path import LoggedPath, LoopTransform, PathPoint
 from .scoring import EgoSample, ObjectSamples, ScoringContext
 from .scoring.comfort import comfort_window
 from .scoring.instant import VEHICLES
 from .scoring.road import RoadMap
-from .seam import Seam
 
 
 class PendingStep(NamedTuple):
-    """A step that has been made and not evaluated yet.
+    """A step that has moved and is not evaluated yet.
 
     Attributes:
         start: the world before it.
@@ -45,7 +42,7 @@ class PendingStep(NamedTuple):
     plan: PlannedTrajectory | None
     events: tuple[Event, ...]
     contacts: StepContacts | None
-    seam: Seam | None = None
+    seam: LoopTransform | None = None
 
 
 LANE_LENGTH = 5.0
@@ -55,7 +52,7 @@ LANE_LENGTH = 5.0
 def scoring_context(
     scene: Scene, spec: ResetSpec, clock: EpisodeClock, path: LoggedPath, start_s: float
 ) -> ScoringContext:
-    """What stays the same over an episode on ``scene``."""
+    """The constant context of an episode on ``scene``."""
     times = clock.start_us + clock.dt_us * np.arange(clock.horizon + 1)
     within = times[times <= scene.end_us]
     transforms, _ = sample(scene.ego, within)
@@ -157,7 +154,7 @@ def object_samples(agents: Agents) -> ObjectSamples:
     )
 
 
-@per_object
+@cache_by_identity
 def _named(objects: tuple[ObjectState, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Ids and categories; the same tuple of objects comes with many steps."""
     return tuple([o.object_id for o in objects]), tuple([o.category for o in objects])

@@ -15,18 +15,16 @@ from scipy.spatial import cKDTree
 from .._records import made_quickly
 from ..scene.lane import Lane
 from ..scene.lane_graph import LaneGraph
-from .agents import Agents, agent_fields
+from .agents import Agents, Event, agent_fields
 from .ego.motion import Motion
-from .ego.route import Command
-from .events import Event
-from .path import Float
+from .path import Command, Float
 from .storyboard.program import ShownSignal
 
 RADIUS = 60.0
 """Places of centre lines are shown so far from the vehicle [m]."""
 SPACING = 5.0
 """Between places along a lane, at most [m]."""
-MOST_LANES, MOST_PLACES = 32, 32
+MAX_LANES, MAX_PLACES = 32, 32
 """The nearest lanes, and of each the places nearest to its own nearest one."""
 
 
@@ -89,7 +87,7 @@ def lanes_around(graph: LaneGraph, x: float, y: float) -> tuple[LanePiece, ...]:
     inside = set(near.tolist())
     return tuple(
         LanePiece(lanes[known.lane[k]], known.values[_run(int(k), known.lane, inside)])
-        for k in order[np.sort(first)[:MOST_LANES]]
+        for k in order[np.sort(first)[:MAX_LANES]]
     )
 
 
@@ -100,9 +98,9 @@ def _run(nearest: int, lane: NDArray[np.int64], inside: set[int]) -> slice:
         return 0 <= k < len(lane) and lane[k] == lane[nearest] and k in inside
 
     low = high = nearest
-    while high - low + 1 < MOST_PLACES and (reaches(low - 1) or reaches(high + 1)):
+    while high - low + 1 < MAX_PLACES and (reaches(low - 1) or reaches(high + 1)):
         low -= reaches(low - 1)
-        if high - low + 1 < MOST_PLACES:
+        if high - low + 1 < MAX_PLACES:
             high += reaches(high + 1)
     return slice(low, high + 1)
 

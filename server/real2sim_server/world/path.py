@@ -1,9 +1,9 @@
-"""The recorded way of the ego vehicle as a curve that everything else is measured along."""
+"""The recorded path of the ego vehicle, which everything else is measured along."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -403,3 +403,88 @@ def _apart(positions: Float) -> list[int]:
             kept.append(i)
             x, y = px, py
     return kept
+
+
+# --- Loops ---------------------------------------------------------------------------------------
+
+
+class LoopTransform(NamedTuple):
+    """Takes places as they were before the ego was put back to where they are for it after.
+
+    Attributes:
+        x, y: shift after the turn [m].
+        turn: about the origin of the world [rad].
+    """
+
+    x: float
+    y: float
+    turn: float
+
+    @classmethod
+    def between(
+        cls, before: tuple[float, float, float], after: tuple[float, float, float]
+    ) -> LoopTransform:
+        """The one that takes the pose ``before``, x, y [m], yaw [rad], to the pose ``after``."""
+        turn = after[2] - before[2]
+        cos, sin = math.cos(turn), math.sin(turn)
+        x = after[0] - cos * before[0] + sin * before[1]
+        return cls(x, after[1] - sin * before[0] - cos * before[1], turn)
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        """Where a place is [m]."""
+        cos, sin = math.cos(self.turn), math.sin(self.turn)
+        return cos * x - sin * y + self.x, sin * x + cos * y + self.y
+
+    def poses(self, poses: Float) -> Float:
+        """Poses [N, 3] of x, y [m], yaw [rad]."""
+        cos, sin = math.cos(self.turn), math.sin(self.turn)
+        x, y, yaw = poses.T
+        return np.column_stack(
+            [cos * x - sin * y + self.x, sin * x + cos * y + self.y, yaw + self.turn]
+        )
+
+
+# --- Route ---------------------------------------------------------------------------------------
+
+ROUTE_SPACING, ROUTE_POINTS = 1.0, 4096
+"""Of a whole route: way from point to point [m], and how many points it has at most."""
+
+Command = Literal["straight", "left", "right"]
+
+WAYPOINTS = 20
+WAYPOINT_SPACING = 2.0
+"""Distance along the path between waypoints; the first lies this far ahead [m]."""
+
+COMMAND_AHEAD = 25.0
+"""The command looks at the heading this far ahead [m]."""
+
+TURN = 0.35
+"""A change of heading beyond this is a turn [rad]."""
+
+
+def route_ahead(path: LoggedPath, s: float, x: float, y: float, yaw: float) -> Float:
+    """Waypoints [20, 2] in the vehicle frame [m] along the path ahead of distance ``s``.
+
+    Where the recording ends, the route goes straight on.
+
+    Args:
+        path: the recorded way.
+        s: where the vehicle is along it [m].
+        x, y, yaw: vehicle in the world [m], [rad].
+    """
+    found: Float = waypoints(path.knots, s, (x, y, yaw), WAYPOINTS, WAYPOINT_SPACING)
+    return found
+
+
+def whole_route(path: LoggedPath) -> Float:
+    """[N, 4] float64, x, y, z [m] and heading [rad] along a path from its start to its end."""
+    count = min(max(round(path.length / ROUTE_SPACING), 1), ROUTE_POINTS - 1) + 1
+    return np.array([path.at(s) for s in np.linspace(0.0, path.length, count).tolist()])
+
+
+def command_ahead(path: LoggedPath, s: float) -> Command:
+    """Which way the path turns over the next 25 m."""
+    turn = turn_between(path.knots, s, s + COMMAND_AHEAD)
+    if turn > TURN:
+        return "left"
+    return "right" if turn < -TURN else "straight"

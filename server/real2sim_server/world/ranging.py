@@ -1,4 +1,4 @@
-"""LiDARs and radars of an episode: as a reset names them, the way they have come, their clouds."""
+"""LiDARs and radars of an episode: as its reset names them, their motion, and their clouds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..scene import Beams, Lidar, LidarError, Radar, RadarError
 from ..scene.lidar_catalogue import catalogue_lidar, lidar_of
 from ..scene.radar import catalogue_radar
 from .agents import Agents, rows_of
-from .errors import WorldError
+from .common import WorldError
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,19 +65,19 @@ class Cloud:
 
 
 def in_frame(points: Float, frame: str, T_vehicle_sensor: Float) -> NDArray[np.float32]:
-    """Points [N, 3] of the sensor's frame in the frame that is asked for."""
+    """Points [N, 3] of the sensor's frame in the requested frame."""
     if frame == "vehicle":
         points = points @ T_vehicle_sensor[:3, :3].T + T_vehicle_sensor[:3, 3]
     return points.astype(np.float32)
 
 
 SHORTEST_US = 100_000
-"""So much is kept whatever the sensors, for a look aside."""
+"""The history is at least this long, whatever the sensors [us]."""
 
 
 @dataclass(frozen=True, eq=False)
-class StepWay:
-    """One step of the clock.
+class MotionSegment:
+    """Motion during one step of the clock.
 
     Attributes:
         since_us, until_us: its instants [us].
@@ -92,29 +92,29 @@ class StepWay:
 
 
 @dataclass(frozen=True, eq=False)
-class Wake:
-    """The last steps, oldest first; none before the first step.
+class MotionHistory:
+    """Motion of the last steps, oldest first; empty before the first step.
 
     Attributes:
-        keep_us: how far back they reach at least, where there have been so many.
-        ways: of the steps.
+        keep_us: the history covers at least this time once that many steps have passed [us].
+        segments: one per step.
     """
 
     keep_us: int
-    ways: tuple[StepWay, ...] = ()
+    segments: tuple[MotionSegment, ...] = ()
 
     @classmethod
-    def of(cls, longest_us: int) -> Wake:
-        """Before the first step of an episode whose sweeps take up to ``longest_us``."""
+    def of(cls, longest_us: int) -> MotionHistory:
+        """An empty history for an episode whose sweeps take up to ``longest_us``."""
         return cls(max(longest_us, SHORTEST_US))
 
-    def after(self, way: StepWay) -> Wake:
-        """With one more step."""
-        since = way.until_us - self.keep_us
-        ways, old = self.ways, 0
-        while old < len(ways) and ways[old].until_us <= since:
+    def after(self, segment: MotionSegment) -> MotionHistory:
+        """The history with one more step."""
+        since = segment.until_us - self.keep_us
+        segments, old = self.segments, 0
+        while old < len(segments) and segments[old].until_us <= since:
             old += 1
-        return Wake(self.keep_us, (*ways[old:], way))
+        return MotionHistory(self.keep_us, (*segments[old:], segment))
 
     def ego_poses(self, times_us: Float, *, t_us: int, now: Float, twist: Float) -> Float:
         """``T_world_body`` [S, 4, 4] at ``times_us`` [S] [us].
@@ -126,46 +126,48 @@ class Wake:
             twist: [6] velocity [m/s] and angular velocity [rad/s] now, for times before the first
                 step.
         """
-        if not self.ways:
+        if not self.segments:
             return _on(now, twist[:3], float(twist[5]), (times_us - t_us) * 1e-6)
-        return _along(times_us, self.ways, [way.ego for way in self.ways])
+        return _along(times_us, self.segments, [segment.ego for segment in self.segments])
 
     def object_poses(self, object_id: str, times_us: Float, *, t_us: int, now: Agents) -> Float:
         """``T_world_object`` [S, 4, 4] of an object that is there now, at ``times_us`` [S] [us]."""
         row = rows_of(now)[object_id]
-        ends = [_ends(way, object_id) for way in self.ways]
+        ends = [_ends(segment, object_id) for segment in self.segments]
         first = next((k for k, pair in enumerate(ends) if pair is not None), len(ends))
         whole = [pair for pair in ends[first:] if pair is not None]
         pose = now.transforms[row]
         if not whole or len(whole) < len(ends) - first or not np.array_equal(whole[-1][1], pose):
             # An edit has put it here.
             return _on(pose, now.velocities[row], 0.0, (times_us - t_us) * 1e-6)
-        return _along(times_us, self.ways[first:], whole)
+        return _along(times_us, self.segments[first:], whole)
 
 
-def _ends(way: StepWay, object_id: str) -> tuple[Float, Float] | None:
+def _ends(segment: MotionSegment, object_id: str) -> tuple[Float, Float] | None:
     """Poses of an object before and after a step; None where it was not there."""
-    before, after = (rows_of(agents).get(object_id) for agents in way.agents)
+    before, after = (rows_of(agents).get(object_id) for agents in segment.agents)
     if before is None or after is None:
         return None
-    return way.agents[0].transforms[before], way.agents[1].transforms[after]
+    return segment.agents[0].transforms[before], segment.agents[1].transforms[after]
 
 
-def _along(times_us: Float, ways: Sequence[StepWay], ends: Sequence[tuple[Float, Float]]) -> Float:
-    """Poses along ways; before the first straight on backwards."""
+def _along(
+    times_us: Float, segments: Sequence[MotionSegment], ends: Sequence[tuple[Float, Float]]
+) -> Float:
+    """Poses along segments, extrapolated straight backwards before the first one."""
     found = np.empty((len(times_us), 4, 4))
-    for number, (way, (before, after)) in enumerate(zip(ways, ends, strict=True)):
-        inside = times_us <= way.until_us
+    for number, (segment, (before, after)) in enumerate(zip(segments, ends, strict=True)):
+        inside = times_us <= segment.until_us
         if number:
-            inside &= times_us > way.since_us
+            inside &= times_us > segment.since_us
         if inside.any():
-            part = (times_us[inside] - way.since_us) / (way.until_us - way.since_us)
+            part = (times_us[inside] - segment.since_us) / (segment.until_us - segment.since_us)
             found[inside] = _between(before, after, part)
     return found
 
 
 def _between(before: Float, after: Float, part: Float) -> Float:
-    """Poses [P, 4, 4] at ``part`` [P] of the way, 0 to 1; below 0 straight on, not turned."""
+    """Poses [P, 4, 4] at fractions ``part`` [P] of a segment; below 0 extrapolated, not turned."""
     turns = matrix_to_quaternion(np.stack([before[:3, :3], after[:3, :3]]))
     places = before[:3, 3] + part[:, None] * (after[:3, 3] - before[:3, 3])
     return transform_from(places, slerp(turns[0], turns[1], np.clip(part, 0.0, 1.0)))
@@ -182,8 +184,8 @@ def _on(pose: Float, velocity: Float, yaw_rate: float, seconds: Float) -> Float:
 
 
 KEPT_LIDARS = 32
-"""Sensors whose rays are kept for the next episode."""
-LONGEST_US = 1_000_000
+"""Sensors whose rays are cached for later episodes."""
+MAX_SWEEP_US = 1_000_000
 """Of sweeps; what happened before is forgotten."""
 
 
@@ -276,7 +278,7 @@ class RangingSensors:
         return max((m.duration_us for m in self.lidars), default=0)
 
     def due(self, elapsed_us: int) -> tuple[Mounted, ...]:
-        """Those whose cloud is complete so long after the beginning."""
+        """The sensors whose cloud is complete this long after the start."""
         return tuple(m for m in self.all if elapsed_us % m.period_us == 0)
 
 
@@ -316,8 +318,8 @@ def _mounted_lidar(spec: LidarSpec, dt_us: int) -> MountedLidar:
     duration_us = span_us(lidar.beams)
     period_us = spec.period_us or max(-(-duration_us // dt_us), 1) * dt_us
     _check_period(what, period_us, dt_us)
-    if duration_us > LONGEST_US:
-        raise _refused(f"{what}: a sweep of {duration_us} us; {LONGEST_US} us at most")
+    if duration_us > MAX_SWEEP_US:
+        raise _refused(f"{what}: a sweep of {duration_us} us; {MAX_SWEEP_US} us at most")
     if period_us < duration_us:
         raise _refused(
             f"{what}: a sweep takes {duration_us} us and is asked for every {period_us} us",
@@ -363,7 +365,7 @@ def _key(spec: LidarSpec) -> tuple[str, Pose | None, float | None]:
 
 @lru_cache(maxsize=KEPT_LIDARS)
 def _radar(name: str, model: RadarModel, pose: Pose | None) -> Radar:
-    """With its rays, so that they are refused here where they are none."""
+    """The sensor with its rays, which are validated here."""
     radar = Radar(name, model) if pose is None else Radar(name, model, _transform(pose))
     assert radar.rays.beams.count == model.ray_count
     return radar

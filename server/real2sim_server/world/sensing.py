@@ -1,4 +1,4 @@
-"""What LiDARs and radars measure in a world: what their rays meet, and the clouds made of it."""
+"""Measurements of LiDARs and radars in a world: the targets of their rays, and point clouds."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from .world import World
 
 
 @dataclass(frozen=True, eq=False)
-class MetThings:
-    """Background, objects and fragments at an instant.
+class RayTargets:
+    """Targets of rays at an instant: background, objects and fragments.
 
     Attributes:
         instances: background first, then the objects in their order, then fragments.
-        attributes: what is known of their reflectivity.
+        attributes: reflectivity, where it is known.
         object_ids: of the objects.
     """
 
@@ -42,9 +42,9 @@ class MetThings:
     object_ids: Sequence[str]
 
 
-def met_things(world: World) -> MetThings:
-    """What there is for rays to meet: with surfaces for LiDARs where the scene has them, objects
-    deformed by impacts as images show them, and no shadows."""
+def ray_targets(world: World) -> RayTargets:
+    """The targets of rays in a world: LiDAR surfaces where the scene has them, objects deformed by
+    impacts as in images, no shadows."""
     scene, agents = world.scene, world.agents
     shown_us = min(world.t_us, scene.end_us)
     found = [met_background(scene, world.state)]
@@ -58,13 +58,13 @@ def met_things(world: World) -> MetThings:
         fragments = world.deformation.fragments(world.t_us)
         found += [(fragment, None) for fragment in fragments]
     instances, attributes = zip(*found, strict=True)
-    return MetThings(instances, attributes, ids)
+    return RayTargets(instances, attributes, ids)
 
 
 def _deform(
     world: World, found: list[tuple[Instance, Attributes | None]], ids: Sequence[str]
 ) -> None:
-    """Put deformed objects in the place of whole ones."""
+    """Replace intact objects with deformed ones."""
     shapes = world.deformation
     assert shapes is not None
     if not shapes.has_impacts:
@@ -77,18 +77,18 @@ def _deform(
             found[k] = (deformed, None)
 
 
-def sweep_request(world: World, lidar: Lidar, things: MetThings) -> CastRequest:
+def sweep_request(world: World, lidar: Lidar, targets: RayTargets) -> CastRequest:
     """The sweep that ends at the instant of ``world``."""
     offsets = lidar.beams.slots[0]
     times = world.t_us + offsets
-    wake, agents = world.wake, world.agents
-    ego = wake.ego_poses(times, t_us=world.t_us, now=world.T_world_body, twist=world.twist)
+    history, agents = world.motion_history, world.agents
+    ego = history.ego_poses(times, t_us=world.t_us, now=world.T_world_body, twist=world.twist)
     still = not np.any(offsets)
-    moved: list[Float | None] = [None] * len(things.instances)
-    for k, object_id in enumerate(things.object_ids, start=1):
+    moved: list[Float | None] = [None] * len(targets.instances)
+    for k, object_id in enumerate(targets.object_ids, start=1):
         if not still:
-            moved[k] = wake.object_poses(object_id, times, t_us=world.t_us, now=agents)
-    met = SweepScene(things.instances, tuple(moved), things.attributes, incidence_of(world.scene))
+            moved[k] = history.object_poses(object_id, times, t_us=world.t_us, now=agents)
+    met = SweepScene(targets.instances, tuple(moved), targets.attributes, incidence_of(world.scene))
     return met.request(lidar, ego @ lidar.T_vehicle_lidar)
 
 
@@ -96,25 +96,24 @@ SEED_BYTES = 7
 
 
 def sweep_cloud(
-    world: World, mounted: MountedLidar, things: MetThings, caster: CastBackend
+    world: World, mounted: MountedLidar, targets: RayTargets, caster: CastBackend
 ) -> Cloud:
-    """The sweep of a LiDAR that ends at the instant of ``world``; the same bits again for the same
-    episode."""
+    """The sweep of a LiDAR that ends at the instant of ``world``, deterministic to the bit."""
     return measured_sweep(
-        sweep_request(world, mounted.lidar, things),
+        sweep_request(world, mounted.lidar, targets),
         mounted,
         caster,
         t_us=world.t_us,
         seed=sensor_seed(world, mounted.name),
         T_world_vehicle=world.T_world_body,
-        T_world_told=world.T_world_estimate,
+        T_world_estimate=world.T_world_estimate,
     )
 
 
 def recorded_cloud(
     scene: Scene, state: ScenarioState, mounted: MountedLidar, t_us: int, caster: CastBackend
 ) -> Cloud:
-    """The sweep of a LiDAR on the recording vehicle that ends at ``t_us``, all objects as edited.
+    """The sweep of a LiDAR on the recording vehicle that ends at ``t_us``, with edits applied.
 
     Raises:
         TimeOutOfRangeError: ``t_us`` is outside the recording.
@@ -129,7 +128,7 @@ def recorded_cloud(
         t_us=t_us,
         seed=0,
         T_world_vehicle=T_world_vehicle,
-        T_world_told=T_world_vehicle,
+        T_world_estimate=T_world_vehicle,
     )
 
 
@@ -141,18 +140,18 @@ def measured_sweep(
     t_us: int,
     seed: int,
     T_world_vehicle: Float,
-    T_world_told: Float,
+    T_world_estimate: Float,
 ) -> Cloud:
-    """What a LiDAR makes of the rays of a sweep.
+    """The point cloud that a LiDAR measures in a sweep.
 
     Args:
         request: of the sweep.
         mounted: the LiDAR.
-        caster: follows the rays.
+        caster: casts the rays.
         t_us: when the last one is fired [us].
         seed: of noise and losses.
-        T_world_vehicle: [4, 4], where the vehicle is then.
-        T_world_told: [4, 4], where it takes itself to be.
+        T_world_vehicle: [4, 4], true pose of the vehicle then.
+        T_world_estimate: [4, 4], its estimated pose.
     """
     spec, lidar = mounted.spec, mounted.lidar
     echo = caster.cast(request)
@@ -171,21 +170,21 @@ def measured_sweep(
         frame=spec.frame,
         compensated=spec.compensated,
         T_vehicle_sensor=lidar.T_vehicle_lidar,
-        T_world_sensor=T_world_told @ lidar.T_vehicle_lidar,
+        T_world_sensor=T_world_estimate @ lidar.T_vehicle_lidar,
         columns=columns,
         codec=spec.codec,
     )
 
 
 def sensor_seed(world: World, name: str) -> int:
-    """Of the noise of a sensor at an instant."""
+    """Seed of the noise of a sensor at an instant."""
     words = f"{world.spec.seed}/{name}/{world.steps}"
     digest = hashlib.blake2b(words.encode(), digest_size=SEED_BYTES).digest()
     return int.from_bytes(digest, "little")
 
 
 def _returns(sweep: Sweep, echo: Echo, mounted: MountedLidar) -> dict[str, NDArray[Any]]:
-    """Columns of all returns, ray by ray, near to far: rows of a turning sensor one by one."""
+    """Columns of all returns, by ray, near to far; a spinning sensor row by row."""
     lidar = mounted.lidar
     hit = np.flatnonzero(sweep.hit.ravel())
     names = tuple(sweep.returns)
@@ -214,7 +213,7 @@ def _returns(sweep: Sweep, echo: Echo, mounted: MountedLidar) -> dict[str, NDArr
 
 
 def _rings(lidar: Lidar) -> NDArray[np.uint16]:
-    """Row of each ray of a turning sensor; 0 of others."""
+    """Row of each ray of a spinning sensor; 0 for other sensors."""
     rings = np.zeros(lidar.shape, np.uint16)
     if len(lidar.shape) > 1:
         rings[:] = np.arange(lidar.shape[0])[:, None]
@@ -240,13 +239,13 @@ def _points(
 
 
 def scan_cloud(
-    world: World, mounted: MountedRadar, things: MetThings, caster: CastBackend
+    world: World, mounted: MountedRadar, targets: RayTargets, caster: CastBackend
 ) -> Cloud:
-    """The scan of a radar at the instant of ``world``; the same bits again for the same episode."""
+    """The scan of a radar at the instant of ``world``, deterministic to the bit."""
     radar, spec = mounted.radar, mounted.spec
-    request = sweep_request(world, radar.rays, things)
+    request = sweep_request(world, radar.rays, targets)
     echo = caster.cast(request)
-    patches = _patches(world, request, echo, things)
+    patches = _patches(world, request, echo, targets)
     found = radar_detections(patches, radar, seed=sensor_seed(world, mounted.name))
     columns: dict[str, NDArray[Any]] = {
         "points": in_frame(found.points, spec.frame, radar.T_vehicle_radar)
@@ -268,7 +267,7 @@ def scan_cloud(
     )
 
 
-def _patches(world: World, request: CastRequest, echo: Echo, things: MetThings) -> Patches:
+def _patches(world: World, request: CastRequest, echo: Echo, targets: RayTargets) -> Patches:
     lidar = request.lidar
     hit = echo.hit
     distance = echo.range[hit].astype(np.float64)
@@ -276,7 +275,7 @@ def _patches(world: World, request: CastRequest, echo: Echo, things: MetThings) 
     T_world_sensor = request.T_world_lidar[-1]
     rays = directions @ T_world_sensor[:3, :3].T
     points = rays * distance[:, None] + T_world_sensor[:3, 3]
-    owner, normals, semantic, centres, velocities = _owners(world, things, echo.member[hit])
+    owner, normals, semantic, centres, velocities = _owners(world, targets, echo.member[hit])
     on_ground = np.abs(points[:, 2] - world.ground.height_at(points[:, :2])) < TOLERANCE
     semantic = np.where((semantic == STATIC) & on_ground, GROUND, semantic).astype(np.uint8)
     cosine = np.abs(np.einsum("ni,ni->n", normals, rays))
@@ -293,17 +292,17 @@ def _patches(world: World, request: CastRequest, echo: Echo, things: MetThings) 
 
 
 def _owners(
-    world: World, things: MetThings, members: NDArray[np.int32]
+    world: World, targets: RayTargets, members: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], Float, NDArray[np.uint8], Float, Float]:
-    """Of each ray: the number of the instance that it meets, the normal there in the world, its
-    class; and for each instance its centre and its velocity and turn [6] in the world."""
-    counts = [len(instance.cloud) for instance in things.instances]
+    """For each ray the number of the instance it hits, its class, and the world normal there;
+    for each instance its centre and its twist [6] in the world."""
+    counts = [len(instance.cloud) for instance in targets.instances]
     firsts = np.cumsum([0, *counts])
     owner = np.searchsorted(firsts, members, side="right") - 1
     normals = np.zeros((len(members), 3))
     centres, velocities = np.zeros((len(counts), 3)), np.zeros((len(counts), 6))
     semantic = np.zeros(len(members), np.uint8)
-    for k, instance in enumerate(things.instances):
+    for k, instance in enumerate(targets.instances):
         own = owner == k
         pose = instance.T_world_object
         if pose is not None:
@@ -311,8 +310,8 @@ def _owners(
         if own.any():
             normals[own] = _normals(instance, members[own] - firsts[k])
             semantic[own] = instance.semantic
-    velocities[1 : len(things.object_ids) + 1, :3] = world.agents.velocities
-    velocities[1 : len(things.object_ids) + 1, 5] = _turns(world, things.object_ids)
+    velocities[1 : len(targets.object_ids) + 1, :3] = world.agents.velocities
+    velocities[1 : len(targets.object_ids) + 1, 5] = _turns(world, targets.object_ids)
     return owner, normals, semantic, centres, velocities
 
 
@@ -334,17 +333,19 @@ def _turns(world: World, object_ids: Any) -> Float:
     step = world.spec.dt_us
     times = np.array([world.t_us - step, world.t_us], np.float64)
     rates = np.zeros(len(object_ids))
-    if not world.wake.ways:
+    if not world.motion_history.segments:
         return rates
     for k, object_id in enumerate(object_ids):
-        before, after = world.wake.object_poses(object_id, times, t_us=world.t_us, now=world.agents)
+        before, after = world.motion_history.object_poses(
+            object_id, times, t_us=world.t_us, now=world.agents
+        )
         turn = after[:3, :3] @ before[:3, :3].T
         rates[k] = np.arctan2(turn[1, 0], turn[0, 0]) / (step * 1e-6)
     return rates
 
 
 def _at(velocities: Float, owner: NDArray[np.int64], centres: Float, points: Float) -> Float:
-    """Velocity [P, 3] in the world of the points that rays meet."""
+    """Velocity [P, 3] in the world of the points hit."""
     arms = points - centres[owner]
     own = velocities[owner]
     moving: Float = own[:, :3] + np.cross(own[:, 3:], arms)
@@ -360,11 +361,11 @@ def _of_sensor(world: World, T_world_sensor: Float) -> Float:
 
 
 def clouds_of(world: World, due: Sequence[Mounted], caster: CastBackend) -> list[Cloud]:
-    """What ``due`` sensors measure at the instant of ``world``, in their order."""
-    things = met_things(world)
+    """Clouds of the ``due`` sensors at the instant of ``world``, in their order."""
+    targets = ray_targets(world)
     return [
-        sweep_cloud(world, mounted, things, caster)
+        sweep_cloud(world, mounted, targets, caster)
         if isinstance(mounted, MountedLidar)
-        else scan_cloud(world, mounted, things, caster)
+        else scan_cloud(world, mounted, targets, caster)
         for mounted in due
     ]

@@ -15,17 +15,16 @@ from .._numba import is_on_disk, made
 from ..edit import ScenarioState
 from ..render.types import Instance
 from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
+from .collision.bodies import BodyProperties, BodyState, Impact, ImpactParticipant
+from .collision.contact import ObstacleGrid
 from .collision.deformation import DeformationTracker
-from .collision.impact import Impact, ImpactParticipant
-from .collision.obstacles import ObstacleGrid
-from .collision.rigid_body import BodyProperties, BodyState
 from .collision.sweep import StepStart, swept_contacts
 from .driving import KINDS, PLANNING_AHEAD, advance_vehicle, prepare_schedule
+from .ego.controller import make_tracker
 from .ego.motion import Motion
-from .ego.reference import PlannedTrajectory, ReferenceTrajectory
-from .ego.trackers import make_tracker
+from .ego.plan import PlannedTrajectory, ReferenceTrajectory
 from .scoring.comfort import windowed_sum
-from .scoring.update import NONE_AGAINST
+from .scoring.metric import NONE_AGAINST
 from .world import World
 
 PERIOD_US = 100_000

@@ -17,43 +17,41 @@ from ..edit.tracks import PackedTracks
 from ..render.types import Instance
 from ..scene import Scene
 from . import scoring
-from .agents import Agents
-from .beyond_log import lanes_route
-from .collision.contact_state import ContactState, StepMotion
-from .collision.deformation import Deformation, DeformationTracker
-from .collision.impact import Impact
-from .collision.obstacles import obstacle_grid
-from .collision.overlaps import overlapping_rows
-from .collision.step_contacts import StepContacts, contacts_of_impacts, contacts_of_overlaps
-from .collision.sweep import StepStart
-from .draws import Draws
-from .ego.box import ego_box
-from .ego.controller import EgoController, Plan, emergency_brake
-from .ego.motion import Motion, logged_motion
-from .ego.reference import PlannedTrajectory
-from .ego.route import command_ahead, route_ahead
-from .ego.suspension import LEVEL, sprung, tilted
-from .episode import episode_clock, takes_effect_us
-from .episode_route import EpisodeRoute
-from .errors import WorldError
-from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
-from .events import Event
-from .evolve import evolved
-from .observation import LanePiece, Observation, lanes_around
-from .path import Float, LoggedPath, PathPoint
-from .placement import placed
-from .randomization import (
-    RandomizedIdm,
-    estimate_error,
-    latency_jitter_us,
-    randomized_start,
+from .agents import Agents, Event, Strides
+from .boxes import ego_box
+from .collision.bodies import Impact
+from .collision.contact import obstacle_grid
+from .collision.contact_state import (
+    ContactState,
+    StepContacts,
+    StepMotion,
+    contacts_of_impacts,
+    contacts_of_overlaps,
 )
-from .ranging import Mounted, StepWay, Wake, mounted_sensors
+from .collision.deformation import Deformation, DeformationTracker
+from .collision.sweep import StepStart, overlapping_rows
+from .common import Draws, WorldError, copy_with
+from .ego.controller import EgoController, Plan, emergency_brake
+from .ego.motion import LEVEL, Motion, logged_motion, sprung, tilted
+from .ego.plan import PlannedTrajectory
+from .episode import (
+    EpisodeRoute,
+    RandomizedIdm,
+    episode_clock,
+    estimate_error,
+    lanes_route,
+    latency_jitter_us,
+    placed,
+    randomized_start,
+    takes_effect_us,
+)
+from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
+from .observation import LanePiece, Observation, lanes_around
+from .path import Float, LoggedPath, LoopTransform, PathPoint, command_ahead, route_ahead
+from .ranging import MotionHistory, MotionSegment, Mounted, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score
-from .seam import Seam
 from .storyboard.program import ShownSignal
 from .storyboard.run import StoryboardRun, begin_storyboard
-from .strides import Strides
 from .traffic import ObservedEgo, Surroundings, Traffic
 from .traffic.spawner import begin_spawner
 
@@ -86,9 +84,9 @@ class World:
         terminated, truncated, reason: how the episode ended: ``collision``, ``horizon``,
             ``deadline``, ``wall_clock``.
         lap: times that the ego has been put back to the start of the route.
-        drawn: what the seed has drawn for the start and for objects so far, by name.
+        sampled: values sampled for the start and for objects so far, by name.
         ranging: LiDARs and radars of the episode.
-        wake: the way that all has come, as far back as a sweep looks.
+        motion_history: of ego and objects, as far back as a sweep looks.
         strides: of people who are not where their trajectories lead.
     """
 
@@ -101,7 +99,7 @@ class World:
         revision: int = 0,
         deformation: Deformation | None = None,
     ) -> None:
-        """The world at step 0: the ego as it was recorded at the start time, on the ground.
+        """The world at step 0, with the ego as recorded at the start time, on the ground.
 
         Raises:
             WorldError: the episode cannot run as asked; see :func:`~.episode.episode_clock`.
@@ -120,7 +118,7 @@ class World:
         self.lap = 0
         self._clock = episode_clock(scene, spec)
         self.ranging = mounted_sensors(spec.lidars, spec.radars, spec.dt_us)
-        self.wake = Wake.of(self.ranging.longest_us)
+        self.motion_history = MotionHistory.of(self.ranging.longest_us)
         self.strides = Strides()
         self.t_us = self._clock.at(self.steps)
         # Until then the ego moves as recorded.
@@ -131,7 +129,7 @@ class World:
         self._tracks = self._tracks_of(state)
         self.ground = scene.ground
         first = self._first_storyboard()
-        self.motion, drawn = self._first_motion(first)
+        self.motion, sampled = self._first_motion(first)
         self._path_point: PathPoint = self._path.nearest(self.motion.x, self.motion.y)
         self.T_world_vehicle: Float = self._ego_pose()
         self._attitude, self.T_world_body = LEVEL, self.T_world_vehicle
@@ -139,9 +137,9 @@ class World:
         self._controller = EgoController(spec, scene.ego)
         self.traffic = self._first_traffic(first)
         if first is not None:
-            drawn |= dict(first.drawn)
-        self._start_drawn = drawn
-        self._step_drawn: Mapping[str, float] = drawn | dict(self.traffic.drawn)
+            sampled |= dict(first.sampled)
+        self._start_sampled = sampled
+        self._step_sampled: Mapping[str, float] = sampled | dict(self.traffic.sampled)
         self._off_route = self._off_road = False
         self._contacts = self._initial_contacts()
         if deformation is None and self._contacts.exchanges_momentum and spec.contact.dents:
@@ -151,7 +149,7 @@ class World:
         self._edit_events: tuple[Event, ...] = ()
         self._pending: PendingStep | None = None
         self._context = scoring_context(scene, spec, self._clock, self._path, self._path_point.s)
-        self._seam: Seam | None = None
+        self._seam: LoopTransform | None = None
         self.instant = self._instant(StepContacts())
         self.accumulator: MetricAccumulator = scoring.begin_accumulator(self.instant, self._context)
 
@@ -172,23 +170,23 @@ class World:
 
     @property
     def storyboard(self) -> StoryboardRun | None:
-        """The storyboard of the episode as it is now; None where it has none."""
+        """The running storyboard of the episode; None where it has none."""
         found = self.traffic.storyboard
         return found if isinstance(found, StoryboardRun) else None
 
     @property
     def route(self) -> LoggedPath:
-        """The way that everything is measured along."""
+        """The path that everything is measured along."""
         return self._path
 
     @property
     def path_point(self) -> PathPoint:
-        """Where the ego is along the route."""
+        """Position of the ego along the route."""
         return self._path_point
 
     @property
     def contacts(self) -> ContactState:
-        """What is in contact now."""
+        """Current contacts."""
         return self._contacts
 
     @property
@@ -197,13 +195,13 @@ class World:
         return self.t_us < self._warm_up_end_us
 
     @property
-    def drawn(self) -> dict[str, float]:
-        """What the seed has drawn for the start and for objects so far, by name."""
-        return self._start_drawn | dict(self.traffic.drawn)
+    def sampled(self) -> dict[str, float]:
+        """Values sampled for the start and for objects so far, by name."""
+        return self._start_sampled | dict(self.traffic.sampled)
 
     @property
     def T_world_estimate(self) -> Float:
-        """[4, 4] float64, the body where the ego takes itself to be; ``T_world_body`` where its
+        """[4, 4] float64, the body at the ego's estimate of its pose; ``T_world_body`` where the
         estimate has no errors."""
         if self._estimate_error is None:
             return self.T_world_body
@@ -213,7 +211,7 @@ class World:
 
     @property
     def context(self) -> scoring.ScoringContext:
-        """What stays the same for the scores."""
+        """The constant context of the scores."""
         return self._context
 
     def step(
@@ -225,7 +223,7 @@ class World:
         return self.evaluate()
 
     def move(self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False) -> None:
-        """The first half of a step: all that images show. Let :meth:`evaluate` follow.
+        """The first half of a step: everything that images show. :meth:`evaluate` must follow.
 
         Order: edits made since the last step are in effect, the ego of a loop that has reached its
         end is put back to its start, then ego, objects, contact.
@@ -240,7 +238,7 @@ class World:
                 named or with times that are over; the world is as before.
         """
         self._check_running()
-        drawn_before = self.traffic.drawn
+        sampled_before = self.traffic.sampled
         jitter_us = latency_jitter_us(
             self.spec.randomization.latency_us if plan is not None else 0, self._draws, self.steps
         )
@@ -256,24 +254,32 @@ class World:
         self.strides = self.strides.after(
             self.scene, self.agents, since_us=since_us, t_us=self.t_us
         )
-        ways = (body, self.T_world_body), (start.agents, self.agents)
-        self.wake = self.wake.after(StepWay(since_us, self.t_us, *ways))
-        self._step_drawn = _newly_drawn(self.traffic.drawn, drawn_before, jitter_us)
+        spans = (body, self.T_world_body), (start.agents, self.agents)
+        self.motion_history = self.motion_history.after(MotionSegment(since_us, self.t_us, *spans))
+        self._step_sampled = _newly_sampled(self.traffic.sampled, sampled_before, jitter_us)
         contacts = self._apply_impacts(moved.impacts, start.agents)
-        told = self._storyboard_events()
-        events = (*self._edit_events, *loop_events, *late_events, *reaction_events, *told)
+        storyboard_events = self._storyboard_events()
+        events = (
+            *self._edit_events,
+            *loop_events,
+            *late_events,
+            *reaction_events,
+            *storyboard_events,
+        )
         self._pending = PendingStep(start, trajectory, events, contacts, self._seam)
         self._edit_events = ()
 
     def evaluate(self) -> list[Event]:
-        """The second half, if it is still pending: contacts, scores and events. All that images
-        show stays as it is, so they may be drawn meanwhile."""
+        """The second half of a step, if it is pending: contacts, scores and events.
+
+        It changes nothing that images show, so they may be rendered at the same time.
+        """
         if self._pending is not None:
             start, plan, events, contacts, seam = self._pending
             self._pending = None
             contacts = self._overlap_contacts(start) if contacts is None else contacts
             if contacts.touching != self._contacts.touching:
-                self._contacts = evolved(self._contacts, touching=contacts.touching)
+                self._contacts = copy_with(self._contacts, touching=contacts.touching)
             self.instant = self._instant(contacts, plan, seam)
             self.accumulator = scoring.update_accumulator(
                 self.accumulator, self.instant, self._context
@@ -283,7 +289,7 @@ class World:
         return list(self._events)
 
     def stop(self, reason: str) -> None:
-        """End the episode where it is, without a step: ``deadline`` or ``wall_clock``. Raises
+        """End the episode without a step, by ``deadline`` or ``wall_clock``. Raises
         WorldError: EPISODE_OVER."""
         self._check_running()
         self.truncated, self.reason = True, reason
@@ -340,7 +346,7 @@ class World:
         return outcome
 
     def observe(self) -> Observation:
-        """What the policy gets at this instant, apart from images."""
+        """The observation at this instant, apart from images."""
         motion, s, truth = self.motion, self._path_point.s, None
         if self._estimate_error is not None:
             truth = (motion, self.T_world_body) if self.spec.privileged else None
@@ -363,7 +369,7 @@ class World:
             reason=self.reason,
             warming_up=self.warming_up,
             lap=self.lap,
-            drawn=self._step_drawn,
+            drawn=self._step_sampled,
             truth=truth,
             signals=self._signals(),
             lanes=self._lanes_around(motion),
@@ -385,7 +391,7 @@ class World:
         return scoring.scores_of(self.accumulator, self._context)
 
     def instances(self) -> list[Instance]:
-        """What the renderer draws at this instant; nothing is copied."""
+        """The instances to render at this instant; nothing is copied."""
         shown_us = min(self.t_us, self.scene.end_us)
         strides = self.strides.made
         drawn = compose(self.scene, self.state, self.agents, shown_us, strides=strides)
@@ -424,8 +430,8 @@ class World:
         return self.ranging.due(self.steps * self._clock.dt_us)
 
     def fork(self) -> World:
-        """A world that goes on from here on its own; it shares everything that never changes."""
-        return evolved(self)
+        """An independent copy of the world, which shares everything immutable."""
+        return copy_with(self)
 
     # --- phases of a step -------------------------------------------------------------------
 
@@ -458,7 +464,7 @@ class World:
         return controller, [Event("deadline_missed", self.t_us)]
 
     def _put_back(self, controller: EgoController) -> tuple[EgoController, list[Event]]:
-        """The ego of a loop, back at the start of the recorded drive once it is at its end."""
+        """Put the ego of a loop back to the start of the recorded drive once it is at its end."""
         put = self._episode_route.put_back(self.motion, self._path_point)
         self._seam = put.seam if put is not None else None
         if put is None:
@@ -474,7 +480,7 @@ class World:
         return controller.put_back(put.seam), [Event("looped", self.t_us, data=data)]
 
     def _let_agents_react(self) -> list[Event]:
-        """Objects stop repeating the log once the ego is too far from where it was recorded."""
+        """Let objects stop repeating the log once the ego is too far from its recorded pose."""
         agents = self.spec.agents
         if agents.ego_off_log == "replay" or self.traffic.reacting:
             return []
@@ -489,7 +495,7 @@ class World:
         return [Event("agents_react", self.t_us, data={"distance": distance})]
 
     def _advance(self, controller: EgoController) -> StepMotion:
-        """Objects, then the ego, one clock step on from this instant."""
+        """Objects, then the ego, one clock step later."""
         t_us, before = self.t_us, self.agents
         end_us = t_us + self._clock.dt_us
         traffic = self.traffic.advance(self._tracks, end_us, lambda: self._surroundings(before))
@@ -505,7 +511,7 @@ class World:
         )
 
     def _commit_motion(self, moved: StepMotion) -> None:
-        """The step is made: clock, ego, objects and contacts are those at its end."""
+        """Commit the step: clock, ego, objects and contacts at its end."""
         seconds = self._clock.dt_us * 1e-6
         acceleration = (moved.motion.speed - self.motion.speed) / seconds
         self.steps += 1
@@ -549,7 +555,7 @@ class World:
         return contacts_of_impacts(impacts, self.t_us, touching=touching, before=before)
 
     def _step_start(self, controller: EgoController) -> StepStart:
-        """The world before a step, and how the ego goes on from there under its controller."""
+        """The world before a step, and the motion of the ego under its controller from there."""
         motion, t_us, at = self.motion, self.t_us, None
         if self.spec.action != "pose" and not self.warming_up:
 
@@ -572,7 +578,7 @@ class World:
         return contacts
 
     def _departure_events(self) -> list[Event]:
-        """The ego leaves the surroundings of the recorded path, or the road."""
+        """Events of an ego that leaves the surroundings of the recorded path, or the road."""
         events = []
         distance = math.dist(self._path_point.position[:2], (self.motion.x, self.motion.y))
         was_off_route, self._off_route = self._off_route, distance > OFF_ROUTE_DISTANCE
@@ -584,7 +590,7 @@ class World:
         return events
 
     def _storyboard_events(self) -> list[Event]:
-        """Elements of the storyboard that have begun and ended in the step."""
+        """Events of storyboard elements that started or stopped in the step."""
         run = self.storyboard
         return [
             Event("storyboard", c.t_us, element=c.element, element_type=c.type, change=c.change)
@@ -605,7 +611,7 @@ class World:
     # --- views of the instant ---------------------------------------------------------------
 
     def _first_motion(self, storyboard: StoryboardRun | None) -> tuple[Motion, dict[str, float]]:
-        """The ego at the start, and what the seed drew for it by name."""
+        """The ego at the start, and the values sampled for it by name."""
         recorded = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
         if storyboard is not None and storyboard.ego_put:
             recorded = storyboard.ego_motion(recorded)
@@ -615,7 +621,7 @@ class World:
             pose = self.ground.pose_on(motion.x, motion.y, motion.yaw)
             return set(overlapping_rows(ego_box(pose, size), size, others))
 
-        # Boxes of a recording may overlap slightly; a drawn start must not touch anybody else.
+        # Boxes of a recording may overlap slightly; a sampled start must not touch anybody else.
         return randomized_start(
             recorded,
             self._path,
@@ -625,7 +631,7 @@ class World:
         )
 
     def _first_storyboard(self) -> StoryboardRun | None:
-        """The storyboard at the start, the ego where it was recorded."""
+        """The storyboard at the start, with the ego as recorded."""
         if self.spec.storyboard is None:
             return None
         motion = logged_motion(self.scene.ego, self.t_us, self.spec.ego)
@@ -686,7 +692,7 @@ class World:
         self,
         contacts: StepContacts,
         plan: PlannedTrajectory | None = None,
-        seam: Seam | None = None,
+        seam: LoopTransform | None = None,
     ) -> Instant:
         height = float(self.T_world_vehicle[2, 3])
         laps = self.lap * self._episode_route.lap_length if self.lap else 0.0
@@ -703,9 +709,9 @@ class World:
         )
 
 
-def _newly_drawn(
+def _newly_sampled(
     now: Mapping[str, float], before: Mapping[str, float], jitter_us: int
 ) -> Mapping[str, float]:
-    """What has been drawn in a step, by name."""
-    drawn = {} if now is before else {k: v for k, v in now.items() if k not in before}
-    return drawn | {"latency_us": float(jitter_us)} if jitter_us else drawn
+    """Values sampled in a step, by name."""
+    sampled = {} if now is before else {k: v for k, v in now.items() if k not in before}
+    return sampled | {"latency_us": float(jitter_us)} if jitter_us else sampled

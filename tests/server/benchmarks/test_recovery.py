@@ -53,8 +53,8 @@ def test_starts_are_the_same_for_every_planner(tiny_scene):
 
 def test_starts_are_far_from_the_path_and_turned(tiny_scene):
     worlds = recovery.displaced_worlds(tiny_scene, 3, OPTIONS)
-    assert all(0.15 <= abs(world.drawn["start.lateral"]) <= 0.2 for world in worlds)
-    assert all(0.015 <= abs(world.drawn["start.heading"]) <= 0.02 for world in worlds)
+    assert all(0.15 <= abs(world.sampled["start.lateral"]) <= 0.2 for world in worlds)
+    assert all(0.015 <= abs(world.sampled["start.heading"]) <= 0.02 for world in worlds)
 
 
 def test_both_are_taught_as_many_frames(tiny_scene):

@@ -21,7 +21,7 @@ from real2sim_server.render.rasterize import SMALL_IMAGES
 from real2sim_server.scene import Scene
 from real2sim_server.scene.io import read_packed
 from real2sim_server.world import World
-from real2sim_server.world.errors import WorldError
+from real2sim_server.world.common import WorldError
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from real2sim_server.scene import Scene
 from real2sim_server.scene.io import read_packed
 from real2sim_server.world import World
 from real2sim_server.world.batch import BatchWorld
-from real2sim_server.world.errors import WorldError
+from real2sim_server.world.common import WorldError
 
 CLOSE = 1e-9
 PLAN_US = np.arange(1, 11) * 200_000

@@ -22,8 +22,8 @@ from real2sim_server.world.recording.replay import (
     Replayer,
     action_payload,
     reset_payload,
+    stored_spec,
 )
-from real2sim_server.world.recording.stored_spec import stored_spec
 
 COAST = Control(acceleration=0.0, steering=0.0)
 CONTROL = {"action": "control", "privileged": True}

@@ -6,7 +6,7 @@ import pytest
 from real2sim_proto.base import Pose
 from real2sim_proto.operations import SetPose, Translate
 from real2sim_proto.plans import Control, PoseCommand
-from real2sim_server.world.ego.box import REAR_OVERHANG, ego_box
+from real2sim_server.world.boxes import REAR_OVERHANG, ego_box
 
 GO_ON = {"action": "control", "on_collision": "continue"}
 COAST = Control(acceleration=0.0, steering=0.0)

@@ -35,9 +35,15 @@ from real2sim_server.world.driving import (
     prepare_schedule,
     vehicle_parameters,
 )
-from real2sim_server.world.driving.ilqr import INPUT_COST, STATE_COST, STEP, STEPS
-from real2sim_server.world.driving.lqr import HEADWAY, TIME
-from real2sim_server.world.driving.tyres import integrate
+from real2sim_server.world.driving.trackers import (
+    HEADWAY,
+    INPUT_COST,
+    STATE_COST,
+    STEP,
+    STEPS,
+    TIME,
+)
+from real2sim_server.world.driving.vehicle import integrate
 from real2sim_server.world.ego.motion import Motion
 
 IDEAL = {"steering_lag": 0.0, "drive_lag": 0.0}

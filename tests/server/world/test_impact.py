@@ -11,8 +11,8 @@ import torch
 from real2sim_proto.operations import SetPhysics
 from real2sim_proto.plans import Control
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.world.collision.manifold import contact_impulse, contact_manifold, corners
-from real2sim_server.world.collision.rigid_body import BodyProperties, BodyState, integrate_sliding
+from real2sim_server.world.collision.bodies import BodyProperties, BodyState, integrate_sliding
+from real2sim_server.world.collision.contact import contact_impulse, contact_manifold, corners
 
 COAST = Control(acceleration=0.0, steering=0.0)
 GO_ON = {"action": "control", "on_collision": "continue", "privileged": True}

@@ -18,11 +18,11 @@ from real2sim_server.geometry import box_kernels
 from real2sim_server.geometry.box import box_penetration
 from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
 from real2sim_server.geometry.transform import transform_from
-from real2sim_server.world import broad_phase_kernels, path, warm_up
-from real2sim_server.world.collision import sweep_kernels
+from real2sim_server.world import boxes as world_boxes
+from real2sim_server.world import path, warm_up
 from real2sim_server.world.driving import entries
-from real2sim_server.world.ego.reference import PlannedTrajectory
-from real2sim_server.world.scoring import comfort, hazard, road
+from real2sim_server.world.ego.plan import PlannedTrajectory
+from real2sim_server.world.scoring import comfort, instant, road
 from real2sim_server.world.scoring.comfort import ComfortAccumulator, plans_agree
 from real2sim_server.world.warm_up import warm_up_planning
 
@@ -160,7 +160,7 @@ def test_all_boxes_that_overlap_are_within_reach(seed, count):
     transforms = transform_from(positions, rng.normal(size=(count, 4)))
     box = transform_from(rng.normal(size=3), rng.normal(size=4))
 
-    near = broad_phase_kernels.within_reach(box, SIZE, transforms, sizes)
+    near = world_boxes.within_reach(box, SIZE, transforms, sizes)
     distances = np.linalg.norm(positions - box[:3, 3], axis=1)
     balls = (np.linalg.norm(sizes, axis=1) + np.linalg.norm(SIZE)) / 2
     np.testing.assert_array_equal(near, np.flatnonzero(distances < balls))
@@ -178,7 +178,7 @@ def test_boxes_that_overlap_soon_may_overlap(seed):
     box = transform_from(ahead, yaw_quaternion(ego[2]))
     meets = overlapping(box, transform_from(positions, quaternions), sizes)
 
-    may = broad_phase_kernels.may_overlap(ego, SIZE, 0.1, positions, quaternions, velocities, sizes)
+    may = world_boxes.may_overlap(ego, SIZE, 0.1, positions, quaternions, velocities, sizes)
     assert may or not meets
 
 
@@ -186,15 +186,15 @@ def test_boxes_far_away_may_not_overlap():
     boxes = some_boxes(np.random.default_rng(0), 20, spread=3.0)
     boxes[0][:, 0] += 60.0
 
-    assert not broad_phase_kernels.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *boxes)
+    assert not world_boxes.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *boxes)
     nobody = [b[:0] for b in boxes]
-    assert not broad_phase_kernels.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *nobody)
+    assert not world_boxes.may_overlap((0.0, 0.0, 0.0, 8.0, 0.0, 0.0), SIZE, 0.1, *nobody)
 
 
 def test_headings_are_those_of_quaternions():
     quaternions = np.random.default_rng(0).normal(size=(50, 4))
 
-    found = broad_phase_kernels.headings(quaternions)
+    found = world_boxes.headings(quaternions)
     np.testing.assert_allclose(found, quaternion_yaw(quaternions), atol=1e-12)
 
 
@@ -265,7 +265,7 @@ def test_the_first_meeting_is_that_of_boxes_moved_step_by_step(seed, everywhere)
     ego = (0.3, -0.2, float(rng.uniform(-4, 4)), 6.0, 0.2, -0.8)
 
     nobody = np.zeros(len(sizes), np.bool_)
-    found = hazard.first_overlap_step(ego, SIZE, 1.35, everywhere, others, nobody)
+    found = instant.first_overlap_step(ego, SIZE, 1.35, everywhere, others, nobody)
     assert found == first_meeting_by_sampling(ego, everywhere, others)
 
 
@@ -274,7 +274,7 @@ def test_objects_that_are_ignored_are_not_met():
     ego = (0.0, 0.0, 0.0, 5.0, 0.0, -0.5)
 
     found = [
-        hazard.first_overlap_step(ego, SIZE, 1.35, False, others, np.array([ignored]))
+        instant.first_overlap_step(ego, SIZE, 1.35, False, others, np.array([ignored]))
         for ignored in (False, True)
     ]
     assert found == [7, -1]
@@ -393,11 +393,10 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         box_kernels,
         tracks,
         path,
-        broad_phase_kernels,
+        world_boxes,
         road,
-        hazard,
+        instant,
         comfort,
-        sweep_kernels,
     )
     kernels = [v for m in modules for v in vars(m).values() if isinstance(v, Dispatcher)]
     before = {k.__name__: len(k.signatures) for k in kernels}

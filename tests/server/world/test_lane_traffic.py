@@ -13,8 +13,8 @@ from real2sim_proto.episode import LaneDriver, ResetSpec
 from real2sim_proto.plans import Control
 from real2sim_server.scene import Lane, LaneGraph
 from real2sim_server.world import World, WorldError
-from real2sim_server.world.traffic.idm import Idm, Leader, Neighbours, incentive
-from real2sim_server.world.traffic.lane_changer import LaneChanger
+from real2sim_server.world.traffic.driver import Idm, Leader, Neighbours, incentive
+from real2sim_server.world.traffic.idm_drivers import LaneChanger
 
 COAST = Control(acceleration=0.0, steering=0.0)
 FREE = Neighbours(None, None)

@@ -13,7 +13,7 @@ from real2sim_proto.drive import Obs
 from real2sim_proto.episode import ResetSpec
 from real2sim_server.scene import Lane, LaneGraph
 from real2sim_server.world import World
-from real2sim_server.world.observation import MOST_LANES, MOST_PLACES, RADIUS, lanes_around
+from real2sim_server.world.observation import MAX_LANES, MAX_PLACES, RADIUS, lanes_around
 
 
 def lane(name: str, points, **fields) -> Lane:
@@ -56,8 +56,8 @@ def test_what_is_shown_is_bounded_however_dense_a_map_is():
         for k, (x, y) in enumerate(rng.uniform(-40, 40, (200, 2)))
     ]
     found = lanes_around(LaneGraph.of([spiral, *many]), 0.0, 0.0)
-    assert len(found) == MOST_LANES
-    assert all(len(piece.places) <= MOST_PLACES for piece in found)
+    assert len(found) == MAX_LANES
+    assert all(len(piece.places) <= MAX_PLACES for piece in found)
     assert sum(piece.places.nbytes for piece in found) <= 32 * 1024
     nearest = [np.hypot(*piece.places[:, :2].T).min() for piece in found]
     assert nearest == sorted(nearest)

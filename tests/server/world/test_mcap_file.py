@@ -17,8 +17,12 @@ from real2sim_proto.plans import Control, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.world.ranging import Cloud
-from real2sim_server.world.recording.mcap_file import mcap_bytes, recording_in, save_mcap
-from real2sim_server.world.recording.recorded_clouds import cloud_document
+from real2sim_server.world.recording.mcap_file import (
+    cloud_document,
+    mcap_bytes,
+    recording_in,
+    save_mcap,
+)
 from real2sim_server.world.recording.recording import RecordingError, record, to_bytes
 from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
 

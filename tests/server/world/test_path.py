@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from real2sim_server.geometry.rotation import multiply_quaternions, yaw_quaternion
 from real2sim_server.scene import Trajectory
 from real2sim_server.world import LoggedPath
-from real2sim_server.world.ego.route import command_ahead, route_ahead
-from real2sim_server.world.path import strip_ahead
+from real2sim_server.world.path import command_ahead, route_ahead, strip_ahead
 
 
 def along(xyz: list[tuple[float, float, float]], quaternions: np.ndarray) -> Trajectory:

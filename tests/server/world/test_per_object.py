@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from real2sim_proto.episode import EgoSpec
-from real2sim_server.world.per_object import MOST, per_object
+from real2sim_server.world.common import MAX_CACHED, cache_by_identity
 
 
 def test_an_object_is_asked_about_once_and_another_of_its_own() -> None:
     asked: list[float] = []
 
-    @per_object
+    @cache_by_identity
     def wheelbase(spec: EgoSpec) -> float:
         asked.append(spec.wheelbase)
         return spec.wheelbase
@@ -20,8 +20,8 @@ def test_an_object_is_asked_about_once_and_another_of_its_own() -> None:
 
 
 def test_objects_that_are_gone_are_nobody_elses() -> None:
-    @per_object
+    @cache_by_identity
     def first(values: list[int]) -> int:
         return values[0]
 
-    assert [first([k]) for k in range(MOST + 100)] == list(range(MOST + 100))
+    assert [first([k]) for k in range(MAX_CACHED + 100)] == list(range(MAX_CACHED + 100))

@@ -16,20 +16,21 @@ from real2sim_server.physics.solver import Solver, SolverOptions
 from real2sim_server.simulation.experiments.crash_tests import CAR_SIZE, MALIBU_MASS, whole_car
 from real2sim_server.simulation.structure import STRUCTURES, YAW_RADIUS, stiffness_of, yaw_inertia
 from real2sim_server.world import World
-from real2sim_server.world.collision.face_pulse import advance_face_pulse, face_contact
-from real2sim_server.world.collision.manifold import contact_impulse, contact_manifold, corners
-from real2sim_server.world.collision.obstacles import ObstacleGrid
-from real2sim_server.world.collision.pulse import (
+from real2sim_server.world.collision.bodies import BodyProperties, BodyState
+from real2sim_server.world.collision.contact import (
     SPREAD,
+    ObstacleGrid,
     Pulse,
+    contact_impulse,
+    contact_manifold,
     contact_width,
+    corners,
     face_owner,
     mutual_stiffness,
     yielding_patch,
 )
-from real2sim_server.world.collision.rigid_body import BodyProperties, BodyState
-from real2sim_server.world.recording.replay import Entry, recorded_spec, reset_payload
-from real2sim_server.world.recording.stored_spec import stored_spec
+from real2sim_server.world.collision.solver_state import advance_face_pulse, face_contact
+from real2sim_server.world.recording.replay import Entry, recorded_spec, reset_payload, stored_spec
 
 COAST = Control(acceleration=0.0, steering=0.0)
 GO_ON = {"action": "control", "on_collision": "continue", "privileged": True, "dt_us": 20_000}

@@ -9,7 +9,7 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
 from real2sim_server.world import World, WorldError
-from real2sim_server.world.draws import Draws
+from real2sim_server.world.common import Draws
 from real2sim_server.world.recording.recording import (
     digest,
     first_difference,
@@ -17,12 +17,7 @@ from real2sim_server.world.recording.recording import (
     recording_of_bytes,
     to_bytes,
 )
-from real2sim_server.world.recording.replay import (
-    Entry,
-    Replayer,
-    action_payload,
-    reset_payload,
-)
+from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
 
 COAST = Control(acceleration=0.0, steering=0.0)
 CONTROL = {"action": "control", "privileged": True}
@@ -121,7 +116,7 @@ def test_what_is_drawn_is_in_the_first_observation_alone(begun):
     assert set(world.observe().drawn) == {f"start.{name}" for name in START["start"]}
     world.step(COAST)
     assert world.observe().drawn == {}
-    assert set(world.drawn) == {f"start.{name}" for name in START["start"]}
+    assert set(world.sampled) == {f"start.{name}" for name in START["start"]}
 
 
 def test_a_start_is_not_drawn_for_a_warm_up(begun):
@@ -135,7 +130,7 @@ def test_a_start_is_not_drawn_for_a_warm_up(begun):
 def test_parameters_of_idm_are_drawn_for_each_object(begun, moving):
     cars = {"a": moving(30, 0, z=0.8, speed=6.0), "b": moving(60, 0, z=0.8, speed=6.0)}
     spec = {"agents": {"default": "idm"}}
-    drawn = begun(4, {"traffic": {"headway": 0.3, "desired_speed": 0.2}}, spec=spec, **cars).drawn
+    drawn = begun(4, {"traffic": {"headway": 0.3, "desired_speed": 0.2}}, spec=spec, **cars).sampled
     assert set(drawn) == {f"agents.{c}.{n}" for c in "ab" for n in ("headway", "desired_speed")}
     assert 1.05 <= drawn["agents.a.headway"] <= 1.95
     assert 4.8 <= drawn["agents.a.desired_speed"] <= 7.2
@@ -145,8 +140,8 @@ def test_parameters_of_idm_are_drawn_for_each_object(begun, moving):
 def test_what_is_drawn_for_an_object_does_not_depend_on_the_others(begun, moving):
     a, b = moving(30, 0, z=0.8, speed=6.0), moving(60, 0, z=0.8, speed=6.0)
     spec, ranges = {"agents": {"default": "idm"}}, {"traffic": {"headway": 0.3}}
-    alone = begun(4, ranges, spec=spec, b=b).drawn["agents.b.headway"]
-    assert begun(4, ranges, spec=spec, a=a, b=b).drawn["agents.b.headway"] == alone
+    alone = begun(4, ranges, spec=spec, b=b).sampled["agents.b.headway"]
+    assert begun(4, ranges, spec=spec, a=a, b=b).sampled["agents.b.headway"] == alone
 
 
 # --- ego estimate ---------------------------------------------------------------------------------

@@ -80,7 +80,9 @@ def test_poses_between_instants_are_those_of_the_way(drive):
         world.step(Control(acceleration=1.0, steering=0.3))
         poses.append(world.T_world_body)
     times = world.t_us - np.array([100_000.0, 75_000, 50_000, 25_000, 0])
-    found = world.wake.ego_poses(times, t_us=world.t_us, now=world.T_world_body, twist=world.twist)
+    found = world.motion_history.ego_poses(
+        times, t_us=world.t_us, now=world.T_world_body, twist=world.twist
+    )
     np.testing.assert_allclose(found[::2], poses, atol=1e-9)
     middle = (poses[0][:3, 3] + poses[1][:3, 3]) / 2
     np.testing.assert_allclose(found[1][:3, 3], middle, atol=1e-9)
@@ -88,8 +90,8 @@ def test_poses_between_instants_are_those_of_the_way(drive):
 
 def test_the_wake_is_as_long_as_the_longest_sweep(drive):
     world = drive(9)
-    assert len(world.wake.ways) == 2
-    assert world.wake.ways[-1].until_us == world.t_us
+    assert len(world.motion_history.segments) == 2
+    assert world.motion_history.segments[-1].until_us == world.t_us
 
 
 def test_compensated_points_of_a_wall_lie_on_it_and_raw_ones_do_not(drive):
@@ -189,6 +191,6 @@ def test_periods_that_no_sweep_fits_into_are_refused(drive):
 def test_turned_objects_keep_their_turn_between_instants(drive, moving):
     world = drive(2, car=moving(20, 0, z=0.8, yaw=0.4))
     times = np.array([world.t_us - 30_000.0, world.t_us])
-    found = world.wake.object_poses("car", times, t_us=world.t_us, now=world.agents)
+    found = world.motion_history.object_poses("car", times, t_us=world.t_us, now=world.agents)
     turn = quaternion_to_matrix(yaw_quaternion(0.4))
     np.testing.assert_allclose(found[:, :3, :3], np.stack([turn, turn]), atol=1e-12)

@@ -37,8 +37,8 @@ from real2sim_server.world.recording.replay import (
     no_action_impact,
     reset_payload,
     stop_payload,
+    stored_spec,
 )
-from real2sim_server.world.recording.stored_spec import stored_spec
 
 DRIVERS = {"car": {"kind": "external"}, "other": {"kind": "idm"}}
 

@@ -15,8 +15,8 @@ from real2sim_server.world.batch import BatchWorld
 from real2sim_server.world.driving import VEHICLE_MODELS
 from real2sim_server.world.ego.controller import EgoController
 from real2sim_server.world.ego.motion import Motion
-from real2sim_server.world.ego.reference import PlannedTrajectory
-from real2sim_server.world.recording.stored_spec import stored_spec
+from real2sim_server.world.ego.plan import PlannedTrajectory
+from real2sim_server.world.recording.replay import stored_spec
 
 BEHIND, ASIDE = 11.0, 2.5
 """A gap beside the road, from where the vehicle has stopped [m]."""

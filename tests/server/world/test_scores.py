@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from real2sim_server.world import scoring
-from real2sim_server.world.ego.reference import PlannedTrajectory
+from real2sim_server.world.ego.plan import PlannedTrajectory
 from real2sim_server.world.scoring import (
     ContactRecord,
     Instant,
@@ -18,7 +18,7 @@ from real2sim_server.world.scoring import (
     ScoringContext,
 )
 from real2sim_server.world.scoring.comfort import comfort_sample, comfort_window
-from real2sim_server.world.scoring.hazard import side_of_contact
+from real2sim_server.world.scoring.instant import side_of_contact
 
 from .scored_drives import DT, NOBODY, car, context, drive, ego, scores
 

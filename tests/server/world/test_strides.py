@@ -13,7 +13,7 @@ from real2sim_server.scenarios.fit import fitted_to_scene
 from real2sim_server.scenarios.flat_scene import flat_scene
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.world import World
-from real2sim_server.world.sensing import met_things
+from real2sim_server.world.sensing import ray_targets
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_a_person_is_as_tall_as_asked_and_no_wider_than_people_are(crossing):
 
 def test_lidars_meet_the_person_that_cameras_see(crossing):
     world = crossing[-20]
-    met = met_things(world).instances[1 + row_of(world)]
+    met = ray_targets(world).instances[1 + row_of(world)]
     assert torch.equal(met.cloud.means, drawn(world))
 
 

@@ -18,7 +18,7 @@ from real2sim_server.edit import ScenarioState
 from real2sim_server.geometry.rotation import yaw_quaternion
 from real2sim_server.scene import CameraRig, GaussianCloud, Scene, Trajectory
 from real2sim_server.world import World
-from real2sim_server.world.collision.sweep_kernels import first_contacts
+from real2sim_server.world.boxes import first_contacts
 from real2sim_server.world.recording.recording import first_difference, record
 from real2sim_server.world.recording.replay import (
     Entry,

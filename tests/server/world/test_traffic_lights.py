@@ -11,8 +11,8 @@ import pytest
 from real2sim_server.scene import Signal
 from real2sim_server.scene.lane import StopLine
 from real2sim_server.world import scoring
-from real2sim_server.world.recording.rows import instant_row, read_instant
-from real2sim_server.world.scoring.hazard import shows_red
+from real2sim_server.world.recording.recording import instant_row, read_instant
+from real2sim_server.world.scoring.instant import shows_red
 from real2sim_server.world.scoring.metrics import light_compliance, lights
 from real2sim_server.world.scoring.road import RoadMap
 from real2sim_server.world.storyboard.program import ShownSignal

@@ -13,8 +13,7 @@ from real2sim_server.world.driving import (
     VehicleModel,
     vehicle_parameters,
 )
-from real2sim_server.world.driving.dispatch import choice
-from real2sim_server.world.driving.kinematic_bicycle import rolling_steering, step_rolling
+from real2sim_server.world.driving.vehicle import choice, rolling_steering, step_rolling
 
 H = 0.01
 DRAG = 0.1

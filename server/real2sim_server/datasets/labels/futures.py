@@ -8,8 +8,7 @@ from typing import Any
 from ...edit import ObjectState, PlacedObjects
 from ...geometry.rotation import Float, matrix_to_quaternion, quaternion_yaw
 from ...geometry.transform import invert_transform
-from ...world.ego.route import command_ahead, route_ahead
-from ...world.path import LoggedPath
+from ...world.path import LoggedPath, command_ahead, route_ahead
 from ..drive import Drive
 
 STEP_US = 500_000

@@ -24,8 +24,8 @@ from ...world import (
     metrics_version,
     plan_in_world,
 )
-from ...world.ego.reference import PlannedTrajectory
-from ...world.ego.route import whole_route
+from ...world.ego.plan import PlannedTrajectory
+from ...world.path import whole_route
 from ..library.views import camera_infos, edited_objects
 from .sensors import MAX_IMAGE_BYTES
 from .session import Session
@@ -68,7 +68,7 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
             "truncated": world.truncated,
             "reason": world.reason,
             "lap": world.lap,
-            "drawn": world.drawn,
+            "drawn": world.sampled,
         }
     )
 

@@ -9,7 +9,7 @@ from real2sim_proto import ErrorCode, encode
 
 from ...world import World
 from ...world.ranging import MountedLidar, MountedRadar, RangingSensors
-from ...world.recording.recorded_clouds import cloud_document
+from ...world.recording.mcap_file import cloud_document
 from ...world.recording.recording import Recording, record, to_bytes
 from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
 from ..http.problems import ServiceError

@@ -9,25 +9,22 @@ from typing import NamedTuple
 
 from real2sim_proto.episode import EgoSpec, ResetSpec
 
-from ..agents import Agents, rows_in
-from ..broad_phase_kernels import may_meet_any, may_overlap
+from ..agents import Agents, Event, rows_in
+from ..boxes import REAR_OVERHANG, may_meet_any, may_overlap
 from ..driving import Command
-from ..ego.box import REAR_OVERHANG
 from ..ego.controller import EgoController
 from ..ego.motion import Motion
 from ..path import Float
+from ..scoring.instant import ContactRecord
 from ..traffic import Traffic
-from .bodies import ImpactedObject
-from .impact import Impact
-from .obstacles import ObstacleGrid
-from .overlaps import EgoContacts, ego_contacts
-from .pulse import Pulse
+from .bodies import Impact, ImpactedObject
+from .contact import ObstacleGrid, Pulse
 from .solver import solve_collisions
 from .solver_state import CollisionStep
-from .sweep import StepStart, swept_contacts
+from .sweep import BACKGROUND, EgoContacts, StepStart, ego_contacts, swept_contacts
 
 WIDEN = 0.3
-"""By how much places that the ego may reach are widened [m]."""
+"""Margin around the positions that the ego may reach [m]."""
 
 HeightAt = Callable[[float, float], float]
 """Height of the ground [m] at x, y [m]."""
@@ -52,7 +49,7 @@ class StepMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """What is in contact at one instant of an episode.
+    """Contacts at one instant of an episode.
 
     Attributes:
         spec: of the episode.
@@ -285,3 +282,78 @@ class _SteppedController:
 
 def _impacted_objects(traffic: Traffic) -> dict[str, ImpactedObject]:
     return {i: d for i, d in traffic.drivers.items() if isinstance(d, ImpactedObject)}
+
+
+# --- Contacts of a step --------------------------------------------------------------------------
+
+# Events for the planner, records for the scores.
+
+
+class StepContacts(NamedTuple):
+    """Contacts of one step.
+
+    Attributes:
+        events: collisions that began.
+        records: contacts of the ego.
+        touching: names of what is in contact now.
+        secondary: contacts between objects that began.
+    """
+
+    events: tuple[Event, ...] = ()
+    records: tuple[ContactRecord, ...] = ()
+    touching: frozenset[str] = frozenset()
+    secondary: int = 0
+
+
+def contacts_of_overlaps(found: EgoContacts, t_us: int) -> StepContacts:
+    """Contacts of a step in which bodies pass through each other."""
+    events = (Event("collision", t_us, c.object_id, data=c.event_data()) for c in found.begun)
+    return StepContacts(tuple(events), found.records, found.touching)
+
+
+def contacts_of_impacts(
+    impacts: tuple[Impact, ...], t_us: int, *, touching: frozenset[str], before: Agents
+) -> StepContacts:
+    """Contacts of a step in which bodies push each other.
+
+    Args:
+        impacts: of the step.
+        t_us: at its end [us].
+        touching: names of what was in contact one step before.
+        before: objects at its start.
+    """
+    begun = [i for i in impacts if _pair_name(i) not in touching]
+    return StepContacts(
+        tuple(Event("collision", t_us, i.object_id, i.other_id, i.event_data()) for i in begun),
+        _ego_records(impacts, touching=touching, agents=before),
+        frozenset(_pair_name(i) for i in impacts),
+        sum(i.other_id is not None for i in begun),
+    )
+
+
+def _ego_records(
+    impacts: tuple[Impact, ...], *, touching: frozenset[str], agents: Agents
+) -> tuple[ContactRecord, ...]:
+    """Impacts of the ego for the scores."""
+    categories = {o.object_id: o.category for o in agents.objects}
+    return tuple(
+        ContactRecord(
+            object_id=impact.object_id,
+            category=categories.get(impact.object_id or "", BACKGROUND),
+            side=impact.side,
+            relative_speed=impact.relative_speed,
+            ego_speed=impact.speeds[0],
+            object_speed=impact.speeds[1],
+            impulse=impact.impulse,
+            begun=(impact.object_id or BACKGROUND) not in touching,
+            since=impact.since,
+        )
+        for impact in impacts
+        if impact.other_id is None
+    )
+
+
+def _pair_name(impact: Impact) -> str:
+    """Name of a pair in contact; for the ego's contacts the name of the object."""
+    name = impact.object_id or BACKGROUND
+    return name if impact.other_id is None else f"{name}\n{impact.other_id}"

@@ -1,4 +1,4 @@
-"""What the substeps of a step with collisions work on: bodies, contacts and what they exchanged."""
+"""State of the substeps of a step with collisions: bodies, contacts and exchanged impulses."""
 
 from __future__ import annotations
 
@@ -10,17 +10,35 @@ from typing import NamedTuple
 from real2sim_proto.episode import ContactSpec, EgoSpec
 
 from ..agents import Agents
+from ..boxes import REAR_OVERHANG
 from ..driving import Command
-from ..ego.box import REAR_OVERHANG
 from ..ego.motion import Motion
-from ..scoring.hazard import side_of_contact
-from ..scoring.instant import Side
-from .bodies import ImpactedObject
-from .impact import MUTUAL_STIFFNESS, ImpactParticipant
-from .manifold import Bodies, ContactImpulse, ContactManifold, contact_manifold, corners
-from .obstacles import ObstacleGrid
-from .pulse import Pulse
-from .rigid_body import BodyProperties, BodyState
+from ..scoring.instant import Side, side_of_contact
+from .bodies import MUTUAL_STIFFNESS, BodyProperties, BodyState, ImpactedObject, ImpactParticipant
+from .contact import (
+    SLOW,
+    Bodies,
+    ContactImpulse,
+    ContactManifold,
+    Corner,
+    ObstacleGrid,
+    Patch,
+    Pulse,
+    advance_pulse,
+    contact_impulse,
+    contact_manifold,
+    contact_width,
+    corners,
+    face_owner,
+    mutual_stiffness,
+    overlap_patch,
+    overlap_shape,
+    patch_of,
+    relative_motion,
+    shortened,
+    span_across,
+    yielding_patch,
+)
 
 EGO = ""
 """Key of the ego among the bodies; no object has an empty id."""
@@ -29,7 +47,7 @@ BACKGROUND = "\0"
 
 @dataclass(frozen=True, eq=False)
 class CollisionStep:
-    """A step of the clock before its collisions are solved.
+    """A step before its collisions are solved.
 
     Attributes:
         t_us, dt_us: the step [us].
@@ -125,7 +143,7 @@ class SolverState:
 
 
 def bodies_of(state: SolverState, a: str, b: str) -> Bodies:
-    """Two bodies as they are now; None for the background."""
+    """Current state of two bodies; None for the background."""
     second = None if b == BACKGROUND else (state.bodies[b], state.properties[b])
     return (state.bodies[a], state.properties[a]), second
 
@@ -213,3 +231,326 @@ def make_dynamic(state: SolverState, impacted_now: set[str]) -> None:
             ):
                 state.ignored_pairs.add(frozenset((i, j)))
     state.dynamic |= impacted_now
+
+
+# --- Impact along a face -------------------------------------------------------------------------
+
+# Strips of structure yield independently. Force acts only where two bodies still approach each
+# other, and grows with the depth of penetration there, as on the points around a vehicle in SMAC
+# (McHenry 1971). Where one turns away, force remains on the part that the other still runs into and
+# moves along the face with it; at the centre of the whole contact it would end as soon as that
+# centre stops.
+#
+# The force of vehicles is progressive: the outermost structure folds at little force, which grows
+# with the folding speed, and the rails behind it carry the published stiffness. An impact at 10 m/s
+# therefore lasts longer than one at 30.
+
+STRIPS = 16
+SHALLOW, DEEPENING, RATE = 0.2, 0.35, 0.015
+"""Share of the stiffness of two vehicles that acts at no depth, how much comes with each metre of
+depth, and what depth closing by 1 m/s counts as [m]. Fitted to forces between the matter's cars:
+57 kN at once and 88 kN at 0.5 m in a rear end of 10 m/s, 153 kN at once and 435 kN at 1.25 m head
+on at 30 m/s; and to how long they push."""
+
+
+class Strip(NamedTuple):
+    """Part of a contact: its middle x, y, and how deep the two are in one another there [m]."""
+
+    x: float
+    y: float
+    depth: float
+
+
+class FaceContact(NamedTuple):
+    """Where two boxes reach into one another: all of it, and in strips of one width across."""
+
+    patch: Patch
+    strips: tuple[Strip, ...]
+
+
+class Push(NamedTuple):
+    """An impulse on the first body, its opposite on the second, at x, y [m]."""
+
+    x: float
+    y: float
+    impulse: ContactImpulse
+
+    def on(self, bodies: Bodies) -> Bodies:
+        """Both afterwards."""
+        (first, properties), second = bodies
+        jx, jy, _ = self.impulse
+        pushed = first.pushed(properties, self.x, self.y, jx, jy), properties
+        if second is None:
+            return pushed, None
+        return pushed, (second[0].pushed(second[1], self.x, self.y, -jx, -jy), second[1])
+
+
+def face_contact(
+    first: list[Corner], second: list[Corner], nx: float, ny: float
+) -> FaceContact | None:
+    """Where two boxes reach into one another along a unit normal; None where they do not."""
+    shape = overlap_shape(first, second)
+    found = patch_of(shape, nx, ny)
+    if found is None:
+        return None
+    low, high = span_across(shape, nx, ny)
+    turned = [(x * nx + y * ny, y * nx - x * ny) for x, y in shape]
+    strips = []
+    for k in range(STRIPS):
+        across = low + (k + 0.5) * (high - low) / STRIPS
+        begin, end = _chord(turned, across)
+        middle = (begin + end) / 2
+        x, y = middle * nx - across * ny, middle * ny + across * nx
+        strips.append(Strip(x, y, end - begin))
+    return FaceContact(Patch(*found), tuple(strips))
+
+
+def advance_face_pulse(
+    bodies: Bodies,
+    pulse: Pulse,
+    contact: FaceContact,
+    h: float,
+    *,
+    friction: float,
+    progressive: bool = False,
+) -> tuple[Pulse, list[Push]]:
+    """What the two exchange in the next ``h`` seconds, one push after the other.
+
+    Args:
+        bodies: both; None for what cannot move.
+        pulse: until now.
+        contact: where they overlap now.
+        h: [s].
+        friction: tangential per normal impulse at most.
+        progressive: force grows with the closing speed and more than in proportion to depth.
+    """
+    nx, ny = pulse.along(bodies)
+    if contact.patch.depth > pulse.depth:
+        pulse = pulse._replace(depth=contact.patch.depth, width=contact.patch.width)
+    # Impulse per depth of a strip [N s/m].
+    stiffness = mutual_stiffness(bodies, nx, ny) * contact.patch.width / STRIPS * h
+    rate = RATE if progressive else 0.0
+    loading = _progressive(contact, 0.0) if progressive else contact
+    pulse, pushes = _compressed(bodies, pulse, loading, (stiffness, rate), friction)
+    for push in pushes:
+        bodies = push.on(bodies)
+    if not pulse.loading:
+        if progressive:
+            contact = _progressive(contact, pulse.restitution)
+        pulse, back = _restored(bodies, pulse, contact, stiffness, friction)
+        pushes += back
+    return pulse, pushes
+
+
+def _compressed(
+    bodies: Bodies,
+    pulse: Pulse,
+    contact: FaceContact,
+    law: tuple[float, float],
+    friction: float,
+) -> tuple[Pulse, list[Push]]:
+    """The push of strips whose bodies come nearer, at most what stops them; ``law``: impulse per
+    depth of a strip [N s/m], and depth that speed counts as [s]."""
+    nx, ny = pulse.along(bodies)
+    stiffness, rate = law
+    parting = [(s, _parting(bodies, s, nx, ny)) for s in contact.strips]
+    approaching = [s._replace(depth=s.depth - rate * v) for s, v in parting if v < 0.0]
+    depth, place = _resultant(approaching, nx, ny)
+    if depth <= 0.0:
+        return pulse._replace(loading=False, settled=contact.patch.depth), []
+    motion = relative_motion(bodies, place)
+    stopping = contact_impulse(*bodies, place, restitution=0.0, friction=friction)
+    most = motion.normal_part(stopping) if stopping is not None else 0.0
+    push = min(most, stiffness * depth)
+    pulse = pulse._replace(compression=pulse.compression + push, loading=push < most)
+    if not pulse.loading:
+        pulse = pulse._replace(settled=contact.patch.depth)
+    return pulse, [Push(place.x, place.y, motion.limited(push, friction))]
+
+
+def _restored(
+    bodies: Bodies, pulse: Pulse, contact: FaceContact, stiffness: float, friction: float
+) -> tuple[Pulse, list[Push]]:
+    """The push that gives back a part of what was compressed, all along the contact."""
+    nx, ny = pulse.along(bodies)
+    depth, place = _resultant(contact.strips, nx, ny)
+    left = pulse.restitution * pulse.compression - pulse.restored
+    back = max(min(pulse.restitution * stiffness * depth, left), 0.0)
+    if back == 0.0:
+        return pulse, []
+    motion = relative_motion(bodies, place)
+    pulse = pulse._replace(restored=pulse.restored + back)
+    return pulse, [Push(place.x, place.y, motion.limited(back, friction))]
+
+
+def _progressive(contact: FaceContact, restitution: float) -> FaceContact:
+    """A contact with those depths at which the stiffness of two vehicles gives their force.
+
+    What is wholly given back takes all the stiffness: how fast it was folded has added to what
+    there is to be given.
+    """
+    strips = []
+    for s in contact.strips:
+        share = min(SHALLOW + DEEPENING * s.depth, 1.0)
+        strips.append(s._replace(depth=(share + restitution * (1.0 - share)) * s.depth))
+    return contact._replace(strips=tuple(strips))
+
+
+def _resultant(
+    strips: tuple[Strip, ...] | list[Strip], nx: float, ny: float
+) -> tuple[float, ContactManifold]:
+    """Sum of the depths of strips [m], and the place where force by depth has no moment."""
+    depth = sum(s.depth for s in strips)
+    if depth <= 0.0:
+        return 0.0, ContactManifold(0.0, 0.0, nx, ny, 0.0)
+    x = sum(s.depth * s.x for s in strips) / depth
+    y = sum(s.depth * s.y for s in strips) / depth
+    return depth, ContactManifold(x, y, nx, ny, depth)
+
+
+def _parting(bodies: Bodies, strip: Strip, nx: float, ny: float) -> float:
+    """Speed at which two bodies part along the normal at a strip [m/s]."""
+    first, second = bodies
+    vx, vy = first[0].velocity_at(strip.x, strip.y)
+    if second is not None:
+        wx, wy = second[0].velocity_at(strip.x, strip.y)
+        vx, vy = vx - wx, vy - wy
+    return vx * nx + vy * ny
+
+
+def _chord(shape: list[Corner], across: float) -> tuple[float, float]:
+    """From where to where along the normal a convex shape reaches at a place across it [m].
+
+    Corners are given as (along, across).
+    """
+    found = []
+    a, s = shape[-1]
+    for b, t in shape:
+        if (s <= across) != (t <= across):
+            found.append(a + (b - a) * (across - s) / (t - s))
+        a, s = b, t
+    return (min(found), max(found)) if found else (0.0, 0.0)
+
+
+# --- Impacts under way ---------------------------------------------------------------------------
+
+# Contacts that have begun, the record of their impulses, and how much shorter the bodies are
+# afterwards. :mod:`.contact` computes what two bodies exchange in an instant.
+
+
+def exchange(state: SolverState, a: str, b: str, manifold: ContactManifold, h: float) -> bool:
+    """Exchange momentum for ``h`` seconds; whether there was any to exchange."""
+    pulse = state.pulses.get((a, b)) or _begin_pulse(state, a, b, manifold)
+    if pulse is None:
+        return False
+    bodies, contact = bodies_of(state, a, b), state.step.contact
+    nx, ny = pulse.along(bodies)
+    face = _face(state, a, b, nx, ny)
+    patch = face.patch if face is not None else _patch(state, a, b, nx, ny)
+    if patch is None:
+        return False
+    if contact.residual_crush and pulse.has_settled(patch):
+        state.pulses[a, b] = pulse
+        pair_impulse(state, (a, b), manifold, approach=0.0)
+        return False
+    if face is not None:
+        pulse, pushes = advance_face_pulse(
+            bodies,
+            pulse,
+            face,
+            h,
+            friction=contact.friction,
+            progressive=contact.progressive and all(b is None or b[1].vehicle for b in bodies),
+        )
+    else:
+        pulse, impulse = advance_pulse(bodies, pulse, patch, h, friction=contact.friction)
+        pushes = [] if impulse is None else [Push(patch.x, patch.y, impulse)]
+    if pulse.over and pulse.depth > pulse.kept:
+        _shorten(state, a, b, pulse)
+        left = _patch(state, a, b, nx, ny)
+        settled = 0.0 if left is None else left.depth
+        pulse = pulse._replace(kept=pulse.depth, settled=settled)
+    state.pulses[a, b] = pulse
+    exchanged = pair_impulse(state, (a, b), manifold, approach=0.0)
+    for push in pushes:
+        _push(state, a, b, push, exchanged)
+    return bool(pushes)
+
+
+def _push(state: SolverState, a: str, b: str, push: Push, exchanged: PairImpulse) -> None:
+    bodies, impulse = bodies_of(state, a, b), push.impulse
+    after, dissipated = pushed(bodies, (push.x, push.y), impulse)
+    state.bodies[a] = after[0]
+    if after[1] is not None:
+        state.bodies[b] = after[1]
+    exchanged.jx, exchanged.jy = exchanged.jx + impulse.jx, exchanged.jy + impulse.jy
+    exchanged.energy, exchanged.masses = exchanged.energy + dissipated, masses_of(bodies)
+
+
+def _begin_pulse(state: SolverState, a: str, b: str, manifold: ContactManifold) -> Pulse | None:
+    """The pulse of two bodies that have just met; None where they part already."""
+    bodies, contact = bodies_of(state, a, b), state.step.contact
+    whole = contact_impulse(
+        *bodies, manifold, restitution=contact.restitution, friction=contact.friction
+    )
+    if whole is None:
+        pair_impulse(state, (a, b), manifold, approach=0.0)
+        return None
+    nx, ny = manifold.nx, manifold.ny
+    exchanged = pair_impulse(state, (a, b), manifold, approach=whole.approach)
+    exchanged.whole, exchanged.masses = math.hypot(whole.jx, whole.jy), masses_of(bodies)
+    exchanged.lost = pushed(bodies, (manifold.x, manifold.y), whole)[1]
+    patch = _patch(state, a, b, nx, ny)
+    width = contact_width(bodies, patch.width if patch is not None else 0.0, nx, ny)
+    exchanged.stiffness = mutual_stiffness(bodies, nx, ny) * width
+    if b == BACKGROUND and state.step.background is not None:
+        exchanged.breadth = state.step.background.breadth(manifold.x, manifold.y, nx, ny)
+    make_dynamic(state, {a, b} - {BACKGROUND} - state.dynamic)
+    restitution = contact.restitution if whole.approach > SLOW else 0.0
+    face = face_owner(bodies, nx, ny) if contact.distributed else 1
+    owner = bodies[face]
+    yaw = owner[0].yaw if owner is not None else 0.0
+    return Pulse(math.atan2(ny, nx) - yaw, restitution, face=face)
+
+
+def end_pulse(state: SolverState, a: str, b: str) -> None:
+    """Two bodies have parted."""
+    pulse = state.pulses.pop((a, b), None)
+    if pulse is not None:
+        _shorten(state, a, b, pulse)
+
+
+def _shorten(state: SolverState, a: str, b: str, pulse: Pulse) -> None:
+    """The ends of two bodies stay shorter by what was crushed for good."""
+    bodies = bodies_of(state, a, b)
+    nx, ny = pulse.along(bodies)
+    stiffness = mutual_stiffness(bodies, nx, ny)
+    for i, body, sign in ((a, bodies[0], -1.0), (b, bodies[1], 1.0)):
+        if body is None:
+            continue
+        front, rear = shortened(body, pulse, sign * nx, sign * ny, stiffness)
+        state.properties[i] = body[1].shortened(front, rear)
+        if i == EGO:
+            state.ego_crush = state.ego_crush[0] + front, state.ego_crush[1] + rear
+
+
+def _face(state: SolverState, a: str, b: str, nx: float, ny: float) -> FaceContact | None:
+    """Where two vehicles or objects meet, in strips; None for the background, and for nowhere."""
+    first, second = bodies_of(state, a, b)
+    if second is None or not state.step.contact.distributed:
+        return None
+    return face_contact(corners(*first), corners(*second), nx, ny)
+
+
+def _patch(state: SolverState, a: str, b: str, nx: float, ny: float) -> Patch | None:
+    """Where two bodies reach into one another, seen along a normal."""
+    first, second = bodies_of(state, a, b)
+    if second is None:
+        assert state.step.background is not None
+        return state.step.background.patch(*first, nx, ny)
+    shapes = corners(*first), corners(*second)
+    contact = state.step.contact
+    if contact.residual_crush and not contact.distributed:
+        return yielding_patch(*shapes, nx, ny)
+    found = overlap_patch(*shapes, nx, ny)
+    return None if found is None else Patch(*found)

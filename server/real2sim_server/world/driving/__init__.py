@@ -1,7 +1,7 @@
-"""How the controlled vehicle moves and steers: plain functions, compiled.
+"""How the controlled vehicle moves and steers: plain compiled functions.
 
-Everything here takes and gives floats, tuples and arrays. :mod:`.entries` is what Python calls;
-:mod:`.vehicle_models` and :mod:`.trackers` are the families that it chooses from.
+All functions take and return floats, tuples and arrays. Python calls :mod:`.entries`, which chooses
+from the models of :mod:`.vehicle` and the trackers of :mod:`.trackers`.
 """
 
 from .curve import MOVING, NO_POSE
@@ -14,10 +14,17 @@ from .entries import (
     plan_curve,
     prepare_schedule,
 )
-from .state import Command, PlanarState
 from .trackers import HOLD, ILQR, KINDS, LQR, PLANNING_AHEAD, PURSUIT
-from .vehicle import GRAVITY, VehicleParameters, wheel_load
-from .vehicle_models import VEHICLE_MODELS, VehicleModel, vehicle_parameters
+from .vehicle import (
+    GRAVITY,
+    VEHICLE_MODELS,
+    Command,
+    PlanarState,
+    VehicleModel,
+    VehicleParameters,
+    vehicle_parameters,
+    wheel_load,
+)
 
 __all__ = [
     "GRAVITY",

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..._numba import func
-from .state import clamped, wrapped
+from .vehicle import clamped, wrapped
 
 T, X, Y, YAW, VX, VY = range(6)
 

@@ -7,19 +7,20 @@ import math
 import numpy as np
 
 from ..._numba import func, kernel
-from .actuators import (
+from .curve import PlanCurve, at, curve_through, heading
+from .trackers import HOLD, tracker_command, tracker_schedule
+from .vehicle import (
+    Command,
+    PlanarState,
+    VehicleParameters,
     actuator_outputs,
     delay_line,
     delay_substeps,
     delayed_commands,
+    foreseen_state,
     push_command,
+    step_vehicle,
 )
-from .curve import PlanCurve, at, curve_through, heading
-from .foresight import foreseen_state
-from .state import Command, PlanarState
-from .trackers import HOLD, tracker_command, tracker_schedule
-from .vehicle import VehicleParameters
-from .vehicle_models import step_vehicle
 
 SUBSTEP_US = 10_000
 
@@ -69,7 +70,7 @@ def plan_curve(state, start_us, plan, vehicle):
     """A plan as a curve, see :class:`.curve.Curve`.
 
     Args:
-        state: nine floats of a :class:`.state.PlanarState`.
+        state: nine floats of a :class:`.vehicle.PlanarState`.
         start_us: when the vehicle is in that state [us].
         plan: times [N] int64, increasing, after ``start_us`` [us]; poses [N, 3] float64, x, y [m],
             yaw [rad], world; and seconds from the start, x, y, yaw of the single pose of the plan
@@ -130,10 +131,10 @@ def advance_vehicle(state, pending, law, vehicle, dt_us):
     Within a substep the steering angle moves at most at its rate limit. The kinematic bicycle
     follows the arc of its mean exactly; speed changes linearly until it reaches 0 or the greatest
     speed. The dynamic bicycle does the same at walking pace and slips on its tyres above, see
-    :mod:`.tyres`. Braking never ends in reversing.
+    :mod:`.vehicle`. Braking never ends in reversing.
 
     Args:
-        state: nine floats of a :class:`.state.PlanarState`.
+        state: nine floats of a :class:`.vehicle.PlanarState`.
         pending: [W, 2] float64, commands on their way to the wheels, newest first.
         law: kind, knots and turn rate of its plan, seconds since that began, the command to hold,
             which trackers ignore, and the schedules: of :func:`prepare_schedule` for trackers

@@ -1,8 +1,72 @@
-"""Constants of the controlled vehicle."""
+"""The controlled vehicle: its constants, state, models and actuators.
+
+A vehicle model is two compiled functions, see :class:`VehicleModel`. A new model needs these two
+functions and an entry in :data:`VEHICLE_MODELS`.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from real2sim_proto.episode import EgoSpec
+
+from ..._numba import func
+from ..common import cache_by_identity
+
+# --- State ---------------------------------------------------------------------------------------
+
+GENTLE_BRAKING = 2.0
+"""Deceleration after a plan's end [m/s^2]."""
+
+
+class PlanarState(NamedTuple):
+    """A vehicle on the plane, referred to its rear axle.
+
+    Attributes:
+        x, y: rear axle centre, world [m].
+        yaw: heading [rad], not wrapped.
+        speed: along the heading [m/s].
+        acceleration: along the heading, mean over the last step [m/s^2].
+        steering: road-wheel angle, positive to the left [rad].
+        yaw_rate: [rad/s].
+        lateral_speed: of the rear axle, positive to the left; 0 while its wheels roll [m/s].
+        drive: acceleration that engine or brakes bring about now [m/s^2].
+    """
+
+    x: float
+    y: float
+    yaw: float
+    speed: float
+    acceleration: float
+    steering: float
+    yaw_rate: float
+    lateral_speed: float
+    drive: float
+
+
+class Command(NamedTuple):
+    """A command: acceleration [m/s^2] and road-wheel angle [rad]."""
+
+    acceleration: float
+    steering: float
+
+
+@func
+def clamped(value, least, most):
+    """``value``, or the bound that it is beyond."""
+    return min(max(value, least), most)
+
+
+@func
+def wrapped(angle):
+    """The angle [rad] less the full turns in it: within half a turn."""
+    return angle - math.tau * math.floor(angle / math.tau + 0.5)
+
 
 GRAVITY = 9.81
 
@@ -27,7 +91,7 @@ class VehicleParameters(NamedTuple):
     """A car as two axles that carry a mass, with the limits of what moves and steers it.
 
     Attributes:
-        model: number of its model, see :mod:`.vehicle_models`.
+        model: number of its model, see :data:`VEHICLE_MODELS`.
         wheelbase: [m].
         mass: [kg].
         inertia: about the vertical axis through the centre of mass [kg m^2].
@@ -73,3 +137,460 @@ class VehicleParameters(NamedTuple):
     known_drive_delay: float
     known_drive_lag: float
     tracker_version: int
+
+
+# --- Dispatch ------------------------------------------------------------------------------------
+
+
+def choice(functions: Sequence[Any]) -> Any:
+    """The compiled function ``call(number, *args)``, which calls that one of ``functions``.
+
+    All take the same arguments and return the same types. The number is compared one by one, which
+    costs nothing measurable for a handful of them and lets the compiler see into all of them.
+    """
+    first, *rest = functions
+    if not rest:
+
+        @func
+        def last(_number, *args):
+            return first(*args)
+
+        return last
+    others = choice(rest)
+
+    @func
+    def chosen(number, *args):
+        if number == 0:
+            return first(*args)
+        return others(number - 1, *args)
+
+    return chosen
+
+
+# --- Kinematic bicycle ---------------------------------------------------------------------------
+
+
+@func
+def step_rolling(state, command, vehicle, h):
+    """The vehicle ``h`` seconds later."""
+    return rolled(state, command, command.acceleration, vehicle, h)
+
+
+@func
+def rolling_steering(rolling, _curvature, _speed, _vehicle):
+    """Road-wheel angle [rad] that keeps a curvature: that of wheels that roll."""
+    return rolling
+
+
+@func
+def rolled(state, command, acceleration, vehicle, h):
+    """Kinematic bicycle: wheels go where they point; what brings ``acceleration`` about may be
+    asked for more."""
+    steering = _limited_steering(state.steering, command.steering, vehicle, h)
+    speed, distance = _limited_speed(state.speed, acceleration, vehicle, h)
+    curvature = math.tan((state.steering + steering) / 2) / vehicle.wheelbase
+    turn = distance * curvature
+    chord = distance * sinc(turn / 2)
+    heading = state.yaw + turn / 2
+    return PlanarState(
+        state.x + chord * math.cos(heading),
+        state.y + chord * math.sin(heading),
+        state.yaw + turn,
+        speed,
+        0.0,
+        steering,
+        speed * math.tan(steering) / vehicle.wheelbase,
+        0.0,
+        command.acceleration,
+    )
+
+
+@func
+def _limited_steering(steering, wanted, vehicle, h):
+    most = vehicle.max_steer_rate * h
+    wanted = clamped(wanted, -vehicle.max_steer, vehicle.max_steer)
+    return steering + clamped(wanted - steering, -most, most)
+
+
+@func
+def _limited_speed(speed, wanted, vehicle, h):
+    """Speed after ``h`` seconds and distance covered; linear in time until a limit is met."""
+    acceleration = clamped(wanted, -vehicle.max_braking, vehicle.max_acceleration)
+    if acceleration == 0.0:
+        return speed, speed * h
+    limit = max(vehicle.max_speed, speed) if acceleration > 0 else min(0.0, speed)
+    until_limit = (limit - speed) / acceleration
+    if until_limit >= h:
+        end = speed + acceleration * h
+        return end, (speed + end) / 2 * h
+    return limit, (speed + limit) / 2 * until_limit + limit * (h - until_limit)
+
+
+@func
+def sinc(angle):
+    """sin(angle) / angle, by its series near 0 where the quotient loses its digits."""
+    if abs(angle) < 1e-4:
+        return 1.0 - angle * angle / 6.0
+    return math.sin(angle) / angle
+
+
+# --- Tyres of the dynamic bicycle ----------------------------------------------------------------
+
+_wheel_load = func(wheel_load)
+
+SLOWEST, FASTER = 2.0, 4.0
+"""Below the first speed slip angles mean nothing and the kinematic bicycle holds; between the two
+its lateral motion fades into that of the tyres [m/s]."""
+
+
+@func
+def tyre_weight(speed):
+    """Weight of the tyres' lateral motion, 0 to 1; the rest is rolling."""
+    return clamped((speed - SLOWEST) / (FASTER - SLOWEST), 0.0, 1.0)
+
+
+@func
+def integrate(vehicle, state, steering, acceleration, h):
+    """The state ``h`` seconds later, by the classical Runge-Kutta method.
+
+    Args:
+        vehicle: constants.
+        state: of the centre of mass, see :func:`rates`.
+        steering: at the beginning and the end; in between it moves linearly [rad].
+        acceleration: by engine or brakes [m/s^2].
+        h: at most 10 ms; the fastest motion is that of the tyres, about 1/(60 vx) s.
+    """
+    begin, end = steering
+    middle = (begin + end) / 2
+    a = rates(vehicle, state, begin, acceleration)
+    b = rates(vehicle, _integrated(state, a, h / 2), middle, acceleration)
+    c = rates(vehicle, _integrated(state, b, h / 2), middle, acceleration)
+    d = rates(vehicle, _integrated(state, c, h), end, acceleration)
+    mean = (
+        (a[0] + 2 * b[0] + 2 * c[0] + d[0]) / 6,
+        (a[1] + 2 * b[1] + 2 * c[1] + d[1]) / 6,
+        (a[2] + 2 * b[2] + 2 * c[2] + d[2]) / 6,
+        (a[3] + 2 * b[3] + 2 * c[3] + d[3]) / 6,
+        (a[4] + 2 * b[4] + 2 * c[4] + d[4]) / 6,
+        (a[5] + 2 * b[5] + 2 * c[5] + d[5]) / 6,
+    )
+    return _integrated(state, mean, h)
+
+
+@func
+def rates(vehicle, state, steering, acceleration):
+    """Time derivative of (x, y, yaw, vx, vy, yaw rate) of the centre of mass: place and heading in
+    the world, velocity in the vehicle frame."""
+    _, _, yaw, vx, vy, turn = state
+    front, rear = axle_forces(vehicle, (vx, vy, turn), steering, acceleration)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    across = front * math.cos(steering)
+    return (
+        vx * cos - vy * sin,
+        vx * sin + vy * cos,
+        turn,
+        acceleration - front * math.sin(steering) / vehicle.mass + vy * turn,
+        (across + rear) / vehicle.mass - vx * turn,
+        (vehicle.front * across - vehicle.rear * rear) / vehicle.inertia,
+    )
+
+
+@func
+def axle_forces(vehicle, moving, steering, acceleration):
+    """Lateral forces [N] of front and rear axle, each across its wheels.
+
+    Loads shift with the longitudinal acceleration, whose force is shared by load, so that each
+    axle's friction circle leaves it the same part for cornering.
+
+    Args:
+        vehicle: constants.
+        moving: velocity of the centre of mass in the vehicle frame [m/s], forward above 0, and
+            yaw rate [rad/s].
+        steering: road-wheel angle [rad].
+        acceleration: by engine or brakes, at most friction times gravity [m/s^2].
+    """
+    vx, vy, turn = moving
+    mass, height, wheelbase = vehicle.mass, vehicle.height, vehicle.wheelbase
+    load_f = _wheel_load(mass, height, wheelbase, vehicle.rear, acceleration)
+    load_r = _wheel_load(mass, height, wheelbase, vehicle.front, -acceleration)
+    used = acceleration / GRAVITY
+    left = math.sqrt(max(vehicle.friction**2 - used * used, 0.0))
+    slip_f = steering - math.atan2(vy + vehicle.front * turn, vx)
+    slip_r = -math.atan2(vy - vehicle.rear * turn, vx)
+    return (
+        fiala(slip_f, vehicle.front_cornering * load_f, left * load_f),
+        fiala(slip_r, vehicle.rear_cornering * load_r, left * load_r),
+    )
+
+
+@func
+def fiala(slip, stiffness, limit):
+    """Lateral force [N] of a tyre: linear for small slip, ``limit`` when it slides.
+
+    The brush model with parabolic pressure (Fiala 1954; Pacejka 2012, Tire and Vehicle Dynamics,
+    eq. 3.11).
+
+    Args:
+        slip: angle from the wheel's motion to its heading [rad]; the force has its sign.
+        stiffness: at zero slip [N/rad].
+        limit: friction times load, less what the longitudinal force takes [N].
+    """
+    if limit <= 0.0:
+        return 0.0
+    if abs(slip) >= math.atan(3 * limit / stiffness):
+        return math.copysign(limit, slip)
+    sliding = stiffness * math.tan(slip) / (3 * limit)
+    return 3 * limit * sliding * (1 - abs(sliding) + sliding * sliding / 3)
+
+
+@func
+def _integrated(state, rate, h):
+    x, y, yaw, vx, vy, turn = state
+    return (
+        x + h * rate[0],
+        y + h * rate[1],
+        yaw + h * rate[2],
+        vx + h * rate[3],
+        vy + h * rate[4],
+        turn + h * rate[5],
+    )
+
+
+# --- Dynamic bicycle -----------------------------------------------------------------------------
+
+
+@func
+def step_slipping(state, command, vehicle, h):
+    """The vehicle ``h`` seconds later; fades into the kinematic bicycle where it is slow."""
+    most = vehicle.friction * GRAVITY
+    limited = clamped(command.acceleration, -most, most)
+    rolling = rolled(state, command, limited, vehicle, h)
+    weight = tyre_weight(min(state.speed, rolling.speed))
+    if weight == 0.0:
+        return rolling
+    cos, sin = math.cos(state.yaw), math.sin(state.yaw)
+    centre = (
+        state.x + vehicle.rear * cos,
+        state.y + vehicle.rear * sin,
+        state.yaw,
+        state.speed,
+        state.lateral_speed + vehicle.rear * state.yaw_rate,
+        state.yaw_rate,
+    )
+    acceleration = (rolling.speed - state.speed) / h
+    steering = (state.steering, rolling.steering)
+    x, y, yaw, vx, vy, turn = integrate(vehicle, centre, steering, acceleration, h)
+    rest = 1 - weight
+    return PlanarState(
+        weight * (x - vehicle.rear * math.cos(yaw)) + rest * rolling.x,
+        weight * (y - vehicle.rear * math.sin(yaw)) + rest * rolling.y,
+        weight * yaw + rest * rolling.yaw,
+        weight * max(vx, 0.0) + rest * rolling.speed,
+        0.0,
+        rolling.steering,
+        weight * turn + rest * rolling.yaw_rate,
+        weight * (vy - vehicle.rear * turn),
+        command.acceleration,
+    )
+
+
+@func
+def understeer_steering(rolling, curvature, speed, vehicle):
+    """Road-wheel angle [rad] that keeps a curvature: more than that of wheels that roll, by the
+    understeer at the lateral acceleration."""
+    return rolling + vehicle.understeer * speed**2 * curvature
+
+
+# --- Models --------------------------------------------------------------------------------------
+
+
+class VehicleModel(NamedTuple):
+    """How a vehicle moves; both are made by :func:`real2sim_server._numba.func`.
+
+    Attributes:
+        step: ``step(state, command, vehicle, h)``, the :class:`PlanarState` ``h`` seconds
+            later (at most 10 ms) under a :class:`Command` that has reached the wheels, for
+            :class:`.vehicle.VehicleParameters`; holds their limits.
+        steady_steering: ``steady_steering(rolling, curvature, speed, vehicle)``, the road-wheel
+            angle [rad] that keeps a curvature [1/m] at a speed [m/s], where wheels that only roll
+            would need the angle ``rolling``. Trackers steer by it.
+        backwards: name of the model whose mirror image drives backwards in its place, at the low
+            speeds of a reverse gear; None for a model that cannot.
+    """
+
+    step: Any
+    steady_steering: Any
+    backwards: str | None = "kinematic_bicycle"
+
+
+VEHICLE_MODELS: Mapping[str, VehicleModel] = {
+    "kinematic_bicycle": VehicleModel(step_rolling, rolling_steering),
+    "dynamic_bicycle": VehicleModel(step_slipping, understeer_steering),
+}
+"""By the name of ``EgoSpec.dynamics``; the number of a model is its place."""
+
+step_vehicle = choice([model.step for model in VEHICLE_MODELS.values()])
+steady_steering = choice([model.steady_steering for model in VEHICLE_MODELS.values()])
+
+
+@cache_by_identity
+@lru_cache(maxsize=256)
+def vehicle_parameters(spec: EgoSpec) -> VehicleParameters:
+    """The constants of a spec."""
+    figures, actuators = spec.vehicle, spec.actuators
+    front = (1 - figures.front_load) * spec.wheelbase
+    rear = figures.front_load * spec.wheelbase
+    # k^2 / (a b) is close to 1 for passenger cars (Heydinger et al. 1999, SAE 1999-01-1336).
+    inertia = figures.yaw_inertia or figures.mass * front * rear
+    lags = {
+        "steering_delay": actuators.steering_delay_us * 1e-6,
+        "steering_lag": actuators.steering_lag,
+        "drive_delay": actuators.drive_delay_us * 1e-6,
+        "drive_lag": actuators.drive_lag,
+    }
+    known = {f"known_{name}": value * actuators.foreseen for name, value in lags.items()}
+    return VehicleParameters(
+        model=list(VEHICLE_MODELS).index(spec.dynamics),
+        wheelbase=spec.wheelbase,
+        mass=figures.mass,
+        inertia=inertia,
+        front=front,
+        rear=rear,
+        height=figures.centre_height,
+        friction=figures.friction,
+        front_cornering=figures.front_cornering,
+        rear_cornering=figures.rear_cornering,
+        understeer=(1 / figures.front_cornering - 1 / figures.rear_cornering) / GRAVITY,
+        max_steer=spec.max_steer,
+        max_steer_rate=spec.max_steer_rate,
+        max_acceleration=spec.max_acceleration,
+        max_braking=spec.max_braking,
+        max_speed=spec.max_speed,
+        **lags,
+        **known,
+        tracker_version=spec.tracker_version,
+    )
+
+
+# --- Actuators -----------------------------------------------------------------------------------
+
+# Dead times, followed by first-order lags, lie between a command and the wheels.
+
+
+@func
+def delay_line(pending, vehicle, h):
+    """The line of delayed commands in substeps of ``h`` seconds, and one more.
+
+    Args:
+        pending: [W, 2] float64, on their way, newest first.
+        vehicle: constants.
+        h: [s].
+
+    Returns:
+        Line [D + 1, 2] float64 for delays of D substeps, and how many of its rows are in use.
+    """
+    longest = max(delay_substeps(vehicle.drive_delay, h), delay_substeps(vehicle.steering_delay, h))
+    line = np.empty((longest + 1, 2))
+    waiting = min(len(pending), longest)
+    for k in range(waiting):
+        line[k, 0], line[k, 1] = pending[k, 0], pending[k, 1]
+    return line, waiting
+
+
+@func
+def delayed_commands(line, waiting):
+    """The commands still on their way: [W, 2] float64, newest first."""
+    pending = np.empty((min(waiting, len(line) - 1), 2))
+    for k in range(len(pending)):
+        pending[k, 0], pending[k, 1] = line[k, 0], line[k, 1]
+    return pending
+
+
+@func
+def push_command(line, waiting, command):
+    """Puts a command at the head of those on their way; how many they are now.
+
+    Args:
+        line: [W, 2] float64, commands newest first; the last drops out where it is full.
+        waiting: rows of it in use.
+        command: the command now.
+    """
+    waiting = min(waiting + 1, len(line))
+    for k in range(waiting - 1, 0, -1):
+        line[k, 0], line[k, 1] = line[k - 1, 0], line[k - 1, 1]
+    line[0, 0], line[0, 1] = command.acceleration, command.steering
+    return waiting
+
+
+@func
+def actuator_outputs(queue, state, vehicle, h, ahead):
+    """What engine, brakes and steering gear aim at in a substep of ``h`` seconds.
+
+    Until the first command arrives they keep what they do.
+
+    Args:
+        queue: line of commands and how many of its rows are in use.
+        state: of the vehicle when the substep begins.
+        vehicle: constants.
+        h: [s].
+        ahead: substeps after that in which the newest command was given; commands that are not
+            given yet are taken to be like the newest.
+    """
+    line, waiting = queue
+    drive, steering = state.drive, state.steering
+    k = max(delay_substeps(vehicle.drive_delay, h) - ahead, 0)
+    if k < waiting:
+        drive = clamped(line[k, 0], -vehicle.max_braking, vehicle.max_acceleration)
+    k = max(delay_substeps(vehicle.steering_delay, h) - ahead, 0)
+    if k < waiting:
+        steering = line[k, 1]
+    return Command(
+        _first_order_lag(state.drive, drive, h, vehicle.drive_lag),
+        _first_order_lag(state.steering, steering, h, vehicle.steering_lag),
+    )
+
+
+@func
+def delay_substeps(delay, h):
+    """A dead time [s] in whole substeps of ``h`` seconds."""
+    return math.floor(delay / h + 0.5)
+
+
+@func
+def leading(value, wanted, h, lag):
+    """What to ask of a first-order lag at ``value`` so that it is at ``wanted`` ``h`` seconds
+    later."""
+    if lag == 0.0:
+        return wanted
+    return value - (wanted - value) / math.expm1(-h / lag)
+
+
+@func
+def _first_order_lag(value, wanted, h, lag):
+    """Where a first-order lag is ``h`` seconds later."""
+    if lag == 0.0:
+        return wanted
+    return value - (wanted - value) * math.expm1(-h / lag)
+
+
+# --- Prediction ----------------------------------------------------------------------------------
+
+# Trackers that know the dead times decide for the state in which their command will take effect (a
+# Smith predictor without model error), so that dead time does not make the loop less stable.
+
+
+@func
+def foreseen_state(state, queue, vehicle, h, substeps):
+    """The vehicle some substeps later, under the commands that are on their way.
+
+    Args:
+        state: of the vehicle.
+        queue: line of commands and how many of its rows are in use.
+        vehicle: constants.
+        h: length of a substep [s].
+        substeps: how many.
+    """
+    for k in range(substeps):
+        outputs = actuator_outputs(queue, state, vehicle, h, k + 1)
+        state = step_vehicle(vehicle.model, state, outputs, vehicle, h)
+    return state

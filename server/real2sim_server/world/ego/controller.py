@@ -1,7 +1,8 @@
-"""From plans to motion: the controller of the plan in effect, and of the log before any plan."""
+"""Controllers of the ego: they follow the plan in effect, or the log before any plan."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol, Self, assert_never
 
@@ -14,14 +15,209 @@ from real2sim_proto.plans import Control, Gear, PoseCommand, TrajectoryPlan
 from ..._records import made_quickly
 from ...edit.tracks import sample
 from ...scene import Trajectory
-from ..driving import Command
-from ..errors import WorldError
-from ..evolve import evolved
-from ..seam import Seam
-from .gear import advance_in_gear, can_reverse
-from .motion import Motion, advance_motion, constant_law, teleported
-from .reference import PlannedTrajectory, Pose, SinglePose
-from .trackers import tracker_of
+from ..common import WorldError, copy_with
+from ..driving import KINDS, LQR, MOVING, Command
+from ..path import LoopTransform
+from .motion import Motion, advance_motion, commanded, constant_law, teleported
+from .plan import (
+    Leg,
+    PlannedTrajectory,
+    Pose,
+    ReferenceTrajectory,
+    SinglePose,
+    advance_in_gear,
+    backwards_spec,
+    can_reverse,
+    command_in_gear,
+    legs_of,
+    mirrored,
+)
+
+# --- Trackers ------------------------------------------------------------------------------------
+
+
+@made_quickly
+@dataclass(frozen=True, eq=False)
+class ControlledTracker:
+    """A controller in the vehicle, bound by the vehicle's limits; knows nothing of the past, so
+    that a copied world goes on alike.
+
+    Attributes:
+        kind: number of the tracker, see :mod:`.driving.trackers`.
+        reference: what is followed.
+        spec: of the vehicle.
+    """
+
+    kind: int
+    reference: ReferenceTrajectory
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later.
+
+        Args:
+            motion: now.
+            since: time since the reference began [s].
+            dt_us: how far to go [us].
+        """
+        return advance_motion(
+            motion, self.reference.control_law(self.kind), self.spec, dt_us, since=since
+        )
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """What to do in a motion, ``t`` seconds after the reference began."""
+        return commanded(motion, self.reference.control_law(self.kind), self.spec, since=t)
+
+    def put_back(self, seam: LoopTransform) -> Self:
+        """The tracker of a vehicle that was put back over the seam."""
+        return replace(self, reference=self.reference.put_back(seam))
+
+
+@dataclass(frozen=True, eq=False)
+class PerfectTracker:
+    """No controller at all: the vehicle is put where the plan is. For open-loop comparisons; obeys
+    no limit of any vehicle.
+
+    Attributes:
+        reference: what is followed.
+        spec: of the vehicle.
+    """
+
+    reference: ReferenceTrajectory
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later: the plan's place, or its last one once it is over."""
+        t = since + dt_us * 1e-6
+        if t >= self.reference.end:
+            return teleported(motion, self.reference.last_pose, self.spec, dt_us)
+        x, y, vx, vy, yaw = self.reference.at(t)
+        if math.hypot(vx, vy) > MOVING:
+            back = vx * math.cos(yaw) + vy * math.sin(yaw) < 0 and can_reverse(self.spec)
+            yaw = math.atan2(-vy, -vx) if back else math.atan2(vy, vx)
+        return teleported(motion, (x, y, yaw), self.spec, dt_us)
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """What an LQR would do; for vehicles that were pushed."""
+        return commanded(motion, self.reference.control_law(LQR), self.spec, since=t)
+
+    def put_back(self, seam: LoopTransform) -> Self:
+        """The tracker of a vehicle that was put back over the seam."""
+        return replace(self, reference=self.reference.put_back(seam))
+
+
+@dataclass(frozen=True, eq=False)
+class GearedLeg:
+    """A leg of a plan as it is followed.
+
+    Attributes:
+        backwards: whether in reverse gear; the reference is then the mirror image's.
+        begin_us, end_us: from the beginning of the plan [us].
+        reference: what is followed.
+    """
+
+    backwards: bool
+    begin_us: int
+    end_us: int
+    reference: ReferenceTrajectory
+
+
+@dataclass(frozen=True, eq=False)
+class GearedTracker:
+    """A controller that changes gear where its plan turns back.
+
+    Attributes:
+        kind: number of the tracker, see :mod:`.driving.trackers`.
+        legs: of the plan, one after the other.
+        spec: of the vehicle.
+    """
+
+    kind: int
+    legs: tuple[GearedLeg, ...]
+    spec: EgoSpec
+
+    def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
+        """The vehicle ``dt_us`` later, ``since`` seconds after the plan began."""
+        at_us = round(since * 1e6)
+        end_us = at_us + dt_us
+        while at_us < end_us:
+            leg = self._leg_at(at_us)
+            until_us = end_us if leg is self.legs[-1] else min(end_us, leg.end_us)
+            motion = advance_in_gear(
+                motion,
+                leg.reference.control_law(self.kind),
+                self.spec,
+                until_us - at_us,
+                since=(at_us - leg.begin_us) * 1e-6,
+                backwards=leg.backwards,
+            )
+            at_us = until_us
+        return motion
+
+    def command(self, motion: Motion, t: float) -> Command:
+        """What to do in a motion, ``t`` seconds after the plan began."""
+        leg = self._leg_at(round(t * 1e6))
+        law = leg.reference.control_law(self.kind)
+        since = t - leg.begin_us * 1e-6
+        return command_in_gear(motion, law, self.spec, since=since, backwards=leg.backwards)
+
+    def put_back(self, seam: LoopTransform) -> Self:
+        """The tracker of a vehicle that was put back over the seam."""
+        legs = [replace(leg, reference=leg.reference.put_back(seam)) for leg in self.legs]
+        return replace(self, legs=tuple(legs))
+
+    def _leg_at(self, at_us: int) -> GearedLeg:
+        return next((leg for leg in self.legs if at_us < leg.end_us), self.legs[-1])
+
+
+def tracker_of(
+    motion: Motion,
+    start_us: int,
+    trajectory: PlannedTrajectory,
+    spec: EgoSpec,
+    before: SinglePose | None = None,
+) -> ControlledTracker | GearedTracker | PerfectTracker:
+    """The tracker that the spec names, of a vehicle that is in ``motion`` at ``start_us``;
+    ``before``: what a trajectory of a single pose goes on from."""
+    if spec.tracker != "perfect" and can_reverse(spec):
+        legs = legs_of(trajectory, motion, before)
+        if len(legs) > 1 or legs[0].backwards or motion.reversing or motion.speed < 0:
+            geared = [_geared(leg, motion, start_us, spec, before) for leg in legs]
+            return GearedTracker(KINDS[spec.tracker], tuple(geared), spec)
+    ahead = ReferenceTrajectory(
+        motion, start_us=start_us, trajectory=trajectory, spec=spec, before=before
+    )
+    return make_tracker(ahead, spec)
+
+
+def _geared(
+    leg: Leg, motion: Motion, start_us: int, spec: EgoSpec, before: SinglePose | None
+) -> GearedLeg:
+    begin_us = start_us if leg.begin_us is None else leg.begin_us
+    trajectory = leg.trajectory
+    if leg.cusp is not None:
+        x, y, yaw = leg.cusp
+        motion = Motion(x, y, yaw)
+    if leg.backwards:
+        motion, spec = mirrored(motion), backwards_spec(spec)
+        turned = trajectory.poses + np.array([0.0, 0.0, math.pi])
+        trajectory = PlannedTrajectory(trajectory.times_us, turned)
+        before = before and before._replace(yaw=before.yaw + math.pi)
+    reference = ReferenceTrajectory(
+        motion, start_us=begin_us, trajectory=trajectory, spec=spec, before=before
+    )
+    end_us = int(trajectory.times_us[-1]) - start_us
+    return GearedLeg(leg.backwards, begin_us - start_us, end_us, reference)
+
+
+def make_tracker(
+    reference: ReferenceTrajectory, spec: EgoSpec
+) -> ControlledTracker | PerfectTracker:
+    """The tracker that the spec names, of a plan that leads forwards."""
+    if spec.tracker == "perfect":
+        return PerfectTracker(reference, spec)
+    return ControlledTracker(KINDS[spec.tracker], reference, spec)
+
 
 Plan = TrajectoryPlan | Control | PoseCommand
 WorldPlan = PlannedTrajectory | Control | PoseCommand
@@ -42,7 +238,7 @@ class Controller(Protocol):
     def command(self, motion: Motion, t: float) -> Command:
         """What it would do in a motion, ``t`` seconds after it began."""
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """The controller of an ego that was put back over the seam."""
 
 
@@ -79,7 +275,7 @@ class ConstantCommand:
     def _backwards(self, motion: Motion) -> bool:
         return self.gear == "reverse" if self.gear is not None else motion.reversing
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """Itself: a command has no place."""
         return self
 
@@ -99,7 +295,7 @@ class Teleport:
         """Brakes: a teleported vehicle has no controller."""
         return Command(-EMERGENCY_BRAKING, motion.steering)
 
-    def put_back(self, seam: Seam) -> Self:
+    def put_back(self, seam: LoopTransform) -> Self:
         """The pose beyond the seam."""
         x, y, yaw = seam.poses(np.array([self.pose]))[0].tolist()
         return replace(self, pose=(x, y, yaw))
@@ -123,7 +319,7 @@ class PendingPlan:
         """The plan where it is a trajectory."""
         return self.plan if isinstance(self.plan, PlannedTrajectory) else None
 
-    def put_back(self, seam: Seam) -> PendingPlan:
+    def put_back(self, seam: LoopTransform) -> PendingPlan:
         """The plan of an ego that was put back over the seam."""
         if isinstance(self.plan, PlannedTrajectory):
             return replace(self, plan=replace(self.plan, poses=seam.poses(self.plan.poses)))
@@ -191,7 +387,7 @@ class EgoController:
             )
         kept = tuple(p for p in self.pending if p.from_us < from_us)
         pending = (*kept, PendingPlan(from_us, plan_in_world(plan, motion)))
-        return evolved(self, pending=pending)
+        return copy_with(self, pending=pending)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[EgoController, Motion]:
         """Controller and vehicle ``us`` later than ``t_us``."""
@@ -205,7 +401,7 @@ class EgoController:
             t_us = until
         return current, motion
 
-    def put_back(self, seam: Seam) -> EgoController:
+    def put_back(self, seam: LoopTransform) -> EgoController:
         """The controller and its plans of an ego that was put back over the seam."""
         controller = self.controller.put_back(seam) if self.controller is not None else None
         pending = tuple(plan.put_back(seam) for plan in self.pending)

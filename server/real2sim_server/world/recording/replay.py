@@ -1,8 +1,8 @@
-"""An episode as a log of requests, and its replay, bit for bit."""
+"""An episode as a log of requests, replayed bit for bit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,11 +12,68 @@ from real2sim_proto import decode, encode
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import Operation, stored_operations
 from real2sim_proto.plans import PLAN, Plan
+from real2sim_proto.storyboard import stored_storyboard
 
 from ...edit import ScenarioState
 from ...scene import Scene
 from ..world import World
-from .stored_spec import stored_spec
+
+# --- Stored specs --------------------------------------------------------------------------------
+
+# Logs of earlier versions are read too.
+
+BEFORE: Mapping[str, Any] = {
+    "ego": {
+        "actuators": {"steering_lag": 0.0, "drive_lag": 0.0, "foreseen": False},
+        "suspension": None,
+        "max_reverse_speed": 0.0,
+        "tracker_version": 1,
+    },
+    "contact": {
+        "swept": False,
+        "pulse": False,
+        "residual_crush": False,
+        "distributed": False,
+        "progressive": False,
+        "breakage": False,
+        "weighed_by_height": False,
+    },
+}
+"""How episodes ran before members had their present defaults, or before there were such members.
+
+Logs hold specs in full, so a member that is absent is one that its writer did not know. Whoever
+adds a member whose default changes an episode names here what keeps its bits.
+"""
+
+
+def stored_spec(fields: Mapping[str, Any]) -> ResetSpec:
+    """The spec of a log, with the meaning that it had when it was written.
+
+    Raises:
+        ValueError: it is no spec.
+    """
+    completed = _completed(fields, BEFORE)
+    if isinstance(board := completed.get("storyboard"), Mapping):
+        completed["storyboard"] = stored_storyboard(board)
+    spec = ResetSpec.model_validate(completed)
+    if fields.get("horizon") is None:
+        # To the end of the log, also where the episode could have gone on.
+        return spec.model_copy(update={"horizon": None})
+    return spec
+
+
+def _completed(fields: Mapping[str, Any], absent: Mapping[str, Any]) -> dict[str, Any]:
+    """``fields`` with members of ``absent`` where it has none."""
+    found = dict(fields)
+    for name, value in absent.items():
+        if isinstance(value, Mapping):
+            inner = found.get(name, {})
+            if isinstance(inner, Mapping):
+                found[name] = _completed(inner, value)
+        else:
+            found.setdefault(name, value)
+    return found
+
 
 KINDS = ("reset", "action", "edit", "agent", "snapshot", "restore", "stop")
 _OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
@@ -128,7 +185,7 @@ class Replayer:
 
 
 def recorded_spec(reset: Entry) -> ResetSpec:
-    """How a recorded episode runs, see :func:`~.stored_spec.stored_spec`."""
+    """How a recorded episode runs, see :func:`stored_spec`."""
     return stored_spec(decode(reset.payload)["spec"])
 
 
@@ -150,12 +207,6 @@ def _apply_entry(world: World, kind: str, fields: dict[str, Any]) -> None:
             world.stop(fields["reason"])
         case _:
             raise ValueError(f"a log entry of kind {kind!r}; known are {', '.join(KINDS)}")
-
-
-def replayed_worlds(replayer: Replayer, entries: Iterable[Entry]) -> Iterator[tuple[Entry, World]]:
-    """Every entry with the world after it."""
-    for entry in entries:
-        yield entry, replayer.apply(entry)
 
 
 def no_action_impact(replayer: Replayer, entries: Sequence[Entry]) -> float:

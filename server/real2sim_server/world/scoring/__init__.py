@@ -1,6 +1,6 @@
-"""Versioned metrics of episodes: the same code for a running episode and for a recording.
+"""Versioned metrics of episodes: the same code scores running episodes and recordings.
 
-:mod:`.metric` is the family, :mod:`.metrics` its members.
+:mod:`.metric` is the registry, :mod:`.metrics` has the metrics of the field.
 """
 
 from .instant import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext
@@ -10,13 +10,14 @@ from .metric import (
     MetricAccumulator,
     MetricValue,
     Score,
+    begin_accumulator,
     metric,
     metric_versions,
     metrics_version,
     scores_of,
+    update_accumulator,
 )
 from .metrics import running_metrics
-from .update import begin_accumulator, update_accumulator
 
 __all__ = [
     "METRICS",

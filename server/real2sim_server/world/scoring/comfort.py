@@ -12,7 +12,7 @@ import numpy as np
 
 from ..._numba import kernel
 from ..._records import made_quickly
-from ..ego.reference import PlannedTrajectory
+from ..ego.plan import PlannedTrajectory
 from ..path import Float
 from .instant import EgoSample, Instant, ScoringContext
 

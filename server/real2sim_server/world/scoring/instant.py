@@ -1,9 +1,12 @@
-"""What the scores need to know of one instant, and of the episode."""
+"""Inputs of the scores: samples of an instant, context of the episode, time to collision, fault."""
+
+# ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -11,10 +14,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._numba import kernel
 from ..._records import made_quickly
-from ..ego.reference import PlannedTrajectory
-from ..path import Float
-from ..seam import Seam
+from ...scene import LaneGraph, Signal
+from ..ego.plan import PlannedTrajectory
+from ..path import Float, LoopTransform
 from ..storyboard.program import ShownSignal
 from .road import DENSITY, RoadMap, in_lane, off_road
 
@@ -115,7 +119,7 @@ class Instant:
     contacts: tuple[ContactRecord, ...] = ()
     secondary: int = 0
     plan: PlannedTrajectory | None = None
-    seam: Seam | None = None
+    seam: LoopTransform | None = None
     signals: tuple[ShownSignal, ...] = ()
 
 
@@ -283,3 +287,337 @@ def _dense(line: Float) -> Float:
     at = np.append(np.arange(0.0, s[-1], DENSITY), s[-1])
     points: Sequence[Float] = [np.interp(at, s, line[:, k]) for k in (0, 1)]
     return np.stack(points, axis=1)
+
+
+# --- Hazards -------------------------------------------------------------------------------------
+
+# Time to collision, side and fault of contacts, and red lights that the ego crossed.
+
+HORIZON, STEP = 3.0, 0.1
+STEPS = 31
+"""Times from 0 to the horizon."""
+
+AHEAD, BEHIND = math.radians(30), math.radians(150)
+"""Bearings within which an object counts as ahead, beyond which as behind (nuPlan)."""
+
+
+@kernel
+def first_overlap_step(ego, size, centre_ahead, everywhere, others, ignored):
+    """The first step of 0.1 s up to 3 s at which the ego box overlaps that of an object.
+
+    Args:
+        ego: x, y [m], yaw [rad], speed, lateral speed [m/s] of the rear axle, height of the
+            ground z [m].
+        size: (length, width, height) of its box [m].
+        centre_ahead: rear axle to the middle of the box [m].
+        everywhere: whether all objects count that are not behind the ego; else those ahead.
+        others: centres [K, 3] [m], yaws [K] [rad], sizes [K, 3] [m], velocities [K, 2] [m/s] of
+            the objects, float64, world.
+        ignored: [K] bool, objects that do not count.
+
+    Returns:
+        Number of steps; -1 where they do not overlap.
+    """
+    x, y, yaw, forward, lateral, z = ego
+    centres, yaws, sizes, velocities = others
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    vx, vy = forward * cos - lateral * sin, forward * sin + lateral * cos
+    middle_x, middle_y = x + centre_ahead * cos, y + centre_ahead * sin
+    first = STEPS
+    for k in range(len(yaws)):
+        if ignored[k]:
+            continue
+        low = centres[k, 2] - sizes[k, 2] / 2
+        if low >= z + size[2] or low + sizes[k, 2] <= z:
+            continue
+        dx, dy = centres[k, 0] - middle_x, centres[k, 1] - middle_y
+        wx, wy = velocities[k, 0] - vx, velocities[k, 1] - vy
+        reach = (math.hypot(size[0], size[1]) + math.hypot(sizes[k, 0], sizes[k, 1])) / 2
+        if _closest(dx, dy, wx, wy) >= reach:
+            continue
+        bearing = math.atan2(centres[k, 1] - y, centres[k, 0] - x) - yaw
+        bearing = abs((bearing + math.pi) % math.tau - math.pi)
+        if bearing >= AHEAD and not (everywhere and bearing <= BEHIND):
+            continue
+        for step in range(first):
+            t = step * STEP
+            apart_x = centres[k, 0] + velocities[k, 0] * t - (middle_x + vx * t)
+            apart_y = centres[k, 1] + velocities[k, 1] * t - (middle_y + vy * t)
+            if _overlap(apart_x, apart_y, yaw, size, yaws[k], sizes[k]):
+                first = step
+                break
+    return first if first < STEPS else -1
+
+
+@kernel
+def _closest(x, y, vx, vy):
+    """Smallest distance [m] within the horizon of a point at (x, y) [m] that moves [m/s]."""
+    squared = max(vx * vx + vy * vy, 1e-12)
+    t = min(max(-(x * vx + y * vy) / squared, 0.0), HORIZON)
+    return math.hypot(x + vx * t, y + vy * t)
+
+
+@kernel
+def _overlap(x, y, yaw, size, other_yaw, other_size):
+    """Whether two boxes overlap on the plane, the second's middle being (x, y) off: separating
+    axes."""
+    cos_a, sin_a = math.cos(yaw), math.sin(yaw)
+    cos_b, sin_b = math.cos(other_yaw), math.sin(other_yaw)
+    turn = other_yaw - yaw
+    c, s = abs(math.cos(turn)), abs(math.sin(turn))
+    la, wa, lb, wb = size[0], size[1], other_size[0], other_size[1]
+    return (
+        abs(x * cos_a + y * sin_a) < (la + lb * c + wb * s) / 2
+        and abs(y * cos_a - x * sin_a) < (wa + lb * s + wb * c) / 2
+        and abs(x * cos_b + y * sin_b) < (lb + la * c + wa * s) / 2
+        and abs(y * cos_b - x * sin_b) < (wb + la * s + wa * c) / 2
+    )
+
+
+STANDSTILL = 5e-3
+"""Below this speed the time to collision is not defined (NAVSIM) [m/s]."""
+
+NEVER = math.inf
+
+
+def time_to_collision(
+    instant: Instant, context: ScoringContext, *, off_lane: bool, hit: frozenset[str]
+) -> float:
+    """First time [s] in steps of 0.1 s up to 3 s at which the ego box overlaps an object's.
+
+    All keep their velocities. Objects ahead count, or behind an ego that drives backwards; when
+    the ego is in several lanes or off the road, all that are not on its other side (nuPlan,
+    NAVSIM).
+
+    Args:
+        instant: now.
+        context: the ego's size.
+        off_lane: whether the ego is in several lanes or off the road.
+        hit: objects it is in contact with already, which do not count.
+    """
+    ego, others = instant.ego, instant.others
+    if not others.ids or math.hypot(ego.speed, ego.lateral_speed) < STANDSTILL:
+        return NEVER
+    moving = (ego.x, ego.y, ego.yaw, ego.speed, ego.lateral_speed, ego.z)
+    ahead = context.centre_ahead
+    if ego.speed < -STANDSTILL:
+        # The mirror image, for which what lies where it drives to is ahead.
+        moving = (ego.x, ego.y, ego.yaw + math.pi, -ego.speed, -ego.lateral_speed, ego.z)
+        ahead = -ahead
+    step: int = first_overlap_step(
+        moving,
+        context.ego_size,
+        ahead,
+        off_lane,
+        (others.centres, others.yaws, others.sizes, others.velocities),
+        np.array([i in hit for i in others.ids]) if hit else np.zeros(len(others.ids), np.bool_),
+    )
+    return NEVER if step < 0 else step * STEP
+
+
+STOPPED = 5e-2
+"""Speed at which a vehicle counts as stopped (nuPlan) [m/s]."""
+
+
+def side_of_contact(
+    ego_box: tuple[float, float, float, float, float],
+    ego_speed: float,
+    box: tuple[float, float, float, float, float],
+    speed: float,
+    *,
+    axle: float,
+    reversing: bool = False,
+) -> Side:
+    """The side of the ego on which two boxes came into contact, after nuPlan's ``CollisionType``.
+
+    Args:
+        ego_box, box: centre x, y [m], yaw [rad], length, width [m].
+        ego_speed, speed: before the contact, along and across [m/s].
+        axle: from the middle of the ego box back to the rear axle, from which what is behind is
+            seen [m].
+        reversing: whether the ego drives in reverse gear: its tail is then what runs into things,
+            as its front does otherwise.
+    """
+    if abs(ego_speed) <= STOPPED:
+        return "stopped_ego"
+    if abs(speed) <= STOPPED:
+        return "stopped_track"
+    x, y, yaw, length, width = ego_box
+    if reversing:
+        yaw += math.pi
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    bearing = math.atan2(box[1] - y + axle * sin, box[0] - x + axle * cos) - yaw
+    if abs(math.remainder(bearing, math.tau)) > BEHIND:
+        return "rear"
+    half = width / 2
+    bumper = [
+        (x + u * cos - v * sin, y + u * sin + v * cos)
+        for u, v in ((length / 2, half), (length / 2, -half))
+    ]
+    return "front" if _segment_intersects(bumper[0], bumper[1], box) else "lateral"
+
+
+def _segment_intersects(
+    a: tuple[float, float], b: tuple[float, float], box: tuple[float, float, float, float, float]
+) -> bool:
+    """Whether a segment intersects a box: clipped against its two slabs."""
+    x, y, yaw, length, width = box
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    first, last = 0.0, 1.0
+    for axis_x, axis_y, half in ((cos, sin, length / 2), (-sin, cos, width / 2)):
+        p = (a[0] - x) * axis_x + (a[1] - y) * axis_y
+        q = (b[0] - x) * axis_x + (b[1] - y) * axis_y
+        if abs(q - p) < 1e-12:
+            if abs(p) > half:
+                return False
+            continue
+        enter, leave = sorted(((-half - p) / (q - p), (half - p) / (q - p)))
+        first, last = max(first, enter), min(last, leave)
+    return first <= last
+
+
+def ego_at_fault(record: ContactRecord, off_lane: bool) -> bool:
+    """Whether the ego is at fault (nuPlan): it ran into something, or left its lane for it."""
+    if record.side in {"front", "stopped_track"}:
+        return True
+    return record.side == "lateral" and off_lane
+
+
+def fault_class(category: str) -> str:
+    """``vru``, ``vehicle`` or ``object``."""
+    if category in VRU:
+        return "vru"
+    return "vehicle" if category in VEHICLES else "object"
+
+
+ALONG = 0.5
+"""Cosine of the greatest angle between an ego and the direction that a stop line is for."""
+
+LAMPS = {"on", "off", "flashing", "counting"}
+"""Words of states that list lamps from the first, red one on, as ``off;off;on``."""
+
+
+class StopLineAt(NamedTuple):
+    """Where vehicles stop: middle, world [m], their heading there [rad], half its width [m]."""
+
+    x: float
+    y: float
+    heading: float
+    half: float
+
+
+@dataclass(frozen=True)
+class TrafficLights:
+    """What traffic lights showed an ego, and which it ran; immutable.
+
+    Attributes:
+        shown: at the newest instant.
+        ran: signals whose stop line the ego's front crossed while they were red.
+        placed, unplaced: signals so far whose stop line is known, and others.
+    """
+
+    shown: tuple[ShownSignal, ...] = ()
+    ran: frozenset[str] = frozenset()
+    placed: frozenset[str] = frozenset()
+    unplaced: frozenset[str] = frozenset()
+
+    @property
+    def seen(self) -> bool:
+        """Whether there were any."""
+        return bool(self.placed or self.unplaced)
+
+    def updated(
+        self, before: EgoSample | None, instant: Instant, context: ScoringContext
+    ) -> TrafficLights:
+        """One instant later.
+
+        A line counts as run where the signal was red at both ends of the step: what it showed
+        between them is not known.
+
+        Args:
+            before: the ego at the instant before; None at the first.
+            instant, context: as of all scores.
+        """
+        if not instant.signals and not self.shown:
+            return self
+        red = {signal.signal_id for signal in self.shown if shows_red(signal.state)}
+        ran, placed, unplaced = set(self.ran), set(self.placed), set(self.unplaced)
+        for signal in instant.signals:
+            name = signal.signal_id
+            if name in placed or name in unplaced:
+                lines = None
+            else:
+                lines = tuple(stop_lines(signal, context))
+                (placed if lines else unplaced).add(name)
+            if before is None or name not in red or not shows_red(signal.state):
+                continue
+            for line in stop_lines(signal, context) if lines is None else lines:
+                if _crossed(line, before, instant.ego, context):
+                    ran.add(name)
+        sets = (frozenset(ran), frozenset(placed), frozenset(unplaced))
+        return TrafficLights(instant.signals, *sets)
+
+
+NO_LIGHTS = TrafficLights()
+
+
+def shows_red(state: str) -> bool:
+    """Whether a state bids vehicles stop: ``red``, also beside others (``red;amber``), ``stop``, or
+    lamps of which the first is on (``on;off;off``, red first as in OpenDRIVE)."""
+    words = re.findall(r"[a-z]+", state.lower())
+    if words and set(words) <= LAMPS:
+        return len(words) > 1 and words[0] == "on"
+    return "red" in words or "stop" in words
+
+
+def stop_lines(signal: ShownSignal, context: ScoringContext) -> Iterator[StopLineAt]:
+    """Where vehicles stop for a signal: as the storyboard says, as wide as a lane, else as the map
+    does: at its stop line, or at the ends of its lanes. None where neither knows."""
+    graph = None if context.road_map is None else context.road_map.graph
+    if signal.stop_line is not None:
+        x, y, heading = signal.stop_line
+        found = None if graph is None else graph.nearest(x, y, heading, within=5.0)
+        half = context.lane
+        if graph is not None and found is not None:
+            half = graph.lanes[found.lane_id].width(found.s) / 2
+        yield StopLineAt(x, y, heading, half)
+    elif graph is not None and (mapped := graph.signals.get(signal.signal_id)) is not None:
+        yield from _of_map(mapped, graph)
+
+
+def _of_map(signal: Signal, graph: LaneGraph) -> Iterator[StopLineAt]:
+    lanes = [graph.lanes[name] for name in signal.lanes]
+    if signal.stop_line is None:
+        for lane in lanes:
+            x, y, _, heading = lane.at(lane.length)
+            yield StopLineAt(x, y, heading, lane.width(lane.length) / 2)
+        return
+    line = graph.stop_lines[signal.stop_line]
+    first, last = line.points[0, :2], line.points[-1, :2]
+    across = math.atan2(last[1] - first[1], last[0] - first[0])
+    x, y = ((first + last) / 2).tolist()
+    ruled = lanes or [graph.lanes[name] for name in line.lanes]
+    # Without lanes: traffic comes towards the face of the signal.
+    way = float(ruled[0].headings[-1]) if ruled else signal.heading + math.pi
+    turned = across + math.pi / 2
+    heading = turned if math.cos(turned - way) > 0 else turned + math.pi
+    yield StopLineAt(x, y, heading, math.hypot(*(last - first)) / 2)
+
+
+def _crossed(line: StopLineAt, before: EgoSample, now: EgoSample, context: ScoringContext) -> bool:
+    """Whether the middle of the ego's front crossed a line in its direction within a step."""
+    if math.cos(now.yaw - line.heading) <= ALONG:
+        return False
+    (s0, d0), (s1, d1) = (_front(line, ego, context) for ego in (before, now))
+    if not s0 <= 0.0 < s1:
+        return False
+    return abs(d0 + (d1 - d0) * s0 / (s0 - s1)) <= line.half
+
+
+def _front(line: StopLineAt, ego: EgoSample, context: ScoringContext) -> tuple[float, float]:
+    """The middle of the ego's front: beyond the line, and to the left of its middle [m]."""
+    ahead = context.ego_size[0] - context.rear_overhang
+    x = ego.x + ahead * math.cos(ego.yaw) - line.x
+    y = ego.y + ahead * math.sin(ego.yaw) - line.y
+    cos, sin = math.cos(line.heading), math.sin(line.heading)
+    return x * cos + y * sin, y * cos - x * sin

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import math
 
-from .hazard import fault_class
-from .instant import ScoringContext
+from .instant import ScoringContext, fault_class
 from .metric import (
-    LEAST_ROUTE,
     METRICS,
+    MIN_ROUTE,
     Aspect,
     MetricAccumulator,
     MetricValue,
-    assumed_progress,
-    assumed_route,
     expert_progress,
     metric,
-    progress_along_route,
-    relative_progress,
-    route_completion,
 )
+
+SHORT_ROUTE = 5.0
+"""Ways up to this are no measure of progress to NAVSIM and AlpaSim [m]."""
 
 TTC_BOUND = 0.95
 """nuPlan; NAVSIM's projections at 0, 0.3, 0.6, 0.9 s ask the same on a grid of 0.1 s [s]."""
@@ -27,6 +24,58 @@ TTC_BOUND = 0.95
 NAVSIM_SEES: tuple[Aspect, ...] = ("progress", "comfort", "near_misses", "road", "fault")
 CARLA_PENALTIES = {"vru": 0.5, "vehicle": 0.6, "object": 0.65}
 NO_MAP = "no map: corridor and lanes come from the recorded drive"
+
+
+def progress_along_route(accumulator: MetricAccumulator) -> float:
+    """Way along the route [m]; not what was driven tail first, which is no way to drive there, nor
+    what was left out by a short cut."""
+    driven = accumulator.s - accumulator.tail_first - accumulator.cut
+    return max(driven - accumulator.start_s, 0.0)
+
+
+def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """Fraction of the recorded way, at most 1; 1 where the recorded drive stands still."""
+    expert = expert_progress(accumulator, context)
+    if expert < MIN_ROUTE:
+        return 1.0
+    return min(progress_along_route(accumulator) / expert, 1.0)
+
+
+def whole_route(accumulator: MetricAccumulator, context: ScoringContext) -> float:
+    """Way of the recorded drive along the route up to the horizon [m]."""
+    return context.route_end_s - accumulator.start_s
+
+
+def route_completion(
+    accumulator: MetricAccumulator, context: ScoringContext, fraction: float = 1.0
+) -> float:
+    """How much of a ``fraction`` of the recorded way up to the horizon was reached; 1 where the
+    recorded drive stands still."""
+    whole = whole_route(accumulator, context)
+    if whole < MIN_ROUTE:
+        return 1.0
+    return min(max(accumulator.furthest - accumulator.start_s, 0.0) / (fraction * whole), 1.0)
+
+
+def assumed_progress(accumulator: MetricAccumulator, context: ScoringContext) -> tuple[str, ...]:
+    """What is taken for granted where the recorded drive is short; nothing where it is not."""
+    expert = expert_progress(accumulator, context)
+    if expert < MIN_ROUTE:
+        return (f"progress 1: the recorded drive stands still ({expert:.1f} m)",)
+    if expert <= SHORT_ROUTE:
+        return (
+            f"progress is measured though the recorded drive is short ({expert:.1f} m); NAVSIM and "
+            "AlpaSim take it as 1",
+        )
+    return ()
+
+
+def assumed_route(accumulator: MetricAccumulator, context: ScoringContext) -> tuple[str, ...]:
+    """What is taken for granted where the recorded drive up to the horizon stands still."""
+    whole = whole_route(accumulator, context)
+    if whole >= MIN_ROUTE:
+        return ()
+    return (f"route completed: the recorded drive stands still ({whole:.1f} m)",)
 
 
 def roads(context: ScoringContext) -> tuple[str, ...]:
@@ -97,7 +146,7 @@ def direction(accumulator: MetricAccumulator) -> float:
 def navsim_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
     """EP of NAVSIM with the recorded drive in place of PDM-Closed."""
     way, expert = progress_along_route(accumulator), expert_progress(accumulator, context)
-    if expert < LEAST_ROUTE:
+    if expert < MIN_ROUTE:
         return 1.0
     clear = no_collision(accumulator) * float(not accumulator.off_road)
     return min(way / max(way * clear, expert), 1.0)
@@ -246,7 +295,7 @@ def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVal
     value = nuplan_so_far(accumulator, context)
     road = roads(context)
     assumed = road if context.knows_limits else ("SL: no speed limit known", *road)
-    if expert < LEAST_ROUTE:
+    if expert < MIN_ROUTE:
         assumed = (*assumed, *assumed_progress(accumulator, context))
     return MetricValue(value, terms, assumed=assumed)
 

@@ -19,7 +19,7 @@ from ...scene.lane import DRIVABLE
 DENSITY = 0.25
 """Distance between points of the lines that roads are made of [m]."""
 
-LONGEST_SPACING = DENSITY * (1 + 1e-9)
+MAX_SPACING = DENSITY * (1 + 1e-9)
 """Spacings exceed ``DENSITY`` by rounding; the margin keeps the search exact [m]."""
 
 
@@ -121,12 +121,12 @@ def _distance(x, y, lines, bound):
             dx, dy = points[k, 0] - x, points[k, 1] - y
             distance = math.sqrt(dx * dx + dy * dy)
             best = min(best, distance)
-            k += max(int((distance - best) / LONGEST_SPACING), 1)
+            k += max(int((distance - best) / MAX_SPACING), 1)
         k = end
     return best
 
 
-LEAST_BEYOND_M = 0.01
+MIN_BEYOND_M = 0.01
 """A corner off every lane and area is this far off the road at least."""
 ALONG = 0.5
 """Cosine of the greatest angle between an ego and the lane that it drives along."""
@@ -186,9 +186,9 @@ class RoadMap:
     def _beyond(self, x: float, y: float) -> float:
         found = self.graph.nearest(x, y, kinds=DRIVABLE)
         if found is None:
-            return LEAST_BEYOND_M
+            return MIN_BEYOND_M
         half = self.graph.lanes[found.lane_id].width(found.s) / 2
-        return max(abs(found.offset) - half, LEAST_BEYOND_M)
+        return max(abs(found.offset) - half, MIN_BEYOND_M)
 
     def in_lane(self, ego: EgoPose, ahead: float) -> bool:
         """Whether the middle of the ego box is in a lane that runs its way, or in a junction."""

@@ -1,4 +1,4 @@
-"""How private actions begin: each gives the entity with what moves it from now on."""
+"""Private actions begin: each gives its entity the controller that moves it from now on."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ from real2sim_proto.storyboard_actions import (
     VisibilityAction,
 )
 
-from ..errors import WorldError
-from ..evolve import evolved
+from ..common import WorldError, copy_with
 from ..path import LoggedPath
 from .motion import (
     FollowIdm,
@@ -44,9 +43,8 @@ from .motion import (
     gentle_duration,
     lane_offset,
 )
-from .roads import Place, RoadPoint, Way, path_through
-from .trajectory import Trajectory, course_of
-from .view import ACROSS, EntityState, Places, View, across, ahead_on_way
+from .roads import Place, RoadPoint, Trajectory, Way, course_of, path_through
+from .view import ACROSS, EntityState, PositionResolver, View, across, ahead_on_way
 
 BESIDE_ROUTE = 10.0
 """An entity teleported within this distance of its assigned route keeps the route [m]."""
@@ -67,7 +65,7 @@ class Beginning:
     """
 
     view: View
-    places: Places
+    places: PositionResolver
     token: int
     version: int
 
@@ -82,7 +80,7 @@ def begun(actor: EntityState, action: Any, at: Beginning) -> EntityState:
 
 
 def _done(actor: EntityState, at: Beginning, **changes: Any) -> EntityState:
-    return evolved(actor, finished=actor.finished | {at.token}, **changes)
+    return copy_with(actor, finished=actor.finished | {at.token}, **changes)
 
 
 def _dynamics(dynamics: Dynamics, at: Beginning) -> Dynamics:
@@ -100,14 +98,14 @@ def _freed(actor: EntityState) -> EntityState:
     course = actor.trajectory.course
     places = [Place(float(x), float(y), 0.0) for x, y in zip(course.x, course.y, strict=True)]
     way = Way("trajectory", 1, True, path_through(places))
-    return evolved(actor, trajectory=None).on_way(way)
+    return copy_with(actor, trajectory=None).on_way(way)
 
 
 def _on_lane(actor: EntityState, at: Beginning) -> EntityState:
     """Off its trajectory, on the lane where it is."""
     if actor.trajectory is None:
         return actor
-    return evolved(actor, trajectory=None).on_lane(at.view.network)
+    return copy_with(actor, trajectory=None).on_lane(at.view.network)
 
 
 def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityState:
@@ -117,7 +115,7 @@ def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityStat
         rate = float(dynamics.value) if dynamics.dimension == "rate" else math.inf
         rate = math.inf if dynamics.shape == "step" else rate
         follow = FollowSpeed(at.token, action.relative_to, action.relation, value, rate)
-        return evolved(actor, longitudinal=follow)
+        return copy_with(actor, longitudinal=follow)
     if action.relative_to is not None:
         other = at.view.entities[action.relative_to].speed
         value = other + value if action.relation == "delta" else other * value
@@ -125,7 +123,7 @@ def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityStat
     if seconds <= 0.0:
         return _done(actor, at, speed=value, longitudinal=None)
     change = SpeedChange(at.token, dynamics.shape, actor.speed, value, seconds)
-    return evolved(actor, longitudinal=change)
+    return copy_with(actor, longitudinal=change)
 
 
 def _speed_duration(dynamics: Dynamics, start: float, end: float) -> float:
@@ -146,7 +144,7 @@ def _speed_profile(actor: EntityState, action: SpeedProfileAction, at: Beginning
         points.append((time, base + float(point.speed)))
     if time <= 0.0:
         return _done(actor, at, speed=points[-1][1], longitudinal=None)
-    return evolved(actor, longitudinal=SpeedCourse(at.token, tuple(points)))
+    return copy_with(actor, longitudinal=SpeedCourse(at.token, tuple(points)))
 
 
 def _longitudinal_distance(
@@ -156,7 +154,7 @@ def _longitudinal_distance(
     other = at.view.entities[action.entity]
     ahead = ahead_on_way(actor, other.x, other.y, at.view.network)
     leading = ahead < 0.0 if action.place == "any" else action.place == "leading"
-    return evolved(actor, longitudinal=KeepDistance(at.token, action, leading))
+    return copy_with(actor, longitudinal=KeepDistance(at.token, action, leading))
 
 
 def _synchronize(actor: EntityState, action: SynchronizeAction, at: Beginning) -> EntityState:
@@ -176,7 +174,7 @@ def _synchronize(actor: EntityState, action: SynchronizeAction, at: Beginning) -
         steady,
         action.limits,
     )
-    return evolved(actor, longitudinal=control)
+    return copy_with(actor, longitudinal=control)
 
 
 def _where(actor: EntityState, at: Beginning, what: str) -> RoadPoint:
@@ -213,12 +211,12 @@ def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) ->
     value, acceleration = float(action.offset), action.acceleration
     if action.relative_to is not None:
         if action.continuous and acceleration is None:
-            return evolved(actor, lateral=FollowOffset(at.token, action.relative_to, value))
+            return copy_with(actor, lateral=FollowOffset(at.token, action.relative_to, value))
         value += lane_offset(at.view.entities[action.relative_to], at.view)
     # Who was straight on beside the road or on a route counts from its lane's middle now.
     actor = actor.on_lane(at.view.network)
     if action.continuous and acceleration is None:
-        return evolved(actor, lateral=HoldOffset(at.token, value))
+        return copy_with(actor, lateral=HoldOffset(at.token, value))
     most = None if acceleration is None else float(acceleration)
     extent = gentle_duration(action.shape, value - actor.offset, most)
     return _shifted(actor, action.shape, value, extent, at)
@@ -234,9 +232,9 @@ def _shifted(
     by_way: bool = False,
 ) -> EntityState:
     if extent <= 0.0:
-        return _done(evolved(actor, lateral=None, offset=end, drift=0.0).placed(), at)
+        return _done(copy_with(actor, lateral=None, offset=end, drift=0.0).placed(), at)
     change = OffsetChange(at.token, shape, actor.offset, end, extent, by_way)
-    return evolved(actor, lateral=change)
+    return copy_with(actor, lateral=change)
 
 
 def _lateral_distance(
@@ -246,7 +244,7 @@ def _lateral_distance(
     side = {"left": 1.0, "right": -1.0}.get(action.side, 0.0)
     if not side:
         side = math.copysign(1.0, across(other.h, actor.x - other.x, actor.y - other.y))
-    return evolved(actor, lateral=KeepAside(at.token, action, side))
+    return copy_with(actor, lateral=KeepAside(at.token, action, side))
 
 
 def _follow_trajectory(
@@ -263,15 +261,17 @@ def _follow_trajectory(
     elapsed = at.view.elapsed if timing is not None and timing.domain == "absolute" else 0.0
     following = Trajectory(at.token, course, timing, s, elapsed)
     longitudinal = actor.longitudinal if timing is None else None
-    actor = evolved(actor, trajectory=following, lateral=None, longitudinal=longitudinal, drift=0.0)
+    actor = copy_with(
+        actor, trajectory=following, lateral=None, longitudinal=longitudinal, drift=0.0
+    )
     if not following.begun():
         return actor
     if timing is not None:
         time = elapsed * float(timing.scale) + float(timing.offset)
         following = Trajectory(at.token, course, timing, course.way_at(time), elapsed)
-        actor = evolved(actor, trajectory=following)
+        actor = copy_with(actor, trajectory=following)
     place = following.place()
-    return evolved(actor, x=place.x, y=place.y, h=place.h)
+    return copy_with(actor, x=place.x, y=place.y, h=place.h)
 
 
 def _assign_route(actor: EntityState, action: AssignRouteAction, at: Beginning) -> EntityState:
@@ -285,14 +285,14 @@ def _acquire_position(
     here = Place(actor.x, actor.y, actor.h)
     path = at.view.network.route([here, at.places.of(action.position)])
     moved = _on_route(actor, path)
-    return evolved(moved, lateral=OffsetChange(
+    return copy_with(moved, lateral=OffsetChange(
         at.token, "linear", moved.offset, moved.offset, max(path.length - moved.s, 1e-6), True
     ))  # fmt: skip
 
 
 def _on_route(actor: EntityState, path: LoggedPath) -> EntityState:
     way = Way("route", 1, True, path, assigned=True)
-    return evolved(actor, trajectory=None, lateral=None).on_way(way)
+    return copy_with(actor, trajectory=None, lateral=None).on_way(way)
 
 
 def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> EntityState:

@@ -14,9 +14,9 @@ from real2sim_proto.storyboard_actions import (
     SpeedLimits,
 )
 
-from ..evolve import evolved
-from ..traffic.idm import acceleration as idm_acceleration
-from ..traffic.idm import advance_along, leading_agent
+from ..common import copy_with
+from ..traffic.driver import acceleration as idm_acceleration
+from ..traffic.driver import advance_along, leading_agent
 from .roads import Place
 from .view import EntityState, Moved, Shifted, View, across, ahead_on_way, coasting
 
@@ -437,7 +437,7 @@ def advanced(actor: EntityState, view: View, h: float) -> EntityState:
     if control is not None and moved.then is None:
         finished |= {control.token}
     rate = (moved.speed - actor.speed) / h
-    actor = evolved(
+    actor = copy_with(
         actor, longitudinal=moved.then, speed=moved.speed, acceleration=rate, finished=finished
     )
     if actor.trajectory is not None:
@@ -451,7 +451,7 @@ def _on_way(actor: EntityState, view: View, way: float, h: float) -> EntityState
         offset, then = control.step(actor, view, way, h)
         if then is None:
             finished |= {control.token}
-    return evolved(
+    return copy_with(
         actor,
         s=actor.s + way,
         offset=offset,
@@ -469,16 +469,16 @@ def _on_trajectory(actor: EntityState, view: View, way: float, h: float) -> Enti
     travelled = actor.travelled + abs(way)
     if before.timing is not None:
         speed = way / h
-        actor = evolved(actor, speed=speed, acceleration=(speed - actor.speed) / h)
+        actor = copy_with(actor, speed=speed, acceleration=(speed - actor.speed) / h)
     if then is not None:
         place = then.place() if then.begun() else None
         if place is None:
-            return evolved(actor, trajectory=then)
-        return evolved(
+            return copy_with(actor, trajectory=then)
+        return copy_with(
             actor, trajectory=then, x=place.x, y=place.y, h=place.h, travelled=travelled, drift=0.0
         )
     end = before.course.at(before.course.length)
     beyond = max(before.s + way - before.course.length, 0.0) if before.timing is None else 0.0
-    done = evolved(actor, finished=actor.finished | {before.token}, travelled=travelled)
+    done = copy_with(actor, finished=actor.finished | {before.token}, travelled=travelled)
     put = done.put(end, view.network)
-    return evolved(put, s=put.s + beyond).placed() if put.way is not None and beyond else put
+    return copy_with(put, s=put.s + beyond).placed() if put.way is not None and beyond else put

@@ -1,10 +1,10 @@
-"""A storyboard prepared for running: its elements as one list, its conditions numbered."""
+"""A storyboard prepared for running: a flat list of elements, and numbered conditions."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from real2sim_proto import ErrorCode
@@ -15,9 +15,42 @@ from real2sim_proto.storyboard import (
     Storyboard,
     entity_references,
 )
-from real2sim_proto.storyboard_conditions import ElementType, Trigger
+from real2sim_proto.storyboard_conditions import (
+    Acceleration,
+    Angle,
+    Collision,
+    Condition,
+    Distance,
+    ElementType,
+    EndOfRoad,
+    Offroad,
+    ReachPosition,
+    RelativeDistance,
+    Rule,
+    SignalPhase,
+    SignalState,
+    SimulationTime,
+    Speed,
+    StandStill,
+    StoryboardElementState,
+    TimeHeadway,
+    TimeToCollision,
+    TraversedDistance,
+    Trigger,
+    VariableValue,
+)
 
-from ..errors import WorldError
+from ..common import WorldError
+from .view import (
+    EntityState,
+    PositionResolver,
+    View,
+    box_corners_of,
+    closing_speed,
+    corners,
+    distance_to,
+    overlapping,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,3 +308,369 @@ class ShownSignal(NamedTuple):
     signal_id: str
     state: str
     stop_line: tuple[float, float, float] | None
+
+
+# --- Conditions ----------------------------------------------------------------------------------
+
+EQUAL = 1e-6
+"""Numbers that differ by less are equal."""
+
+STANDING = 0.01
+"""Speed of who stands [m/s]."""
+
+INSTANT = 1e-9
+
+
+class ConditionState(NamedTuple):
+    """State of a condition between instants.
+
+    Attributes:
+        before: outcome of its test at the last one; None: it is new.
+        past: times at which what counts has changed, with what it became, as far back as its delay
+            looks.
+        since: of each entity, a figure of the test's own.
+    """
+
+    before: bool | None = None
+    past: tuple[tuple[float, bool], ...] = ()
+    since: Mapping[str, float] = {}
+
+
+@dataclass(eq=False)
+class ConditionContext:
+    """What conditions are evaluated on, at one instant.
+
+    Attributes:
+        view: entities and roads.
+        places: resolves positions.
+        states: state of an element: (type, name, state) -> whether one is in it.
+        variables: parameters and variables.
+        signals: state of each traffic signal.
+        phases: phase of each controller.
+        condition_states: of conditions, by their number; written into.
+    """
+
+    view: View
+    places: PositionResolver
+    states: Callable[[str, str, str], bool]
+    variables: Mapping[str, Any]
+    signals: Mapping[str, str]
+    phases: Mapping[str, str]
+    condition_states: dict[int, ConditionState] = field(default_factory=dict)
+
+
+def is_triggered(
+    trigger: Trigger, numbers: tuple[tuple[int, ...], ...], context: ConditionContext
+) -> bool:
+    """Whether a trigger fires: all conditions of one of its groups hold. Evaluates every condition,
+    so that none misses an edge."""
+    outcomes = [
+        [
+            _counts(condition, number, context)
+            for condition, number in zip(group.conditions, row, strict=True)
+        ]
+        for group, row in zip(trigger.groups, numbers, strict=True)
+    ]
+    return any(all(group) for group in outcomes)
+
+
+def _counts(condition: Condition, number: int, context: ConditionContext) -> bool:
+    previous = context.condition_states.get(number, ConditionState())
+    test = condition.test
+    now, since = _TESTS[type(test)](test, context, previous.since)
+    before = previous.before
+    edge = {
+        "none": now,
+        "rising": before is False and now,
+        "falling": before is True and not now,
+        "rising_or_falling": before is not None and before != now,
+    }[condition.edge]
+    delay, past, elapsed = float(condition.delay), previous.past, context.view.elapsed
+    outcome = edge
+    if delay > 0.0:
+        past = (*past, (elapsed, edge)) if not past or past[-1][1] != edge else past
+        old = [k for k, (t, _) in enumerate(past) if t <= elapsed - delay + INSTANT]
+        outcome = bool(old) and past[old[-1]][1]
+        past = past[old[-1] :] if old else past
+    context.condition_states[number] = ConditionState(now, past, since)
+    return bool(outcome)
+
+
+def _compared(value: Any, rule: Rule, other: Any) -> bool:
+    if isinstance(value, float | int) and isinstance(other, float | int):
+        same = abs(float(value) - float(other)) <= EQUAL
+        value, other = float(value), float(other)
+    else:
+        same, value, other = str(value) == str(other), str(value), str(other)
+    if rule == "equal_to":
+        return same
+    if rule == "not_equal_to":
+        return not same
+    if rule == "greater_than":
+        return bool(value > other)
+    if rule == "less_than":
+        return bool(value < other)
+    return same or bool(value > other if rule == "greater_or_equal" else value < other)
+
+
+Outcome = tuple[bool, Mapping[str, float]]
+
+
+def _of_entities(
+    test: Any,
+    context: ConditionContext,
+    since: Mapping[str, float],
+    holds: Callable[[EntityState], bool],
+) -> Outcome:
+    outcomes = [holds(context.view.entities[name]) for name in test.entities]
+    return (any(outcomes) if test.of == "any" else all(outcomes)), since
+
+
+def _lasting(
+    test: Any,
+    context: ConditionContext,
+    since: Mapping[str, float],
+    holds: Callable[[EntityState], bool],
+) -> Outcome:
+    """What has held for `duration`; ``since`` is when it began for each entity."""
+    now, began, outcomes = context.view.elapsed, dict(since), []
+    for name in test.entities:
+        if not holds(context.view.entities[name]):
+            began.pop(name, None)
+            outcomes.append(False)
+            continue
+        start = began.setdefault(name, now)
+        outcomes.append(now - start >= float(test.duration) - INSTANT)
+    return (any(outcomes) if test.of == "any" else all(outcomes)), began
+
+
+def _simulation_time(
+    test: SimulationTime, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return _compared(context.view.elapsed, test.rule, float(test.value)), since
+
+
+def _time_to_collision(
+    test: TimeToCollision, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    def holds(actor: EntityState) -> bool:
+        if test.entity is not None:
+            other: Any = context.view.entities[test.entity]
+        else:
+            assert test.position is not None
+            other = context.places.of(test.position)
+        distance = _distance(actor, other, test, context)
+        closing = closing_speed(actor, other, test.measure)
+        time = distance / closing if closing > INSTANT else math.inf
+        return _compared(time, test.rule, float(test.value))
+
+    return _of_entities(test, context, since, holds)
+
+
+def _time_headway(
+    test: TimeHeadway, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    def holds(actor: EntityState) -> bool:
+        distance = _distance(actor, context.view.entities[test.entity], test, context)
+        time = distance / abs(actor.speed) if abs(actor.speed) > INSTANT else math.inf
+        return _compared(time, test.rule, float(test.value))
+
+    return _of_entities(test, context, since, holds)
+
+
+def _relative_distance(
+    test: RelativeDistance, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    def holds(actor: EntityState) -> bool:
+        distance = _distance(actor, context.view.entities[test.entity], test, context)
+        return _compared(distance, test.rule, float(test.value))
+
+    return _of_entities(test, context, since, holds)
+
+
+def _to_place(test: Distance, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    place = context.places.of(test.position)
+    return _of_entities(
+        test,
+        context,
+        since,
+        lambda a: _compared(_distance(a, place, test, context), test.rule, float(test.value)),
+    )
+
+
+def _distance(actor: EntityState, other: Any, test: Any, context: ConditionContext) -> float:
+    return distance_to(
+        actor,
+        other,
+        test.measure,
+        test.frame,
+        freespace=test.freespace,
+        network=context.view.network,
+    )
+
+
+def _reach_position(
+    test: ReachPosition, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    place = context.places.of(test.position)
+    return _of_entities(
+        test,
+        context,
+        since,
+        lambda a: math.hypot(place.x - a.x, place.y - a.y) <= float(test.tolerance),
+    )
+
+
+def _speed(test: Speed, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    def part(actor: EntityState) -> float:
+        return actor.drift if test.direction == "lateral" else actor.speed
+
+    def holds(actor: EntityState) -> bool:
+        value = part(actor)
+        if test.relative_to is not None:
+            value -= part(context.view.entities[test.relative_to])
+        return _compared(value, test.rule, float(test.value))
+
+    return _of_entities(test, context, since, holds)
+
+
+def _acceleration(
+    test: Acceleration, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    def holds(actor: EntityState) -> bool:
+        value = actor.acceleration if test.direction is not None else abs(actor.acceleration)
+        return _compared(value, test.rule, float(test.value))
+
+    return _of_entities(test, context, since, holds)
+
+
+def _collision(test: Collision, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    def holds(actor: EntityState) -> bool:
+        if not actor.visible:
+            return False
+        own = corners(actor)
+        if test.entity is not None:
+            other = context.view.entities[test.entity]
+            return other.visible and overlapping(own, corners(other))
+        return any(overlapping(own, box) for box in _others(actor, test.category, context))
+
+    return _of_entities(test, context, since, holds)
+
+
+def _others(
+    actor: EntityState, category: str | None, context: ConditionContext
+) -> list[list[tuple[float, float]]]:
+    """Outlines of entities as they are now, and of all other objects at the start of the step."""
+    entities = context.view.entities
+    found = [
+        corners(other)
+        for other in entities.values()
+        if other is not actor
+        and other.visible
+        and (category is None or other.category == category)
+        and _near(actor, other.x, other.y, other.size[0])
+    ]
+    known = {a.subject.object_id for a in entities.values() if a.subject is not None}
+    around = context.view.surroundings
+    for row, subject in zip(around.bodies.tolist(), around.others.objects, strict=False):
+        x, y, yaw, length, width, _, _ = row
+        if subject.object_id in known or not _near(actor, x, y, length):
+            continue
+        if category is None or subject.category == category:
+            found.append(box_corners_of(x, y, yaw, length, width))
+    return found
+
+
+def _near(actor: EntityState, x: float, y: float, length: float) -> bool:
+    return math.hypot(x - actor.x, y - actor.y) < 2.0 * (actor.size[0] + length)
+
+
+def _traversed(
+    test: TraversedDistance, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    began, outcomes = dict(since), []
+    for name in test.entities:
+        travelled = context.view.entities[name].travelled
+        outcomes.append(travelled - began.setdefault(name, travelled) >= float(test.value))
+    return (any(outcomes) if test.of == "any" else all(outcomes)), began
+
+
+def _stand_still(
+    test: StandStill, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return _lasting(test, context, since, lambda a: abs(a.speed) < STANDING)
+
+
+def _offroad(test: Offroad, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    network = context.view.network
+    return _lasting(test, context, since, lambda a: network.locate(a.x, a.y, a.h) is None)
+
+
+def _end_of_road(test: EndOfRoad, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    def at_end(actor: EntityState) -> bool:
+        way = actor.way if actor.way is not None else actor.on_lane(context.view.network).way
+        assert way is not None
+        near = way.path.nearest(actor.x, actor.y).s
+        return near >= way.length - STANDING
+
+    return _lasting(test, context, since, at_end)
+
+
+def _angle(test: Angle, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
+    base = context.places.origin[2]
+    if test.entity is not None:
+        base = context.view.entities[test.entity].h
+
+    def holds(actor: EntityState) -> bool:
+        off = math.remainder(actor.h - base - float(test.angle), math.tau)
+        return abs(off) <= float(test.tolerance)
+
+    return _of_entities(test, context, since, holds)
+
+
+def _element_state(
+    test: StoryboardElementState, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return context.states(test.element_type, test.element, test.state), since
+
+
+def _variable(
+    test: VariableValue, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    if test.variable not in context.variables:
+        return False, since
+    return _compared(context.variables[test.variable], test.rule, test.value), since
+
+
+def _signal_state(
+    test: SignalState, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return context.signals.get(test.signal) == test.state, since
+
+
+def _signal_phase(
+    test: SignalPhase, context: ConditionContext, since: Mapping[str, float]
+) -> Outcome:
+    return context.phases.get(test.controller) == test.phase, since
+
+
+_TESTS: Mapping[type[Any], Callable[[Any, ConditionContext, Mapping[str, float]], Outcome]] = {
+    SimulationTime: _simulation_time,
+    TimeToCollision: _time_to_collision,
+    TimeHeadway: _time_headway,
+    RelativeDistance: _relative_distance,
+    Distance: _to_place,
+    ReachPosition: _reach_position,
+    Speed: _speed,
+    Acceleration: _acceleration,
+    Collision: _collision,
+    TraversedDistance: _traversed,
+    StandStill: _stand_still,
+    Offroad: _offroad,
+    EndOfRoad: _end_of_road,
+    Angle: _angle,
+    StoryboardElementState: _element_state,
+    VariableValue: _variable,
+    SignalState: _signal_state,
+    SignalPhase: _signal_phase,
+}

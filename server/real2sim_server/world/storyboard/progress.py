@@ -1,4 +1,4 @@
-"""A storyboard within one step of the clock: elements begin and end, entities move on."""
+"""One step of a storyboard: elements start and stop, entities move."""
 
 from __future__ import annotations
 
@@ -14,15 +14,22 @@ from real2sim_proto.storyboard_actions import (
     SignalStateAction,
 )
 
-from ..errors import WorldError
-from ..evolve import evolved
+from ..common import WorldError, copy_with
 from ..traffic.driver import Surroundings
 from .begin_actions import Beginning, begun
-from .conditions import Facts, Memory, fires
 from .motion import advanced
-from .program import Element, Program, Start, phase_start, shown_at
+from .program import (
+    ConditionContext,
+    ConditionState,
+    Element,
+    Program,
+    Start,
+    is_triggered,
+    phase_start,
+    shown_at,
+)
 from .roads import RoadNetwork
-from .view import EntityState, Places, View
+from .view import EntityState, PositionResolver, View
 
 STANDBY, RUNNING, COMPLETE = 0, 1, 2
 STATES = {"standby": STANDBY, "running": RUNNING, "complete": COMPLETE}
@@ -37,7 +44,7 @@ GLOBAL = (
 
 
 class ElementChange(NamedTuple):
-    """An element has begun, ended, been stopped or been skipped.
+    """An element that has started, ended, been stopped or been skipped.
 
     Attributes:
         t_us: when [us].
@@ -52,14 +59,14 @@ class ElementChange(NamedTuple):
     change: str
 
 
-class Memories(NamedTuple):
-    """What a storyboard keeps between steps, apart from entities.
+class ProgressState(NamedTuple):
+    """State of a storyboard between steps, apart from its entities.
 
     Attributes:
         status: of each element.
         times: that each event has begun.
         running: tokens of the actions that run: by number of the element, of each entity.
-        conditions: memory of each.
+        conditions: state of each.
         variables: parameters and variables.
         signal_starts, signal_states: what actions have set of traffic signals.
         token: of the next action.
@@ -70,7 +77,7 @@ class Memories(NamedTuple):
     status: tuple[int, ...]
     times: tuple[int, ...]
     running: Mapping[int, Mapping[str, int]]
-    conditions: Mapping[int, Memory]
+    conditions: Mapping[int, ConditionState]
     variables: Mapping[str, Any]
     signal_starts: Mapping[str, float]
     signal_states: Mapping[str, str]
@@ -80,11 +87,11 @@ class Memories(NamedTuple):
 
 
 class Progress:
-    """What becomes of a storyboard in a step. It is made for the step, and read out at its end.
+    """One step of a storyboard: made for the step and read at its end.
 
     Args:
         program: what runs.
-        entities, memories: before the step.
+        entities, state: before the step.
         network: roads.
         surroundings: of the step.
     """
@@ -93,25 +100,25 @@ class Progress:
         self,
         program: Program,
         entities: Mapping[str, EntityState],
-        memories: Memories,
+        state: ProgressState,
         network: RoadNetwork,
         surroundings: Surroundings,
     ) -> None:
         self._program, self._network, self._surroundings = program, network, surroundings
         self.entities = dict(entities)
-        self._status, self._times = list(memories.status), list(memories.times)
-        self._running = {k: dict(v) for k, v in memories.running.items()}
-        self._conditions = dict(memories.conditions)
-        self._variables = dict(memories.variables)
-        self._starts, self._states = dict(memories.signal_starts), dict(memories.signal_states)
-        self._token, self._over = memories.token, memories.over
-        self._before, self._fresh = memories.fresh, set[tuple[int, str]]()
+        self._status, self._times = list(state.status), list(state.times)
+        self._running = {k: dict(v) for k, v in state.running.items()}
+        self._conditions = dict(state.conditions)
+        self._variables = dict(state.variables)
+        self._starts, self._states = dict(state.signal_starts), dict(state.signal_states)
+        self._token, self._over = state.token, state.over
+        self._before, self._fresh = state.fresh, set[tuple[int, str]]()
         self.changes: list[ElementChange] = []
 
     @property
-    def memories(self) -> Memories:
-        """As they are now."""
-        return Memories(
+    def state(self) -> ProgressState:
+        """The state after the step so far."""
+        return ProgressState(
             tuple(self._status),
             tuple(self._times),
             self._running,
@@ -136,8 +143,8 @@ class Progress:
         self._fresh, self._now = set(), t_us
         self._end_actions()
         if not self._over:
-            facts = self._facts(elapsed, first=first)
-            self._facts_now, self._elapsed = facts, elapsed
+            context = self._context(elapsed, first=first)
+            self._context_now, self._elapsed = context, elapsed
             self._pass_whole()
         self._before = frozenset(self._fresh)
 
@@ -305,9 +312,9 @@ class Progress:
             actor = self.entities[action.entity].put(
                 self._places().of(action.position), self._network
             )
-            self.entities[action.entity] = evolved(actor, visible=True)
+            self.entities[action.entity] = copy_with(actor, visible=True)
         elif isinstance(action, DeleteEntityAction):
-            self.entities[action.entity] = evolved(self.entities[action.entity], visible=False)
+            self.entities[action.entity] = copy_with(self.entities[action.entity], visible=False)
         elif isinstance(action, SignalStateAction):
             self._states[action.signal] = action.state
         elif isinstance(action, SignalPhaseAction):
@@ -324,21 +331,21 @@ class Progress:
         elif isinstance(now, int | float) and isinstance(value, int | float):
             self._variables[action.variable] = now + value if action.rule == "add" else now * value
 
-    # --- facts ----------------------------------------------------------------------------------
+    # --- context ----------------------------------------------------------------------------------
 
     def _fires(self, start: Start) -> bool:
-        return fires(start.trigger, start.numbers, self._facts_now)
+        return is_triggered(start.trigger, start.numbers, self._context_now)
 
-    def _facts(self, elapsed: float, *, first: bool) -> Facts:
+    def _context(self, elapsed: float, *, first: bool) -> ConditionContext:
         signals, phases = shown_at(self._program.board, elapsed, self._starts, self._states)
-        return Facts(
+        return ConditionContext(
             view=self._view(elapsed, first=first),
             places=self._places(),
             states=self._is_in,
             variables=self._variables,
             signals=signals,
             phases=phases,
-            memories=self._conditions,
+            condition_states=self._conditions,
         )
 
     def _is_in(self, type_: str, name: str, state: str) -> bool:
@@ -350,8 +357,8 @@ class Progress:
     def _view(self, elapsed: float, *, first: bool) -> View:
         return View(elapsed, first, self.entities, self._network, self._surroundings)
 
-    def _places(self) -> Places:
-        return Places(self.entities, self._network, self._program.board.origin)
+    def _places(self) -> PositionResolver:
+        return PositionResolver(self.entities, self._network, self._program.board.origin)
 
 
 def _without(actor: EntityState, tokens: set[int], network: RoadNetwork) -> EntityState:
@@ -362,7 +369,7 @@ def _without(actor: EntityState, tokens: set[int], network: RoadNetwork) -> Enti
     if actor.lateral is not None and actor.lateral.token in tokens:
         changes |= {"lateral": None, "drift": 0.0}
     if changes:
-        actor = evolved(actor, **changes)
+        actor = copy_with(actor, **changes)
     if actor.trajectory is not None and actor.trajectory.token in tokens:
-        actor = evolved(actor, trajectory=None).on_lane(network)
+        actor = copy_with(actor, trajectory=None).on_lane(network)
     return actor

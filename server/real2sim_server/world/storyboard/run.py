@@ -31,23 +31,21 @@ from ...edit.compose import figure_of
 from ...scene import Scene, Trajectory
 from ...scene.lane_graph import LaneGraph
 from ...scene.scene import MAX_OBJECTS
-from ..draws import Draws
-from ..ego.box import REAR_OVERHANG
+from ..boxes import REAR_OVERHANG
+from ..common import Draws, WorldError, copy_with
 from ..ego.motion import Motion
-from ..errors import WorldError
-from ..evolve import evolved
 from ..traffic.driver import ScriptedEntity, Surroundings, recorded_pose
 from .program import PLACING, Program, ShownSignal, program_of, shown_at
-from .progress import COMPLETE, ElementChange, Memories, Progress
+from .progress import COMPLETE, ElementChange, Progress, ProgressState
 from .roads import GraphNetwork, Place, RoadNetwork, RouteNetwork
-from .view import EntityState, Places, observed
+from .view import EntityState, PositionResolver, observed
 
 TRIES = 1000
 """Of a draw that has to fall within a range."""
 
 
 def drawn_values(board: Storyboard, draws: Draws | None) -> tuple[Storyboard, Mapping[str, float]]:
-    """The storyboard with drawn values of the parameters that have a stochastic distribution, and
+    """The storyboard with sampled values of the parameters that have a stochastic distribution, and
     those that are numbers by name. Without ``draws`` as it is.
 
     Raises:
@@ -283,25 +281,25 @@ class StoryboardRun:
         program: what runs.
         network: roads.
         entities: entities by name.
-        memories: elements, conditions, variables.
+        state: elements, conditions, variables.
         drivers: of the objects that it moves, by object id.
         changes: of elements, in the step that led here.
         ego_put: whether it has put the ego somewhere at the start.
         ego: name of the ego among the entities; None: it takes no part.
         elapsed: time since the episode began [s].
-        drawn: what the seed has drawn, by name.
+        sampled: what the seed has sampled, by name.
     """
 
     program: Program
     network: RoadNetwork
     entities: Mapping[str, EntityState]
-    memories: Memories
+    state: ProgressState
     drivers: Mapping[str, ScriptedEntity]
     changes: tuple[ElementChange, ...]
     ego_put: bool
     ego: str | None
     elapsed: float
-    drawn: Mapping[str, float]
+    sampled: Mapping[str, float]
 
     @classmethod
     def begin(
@@ -327,7 +325,7 @@ class StoryboardRun:
         Raises:
             WorldError: INVALID_REQUEST, what it asks for cannot be.
         """
-        board, drawn = drawn_values(board, draws)
+        board, sampled = drawn_values(board, draws)
         board = _resolved(board)
         if network is None:
             lanes = board.roads if isinstance(board.roads, RouteLanes) else RouteLanes()
@@ -351,8 +349,8 @@ class StoryboardRun:
             entry.entity == ego and entry.action.kind in {"speed", *PLACING} for entry in board.init
         )
         run = cls(
-            program, network, MappingProxyType(progress.entities), progress.memories,
-            MappingProxyType({}), (), put, ego, 0.0, drawn,
+            program, network, MappingProxyType(progress.entities), progress.state,
+            MappingProxyType({}), (), put, ego, 0.0, sampled,
         )  # fmt: skip
         return run._with_drivers(surroundings)
 
@@ -363,7 +361,7 @@ class StoryboardRun:
         if self.ego is not None and not entities[self.ego].scripted:
             dt = surroundings.dt if self.elapsed > 0.0 else 0.0
             entities[self.ego] = observed(entities[self.ego], surroundings.ego, dt)
-        progress = Progress(self.program, entities, self.memories, self.network, surroundings)
+        progress = Progress(self.program, entities, self.state, self.network, surroundings)
         count = math.ceil(surroundings.dt_us / TICK_US)
         start_us, now_us = surroundings.start_us, surroundings.t_us
         for k in range(count):
@@ -372,10 +370,10 @@ class StoryboardRun:
             elapsed = (t_us - start_us) * 1e-6
             progress.pass_instant(t_us, elapsed, first=k == 0)
             progress.move(elapsed, (next_us - t_us) * 1e-6, first=k == 0)
-        moved = evolved(
+        moved = copy_with(
             self,
             entities=MappingProxyType(progress.entities),
-            memories=progress.memories,
+            state=progress.state,
             changes=tuple(progress.changes),
             elapsed=(now_us + surroundings.dt_us - start_us) * 1e-6,
         )
@@ -385,9 +383,9 @@ class StoryboardRun:
     def over(self) -> bool:
         """Whether it has been stopped; without a stop trigger, whether all its stories are
         complete."""
-        program, status = self.program, self.memories.status
-        if self.memories.over or (program.stop is not None and program.board.version >= 2):
-            return self.memories.over
+        program, status = self.program, self.state.status
+        if self.state.over or (program.stop is not None and program.board.version >= 2):
+            return self.state.over
         return bool(program.stories) and all(status[s.number] == COMPLETE for s in program.stories)
 
     @property
@@ -409,9 +407,9 @@ class StoryboardRun:
         if not board.signals and not board.controllers:
             return ()
         states, _ = shown_at(
-            board, self.elapsed, self.memories.signal_starts, self.memories.signal_states
+            board, self.elapsed, self.state.signal_starts, self.state.signal_states
         )
-        places = Places(self.entities, self.network, board.origin)
+        places = PositionResolver(self.entities, self.network, board.origin)
         lines = {h.signal_id: h.stop_line for h in board.signals}
         return tuple(
             ShownSignal(name, state, places.of(line)[:3] if (line := lines.get(name)) else None)
@@ -424,7 +422,7 @@ class StoryboardRun:
             for a in self.entities.values()
             if a.subject is not None
         }
-        return evolved(self, drivers=MappingProxyType(drivers))
+        return copy_with(self, drivers=MappingProxyType(drivers))
 
 
 def _resolved(board: Storyboard) -> Storyboard:
@@ -462,7 +460,7 @@ def _first(
     if entity.kind == "new":
         placed = any(e.entity == entity.name and e.action.kind in PLACING for e in board.init)
         there = EntityState.put(actor, Place(0.0, 0.0, 0.0), network)
-        return evolved(there, visible=placed)
+        return copy_with(there, visible=placed)
     assert subject is not None
     track = subject.trajectory
     t_us = min(max(surroundings.t_us, track.start_us), track.end_us)
@@ -474,13 +472,13 @@ def _first(
         pose.yaw,
     )
     speed = pose.velocity[0] * cos + pose.velocity[1] * sin
-    return evolved(actor, speed=speed, visible=True).put(place, network)
+    return copy_with(actor, speed=speed, visible=True).put(place, network)
 
 
-def _nothing_yet(program: Program) -> Memories:
+def _nothing_yet(program: Program) -> ProgressState:
     count = len(program.elements)
     board = program.board
-    return Memories(
+    return ProgressState(
         (0,) * count, (0,) * count, {}, {}, {**board.parameters, **board.variables}, {}, {}, 1,
         over=False, fresh=frozenset(),
     )  # fmt: skip

@@ -25,12 +25,10 @@ from real2sim_proto.storyboard_conditions import Frame, Measure
 
 from ...edit import ObjectState
 from ...scene import Ground
-from ..ego.box import REAR_OVERHANG
-from ..errors import WorldError
-from ..evolve import evolved
+from ..boxes import REAR_OVERHANG
+from ..common import WorldError, copy_with
 from ..traffic.driver import AgentPose, ObservedEgo, Surroundings, level_quaternion
-from .roads import Place, RoadNetwork, RoadPoint, Way, straight
-from .trajectory import Trajectory, course_of
+from .roads import Place, RoadNetwork, RoadPoint, Trajectory, Way, course_of, straight
 
 ACROSS = math.radians(45.0)
 """Who heads further away than this from either direction of its lane goes straight on instead."""
@@ -158,7 +156,9 @@ class EntityState:
     def put(self, place: Place, network: RoadNetwork) -> EntityState:
         """At a place, on the lane that is there or going straight on; its speed is left as it
         is."""
-        put = evolved(self, x=place.x, y=place.y, h=place.h, z=place.z, drift=0.0, trajectory=None)
+        put = copy_with(
+            self, x=place.x, y=place.y, h=place.h, z=place.z, drift=0.0, trajectory=None
+        )
         return put.on_lane(network)
 
     def on_lane(self, network: RoadNetwork) -> EntityState:
@@ -180,14 +180,14 @@ class EntityState:
             # Beyond the ends the nearest point is the end, and the way goes straight on.
             dx, dy = self.x - near.position[0], self.y - near.position[1]
             s += dx * math.cos(near.yaw) + dy * math.sin(near.yaw)
-        return evolved(self, way=way, s=s, offset=offset)
+        return copy_with(self, way=way, s=s, offset=offset)
 
     def placed(self) -> EntityState:
         """Where its way, s and offset say, turned by its drift."""
         assert self.way is not None
         x, y, _, yaw = self.way.path.at(self.s)
         turn = math.atan2(self.drift, self.speed) if abs(self.speed) > SLOW and self.drift else 0.0
-        return evolved(
+        return copy_with(
             self,
             x=x - self.offset * math.sin(yaw),
             y=y + self.offset * math.cos(yaw),
@@ -212,13 +212,13 @@ def observed(actor: EntityState, ego: ObservedEgo, dt: float) -> EntityState:
     cos, sin = math.cos(ego.yaw), math.sin(ego.yaw)
     x, y = ego.x - ahead * cos + left * sin, ego.y - ahead * sin - left * cos
     rate = (ego.speed - actor.speed) / dt if dt > 0.0 else 0.0
-    return evolved(actor, x=x, y=y, h=ego.yaw, speed=ego.speed, acceleration=rate, way=None)
+    return copy_with(actor, x=x, y=y, h=ego.yaw, speed=ego.speed, acceleration=rate, way=None)
 
 
 def coasting(actor: EntityState, h: float) -> EntityState:
     """The ego ``h`` seconds on, as it goes now."""
     way = actor.speed * h
-    return evolved(
+    return copy_with(
         actor,
         x=actor.x + way * math.cos(actor.h),
         y=actor.y + way * math.sin(actor.h),
@@ -398,7 +398,7 @@ def _to_segment(p: tuple[float, float], a: tuple[float, float], b: tuple[float, 
     return math.hypot(p[0] - a[0] - u * dx, p[1] - a[1] - u * dy)
 
 
-class Places:
+class PositionResolver:
     """Turns positions into places at one instant.
 
     Attributes:
@@ -513,13 +513,13 @@ def _beside(entity: EntityState, axes: float, dx: float, dy: float, h: float) ->
 
 
 _RESOLVE: Mapping[type[Any], Any] = {
-    WorldPosition: Places._world,
-    RelativeWorldPosition: Places._relative_world,
-    RelativeObjectPosition: Places._relative_object,
-    RoadPosition: Places._road,
-    LanePosition: Places._lane,
-    RelativeRoadPosition: Places._relative_road,
-    RelativeLanePosition: Places._relative_lane,
-    RoutePosition: Places._route,
-    TrajectoryPosition: Places._trajectory,
+    WorldPosition: PositionResolver._world,
+    RelativeWorldPosition: PositionResolver._relative_world,
+    RelativeObjectPosition: PositionResolver._relative_object,
+    RoadPosition: PositionResolver._road,
+    LanePosition: PositionResolver._lane,
+    RelativeRoadPosition: PositionResolver._relative_road,
+    RelativeLanePosition: PositionResolver._relative_lane,
+    RoutePosition: PositionResolver._route,
+    TrajectoryPosition: PositionResolver._trajectory,
 }

@@ -1,4 +1,4 @@
-"""Other road users: one Protocol, a driver for each way of moving, see :mod:`.drivers`."""
+"""Other road users: a driver for each kind of motion, behind one Protocol (:mod:`.driver`)."""
 
 from .driver import AgentDriver, AgentPose, ObservedEgo, Surroundings
 from .traffic import DRIVERS, Traffic, begin_driver

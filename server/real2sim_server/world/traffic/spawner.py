@@ -18,11 +18,9 @@ from ...geometry.rotation import quaternion_yaw
 from ...scene import Ground, Trajectory
 from ...scene.scene import MAX_OBJECTS
 from ..agents import Agents
-from ..draws import Draws
-from ..errors import WorldError
+from ..common import Draws, WorldError
 from ..path import LoggedPath
-from .driver import AgentDriver, Surroundings, level_quaternion
-from .idm import Idm, highest_speed, lane_beside
+from .driver import AgentDriver, Idm, Surroundings, highest_speed, lane_beside, level_quaternion
 
 PREFIX = DRAWN_PREFIX
 """Of the ids of spawned objects; no id on the wire may hold a colon, so none is taken."""
@@ -66,7 +64,7 @@ class Spawner:
     Attributes:
         spec: how many, where.
         lanes: where they drive.
-        desired: speed that theirs are drawn around [m/s].
+        desired: speed that theirs are sampled around [m/s].
         draws: of the episode.
         ground: what they stand on.
         number: how many have appeared so far.
@@ -165,8 +163,8 @@ class Spawner:
                 added.append(made)
         return spawner, added
 
-    def drawn(self, made: Idm) -> dict[str, float]:
-        """What was drawn for a spawned object, by name."""
+    def sampled(self, made: Idm) -> dict[str, float]:
+        """What was sampled for a spawned object, by name."""
         name = f"agents.{made.subject.object_id}"
         return {f"{name}.desired_speed": made.desired, f"{name}.lane_position": made.s}
 

@@ -27,21 +27,19 @@ from ...edit import ObjectState
 from ...edit.tracks import PackedTracks
 from ...geometry.transform import transform_from
 from ..agents import Agents, rows_of
-from ..errors import WorldError
-from ..evolve import evolved
+from ..common import WorldError, copy_with
 from ..path import Float
-from .adversarial import CutIn, HardBrake, JunctionCrossing
 from .driver import (
     AgentDriver,
     ConstantVelocity,
     External,
+    Idm,
     Replay,
     Script,
     ScriptedEntity,
     Surroundings,
 )
-from .idm import Idm
-from .lane_changer import LaneChanger
+from .idm_drivers import CutIn, HardBrake, JunctionCrossing, LaneChanger
 from .spawner import PREFIX as SPAWNED
 from .spawner import Spawner
 
@@ -76,7 +74,7 @@ DRIVEN = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle", "cycl
 SCRIPTED = (Replay, ConstantVelocity, Idm, LaneChanger, CutIn, HardBrake, JunctionCrossing)
 """Drivers that move an object by themselves."""
 
-NOTHING_DRAWN: Mapping[str, float] = MappingProxyType({})
+NOTHING_SAMPLED: Mapping[str, float] = MappingProxyType({})
 
 
 class RandomizedDrivers(Protocol):
@@ -85,7 +83,7 @@ class RandomizedDrivers(Protocol):
     def driver_of(
         self, subject: ObjectState, spec: IdmDriver
     ) -> tuple[IdmDriver, dict[str, float]]:
-        """The parameters of an object's driver, and those that were drawn by name."""
+        """The parameters of an object's driver, and those that were sampled by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +96,8 @@ class Traffic:
         agents: poses of all objects.
         reacting: whether objects that repeated the log have begun to drive by IDM.
         spawner: lets objects appear and leave; None where nobody does.
-        randomized: draws parameters of drivers; None where nothing is drawn.
-        drawn: all that has been drawn for objects so far, by name.
+        randomized: draws parameters of drivers; None where nothing is sampled.
+        sampled: all that has been sampled for objects so far, by name.
         edits_drive: whether an edit has said who drives an object.
         storyboard: moves entities of its own; None where the episode has none.
     """
@@ -110,7 +108,7 @@ class Traffic:
     reacting: bool = False
     spawner: Spawner | None = None
     randomized: RandomizedDrivers | None = None
-    drawn: Mapping[str, float] = field(default_factory=lambda: NOTHING_DRAWN)
+    sampled: Mapping[str, float] = field(default_factory=lambda: NOTHING_SAMPLED)
     edits_drive: bool = False
     storyboard: Script | None = None
 
@@ -179,7 +177,7 @@ class Traffic:
         """
         base = tracks.at(t_us)
         if not (self.drivers or self.spawner or self.storyboard or self._assigns_drivers):
-            return evolved(self, agents=base)
+            return copy_with(self, agents=base)
         before = surroundings()
         if aims := self._aims:
             before = replace(before, aims=aims)
@@ -302,16 +300,16 @@ class Traffic:
 
     def _with_new_drivers(self, base: Agents, surroundings: Surroundings) -> Traffic:
         """With drivers for objects that have just appeared."""
-        drivers, drawn = dict(self.drivers), dict[str, float]()
+        drivers, sampled = dict(self.drivers), dict[str, float]()
         if self._assigns_drivers:
             for subject in base.objects:
                 if subject.object_id not in drivers:
-                    driver = self._driver_for(subject, surroundings, drawn)
+                    driver = self._driver_for(subject, surroundings, sampled)
                     if driver is not None:
                         drivers[subject.object_id] = driver
         frozen = MappingProxyType(drivers)
         placed = replace(self, drivers=frozen, agents=_with_driver_poses(base, frozen))
-        return placed._with_drawn(drawn)
+        return placed._with_sampled(sampled)
 
     def _with_comers_and_goers(self, base: Agents, before: Surroundings) -> Traffic:
         """After spawned objects have left and others have appeared; ``before``: the step."""
@@ -328,16 +326,16 @@ class Traffic:
         if not added:
             return self
         assert self.spawner is not None
-        drivers, drawn = dict[str, AgentDriver](), dict[str, float]()
+        drivers, sampled = dict[str, AgentDriver](), dict[str, float]()
         for driver in added:
             drivers[driver.subject.object_id] = driver
-            drawn |= self.spawner.drawn(driver)
-        return self.with_drivers(drivers, base)._with_drawn(drawn)
+            sampled |= self.spawner.sampled(driver)
+        return self.with_drivers(drivers, base)._with_sampled(sampled)
 
-    def _with_drawn(self, drawn: Mapping[str, float]) -> Traffic:
-        if not drawn:
+    def _with_sampled(self, sampled: Mapping[str, float]) -> Traffic:
+        if not sampled:
             return self
-        return replace(self, drawn=MappingProxyType({**self.drawn, **drawn}))
+        return replace(self, sampled=MappingProxyType({**self.sampled, **sampled}))
 
     @property
     def _assigns_drivers(self) -> bool:
@@ -346,9 +344,9 @@ class Traffic:
         return named or self.spec.default != "log" or self.reacting
 
     def _driver_for(
-        self, subject: ObjectState, surroundings: Surroundings, drawn: dict[str, float]
+        self, subject: ObjectState, surroundings: Surroundings, sampled: dict[str, float]
     ) -> AgentDriver | None:
-        """The driver of an object that has just appeared; its draws are added to ``drawn``."""
+        """The driver of an object that has just appeared; its draws are added to ``sampled``."""
         spec = self.spec.drivers.get(subject.object_id, subject.driver)
         if spec is None:
             spec = self._default_for(subject)
@@ -356,7 +354,7 @@ class Traffic:
             return None
         if isinstance(spec, IdmDriver) and self.randomized is not None:
             spec, named = self.randomized.driver_of(subject, spec)
-            drawn |= named
+            sampled |= named
         return begin_driver(subject, spec, surroundings)
 
     def _default_for(self, subject: ObjectState) -> DriverSpec | None:

@@ -221,7 +221,7 @@ def test_distributions_are_drawn_by_the_seed(make_scene, moving):
 
     def drawn(seed):
         spec = ResetSpec(seed=seed, storyboard=made)
-        return World(scene, ScenarioState.of(scene), spec).drawn["storyboard.parameters.when"]
+        return World(scene, ScenarioState.of(scene), spec).sampled["storyboard.parameters.when"]
 
     assert 1.0 <= drawn(1) < 3.0
     assert drawn(1) == drawn(1) != drawn(2)

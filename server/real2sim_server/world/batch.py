@@ -1,39 +1,32 @@
-"""Worlds of one scene side by side, as a structure of arrays."""
+"""Many worlds of one scene that step together as a structure of arrays, for learning.
+
+A step costs microseconds. :class:`BatchWorld` acts like a :class:`.world.World` at each of its
+places, within the part of the closed loop that :func:`check_batchable` accepts: the same plans
+lead to the same motions, contacts and ends.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from real2sim_proto.episode import ResetSpec
+from real2sim_proto import ErrorCode
+from real2sim_proto.episode import AgentsSpec, IdmDriver, ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 
-from ...edit import ObjectState, ScenarioState, compose, things_of
-from ...geometry.transform import transform_from
-from ...render.types import Instance
-from ...scene import Scene
-from ..agents import Agents
-from ..collision.contact_state import ContactState
-from ..collision.overlaps import EgoContacts
-from ..collision.sweep import StepStart
-from ..driving import HOLD, KINDS, vehicle_parameters
-from ..ego.controller import EgoController
-from ..ego.gear import can_reverse
-from ..ego.legs import may_lead_backwards
-from ..ego.motion import Motion
-from ..ego.reference import SinglePose
-from ..ego.route import WAYPOINT_SPACING, WAYPOINTS
-from ..ego.suspension import LEVEL, BodyAttitude, sprung_side_by_side, tilted
-from ..path import Float
-from ..scoring.hazard import ego_at_fault
-from ..traffic.idm import Idm
-from ..world import World
-from .step_kernels import (
+from ..edit import ObjectState, ScenarioState, compose, things_of
+from ..geometry.transform import transform_from
+from ..render.types import Instance
+from ..scene import Ground, Scene
+from .agents import Agents
+from .batch_kernels import (
     BEYOND,
+    DRIVES,
+    LEFT,
     MOVED,
     OFFSET,
     PATH_X,
@@ -45,12 +38,169 @@ from .step_kernels import (
     routes_ahead,
     step_worlds,
 )
-from .subset import check_batchable
-from .tables import road_of, tracks_of
-from .traffic_kernels import DRIVES, LEFT
+from .collision.contact_state import ContactState
+from .collision.sweep import EgoContacts, StepStart
+from .common import WorldError
+from .driving import HOLD, KINDS, PLANNING_AHEAD, vehicle_parameters
+from .ego.controller import EgoController
+from .ego.motion import LEVEL, BodyAttitude, Motion, sprung_side_by_side, tilted
+from .ego.plan import SinglePose, can_reverse, may_lead_backwards
+from .path import WAYPOINT_SPACING, WAYPOINTS, Float, LoggedPath
+from .scoring import ScoringContext
+from .scoring.instant import ego_at_fault
+from .traffic.driver import Idm, desired_speed
+from .traffic.traffic import DRIVEN, MOVING
+from .world import World
+
+# --- Supported episodes --------------------------------------------------------------------------
+
+TRACKERS = tuple(name for name, kind in KINDS.items() if kind not in PLANNING_AHEAD)
+FREE = frozenset({"seed", "start_us", "dt_us", "horizon", "sensors", "privileged", "scoring"})
+"""Fields of a reset that may be anything; cameras are drawn by who steps the batch."""
+CHECKED = frozenset({"ego", "action", "agents", "contact"})
+"""Fields of which only a part is known here."""
+
+
+def check_batchable(spec: ResetSpec) -> None:
+    """Refuse what batches do not know.
+
+    Raises:
+        WorldError: INVALID_REQUEST, naming every option that is outside and what is allowed.
+    """
+    outside = [
+        f"{name}={getattr(spec, name)!r}"
+        for name, field in type(spec).model_fields.items()
+        if name not in FREE | CHECKED
+        and getattr(spec, name) != field.get_default(call_default_factory=True)
+    ]
+    allowed = {
+        "action": spec.action in {"control", "trajectory"},
+        "ego.tracker": spec.action == "control" or spec.ego.tracker in TRACKERS,
+        "ego.actuators.*_delay_us": not (
+            spec.ego.actuators.steering_delay_us or spec.ego.actuators.drive_delay_us
+        ),
+        "agents.default": spec.agents.default in {"log", "idm"},
+        "agents (but default)": spec.agents == AgentsSpec(default=spec.agents.default),
+        "contact.background": not spec.contact.background,
+        "contact.swept": spec.contact.swept,
+    }
+    outside += [name for name, fine in allowed.items() if not fine]
+    if outside:
+        raise WorldError(
+            ErrorCode.INVALID_REQUEST,
+            f"worlds in batches do not know {', '.join(outside)}",
+            hint="they know actions 'control' and 'trajectory' by the trackers "
+            f"{', '.join(TRACKERS)}, commands without delay, objects that repeat the log or drive "
+            "by IDM, and episodes that end at the first contact with an object; take single "
+            "worlds for the rest",
+        )
+
+
+# --- Tables --------------------------------------------------------------------------------------
+
+# Compiled code takes them as plain arrays, since parallel loops take no nested tuples.
+
+Longs = NDArray[np.int64]
+
+
+class Tracks(NamedTuple):
+    """Objects of the scenario, N of them.
+
+    Attributes:
+        ends, times, knots: their trajectories, see ``edit.track_kernels.poses_at``.
+        sizes: [N, 3] float64 [m].
+        driven: [N] bool, those that IDM drives.
+        path_ends: [N + 1] int64, where the path of each begins in ``paths``.
+        paths: [P, KNOT] float64, see :mod:`..path_kernels`.
+        desired: [N] float64 [m/s].
+        idm: [5] float64: headway [s], gap [m], acceleration, braking, lateral acceleration
+            [m/s^2].
+    """
+
+    ends: Longs
+    times: Longs
+    knots: Float
+    sizes: Float
+    driven: NDArray[np.bool_]
+    path_ends: Longs
+    paths: Float
+    desired: Float
+    idm: Float
+
+
+class Road(NamedTuple):
+    """Ground and roads.
+
+    Attributes:
+        heights, frame: of the ground, see ``scene.ground_kernels``.
+        route: knots of the recorded way, see :mod:`..path_kernels`.
+        line_points, line_ends, lane_points, lane_ends: of the route and of other lanes, see
+            ``scoring.road_kernels``.
+        half_widths: [2] float64, of both [m].
+        ego_size: [3] float64, (length, width, height) [m].
+    """
+
+    heights: NDArray[np.float32]
+    frame: Float
+    route: Float
+    line_points: Float
+    line_ends: Longs
+    lane_points: Float
+    lane_ends: Longs
+    half_widths: Float
+    ego_size: Float
+
+
+def tracks_of(state: ScenarioState, spec: ResetSpec) -> tuple[tuple[ObjectState, ...], Tracks]:
+    """The visible objects, and their tables."""
+    packed = state.tracks
+    objects = packed.objects
+    ends, times, knots = packed.arrays
+    driven = np.array([spec.agents.default == "idm" and _is_driven(o) for o in objects], np.bool_)
+    paths = [
+        LoggedPath(o.trajectory).knots for o, is_driven in zip(objects, driven, strict=True)
+        if is_driven
+    ]  # fmt: skip
+    lengths = np.zeros(len(objects), np.int64)
+    lengths[driven] = [len(path) for path in paths]
+    idm = IdmDriver()
+    desired = [
+        desired_speed(o, idm) if is_driven else 0.0
+        for o, is_driven in zip(objects, driven, strict=True)
+    ]
+    return objects, Tracks(
+        ends=ends,
+        times=times,
+        knots=knots,
+        sizes=np.ascontiguousarray(packed.sizes, np.float64),
+        driven=driven,
+        path_ends=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        paths=np.concatenate([np.zeros((0, 11)), *paths]),
+        desired=np.array(desired, np.float64),
+        idm=np.array([idm.headway, idm.gap, idm.acceleration, idm.braking, idm.lateral]),
+    )
+
+
+def road_of(ground: Ground, path: LoggedPath, context: ScoringContext) -> Road:
+    """Ground and roads of an episode."""
+    lines, lanes = context.road_lines
+    return Road(
+        *ground.grid,
+        route=path.knots,
+        line_points=lines[0],
+        line_ends=lines[1],
+        lane_points=lanes[0],
+        lane_ends=lanes[1],
+        half_widths=np.array([context.corridor, context.lane], np.float64),
+        ego_size=np.array(context.ego_size, np.float64),
+    )
+
+
+def _is_driven(subject: ObjectState) -> bool:
+    return subject.category in DRIVEN and subject.trajectory.extent >= MOVING
+
 
 Flags = NDArray[np.bool_]
-Longs = NDArray[np.int64]
 
 
 @dataclass(eq=False)
@@ -122,9 +272,9 @@ class BatchStep:
 class BatchWorld:
     """W worlds of one scene and one reset; each place runs an episode of its own.
 
-    What a world of the batch does is what a :class:`..world.World` does, see :mod:`.subset` for
-    the part of it that is known here: same motions, objects, contacts, ends. Worlds know nothing
-    of each other, and no result depends on the number of threads.
+    Each behaves like a :class:`.world.World` within the supported part, see
+    :func:`check_batchable`: same motions, objects, contacts and ends. Worlds are independent of
+    each other, and no result depends on the number of threads.
 
     Attributes:
         scene: shared, immutable.

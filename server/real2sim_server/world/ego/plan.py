@@ -1,0 +1,462 @@
+"""Planned trajectories: the reference to follow, its legs of one gear each, and reverse gear."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from real2sim_proto.episode import EgoSpec
+
+from ..._records import made_quickly
+from ..common import cache_by_identity
+from ..driving import (
+    GRAVITY,
+    HOLD,
+    NO_POSE,
+    VEHICLE_MODELS,
+    Command,
+    curve_at,
+    placed_poses,
+    plan_curve,
+    vehicle_parameters,
+)
+from ..path import Float, LoopTransform
+from .motion import ControlLaw, Motion, advance_motion, commanded, constant_law
+
+Pose = tuple[float, float, float]
+"""x, y [m], yaw [rad] in the world."""
+
+
+FEW, CLEARLY = 40, 1e-6
+"""Poses up to so many are looked at one by one; a way [m] that no rounding turns round."""
+
+
+MAX_GAP_US = 1_000_000
+"""A plan of a single pose goes on from the one before where their poses are this near in time."""
+
+
+@made_quickly
+@dataclass(frozen=True, eq=False)
+class PlannedTrajectory:
+    """Where a planner wants to be when.
+
+    Attributes:
+        times_us: [N] int64, increasing [us].
+        poses: [N, 3] float64, x, y [m], yaw [rad], world.
+        is_clear: whether it is known already to lead forwards.
+    """
+
+    times_us: NDArray[np.int64]
+    poses: Float
+    is_clear: bool = False
+
+    @staticmethod
+    def of(
+        times_us: Sequence[int], poses: Sequence[Pose], frame: Pose | None = None
+    ) -> PlannedTrajectory:
+        """The trajectory through poses of a frame, given by its pose in the world; None: world."""
+        numbers, is_clear = np.array(poses, np.float64), False
+        if frame is not None:
+            numbers, is_clear = placed_poses(numbers, frame, CLEARLY)
+        return PlannedTrajectory(np.array(times_us, np.int64), numbers, is_clear)
+
+    @cached_property
+    def leads_forwards(self) -> bool:
+        """Whether no pose lies behind the one before, as both head."""
+        if len(self.poses) < 2:
+            return False
+        return (
+            self.is_clear or _leads_ahead(self.poses) or float(ways_along(self.poses).min()) >= 0.0
+        )
+
+    def after(self, t_us: int) -> PlannedTrajectory:
+        """What of it is still to come: its end, at once, where all of it is over."""
+        if t_us < self.times_us.item(0):
+            return self
+        over = int(np.searchsorted(self.times_us, t_us, side="right"))
+        if over == len(self.times_us):
+            return PlannedTrajectory(np.array([t_us + 1]), self.poses[-1:])
+        return PlannedTrajectory(self.times_us[over:], self.poses[over:])
+
+
+def _leads_ahead(poses: Float) -> bool:
+    """Whether a plan of a few poses clearly goes along its headings everywhere, as nearly all do:
+    without the arrays of :func:`ways_along`, which take twice as long."""
+    if len(poses) > FEW:
+        return False
+    x, y, yaw = poses[0].tolist()
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    for px, py, pyaw in poses[1:].tolist():
+        pcos, psin = math.cos(pyaw), math.sin(pyaw)
+        if (px - x) * (cos + pcos) + (py - y) * (sin + psin) < CLEARLY:
+            return False
+        x, y, cos, sin = px, py, pcos, psin
+    return True
+
+
+def ways_along(poses: Float) -> Float:
+    """[..., N - 1] way from each of poses [..., N, 3] to the next along their mean heading [m]."""
+    x, y, yaw = poses[..., 0], poses[..., 1], poses[..., 2]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    dx, dy = x[..., 1:] - x[..., :-1], y[..., 1:] - y[..., :-1]
+    ways: Float = (dx * (cos[..., 1:] + cos[..., :-1]) + dy * (sin[..., 1:] + sin[..., :-1])) / 2
+    return ways
+
+
+class SinglePose(NamedTuple):
+    """The only pose of a plan, in the world; the next plan of one pose goes on from it.
+
+    Attributes:
+        at_us: when the vehicle is to be there [us].
+        x, y: [m].
+        yaw: [rad].
+    """
+
+    at_us: int
+    x: float
+    y: float
+    yaw: float
+
+    @staticmethod
+    def of(trajectory: PlannedTrajectory) -> SinglePose | None:
+        """That of a plan, if it has one only."""
+        if len(trajectory.poses) != 1:
+            return None
+        return SinglePose(int(trajectory.times_us[0]), *trajectory.poses[0].tolist())
+
+    def before(self, start_us: int, at_us: int) -> tuple[float, float, float, float]:
+        """As :func:`.driving.plan_curve` takes it for a plan that begins at ``start_us`` and whose
+        pose is for ``at_us``; none where it is too old to say how fast that plan goes."""
+        if not 0 < at_us - self.at_us <= MAX_GAP_US:
+            return NO_POSE
+        return (self.at_us - start_us) * 1e-6, self.x, self.y, self.yaw
+
+    def speed_to(self, at_us: int, pose: Float) -> float | None:
+        """Mean speed along the headings [m/s] to the pose [3] of the next plan; None where that is
+        not one to go on to."""
+        if not 0 < at_us - self.at_us <= MAX_GAP_US:
+            return None
+        way = ways_along(np.array([self[1:], pose]))
+        return way.item() / ((at_us - self.at_us) * 1e-6)
+
+    def put_back(self, seam: LoopTransform) -> SinglePose:
+        """For a vehicle that was put back over the seam."""
+        return SinglePose(self.at_us, *seam.poses(np.array([self[1:]]))[0].tolist())
+
+
+class ReferenceTrajectory:
+    """A planned trajectory as a smooth curve over time, see :mod:`.driving.curve`."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        *,
+        start_us: int,
+        trajectory: PlannedTrajectory,
+        spec: EgoSpec,
+        before: SinglePose | None = None,
+    ) -> None:
+        """The curve of a vehicle that is in ``motion`` at ``start_us``.
+
+        Args:
+            motion: of the vehicle.
+            start_us: now [us].
+            trajectory: after ``start_us``.
+            spec: of the vehicle.
+            before: what a trajectory of a single pose goes on from.
+        """
+        goes_on = NO_POSE
+        if before is not None and len(trajectory.poses) == 1:
+            goes_on = before.before(start_us, int(trajectory.times_us[0]))
+        self._curve = plan_curve(
+            motion.numbers,
+            start_us,
+            (trajectory.times_us, trajectory.poses, goes_on),
+            tuple(vehicle_parameters(spec)),
+        )
+
+    @property
+    def end(self) -> float:
+        """Time of the last pose, from the start [s]."""
+        return float(self._curve[0][-1, 0])
+
+    @property
+    def last_pose(self) -> Pose:
+        """x, y [m], yaw [rad] in the world."""
+        _, x, y, yaw, _, _ = self._curve[0][-1].tolist()
+        return x, y, yaw
+
+    def put_back(self, seam: LoopTransform) -> ReferenceTrajectory:
+        """The curve of a vehicle that was put back over the seam."""
+        knots = self._curve[0].copy()
+        knots[:, 1:4] = seam.poses(knots[:, 1:4])
+        # The tangents turn, and have no place.
+        vx, vy, cos, sin = knots[:, 4], knots[:, 5], math.cos(seam.turn), math.sin(seam.turn)
+        knots[:, 4:6] = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
+        moved = copy.copy(self)
+        moved._curve = (knots, *self._curve[1:])
+        return moved
+
+    def control_law(self, kind: int) -> ControlLaw:
+        """Follows the plan by PURSUIT, LQR or ILQR."""
+        return ControlLaw(kind, *self._curve)
+
+    def at(self, t: float) -> tuple[float, float, float, float, float]:
+        """x, y [m], velocity x, y [m/s] and planned heading [rad] in the world, ``t`` >= 0 seconds
+        after the start."""
+        x, y, vx, vy, yaw = curve_at(self._curve, float(t))
+        return x, y, vx, vy, yaw
+
+
+# --- Legs ----------------------------------------------------------------------------------------
+
+CUSP, ON_AGAIN = 0.05, 0.02
+"""A plan turns back where it goes the other way for this far, and goes on forwards again for this;
+less is noise of a plan that stands [m]."""
+
+NEAR = 0.05
+"""A plan of a single pose changes the gear where the pose is farther away than this on the other
+side [m]."""
+
+
+CREEPING = 0.1
+"""Plans of a single pose that go faster than this from one to the next have the gear of that way,
+wherever the vehicle is [m/s]."""
+
+
+@made_quickly
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """A part of a plan.
+
+    Attributes:
+        backwards: whether it leads against the headings of its poses.
+        trajectory: its poses after its beginning.
+        begin_us: absolute time of its beginning [us]; None for that of the plan.
+        cusp: x, y [m], yaw [rad] where it begins; None where the vehicle is.
+    """
+
+    backwards: bool
+    trajectory: PlannedTrajectory
+    begin_us: int | None = None
+    cusp: tuple[float, float, float] | None = None
+
+
+def legs_of(
+    trajectory: PlannedTrajectory, motion: Motion, before: SinglePose | None = None
+) -> tuple[Leg, ...]:
+    """The legs of a plan for a vehicle; one where it leads forwards all the way. ``before``: what
+    a plan of a single pose goes on from."""
+    poses = trajectory.poses
+    if len(poses) == 1:
+        at_us = int(trajectory.times_us[0])
+        goes = None if before is None else before.speed_to(at_us, poses[0])
+        backwards = _is_behind(poses[0], motion)
+        if goes is not None and abs(goes) > CREEPING:
+            backwards = goes < 0
+        return (Leg(backwards, trajectory),)
+    if not motion.reversing and trajectory.leads_forwards:
+        return (Leg(False, trajectory),)
+    turns = _turns(ways_along(poses), backwards=motion.reversing)
+    legs = []
+    for k, (begin, backwards) in enumerate(turns):
+        end = turns[k + 1][0] if k + 1 < len(turns) else len(poses) - 1
+        first = begin + 1 if k else 0
+        part = PlannedTrajectory(trajectory.times_us[first : end + 1], poses[first : end + 1])
+        x, y, yaw = poses[begin].tolist()
+        legs.append(
+            Leg(backwards, part, int(trajectory.times_us[begin]), (x, y, yaw))
+            if k
+            else Leg(backwards, part)
+        )
+    return tuple(legs)
+
+
+def may_lead_backwards(plans: Float) -> NDArray[np.bool_]:
+    """[W] bool, whether any part of a plan goes against its headings.
+
+    Args:
+        plans: [W, N, 3] poses x, y [m], yaw [rad], each in the frame of its vehicle.
+    """
+    if plans.shape[1] == 1:
+        x, y, yaw = plans[:, 0].T
+        behind: NDArray[np.bool_] = np.less(x * (1 + np.cos(yaw)) + y * np.sin(yaw), 0.0)
+        return behind
+    against: NDArray[np.bool_] = np.any(ways_along(plans) < 0, axis=1)
+    return against
+
+
+def _turns(along: Float, *, backwards: bool) -> list[tuple[int, bool]]:
+    """Where each leg begins, and whether it leads backwards. ``backwards``: the gear before."""
+    way, farthest, place = 0.0, 0.0, 0
+    turns = [(0, backwards)]
+    for k, step in enumerate(along.tolist(), start=1):
+        way += -step if backwards else step
+        if way >= farthest:
+            farthest, place = way, k
+        elif farthest - way > (ON_AGAIN if backwards else CUSP):
+            backwards = not backwards
+            if place == turns[-1][0]:
+                turns[-1] = (place, backwards)
+            else:
+                turns.append((place, backwards))
+            way, farthest, place = farthest - way, farthest - way, k
+    return turns
+
+
+def _is_behind(pose: Float, motion: Motion) -> bool:
+    """Whether a single pose leads a vehicle backwards."""
+    x, y, yaw = pose.tolist()
+    dx, dy = x - motion.x, y - motion.y
+    cos, sin = math.cos(motion.yaw) + math.cos(yaw), math.sin(motion.yaw) + math.sin(yaw)
+    ahead: float = (dx * cos + dy * sin) / 2
+    return ahead < (NEAR if motion.reversing else -NEAR)
+
+
+# --- Reverse gear --------------------------------------------------------------------------------
+
+# A vehicle turned by half a turn, with speeds, accelerations and steering angles of opposite sign,
+# obeys the same equations on its rear axle. Dynamics and trackers therefore only know forward
+# driving. The gear changes at rest only and has its own top speed; commands still in the actuators
+# belong to the gear in which they were given.
+
+SHIFT_BRAKING = 6.0
+"""Deceleration of a vehicle that still rolls on when its plan has turned back already, where it can
+[m/s^2]."""
+
+SHIFT_LOOK_US = 10_000
+"""How often a vehicle that brakes for the other gear is looked at [us]."""
+
+
+def can_reverse(spec: EgoSpec) -> bool:
+    """Whether a vehicle has a reverse gear: a speed for it, and a model that goes backwards."""
+    return spec.max_reverse_speed > 0 and VEHICLE_MODELS[spec.dynamics].backwards is not None
+
+
+@cache_by_identity
+@lru_cache(maxsize=256)
+def backwards_spec(spec: EgoSpec) -> EgoSpec:
+    """The mirror image of a vehicle with a reverse gear."""
+    model = VEHICLE_MODELS[spec.dynamics].backwards
+    change: dict[str, Any] = {"max_speed": spec.max_reverse_speed, "dynamics": model}
+    if model != spec.dynamics:
+        # Tyres that slip set a limit which wheels that only roll do not know.
+        grip = spec.vehicle.friction * GRAVITY
+        change["max_acceleration"] = min(spec.max_acceleration, grip)
+        change["max_braking"] = min(spec.max_braking, grip)
+    return spec.model_copy(update=change)
+
+
+def mirrored(motion: Motion, half_turn: float = math.pi) -> Motion:
+    """The mirror image of a vehicle, which drives forwards where that drives backwards.
+
+    Args:
+        motion: of the vehicle.
+        half_turn: pi, and minus pi for the way back.
+    """
+    return motion._replace(
+        yaw=motion.yaw + half_turn,
+        speed=_negative(motion.speed),
+        acceleration=_negative(motion.acceleration),
+        steering=_negative(motion.steering),
+        lateral_speed=_negative(motion.lateral_speed),
+        drive=_negative(motion.drive),
+        pending=tuple([_mirrored_command(c) for c in motion.pending]),
+    )
+
+
+def advance_in_gear(
+    motion: Motion,
+    law: ControlLaw,
+    spec: EgoSpec,
+    dt_us: int,
+    *,
+    since: float,
+    backwards: bool,
+) -> Motion:
+    """The vehicle ``dt_us`` later under a law of one gear.
+
+    Args:
+        motion: now.
+        law: in the frame of that gear: of the mirror image where it leads backwards.
+        spec: of a vehicle with a reverse gear.
+        dt_us: how far to go [us].
+        since: time since the law's plan began [s].
+        backwards: whether the gear is the reverse one.
+    """
+    end_us = dt_us
+    at_us = 0
+    while at_us < end_us:
+        motion = _in_gear_of_its_motion(motion)
+        if motion.reversing != backwards and motion.speed == 0.0:
+            motion = _shifted(motion)
+        if motion.reversing == backwards:
+            rest_us, later = end_us - at_us, since + at_us * 1e-6
+            return _advanced(motion, law, spec, rest_us, since=later)
+        piece_us = min(SHIFT_LOOK_US, end_us - at_us)
+        motion = _advanced(motion, _braking(law, motion, spec), spec, piece_us, since=0.0)
+        at_us += piece_us
+    return _in_gear_of_its_motion(motion)
+
+
+def command_in_gear(
+    motion: Motion, law: ControlLaw, spec: EgoSpec, *, since: float, backwards: bool
+) -> Command:
+    """What a law of one gear would do, as :func:`advance_in_gear` takes it; along the heading."""
+    if not backwards:
+        return commanded(motion, law, spec, since=since)
+    return _mirrored_command(commanded(mirrored(motion), law, backwards_spec(spec), since=since))
+
+
+def _advanced(
+    motion: Motion, law: ControlLaw, spec: EgoSpec, dt_us: int, *, since: float
+) -> Motion:
+    """By a law of the gear that is engaged."""
+    if not motion.reversing:
+        return advance_motion(motion, law, spec, dt_us, since=since)
+    image = advance_motion(mirrored(motion), law, backwards_spec(spec), dt_us, since=since)
+    return mirrored(image, -math.pi)._replace(reversing=True)
+
+
+def _braking(law: ControlLaw, motion: Motion, spec: EgoSpec) -> ControlLaw:
+    """Brakes in the gear that is engaged. A held command, which is in the frame of the other one,
+    does by its own strength and steers; else the wheels stay as they are."""
+    if law.kind == HOLD:
+        return constant_law(Command(-abs(law.hold[0]), -law.hold[1]))
+    steering = -motion.steering if motion.reversing else motion.steering
+    return constant_law(Command(-min(SHIFT_BRAKING, spec.max_braking), steering))
+
+
+def _in_gear_of_its_motion(motion: Motion) -> Motion:
+    """What pushed a vehicle backwards, or forwards again, has changed its gear."""
+    backwards = motion.speed < 0.0
+    return _shifted(motion) if motion.speed and backwards != motion.reversing else motion
+
+
+def _shifted(motion: Motion) -> Motion:
+    """In the other gear: what brakes goes on braking, and what drives is let go."""
+
+    def kept(acceleration: float) -> float:
+        brakes = acceleration > 0.0 if motion.reversing else acceleration < 0.0
+        return -acceleration if brakes else 0.0
+
+    pending = tuple([Command(kept(c.acceleration), c.steering) for c in motion.pending])
+    return motion._replace(
+        reversing=not motion.reversing, drive=kept(motion.drive), pending=pending
+    )
+
+
+def _mirrored_command(command: Command) -> Command:
+    return Command(_negative(command.acceleration), _negative(command.steering))
+
+
+def _negative(value: float) -> float:
+    """Never minus zero, which would show on the wire."""
+    return 0.0 - value
