@@ -15,7 +15,7 @@ from rich.table import Table
 from ..demo.street import SHIPPED
 from ..edit import posed_instances
 from ..render import render_cameras
-from ..render.cast import cast, detect
+from ..render.cast import cast, sensors
 from ..scene import BrownConrady, Camera, Fisheye, Shutter
 from ..scene.io import read_packed
 from ..scene.lidar_catalogue import catalogue_lidar
@@ -71,7 +71,7 @@ def _sweep() -> dict[str, Callable[[], object]]:
     instances, lidar = street_scene(GAUSSIANS).instances, catalogue_lidar(LIDAR)
     pose = np.eye(4)
     pose[2, 3] = 1.73
-    return {SWEEP: lambda: detect(cast(instances, lidar, pose, backend="cpu"), lidar)}
+    return {SWEEP: lambda: sensors(cast(instances, lidar, pose, backend="cpu"), lidar)}
 
 
 def _lenses() -> dict[str, Callable[[], object]]:

@@ -110,7 +110,7 @@ def _render_sweep(
     json: Path | None,
 ) -> None:
     from ..edit.sweep import sweep_of
-    from ..render.cast import detect, sensor_poses
+    from ..render.cast import sensor_poses, sensors
     from ..render.cast.call import select_caster
     from ..render.cast.files import SUFFIXES, write_sweep
     from ..scene.io import load_scene
@@ -124,7 +124,7 @@ def _render_sweep(
     met = sweep_of(loaded, _without(loaded, delete), sensor, time_us)
     request = met.request(sensor, sensor_poses(loaded.ego, sensor, time_us))
     echo = select_caster().cast(request)
-    sweep = detect(echo, sensor, seed=seed, request=request)
+    sweep = sensors(echo, sensor, seed=seed, request=request)
     picture = out.with_suffix(".png")
     for path in dict.fromkeys((out, picture)):
         write_sweep(sweep, sensor, path)

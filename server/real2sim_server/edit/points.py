@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from real2sim_proto.semantics import GROUND, STATIC
 
 from ..geometry.rotation import quaternion_to_matrix
-from ..render.ground_class import TOLERANCE
+from ..render.lens import TOLERANCE
 from ..render.types import Instance
 from ..scene import Scene
 from ..scene.spherical_harmonics import SH_C0

@@ -5,13 +5,7 @@ from __future__ import annotations
 from real2sim_proto.semantics import semantic_class
 
 from ..geometry.rotation import Float
-from ..render.cast.recorded import (
-    Attributes,
-    SweepScene,
-    incidence_of,
-    met_by_lidar,
-    transforms_at,
-)
+from ..render.cast.call import Attributes, SweepScene, incidence_of, met_by_lidar, transforms_at
 from ..render.types import Instance
 from ..scene import GaussianCloud, Lidar, Scene, Stride
 from .compose import cloud_of, figure_of, kept, without_regions

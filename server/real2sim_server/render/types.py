@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,3 +205,23 @@ class LabelOutput:
     instance: NDArray[np.uint16]
     alone: Sequence[NDArray[np.float32]]
     timing_ms: dict[str, float] = field(default_factory=dict)
+
+
+# What is made of an immutable object once and kept as long as the object lives.
+
+Source = TypeVar("Source")
+Made = TypeVar("Made")
+
+
+def weak_cache(make: Callable[[Source], Made]) -> Callable[[Source], Made]:
+    """``make``, which is called only for what it was not called for before."""
+    kept: weakref.WeakKeyDictionary[Source, Made] = weakref.WeakKeyDictionary()
+
+    @functools.wraps(make)
+    def get(source: Source) -> Made:
+        found = kept.get(source)
+        if found is None:
+            found = kept[source] = make(source)
+        return found
+
+    return get

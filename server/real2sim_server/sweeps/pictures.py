@@ -13,7 +13,7 @@ from real2sim.observation import Observation
 from real2sim.planners import Needs
 
 from ..render import RasterOptions, View, rasterize_batch
-from ..render.quantize import to_uint8
+from ..render.images import to_uint8
 from ..scene import Camera, Scene
 from ..service.library.views import camera_infos
 from ..world import World

@@ -11,8 +11,8 @@ from real2sim_proto.semantics import GROUND, STATIC, semantic_class
 
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
-from ...render.cast import CastBackend, CastRequest, Echo, Sweep, detect
-from ...render.ground_class import TOLERANCE
+from ...render.cast import CastBackend, CastRequest, Echo, Sweep, sensors
+from ...render.lens import TOLERANCE
 from ...scene import Ground, Lidar
 from ..drive import Drive, Moment
 from .boxes import ObjectBox
@@ -45,7 +45,7 @@ def lidar_points(
     met = drive.sweep_at(lidar, moment.t_us)
     request = met.things.request(lidar, met.T_world_lidar)
     echo = caster.cast(request)
-    sweep = detect(echo, lidar, seed=seed)
+    sweep = sensors(echo, lidar, seed=seed)
     ray, ranges, number = _returns(sweep)
     slots = lidar.beams.slots[1].ravel()[ray]
     local = lidar.beams.directions.reshape(-1, 3)[ray] * ranges[:, None]

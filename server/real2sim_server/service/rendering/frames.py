@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from real2sim_proto import encode
 from real2sim_proto.episode import SensorSpec
 
-from ...render.jpeg import JpegEncoder, turbo_jpeg
+from ...render.images import JpegEncoder, turbo_jpeg
 from ...render.modalities import encode_image
 from ...scene import Camera
 from .optics import frame_names

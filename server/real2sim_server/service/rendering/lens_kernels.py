@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from real2sim_proto import ErrorCode
 
 from ...render import Backend, RenderError
-from ...render.lenses import kernels_of_lenses_on_disk, refuse_lenses, warm_up_lenses
+from ...render.frame import kernels_of_lenses_on_disk, refuse_lenses, warm_up_lenses
 from ...scene import Camera
 from ..engine import Engine
 from ..http.problems import ServiceError

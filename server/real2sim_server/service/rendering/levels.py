@@ -18,7 +18,7 @@ from ...render import (
     uses_levels,
     without_levels,
 )
-from ...render.uncertainty import UNCERTAINTY, shown_as_colour
+from ...render.frame import UNCERTAINTY, shown_as_colour
 from ...scene import Camera
 from ..library.memory import IdleItem, MemoryBudget
 

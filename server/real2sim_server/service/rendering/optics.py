@@ -15,7 +15,7 @@ from real2sim_proto.episode import SensorSpec
 
 from ...geometry.rotation import Float
 from ...render import Instance, RigView
-from ...render.effects import Light, to_display, to_light
+from ...render.images import Light, to_display, to_light
 from ...scene import Camera, Lens, Shutter
 from ...scene.camera_motion import moved
 from ...scene.lens import lens_from

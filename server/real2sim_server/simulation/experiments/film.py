@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
 from ...render import Instance, RasterOptions, render_cameras
-from ...render.picture_file import write_png
+from ...render.images import write_png
 from ...render.video import video_file
 from ...scene import Camera, GaussianCloud
 from ..body import BodyMode

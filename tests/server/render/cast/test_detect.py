@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.render.cast import CastRequest, Echo, detect
-from real2sim_server.render.cast.detect import drop_probability, normal, uniform
+from real2sim_server.render.cast import CastRequest, Echo, sensors
+from real2sim_server.render.cast.sensors import drop_probability, normal, uniform
 from real2sim_server.render.types import Instance
 from real2sim_server.scene import Beams, Detection, GaussianCloud, Lidar
 
@@ -38,7 +38,7 @@ def echo(distance: float, intensity: float = 0.8) -> Echo:
 
 
 def test_noise_has_the_sensors_deviation() -> None:
-    sweep = detect(echo(20.0), lidar(range_noise=0.03))
+    sweep = sensors(echo(20.0), lidar(range_noise=0.03))
     assert sweep.hit.all()
     assert np.std(sweep.range) == pytest.approx(0.03, rel=0.05)
     assert np.mean(sweep.range) == pytest.approx(20.0, abs=2e-3)
@@ -46,7 +46,7 @@ def test_noise_has_the_sensors_deviation() -> None:
 
 def test_the_seed_decides() -> None:
     sensor = lidar(range_noise=0.03)
-    first, again, other = (detect(echo(20.0), sensor, seed=seed).range for seed in (5, 5, 6))
+    first, again, other = (sensors(echo(20.0), sensor, seed=seed).range for seed in (5, 5, 6))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
@@ -63,24 +63,24 @@ def test_a_surface_at_the_limit_is_lost_every_second_time() -> None:
 
 def test_power_falls_with_the_square_of_the_distance() -> None:
     sensor = lidar(detection=Detection(range_m=100.0, reflectivity=0.1, softness=1e-3))
-    assert detect(echo(49.0, 0.025), sensor).hit.all()
-    assert not detect(echo(51.0, 0.025), sensor).hit.any()
+    assert sensors(echo(49.0, 0.025), sensor).hit.all()
+    assert not sensors(echo(51.0, 0.025), sensor).hit.any()
 
 
 def test_the_sensors_own_losses_come_on_top() -> None:
     sensor = lidar(detection=Detection(loss=0.2))
-    assert detect(echo(5.0), sensor).hit.mean() == pytest.approx(0.8, abs=0.03)
+    assert sensors(echo(5.0), sensor).hit.mean() == pytest.approx(0.8, abs=0.03)
 
 
 def test_what_is_lost_has_no_values() -> None:
-    sweep = detect(echo(5.0), lidar(detection=Detection(loss=1.0)))
+    sweep = sensors(echo(5.0), lidar(detection=Detection(loss=1.0)))
     assert not sweep.hit.any()
     for values in (sweep.range, sweep.intensity, sweep.instance, sweep.points):
         assert not values.any()
 
 
 def test_points_lie_along_their_rays() -> None:
-    sweep = detect(echo(20.0), lidar())
+    sweep = sensors(echo(20.0), lidar())
     assert np.allclose(np.linalg.norm(sweep.points, axis=-1), sweep.range, rtol=1e-5)
 
 
@@ -98,6 +98,6 @@ def test_what_moves_has_its_velocity() -> None:
     )
     still = np.broadcast_to(np.eye(4), (len(seconds), 4, 4))
     request = CastRequest((Instance(one),), sensor, still, (poses,), (None,))
-    sweep = detect(echo(20.0), sensor, request=request)
+    sweep = sensors(echo(20.0), sensor, request=request)
     assert sweep.velocity is not None
     assert np.allclose(sweep.velocity[sweep.hit], [7, 0, 0], atol=1e-3)

@@ -13,9 +13,9 @@ from real2sim_proto.operations import Delete, EraseRegion
 from real2sim_server.edit.apply import apply_operations
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.edit.sweep import sweep_of
-from real2sim_server.render.cast import cast, detect, recorded_sweep, sensor_poses
+from real2sim_server.render.cast import cast, recorded_sweep, sensor_poses, sensors
+from real2sim_server.render.cast.call import transforms_at
 from real2sim_server.render.cast.files import ply_bytes, sweep_picture, write_sweep
-from real2sim_server.render.cast.recorded import transforms_at
 from real2sim_server.scene import (
     Beams,
     CameraRig,
@@ -108,7 +108,7 @@ def test_a_path_goes_straight_on_beyond_its_ends() -> None:
 
 
 def test_a_sweep_is_written_as_points_arrays_and_a_picture(scene: Scene, tmp_path) -> None:  # type: ignore[no-untyped-def]
-    sweep = detect(recorded_sweep(scene, LIDAR, 500_000), LIDAR)
+    sweep = sensors(recorded_sweep(scene, LIDAR, 500_000), LIDAR)
     count = int(sweep.hit.sum())
     head, _, body = ply_bytes(sweep).partition(b"end_header\n")
     assert f"element vertex {count}".encode() in head

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...._nvrtc import ARCHITECTURES, KernelSource
-from ....render.backends.nvrtc.usage import Usage, usage_of
+from ....render._cuda.launcher import Usage, usage_of
 from ...errors import SolverError
 from .source import FOLDER, SOURCE, solver_source
 
