@@ -1,4 +1,13 @@
-"""Blending from front to back in plain torch: one twin for splats on a plane and along rays."""
+"""The plain torch rasterizer: slow, obvious, differentiable. The oracle of the others.
+
+Semantics are those of gsplat 1.5.3 ``rasterization`` (classic EWA splatting, Zwicker et al. 2001;
+Kerbl et al. 2023), except that depths are compared after rounding the float64 depth to float32.
+
+Cameras with lenses and rolling shutters evaluate every Gaussian for every ray, where its response
+along the ray is largest (Moenne-Loccoz et al. 2024, 3D Gaussian Ray Tracing): there is no
+projection, and only contributions below ALPHA_MIN are left out. The blur of a pixel is that of the
+pinhole at the Gaussian's centre.
+"""
 
 from __future__ import annotations
 
@@ -77,11 +86,7 @@ def blend(splats: Blended, alpha: Tensor, size: tuple[int, ...]) -> tuple[Tensor
     return rgb.reshape(*size, 3), *rest
 
 
-# Cameras with lenses and rolling shutters in plain torch: every Gaussian for every ray.
-#
-# The response of a Gaussian is taken where it is largest along the ray (Moenne-Loccoz et al. 2024,
-# 3D Gaussian Ray Tracing): there is no projection, and nothing is left out but what shows less than
-# ALPHA_MIN. The blur of a pixel is that of the pinhole at the place of the Gaussian's centre.
+# Cameras with lenses and rolling shutters
 
 STEP = 1e-5
 """Of finite differences, relative to the distance."""
@@ -263,10 +268,7 @@ def _blend(splats: RaySplats, rays: Tensor, times: Tensor) -> tuple[Tensor, ...]
     return blend(splats, alpha, shape)
 
 
-# The plain torch rasterizer: slow, obvious, differentiable. The oracle of the others.
-#
-# Semantics are those of gsplat 1.5.3 ``rasterization`` (classic EWA splatting, Zwicker et al. 2001;
-# Kerbl et al. 2023), except that depths are compared after rounding the float64 depth to float32.
+# The rasterizer
 
 TILE = 32
 

@@ -1,4 +1,4 @@
-"""What every rasterizer backend takes and gives."""
+"""The interface of rasterizer backends: requests, results, and what several backends share."""
 
 from __future__ import annotations
 
@@ -254,7 +254,7 @@ def pixel_directions(request: RasterRequest, camera: int) -> Tensor:
     return (x[None, :, None] * matrix[:, 0] + y[:, None, None] * matrix[:, 1]) + matrix[:, 2]
 
 
-# Sizes and gradients on the image where torch itself differentiates, gathered by hooks.
+# Screen statistics from torch hooks
 
 
 def empty_statistics(
@@ -329,7 +329,7 @@ class ScreenWatch:
         self.absolute[:, axis].index_add_(0, index, gradient.abs().sum(1).double())
 
 
-# Small requests that together use every path of a backend.
+# Warm-up: small requests that together use every path of a backend
 
 MANY = 5_000
 """More Gaussians than a backend treats as one block."""

@@ -1,4 +1,4 @@
-"""What the cameras of a vehicle see at one instant."""
+"""Images of a vehicle's cameras at one instant, with lenses, labels and uncertainty."""
 
 from __future__ import annotations
 
@@ -37,11 +37,9 @@ from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .select import select_backend
 from .types import Instance, LabelOutput, RasterOptions, RenderError, RenderOutput, Sky, Window
 
-# How uncertain is what a pixel shows: a pass in which uncertainties take the place of colours.
-#
-# Gaussians, sky and blending are those of the colour image, so that a pixel's value is the mean of
-# what it shows, by how much of it each takes; merged Gaussians of small images have the mean of those
-# they stand for. Backends know nothing of it.
+# Uncertainty: a pass with uncertainties in place of colours. Gaussians, sky and blending are those
+# of the colour image, so a pixel is the mean over its Gaussians, weighted by their share; merged
+# Gaussians of small images have the mean of their members. Backends treat it as a colour.
 
 UNCERTAINTY = "uncertainty"
 """Name of the modality."""
@@ -444,7 +442,7 @@ def _frames(view: RigView, members: Sequence[int], drawn: _Drawn) -> list[Frame]
     ]
 
 
-# Which backends draw lenses and rolling shutters, and their kernels made ready.
+# Lenses and rolling shutters: support and warm-up
 
 EVERYTHING = RasterOptions(median_depth=True)
 
@@ -483,8 +481,7 @@ def warm_up_lenses(backend: str | Backend = "auto") -> None:
         )
 
 
-# Pictures with labels in one walk: colours, and depth and object of each pixel, also of objects as
-# if they stood alone.
+# Labels: colours, depth and object of each pixel in one walk, also of objects as if alone
 
 FRONT = 0.2
 """Transmittance at which the front of a pixel lies, of what labels show."""

@@ -1,4 +1,8 @@
-"""Images to bytes. Pure functions of arrays; they run on any thread."""
+"""From rendered arrays to files and bytes: camera effects, quantization, encoding.
+
+Effects work on linear light: sRGB display values are linearised first and encoded again afterwards.
+The functions are pure and run on any thread.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,7 @@ from .._files import atomic_file
 from .._numba import PARALLEL_LOOPS, kernel
 from .types import RenderError
 
-# Jpeg of colour images: by libjpeg-turbo, or by nvJPEG on the GPU that drew them.
+# JPEG by libjpeg-turbo, or by nvJPEG on the GPU that drew the image
 
 JpegEncoder = Callable[[NDArray[np.uint8], int], bytes]
 """Bytes of an image [H, W, 3] uint8, C order, at a quality of 1 to 100; on any thread."""
@@ -268,7 +272,7 @@ def _png(image: NDArray[Any]) -> bytes:
     return bytes(encoded)
 
 
-# From blended floats to the numbers that leave the renderer, in one pass each.
+# Quantization of blended floats, one pass each
 
 SOLID_ALPHA = 0.5
 """A pixel below this alpha counts as nothing hit."""
@@ -349,7 +353,7 @@ def _keep_solid(
         kept[i] = depth[i] if alpha[i] >= np.float32(SOLID_ALPHA) else np.float32(0)
 
 
-# Pictures as files, whole or not at all.
+# Files, written atomically
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
@@ -367,9 +371,7 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
 __all__ = ["write_png"]
 
 
-# What a real camera does to colour images, after they are drawn.
-#
-# Light is linear: display values are taken apart by the curve of sRGB and put together by it again.
+# Camera effects
 
 Light = NDArray[np.float32]
 STEPS = 1 << 14

@@ -1,8 +1,8 @@
-"""What a camera with a lens or a rolling shutter sees along each pixel, and the way back.
+"""Rays of a camera with a lens or a rolling shutter, the way back, and the ground class.
 
-Blending needs the ray of every pixel; finding which pixels a Gaussian may touch needs the way back,
-for any direction, also those that the lens does not see. Both are tables, so that nothing that
-draws knows a model of lens.
+Blending needs the ray of every pixel; finding the pixels that a Gaussian may touch needs the way
+back for any direction, even those outside the lens. Both are tables, so no renderer depends on a
+lens model.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ def _largest_around(cells: Float, reach: float) -> Float:
     return largest
 
 
-# Which pixels of the background show the ground, told by geometry.
+# Background pixels that show the ground
 
 TOLERANCE = 0.15
 """What is nearer to the ground's height than this shows it [m]."""

@@ -1,4 +1,4 @@
-"""What a sensor modality is, and the registry of all of them."""
+"""Sensor modalities: the images that a camera produces, and their registry."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .images import (
     EXACT_CODECS,
     RGB_CODECS,
+    SOLID_ALPHA,
     EncodedImage,
     JpegEncoder,
     encode_depth,
@@ -19,6 +20,8 @@ from .images import (
     encode_lossless,
     encode_rgb,
     encode_uncertainty,
+    solid_depth,
+    to_uint8,
     turbo_jpeg,
 )
 from .types import RasterOptions, RenderError, RenderOutput
@@ -149,12 +152,10 @@ def encode_image(
     return EncodedImage(data, codec, dtype, image.shape)
 
 
-# Colour images.
+# Colour
 
 
 def _rgb_pixels(output: RenderOutput) -> NDArray[np.uint8]:
-    from .images import to_uint8
-
     return to_uint8(output.rgb, between=output.between)
 
 
@@ -174,12 +175,10 @@ RGB = register(
 )
 
 
-# Depth along the camera's z axis [m]; 0 where nothing was hit.
+# Depth along the z axis of the camera [m]; 0 without a hit
 
 
 def _depth_pixels(output: RenderOutput) -> NDArray[np.float32]:
-    from .images import solid_depth
-
     if output.depth is None:
         raise RenderError("the pass has drawn no depth")
     return solid_depth(output.depth, output.alpha, between=output.between)
@@ -230,10 +229,8 @@ INSTANCE = register(
 )
 
 
-# Depth of the Gaussian that takes half of the light [m]; 0 where none does.
-#
-# The expected depth of :mod:`.depth` is a mean over what a pixel shows, and lies between two things
-# at the edge of one; this is the depth of one of them.
+# Depth of the Gaussian at half of the light [m]; 0 without one. The expected depth is a mean over a
+# pixel and lies between two surfaces at the edge of one; this is the depth of one of them.
 
 
 def _median_depth_pixels(output: RenderOutput) -> NDArray[np.float32]:
@@ -261,14 +258,12 @@ MEDIAN_DEPTH = register(
 )
 
 
-# Classes of what is in front: of objects by their category, the background, the sky.
+# Classes: of objects by their category, the background, the sky
 
 SEMANTIC_DTYPE = np.dtype(np.uint8)
 
 
 def _semantic_pixels(output: RenderOutput) -> NDArray[np.uint8]:
-    from .images import SOLID_ALPHA
-
     if output.instance is None or output.classes is None:
         raise RenderError("the pass has drawn no classes")
     found: NDArray[np.uint8] = output.classes[output.instance.cpu().numpy()]
@@ -294,9 +289,7 @@ SEMANTIC = register(
 )
 
 
-# How well the training rays determine what a pixel shows: the error they let expect, in [0, 1].
-#
-# Of a colour in [0, 1], as a mean of its channels; in every pixel, the sky's too.
+# Expected error of a colour in [0, 1] as a mean of its channels, in every pixel, the sky included
 
 
 def _uncertainty_pixels(output: RenderOutput) -> NDArray[np.float32]:

@@ -1,4 +1,8 @@
-"""Which backend draws, decided once and logged with its reason."""
+"""Selection of a backend, logged with its reason, and levels of detail prepared for it.
+
+Small images are drawn from levels of detail; without preparation, the first small image of a cloud
+makes its levels and waits for them.
+"""
 
 from __future__ import annotations
 
@@ -174,10 +178,7 @@ BACKENDS: dict[str, RegisteredBackend] = {
 """By name. Modules are imported when their backend is made: each needs libraries of its own."""
 
 
-# Levels of detail of clouds, for who counts their memory and makes them before images need them.
-#
-# Small images are drawn from them; without any of this, the first small image of a cloud makes its
-# levels and waits for them.
+# Levels of detail
 
 LEVELS_SHARE = 0.8
 """Memory of levels over that of their cloud, a little more than measured."""

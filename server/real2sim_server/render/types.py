@@ -1,4 +1,4 @@
-"""What goes into rasterize() and what comes out."""
+"""Input and output of rasterize()."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ class RenderOutput:
             to 0.5 or below; 0 where it never does. None when not asked for.
         median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 where there is none, and
             without gradients. None when not asked for.
-        uncertainty: [C, H, W] float32, see :mod:`.uncertainty`; None where nobody asked.
+        uncertainty: [C, H, W] float32, see :mod:`.frame`; None where nobody asked.
         classes: [65536] uint8, of ``instance`` by id; None where nobody asked.
         behind: class of a pixel at which transmittance stays above 0.5.
         timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
@@ -207,7 +207,7 @@ class LabelOutput:
     timing_ms: dict[str, float] = field(default_factory=dict)
 
 
-# What is made of an immutable object once and kept as long as the object lives.
+# Results cached for as long as an immutable object lives
 
 Source = TypeVar("Source")
 Made = TypeVar("Made")

@@ -188,7 +188,7 @@ def test_sessions_share_the_background_and_keep_their_own_objects(serving: Nvrtc
     background = cloud(0)
     worlds = [[Instance(background), Instance(cloud(seed, bands=4), POSE, seed)] for seed in (3, 4)]
     requests = [requests_of([(45, 37)], world)[0] for world in worlds]
-    tables = tables_of(requests, serving._residence, serving._launcher)
+    tables = tables_of(requests, serving._device_scene, serving._launcher)
     assert tables.objects["cameras"].tolist() == [4, 2, 2]
     for request, images in zip(requests, serving.frames(requests, ["rgb"]), strict=True):
         [alone] = serving.frames([request], ["rgb"])

@@ -1,8 +1,14 @@
-"""The innermost step of blending as explicit vector code: one record over eight pixels.
+"""Blending of image tiles on the CPU: sorted records, tile lists, the blend itself.
 
-State of eight pixels is PLANES vectors in a row: transmittance (negative once finished), red,
-green, blue, depth, instance, median depth.
+Records are sorted by depth and listed for each 16x16 tile; tiles are then blended front to back.
+All work is split in a fixed pattern, so any number of threads gives the same bits.
+
+The innermost step is explicit vector code over eight pixels. Their state is PLANES vectors:
+transmittance (negative once finished), red, green, blue, depth, instance, median depth.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -47,10 +53,6 @@ from .records import (
     TILE,
     Records,
 )
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 PLANES = 7
 
@@ -187,13 +189,7 @@ def touched_halves(  # type: ignore[no-untyped-def]
     return types.int64(*(types.float32,) * 6), generate
 
 
-# Front-to-back blending of the tiles.
-#
-# Tiles are dealt to tasks by a fixed pattern and share nothing, so any number of threads gives the
-# same bits.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Front-to-back blending
 
 
 TASKS = 64
@@ -309,13 +305,7 @@ def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median):
                 median[y, x] = pixels[p + 6 * LANES]
 
 
-# Lists of the records that touch each 16x16 tile, in depth order.
-#
-# Records are taken in depth order and counted, then scattered, so the lists need no sorting of their
-# own. Chunks of fixed number have cursors of their own, which keeps the order for any thread count.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Tile lists: records are counted in depth order, then scattered by chunks with own cursors.
 
 
 TILE_CHUNKS = 8
@@ -381,10 +371,7 @@ def scatter_tiles(values, ordered_footprints, order, tiles_x, first_row, last_ro
                     cursors[chunk, tile] += 1
 
 
-# Order of all records by depth: one stable LSD radix sort.
-#
-# Work is split into chunks of fixed number, so the result does not depend on the number of threads;
-# ties keep the order of instances and of Gaussians in them.
+# Depth order: one stable LSD radix sort; ties keep the order of instances and of their Gaussians.
 
 DIGIT_BITS = 11
 SORT_CHUNKS = 8

@@ -1,14 +1,18 @@
-"""The innermost step of blending backwards as explicit vector code: one record over one tile.
+"""Backward blending: from the loss gradients of pixels to the gradients of records.
 
-The walk goes front to back like the forward one and repeats its arithmetic bit for bit, so that
-it stops at the same Gaussians without anything having been noted. With v = colour, depth and 1
-weighted by the loss gradient of a pixel, the pixel's part of the loss is the sum of w v over its
-Gaussians; ``REST`` holds what of this sum is still to come, from which follows the gradient by
-alpha: T v - REST / (1 - alpha).
+The walk goes front to back like the forward pass and repeats its arithmetic bit for bit, so it
+stops at the same Gaussians without stored notes. Let v be colour, depth and 1 weighted by the loss
+gradient of a pixel: the pixel's part of the loss is the sum of w v over its Gaussians. ``REST``
+holds the remaining part of this sum, which gives the gradient by alpha: T v - REST / (1 - alpha).
 
-Gradients by the exponent are gathered as moments over the pixels about the centre of the tile.
-Eight lanes keep sums over the rows; the sum over the lanes comes once at the end.
+The innermost step is explicit vector code: one record over one tile. Gradients by the exponent are
+gathered as moments over the pixels about the centre of the tile. Eight lanes keep sums over the
+rows and are summed once at the end. Each entry of a tile list writes to a slot of its own, so any
+number of threads gives the same bits.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -52,10 +56,6 @@ from .records import (
     SLOPE,
     TILE,
 )
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 LEFT, REST, BY_RED, BY_GREEN, BY_BLUE, BY_DEPTH, BY_ALPHA = range(7)
 """Planes of eight pixels: transmittance (negative once finished), what is still to come of the sum
@@ -310,13 +310,7 @@ def _sum_lanes(builder: ir.IRBuilder, eight: Vectors) -> Lanes:
     return eight[0]
 
 
-# Blending backwards: from loss gradients by pixels to gradients by records.
-#
-# Each place in a tile's list writes to a slot of its own, so any number of threads gives the same
-# bits.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Backward blending of tiles
 
 
 F32 = np.float32

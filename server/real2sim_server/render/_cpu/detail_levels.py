@@ -1,10 +1,17 @@
-"""Gaussians of one cell of space merged into one that has their moments.
+"""Levels of detail of a cloud: merged Gaussians for small images, built once and kept.
 
-With weight ``tau area`` of each, tau = -ln(1 - opacity) its optical depth and ``area`` what it
-covers seen from all around, the merged one has the mean centre, the covariance of all of them
-about it, the mean colour, and an opacity by the optical depth that is the sum of the weights over
-its own area.
+Space is cut into cells along a Z curve, so cells of every size are contiguous ranges of one order.
+Each block of cells chooses its level independently; level 0 is the cloud itself, without a copy. A
+Gaussian larger than the cells of a level is not merged there.
+
+The Gaussians of a cell merge into one with the same moments. Each has the weight ``tau area``,
+where tau = -ln(1 - opacity) is its optical depth and ``area`` its cross section averaged over all
+directions. The merged one has the mean centre, the covariance about it and the mean colour; its
+optical depth is the sum of the weights divided by its own area.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -27,10 +34,6 @@ from ..._numba import PARALLEL_LOOPS
 from ...scene import GaussianCloud, TimeColour
 from .drawing import NO_COEFFICIENTS, CloudArrays, array_of, arrays_of
 from .lanes import inlined, kernel
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 OPACITY_MIN = 1.0 / 255.0
 OPACITY_MAX = 0.999
@@ -236,11 +239,7 @@ def write_covariance(out, slot, xx, xy, xz, yy, yz, zz):
     out[slot, 1, 2] = out[slot, 2, 1] = yz
 
 
-# The levels of detail of a cloud, made once and kept with it.
-#
-# Space is cut into cells along a Z curve, so that cells of all sizes are stretches of one order.
-# Blocks of cells choose their level each for itself; level 0 is the cloud, which is not copied. A
-# Gaussian larger than the cells of a level stays as it is there.
+# Levels of a cloud
 
 LEVELS = 4
 """Merged ones; each has cells twice as large as the one before."""
@@ -464,10 +463,8 @@ def _block_bounds(
     return low, high, np.maximum.reduceat(sizes, starts[:-1]).astype(np.float64)
 
 
-# Arrays of many clouds for one kernel: a table of where they lie in memory.
-#
-# Numba compiles a kernel anew for each number of arrays that it is given, and copying clouds
-# together would copy all that a small image does not show.
+# Arrays of many clouds for one kernel: a table of addresses, since Numba compiles a kernel anew for
+# each number of arrays, and copying clouds together costs more than a small image.
 
 FIELDS = (
     *("means", "quats", "scales", "opacities", "sh", "coefficients", "order", "starts"),

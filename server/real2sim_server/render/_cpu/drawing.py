@@ -1,8 +1,8 @@
-"""Which parts of the clouds the cameras may see.
+"""One pinhole camera on the CPU: visible chunks, kernel inputs, and drawing in pieces.
 
-Gaussians lie in memory much as they lie in space, so whole chunks of CHUNK are behind a camera or
-beside its image. Boxes around their centres are made once for each cloud; what is left out this
-way would have been dropped one by one, so images keep their bits.
+Neighbours in memory are mostly neighbours in space, so whole chunks of CHUNK Gaussians lie behind a
+camera or beside its image. Boxes around their centres are computed once for each cloud. Skipped
+chunks hold only Gaussians that the projection would drop anyway, so images keep their bits.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def bound_chunks(
         bounds[chunk, 6] = sigma
 
 
-# What the kernels of the CPU backend are given: arrays of a request, and space to work in.
+# Kernel inputs: arrays of a request, and work space
 
 NO_COVARS = np.zeros((0, 3, 3), np.float32)
 NO_COEFFICIENTS = np.zeros((0, 0, 3), np.float32)
@@ -283,7 +283,7 @@ def timed(timing: dict[str, float], stage: str) -> Iterator[None]:
     timing[stage] = timing.get(stage, 0.0) + (time.perf_counter() - start) * 1e3
 
 
-# One camera on its way from Gaussians to images, in pieces between which others may draw.
+# Drawing in pieces, between which others may draw
 
 LIST_BUDGET = 1 << 26
 """Entries of tile lists held at once; larger pictures are made in bands of tile rows."""

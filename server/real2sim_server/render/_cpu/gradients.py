@@ -1,9 +1,13 @@
-"""Tile lists for a pass that will be walked backwards.
+"""Passes of the CPU backend that carry gradients.
 
-Each place in a tile's list also has a slot of its own where the gradients of this record in this
-tile go. The slots of one record lie side by side, so that they can be summed in a fixed order
-without locks.
+The forward pass uses the kernels of every other pass and keeps the records and the tile lists of
+each camera. The backward pass prepares the pixels, walks the tiles front to back once more, sums
+the gradients of the tiles for each Gaussian and chains them through projection and colour. Torch
+derives the gradients of poses and cameras from the few numbers of each placement.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -53,9 +57,6 @@ from .project_backward import (
 from .records import CHUNK, EXTENT_X, EXTENT_Y, MEMBER, TILE, Images, Records
 from .sky import add_sky, sample_sky, sky_backward
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 @kernel(parallel=PARALLEL_LOOPS)
 def scatter_slots(values, footprints, order, tiles_x, first_slots, cursors, lists, slots, spans):
@@ -89,10 +90,7 @@ def scatter_slots(values, footprints, order, tiles_x, first_slots, cursors, list
             spans[index, 1] = slot
 
 
-# Drawing one camera for training: like drawing it, but keeping what the way back needs.
-
-# Kernels take arrays by position.
-# ruff: noqa: PLR0917
+# The forward pass of one camera, which keeps what the backward pass needs
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,12 +193,7 @@ def note_radii(
             region += 1
 
 
-# Passes of the CPU backend that carry gradients.
-#
-# The forward pass uses the kernels of every other pass and keeps the records and the tile lists of
-# each camera. The backward pass prepares the pixels, walks the tiles front to back once more, sums
-# what the tiles say of each Gaussian and chains it through projection and colour. Poses and cameras
-# get theirs by torch from the few numbers of each placement.
+# Forward and backward passes
 
 CLOUD_PARTS = ("means", "quats", "scales", "opacities", "sh")
 STAGES = ("project", "sort", "tile", "blend", "sky")
@@ -305,8 +298,8 @@ class TrainingPasses:
                 by_image = Losses(*(_camera_image(loss, camera) for loss in losses))
                 if losses[0] is None:
                     by_image = by_image._replace(rgb=NOTHING[..., None])
-                way = _WayBack(training, camera, seen, by_image, self.space)
-                way.add_to(result)
+                backward = _BackwardPass(training, camera, seen, by_image, self.space)
+                backward.add_to(result)
         if training.screen is not None:
             for held, new in zip(training.screen.gradients, result.screen, strict=True):
                 held.add_(torch.from_numpy(new))
@@ -398,7 +391,7 @@ def _camera_image(images: Tensor | None, camera: int) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, eq=False)
-class _WayBack:
+class _BackwardPass:
     """The way back through one camera."""
 
     training: TrainingPass

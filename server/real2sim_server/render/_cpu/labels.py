@@ -1,7 +1,13 @@
-"""The innermost steps of blending labels as vector code: one record over eight pixels.
+"""Colours and labels of one camera in one walk over the tiles.
 
-Colours come of the very operations of :mod:`.simd`: their bits are those of a picture alone.
+Besides its colour each pixel learns which record is its front; within the windows of objects it
+also learns the front of each object as if that object stood alone. Where others have finished a
+pixel, the walk goes on with the records of objects. Depth, object and class follow from the front,
+once for each pixel. Colours use the same operations as :mod:`.blend`, so their bits are the same.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -42,10 +48,6 @@ from .records import (
     Images,
     Records,
 )
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 LABEL_PLANES = 5
 """Transmittance (negative once finished), red, green, blue, and the front: one more than the number
@@ -159,14 +161,7 @@ def blend_both(  # type: ignore[no-untyped-def]
     return types.int64(*kinds), generate
 
 
-# Colours and labels of tiles in one walk over their records.
-#
-# Beside the colours each pixel learns which record is its front, and within the windows of objects
-# also which one would be if the object stood alone: where others have finished a pixel, the walk goes
-# on with the records of objects. Depth, object and class follow from the front, once for each pixel.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Blending colours and labels
 
 
 F32 = np.float32
@@ -201,7 +196,7 @@ def blend_labels(
         values, lists, starts, background: as of blend_tiles.
         level: transmittance at which a pixel's front lies.
         objects: Objects.
-        fronts: Fronts.
+        fronts: FirstHits.
     """
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
     rgb, alpha, pixel_fronts = images.rgb, images.alpha, fronts.pixels
@@ -352,14 +347,10 @@ def write_own(own, own_alive, windows, x0, y0, shape, alone, used):
                 used[front] = 1
 
 
-# Depth of a pixel's front: where its ray meets that Gaussian most.
-#
-# The centre of a Gaussian may lie decimetres before or behind what a pixel shows of it: discs on a
-# road reach far along the view. The response along a ray is largest where the ray is nearest to the
-# centre in the Gaussian's own measure (Moenne-Loccoz et al. 2024), blurred as its image is.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Depth of a pixel's front: where its ray meets that Gaussian most. The centre may lie decimetres
+# before or behind: discs on a road reach far along the view. The response peaks where the ray is
+# nearest to the centre in the Gaussian's own metric (Moenne-Loccoz et al. 2024), with its image's
+# blur.
 
 
 SHAPE = 16
@@ -481,7 +472,7 @@ def depth_along(shape, u, v, nearest):
     return max(z + (a * x + b * y) / (a * u + b * v + c), nearest)
 
 
-# One camera on its way from Gaussians to a picture and the depths and objects of its fronts.
+# One camera from Gaussians to a picture with labels
 
 MAX_ID = 65_535
 NO_SHAPES = np.zeros((0, SHAPE), np.float32)
@@ -502,7 +493,7 @@ class Objects(NamedTuple):
     first_record: np.int64
 
 
-class Fronts(NamedTuple):
+class FirstHits(NamedTuple):
     """Numbers of records plus one, 0 where there is none.
 
     Attributes:
@@ -517,7 +508,7 @@ class Fronts(NamedTuple):
 
 
 @dataclass
-class Walk:
+class LabelPass:
     """What one camera asks for, and what its walk has found.
 
     Attributes:
@@ -531,7 +522,7 @@ class Walk:
     level: float
     along_rays: bool
     objects: Objects | None = None
-    fronts: Fronts | None = None
+    fronts: FirstHits | None = None
     records: Records | None = None
 
 
@@ -539,7 +530,7 @@ class Walk:
 class LabelDrawing(Drawing):
     """A Drawing that also finds fronts; it is not interrupted."""
 
-    walk: Walk = field(default_factory=lambda: Walk((), 0.5, along_rays=True))
+    walk: LabelPass = field(default_factory=lambda: LabelPass((), 0.5, along_rays=True))
 
     def label(
         self, placement: Placement, chunks: Sequence[Chunks]
@@ -581,7 +572,7 @@ class LabelDrawing(Drawing):
                 break
             before += len(own)
         records = sum(map(len, chunks)) * CHUNK
-        fronts = Fronts(
+        fronts = FirstHits(
             self.space.array("fronts", (self.request.height, self.request.width), np.int32),
             self.space.array("alone", (pixels,), np.int32),
             self.space.array("used", (1 + records,), np.uint8),
@@ -652,7 +643,7 @@ def draw_labels(
         rgb, alpha = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
         images = Images(rgb, alpha, NOT_ASKED, np.zeros((0, 0), np.uint16), NOT_ASKED)
         timing = dict.fromkeys(("project", "sort", "tile", "blend", "sky"), 0.0)
-        walk = Walk(windows[c], level, along_rays)
+        walk = LabelPass(windows[c], level, along_rays)
         drawing = LabelDrawing(request, c, images, space, timing, walk)
         depth, instance, alone = drawing.label(placement, seen[c])
         found.append(LabelOutput(torch.from_numpy(rgb), depth, instance, tuple(alone), timing))

@@ -1,9 +1,9 @@
 """Eight numbers side by side in a kernel under construction, so that formulas read like formulas.
 
 LLVM's loop vectoriser needs checks for overlapping arrays that cost more than a row of pixels, so
-the eight lanes are spelled out as LLVM vectors. They run as one AVX register, as two SSE or NEON
-registers where those are all there is, and give the same bits in each case as long as the machine
-has fused multiply-add.
+the eight lanes are spelled out as LLVM vectors. They run as one AVX register, or as two SSE or NEON
+registers, and give the same bits on every machine with fused multiply-add. The module also holds
+small vectors and matrices of lanes, and the options of the renderer's kernels.
 """
 
 from __future__ import annotations
@@ -248,7 +248,7 @@ def mask_of(builder: ir.IRBuilder, bits: Any) -> Any:
     return builder.bitcast(builder.trunc(bits, ir.IntType(LANES)), vector)
 
 
-# Options of the renderer's kernels; how they are kept on disk is in ``_numba``.
+# Kernel options; ``_numba`` caches kernels on disk.
 
 kernel: Any = functools.partial(cached_kernel, nogil=True)
 """For entry points: they take long enough to let other threads of Python run."""
@@ -261,7 +261,7 @@ instructions, which take several times as long as the work itself.
 """
 
 
-# Vectors and small matrices of eight Gaussians at a time in kernels under construction.
+# Vectors and small matrices of lanes
 
 Vector = list[Lanes]
 

@@ -1,9 +1,15 @@
-"""Projection of eight Gaussians at a time as explicit vector code.
+"""Projection of a cluster of Gaussians onto one image, fused with culling and colour.
 
-The eight lie in PROJECTION planes of eight float32 numbers: first those of a record, in the order
-of its fields, then what is known of the Gaussian, then notes from one step for the next. Each step
-is told by bits which lanes are still in question and answers with those that remain.
+Nothing of the cluster is copied: each visible Gaussian becomes one record, eight at a time. Chunks
+of fixed size write to regions of their own, so the result does not depend on the thread count.
+
+The steps are explicit vector code. Eight Gaussians lie in PROJECTION planes of eight float32
+numbers: the fields of a record, then properties of the Gaussian, then intermediate values. Each
+step takes a bit mask of active lanes and returns the lanes that remain.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -275,12 +281,10 @@ shape_eight = eight_step(partial(_shape, deformed=False), count=PROJECTION)
 shape_eight_deformed = eight_step(partial(_shape, deformed=True), count=PROJECTION)
 
 
-# Which tiles a record may touch: a range of columns in each row of tiles.
-#
-# A footprint is one int64: from the lowest bit on the tiles x0, x1, y0, y1 of the half-open box
-# around it, FIELD bits each, then one bit for each tile of a box of at most SMALL x SMALL tiles, row
-# by row. Such a footprint says everything by itself, so that dealing records to tiles does not need
-# the records, which do not fit a cache.
+# Footprints: the tiles that a record may touch. A footprint is one int64: from the lowest bit the
+# tiles x0, x1, y0, y1 of the half-open box around it, FIELD bits each, then one bit for each tile
+# of a box of at most SMALL x SMALL tiles, row by row. It is complete, so tile lists need no
+# records, which would not fit a cache.
 
 F32 = np.float32
 ZERO = F32(0)
@@ -304,7 +308,7 @@ def footprints_of_eight(typingctx, planes, lanes, view, found):  # type: ignore[
     """Write the footprints of eight records to ``found`` [8] int64.
 
     Args:
-        planes: see :mod:`.project_lanes`.
+        planes: PROJECTION planes, see the module.
         lanes: bits of those that are in question.
         view: CameraParameters.
 
@@ -431,14 +435,7 @@ def side_reach(record: Any, y0: Any, y1: Any, tip: Any, side: Any) -> Any:
     return record[SLOPE] * dy + side * math.sqrt(room) / record[SHARPNESS]
 
 
-# Projection of one cluster of Gaussians onto one image, fused with culling and colour.
-#
-# Nothing of the cluster is copied: what may be seen becomes one record, eight Gaussians at a time.
-# Chunks of fixed size write to regions of their own, so that the result does not depend on the
-# number of threads.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Projection of a cluster
 
 
 TWO = F32(2)
@@ -487,7 +484,7 @@ def project_chunk(cluster, view, start, planes, found, values, footprints, depth
     """Write the records of CHUNK Gaussians from ``start`` on to the region from ``first`` on.
 
     Args:
-        planes, found: work space, see :mod:`.project_lanes` and footprints_of_eight.
+        planes, found: work space, see the module and footprints_of_eight.
 
     Returns:
         Records written.

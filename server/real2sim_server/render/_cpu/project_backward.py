@@ -1,4 +1,13 @@
-"""Gradients of view-dependent colour by the spherical harmonics and by the viewing direction."""
+"""Backward projection: from the gradients of records to those of Gaussians and their placement.
+
+One fused pass over the records of a cluster: sum the slots, chain through the projection and the
+spherical harmonics, write. Intermediate numbers are float64, since the covariances of needles
+cancel. Each chunk sums the gradients of the placement on its own, in a fixed order for any number
+of threads.
+"""
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -28,10 +37,6 @@ from .blend_backward import (
 from .lanes import inlined, kernel
 from .project import FASTMATH
 from .records import BLUE, CHUNK, EXPONENT_UNIT, GREEN, MEMBER, RED
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 F32 = np.float32
 ZERO, ONE, TWO, THREE, FIVE = F32(0), F32(1), F32(2), F32(3), F32(5)
@@ -134,14 +139,7 @@ def weigh(sh, k, r, g, b):
     return sh[k, 0] * r + sh[k, 1] * g + sh[k, 2] * b
 
 
-# Projection backwards: from gradients by records to gradients by Gaussians and their placement.
-#
-# One fused pass over the records of a cluster: sum the slots, chain through the projection, write.
-# Numbers are float64 in between, since the covariances of needles cancel. Chunks sum the gradients
-# of the placement on their own, in a fixed order for any number of threads.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Backward projection
 
 
 F64 = np.float64

@@ -1,8 +1,12 @@
-"""The innermost step of blending by rays as explicit vector code: one record over eight pixels.
+"""Drawing a camera with a lens or a rolling shutter: as a pinhole, with rays in place of the conic.
 
-State of eight pixels is RAY_PLANES vectors in a row: those of the pinhole, then the ray x, y, z and
+Nothing here is compiled before such a camera is drawn. The innermost step is explicit vector code
+over eight pixels. Their state is RAY_PLANES vectors: those of the pinhole, then the ray x, y, z and
 its time, -0.5 to 0.5 over the read-out.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -52,9 +56,6 @@ from .records import (
     Records,
 )
 from .sky import add_ray_sky
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-
 
 RAY = PLANES
 TIME = PLANES + 3
@@ -113,7 +114,7 @@ class _Record:
 
 
 def _ray_intrinsic(extras: int, *, moving: bool) -> Any:
-    """The intrinsic for what :func:`.simd._blend_intrinsic` says, of rays that start in one place
+    """The intrinsic for what :func:`.blend._blend_intrinsic` says, of rays that start in one place
     or (``moving``) in many.
 
     In kernels: blend(pixels, half, record); returns zero when all are finished.
@@ -140,10 +141,7 @@ blend_moving_ray = _ray_intrinsic(1, moving=True)
 blend_moving_ray_all = _ray_intrinsic(7, moving=True)
 
 
-# Blending of tiles by the rays of their pixels; otherwise like :mod:`.blend`.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Blending of tiles by rays; otherwise like :mod:`.blend`
 
 
 F32 = np.float32
@@ -260,9 +258,7 @@ def write_ray_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, medi
                 median[y, x] = pixels[p + 6 * LANES]
 
 
-# Drawing a camera with a lens or a rolling shutter: as a pinhole, with rays in place of the conic.
-#
-# Nothing here is compiled before such a camera is drawn.
+# Drawing
 
 MARGIN = np.radians(2.0)
 """By which the field of view is widened when chunks are left out."""

@@ -4,6 +4,9 @@ Like :mod:`.project`, with the steps of :mod:`.ray_lanes`. Which pixels a large 
 is bounded by the outline that the camera sees.
 """
 
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
+
 from __future__ import annotations
 
 import functools
@@ -52,10 +55,6 @@ from .records import (
     TILE,
     TIP_Y,
 )
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 called = functools.partial(func, _nrt=False)
 """Left to the compiler whether it is inlined: one large Gaussian takes long enough for a call."""

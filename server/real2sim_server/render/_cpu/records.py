@@ -1,4 +1,4 @@
-"""What the CPU kernels hand to each other."""
+"""Data that the CPU kernels hand to each other."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Records(NamedTuple):
 
     Attributes:
         values: [M, RECORD] float32.
-        footprints: [M] int64, see :mod:`.footprint`; they fit a cache where the records do not.
+        footprints: [M] int64, see :mod:`.project`; they fit a cache where the records do not.
         depths: [M] float32, depth of the centres [m].
         counts: [M / CHUNK] int64, records in use of each region.
     """
@@ -125,7 +125,7 @@ class Images(NamedTuple):
     median: NDArray[np.float32]
 
 
-# What the kernels of cameras with lenses hand to each other, besides what all hand on.
+# Cameras with lenses
 
 RAY_RECORD = 2 * RECORD
 """float32 values of a record: two cache lines. The first is that of a pinhole, whose ellipse holds

@@ -1,4 +1,11 @@
-"""The sky behind the picture: the twin of Sky.sample in Numba."""
+"""The sky behind an image, forward and backward: the twin of Sky.sample in Numba.
+
+The backward pass deals texel rows to tasks. Each task looks through all pixels for its rows in the
+same order, so no two threads add to one texel.
+"""
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -9,10 +16,6 @@ from numba import prange
 
 from ..._numba import PARALLEL_LOOPS
 from .lanes import inlined, kernel
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 F32 = np.float32
 ZERO = F32(0)
@@ -125,9 +128,7 @@ def face_coordinates(direction):
     return axis + (np.int32(0) if forward else np.int32(1)), u / largest, v / largest
 
 
-# The sky behind the picture of a camera with a lens.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Cameras with lenses
 
 
 @kernel(parallel=PARALLEL_LOOPS)
@@ -172,10 +173,7 @@ def add_ray_sky(faces, turn, rays, rgb, alpha):
                     add_sample(texels, faces.shape[1], corner, down, right, weight, rgb[row, x])
 
 
-# The sky behind the picture, backwards: gradients by the texels of its faces.
-#
-# Texel rows are dealt to tasks, and each task looks through all pixels for its rows in the same
-# order, so that no two threads add to one texel.
+# Backward pass
 
 """A power of two, so that the owner of a row is its lowest bits."""
 

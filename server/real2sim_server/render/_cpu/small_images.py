@@ -5,6 +5,9 @@ instead. What an image shows depends on nothing but its own request, so any numb
 any company gives the same bits.
 """
 
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
+
 from __future__ import annotations
 
 import math
@@ -57,10 +60,6 @@ from .project import (
 )
 from .records import DEPTH, INSTANCE, RECORD, TILE, CameraParameters, Cluster
 from .sky import CLEAR, add_sample, pixel_direction, texel_corner
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 F32 = np.float32
 HALF = F32(0.5)
@@ -232,7 +231,7 @@ def choose_levels(
 
 @inlined()
 def in_view(low, high, sigma, linear, offset, view):
-    """Whether something of a box may be seen: the planes of :mod:`..cull`, one box."""
+    """Whether something of a box may be seen: the planes of :mod:`.drawing`, one box."""
     reach = REACH_MAX * SLACK_SIZE
     edge = reach * view.blur + SLACK_PIXELS
     x = y = z = 0.0
@@ -406,7 +405,7 @@ def sky_image(faces, matrix, rgb, alpha):
                 add_sample(texels, size, np.uint64(corner), down, right, weight, rgb[row, x])
 
 
-# Requests of small images, alone or many at once, on their way to the kernel that draws them.
+# Requests of small images, alone or many at once
 
 CELL_PIXELS = 2.5
 """Merged cells are at most this large on the image [px]. It takes a seventh less time than 2 and is

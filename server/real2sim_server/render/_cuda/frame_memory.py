@@ -1,4 +1,4 @@
-"""What lies on the device from frame to frame: clouds, colours and skies."""
+"""Data of a frame on the device: clouds that stay, tables of a request, work space, images."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .launcher import (
 )
 
 
-class Residence:
+class DeviceScene:
     """Addresses on the device. What lies elsewhere is copied there once, and kept while the
     original lives."""
 
@@ -70,11 +70,11 @@ class Residence:
         return numbers
 
 
-# From requests to the tables that the kernels read. One pass over the list, the rest is arrays.
+# Tables that the kernels read: one pass over the requests, the rest is arrays.
 
 IDENTITY = np.eye(4)
 CLOUD_COLUMNS = ("means", "quats", "scales", "opacities", "sh", "count", "functions")
-"""What Residence.cloud gives."""
+"""What DeviceScene.cloud gives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class _Drawn:
 
 
 def tables_of(
-    requests: Sequence[RasterRequest], residence: Residence, launcher: Launcher
+    requests: Sequence[RasterRequest], device_scene: DeviceScene, launcher: Launcher
 ) -> Tables:
     """Tables of all cameras of ``requests``, in their order.
 
@@ -120,8 +120,8 @@ def tables_of(
     """
     drawn = _drawn(requests)
     viewmats = np.concatenate([request.viewmats.detach().cpu().numpy() for request in requests])
-    cameras = _cameras(requests, viewmats, residence)
-    objects, tones, moved = _objects(drawn, residence, launcher)
+    cameras = _cameras(requests, viewmats, device_scene)
+    objects, tones, moved = _objects(drawn, device_scene, launcher)
     last = objects[-1] if len(objects) else None
     pixels = cameras["width"][-1].astype(np.int64) * cameras["height"][-1]
     return Tables(
@@ -180,7 +180,7 @@ def _is_same_pose(a: Instance, b: Instance) -> bool:
 
 
 def _cameras(
-    requests: Sequence[RasterRequest], viewmats: NDArray[np.float64], residence: Residence
+    requests: Sequence[RasterRequest], viewmats: NDArray[np.float64], device_scene: DeviceScene
 ) -> NDArray[np.void]:
     counts = [request.cameras for request in requests]
     table = np.zeros(sum(counts), CAMERA)
@@ -193,7 +193,7 @@ def _cameras(
     table["highest"] = (size - centre) / focal + margin
     table["directions"] = viewmats[:, :3, :3].transpose(0, 2, 1) @ np.linalg.inv(Ks)
     table["background"] = np.repeat([r.options.background for r in requests], counts, axis=0)
-    skies = [(residence.sky(r.sky), r.sky.resolution) if r.sky else (0, 0) for r in requests]
+    skies = [(device_scene.sky(r.sky), r.sky.resolution) if r.sky else (0, 0) for r in requests]
     table["sky"] = np.repeat(np.array([sky for sky, _ in skies], np.uint64), counts)
     table["sky_resolution"] = np.repeat([resolution for _, resolution in skies], counts)
     table["behind"] = np.repeat([class_behind(request) for request in requests], counts)
@@ -205,13 +205,13 @@ def _cameras(
 
 
 def _objects(
-    drawn: Sequence[_Drawn], residence: Residence, launcher: Launcher
+    drawn: Sequence[_Drawn], device_scene: DeviceScene, launcher: Launcher
 ) -> tuple[NDArray[np.void], NDArray[np.float32], list[Tensor]]:
     """Table of objects, the tones of their colours, and what was moved for this frame."""
     table = np.zeros(len(drawn), OBJECT)
     if not drawn:
         return table, np.zeros(0, np.float32), []
-    clouds = np.array([residence.cloud(item.instance.cloud) for item in drawn], np.uint64).T
+    clouds = np.array([device_scene.cloud(item.instance.cloud) for item in drawn], np.uint64).T
     for name, column in zip(CLOUD_COLUMNS, clouds, strict=True):
         table[name] = column
     table["first_camera"] = [item.first_camera for item in drawn]
@@ -227,7 +227,7 @@ def _objects(
             moved.append(covars.detach().to(launcher.device).contiguous())
             table["covars"][row] = launcher.pointer(moved[-1])
         if colour is not None:
-            table["colour"][row] = residence.colour(colour)
+            table["colour"][row] = device_scene.colour(colour)
             table["tones"][row] = sum(map(len, tones))
             tones.append(colour.tones(item.instance.t_us).numpy())
             table["tone_count"][row] = len(tones[-1])
@@ -277,7 +277,7 @@ def _sums_before(counts: NDArray[np.integer]) -> NDArray[np.int64]:
     return sums
 
 
-# Memory of a frame on the device: what is uploaded, worked in, and given out.
+# Memory of a frame: uploads, work space, images
 
 ALIGNMENT = 256
 REPORT_BYTES = COUNTERS * 4

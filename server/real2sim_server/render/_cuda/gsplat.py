@@ -1,4 +1,8 @@
-"""Sizes and gradients on the image as gsplat knows them."""
+"""The CUDA backend: gsplat behind the same call.
+
+The device transforms objects into world means and covariances and evaluates their colours in their
+own frames, then gsplat blends them. This module is imported only where CUDA is requested.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +85,7 @@ def track_screen(
     return statistics
 
 
-# Milliseconds of the stages of a picture, by events on the device's own queue.
+# Stage times from events on the device queue
 
 
 class StageTimes:
@@ -126,10 +130,7 @@ class StageTimes:
         return {name: first.elapsed_time(last) for name, (first, last) in self._events.items()}
 
 
-# The CUDA backend: gsplat behind the same call.
-#
-# Objects are brought into the world on the device as means and covariances; their colours are
-# evaluated in their own frames before gsplat blends them. Imported only where CUDA is asked for.
+# The backend
 
 
 class CudaBackend:

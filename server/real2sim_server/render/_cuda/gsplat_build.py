@@ -1,8 +1,14 @@
-"""gsplat's CUDA sources cut down to what the CUDA backend calls.
+"""Compiling gsplat's kernels from wheels alone, and finding compiled ones.
 
-Packed projection, covariances, spherical harmonics, tile intersection and blending of three and
-four channels, forward and backward: minutes of compiling less, and the same functions under the
-same names, so that gsplat's own wrapper finds them.
+PyPI's gsplat has no compiled kernels and compiles them on first use, for minutes and with the
+compiler it happens to find. Here that is a separate step, ``real2sim doctor --build-gpu``: the
+``cuda`` extra brings the compiler in the version that torch was built with. The result is cached
+by the versions of gsplat, torch and Python and by the architectures.
+
+Only what the CUDA backend calls is compiled: packed projection, covariances, spherical harmonics,
+tile intersection and blending of three and four channels, forward and backward. This saves minutes
+and keeps the function names, so gsplat's own wrapper finds them. As a program, the module compiles
+these sources: ``<folder of gsplat> <folder to work in>``.
 """
 
 from __future__ import annotations
@@ -22,7 +28,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch.utils import cpp_extension
 
 from ..._files import atomic_folder
 from ..._nvrtc import kernels_folder
@@ -103,13 +108,13 @@ def _without_bindings(text: str) -> str:
     return binding.sub(lambda found: found[0] if found[1] in FUNCTIONS else "", text)
 
 
-# Compiles gsplat's slim sources, as a program: ``<folder of gsplat> <folder to work in>``.
-#
-# Started by :mod:`.gsplat_build` with the variables by which torch finds the compiler.
+# Compilation
 
 
 def compile_gsplat(package: Path, work: Path) -> None:
     """Leave ``csrc.so`` in ``work``."""
+    from torch.utils import cpp_extension
+
     sources = work / "sources"
     sources.mkdir()
     cuda = package / "cuda"
@@ -130,16 +135,7 @@ def compile_gsplat(package: Path, work: Path) -> None:
     )
 
 
-if __name__ == "__main__":
-    compile_gsplat(Path(sys.argv[1]), Path(sys.argv[2]))
-
-
-# Compiling gsplat's kernels from wheels alone, and finding what was compiled.
-#
-# PyPI's gsplat has no compiled kernels, and compiles them when it is first used, for minutes and
-# with whatever compiler it meets. Here that is a step of its own, ``real2sim doctor --build-gpu``:
-# the compiler comes with the ``cuda`` extra in the version that torch was built with, and what it
-# makes is kept by gsplat, torch, Python and the architectures it is for.
+# Build and cache
 
 LIBRARY = "csrc.so"
 RECORD = "built.json"
@@ -301,3 +297,7 @@ def _key() -> str:
         version = "none"
     tag = f"cp{sys.version_info.major}{sys.version_info.minor}"
     return f"gsplat-{version}-torch{torch.__version__}-{tag}"
+
+
+if __name__ == "__main__":
+    compile_gsplat(Path(sys.argv[1]), Path(sys.argv[2]))

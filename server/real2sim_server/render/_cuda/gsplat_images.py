@@ -4,6 +4,9 @@ tile lists.
 Needs numba-cuda. The kernel also runs in Numba's CUDA simulator, where it is tested.
 """
 
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
+
 from __future__ import annotations
 
 import math
@@ -15,10 +18,6 @@ from numba import cuda
 from torch import Tensor
 
 from ..backend import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-
-# Kernels take arrays by position.
-# ruff: noqa: PLR0917
-
 
 F32 = np.float32
 THREADS = (16, 16)

@@ -1,4 +1,7 @@
-"""What the kernels read, as NumPy types: the structures of ``kernels/frame.h``, field by field."""
+"""Serving kernels on a device: their data types, compilation by NVRTC, and launches.
+
+The NumPy types mirror the structures of ``kernels/frame.h`` field by field.
+"""
 
 from __future__ import annotations
 
@@ -105,7 +108,7 @@ FRAME = _structure(
 )
 
 
-# What compiled kernels take of a GPU, as ptxas says it.
+# Resource usage of compiled kernels, as reported by ptxas
 
 _PATTERN = re.compile(
     r"entry function '(?P<kernel>\w+)'.*?(?P<stack>\d+) bytes stack frame, "
@@ -175,7 +178,7 @@ def usage_of(log: str) -> dict[str, Usage]:
     }
 
 
-# The serving kernels, compiled by NVRTC.
+# Compilation of the serving kernels
 
 __all__ = [
     "ARCHITECTURES",
@@ -237,7 +240,7 @@ def _source() -> KernelSource:
     )
 
 
-# What the backend asks of a device, and the device that is a GPU.
+# Launches
 
 
 class Launcher(Protocol):

@@ -1,7 +1,7 @@
-"""What the CUDA backend needs, what of it is here, and what to do about the rest.
+"""Requirements of the CUDA backends, their state on this machine, and how to meet the rest.
 
-Answers without loading gsplat or compiling anything, so that it can be asked at every start;
-:func:`try_without_device` tries what can be tried on a machine that has no GPU.
+Answers load no gsplat and compile nothing, so they are cheap enough for every start;
+:func:`try_without_device` tests as much as a machine without a GPU can.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def installed_version(distribution: str) -> str | None:
         return None
 
 
-# What the backend needs, what of it is here, and what to do about the rest.
+# Requirements of NVRTC
 
 
 def nvrtc_needs() -> list[Need]:

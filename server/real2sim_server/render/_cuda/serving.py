@@ -22,9 +22,9 @@ from ..types import RasterOptions, RenderError, RenderOutput, WorldViews
 from .frame_memory import (
     PAIRS_PER_SPLAT,
     REPORT_BYTES,
+    DeviceScene,
     FrameMemory,
     Images,
-    Residence,
     Tables,
     tables_of,
     tile_passes,
@@ -58,7 +58,7 @@ class NvrtcBackend:
     def __init__(self, launcher: Launcher | None = None) -> None:
         self._launcher = launcher or CudaLauncher()
         self.device = self._launcher.device
-        self._residence = Residence(self._launcher)
+        self._device_scene = DeviceScene(self._launcher)
         self._memory = FrameMemory(self._launcher)
         self._lock = threading.RLock()
 
@@ -193,7 +193,7 @@ class NvrtcBackend:
                 "gsplat: real2sim doctor --build-gpu"
             )
         memory = self._memory
-        tables = tables_of(requests, self._residence, self._launcher)
+        tables = tables_of(requests, self._device_scene, self._launcher)
         looked_at = int(
             (tables.objects["count"].astype(np.int64) * tables.objects["cameras"]).sum()
         )

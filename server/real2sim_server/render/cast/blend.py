@@ -1,7 +1,12 @@
-"""The innermost step of cast(): one Gaussian met by eight rays, as explicit vector code.
+"""Following rays through the Gaussians of their tile, from near to far.
 
-State of eight rays is STATE vectors in a row. Rays are six vectors: origin and direction.
+Tiles are dealt to tasks in a fixed pattern and share nothing, so any number of threads gives the
+same bits. The innermost step is explicit vector code: one Gaussian against eight rays. The state of
+eight rays is STATE vectors; rays are six vectors, origin and direction.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -45,10 +50,6 @@ from .layout import (
     WHITENING,
 )
 from .types import ECHO_MIN, HALF_LIGHT, TRANSMITTANCE_MIN
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
-
 
 LIGHT, RANGES, REFLECTED, LOST = 0, 1, 2, 3
 """Transmittance, and sums of w tau, w reflectivity and w loss."""
@@ -235,13 +236,7 @@ __all__ = [
 ]
 
 
-# Following the rays of each tile, from near to far.
-#
-# Tiles are dealt to tasks by a fixed pattern and share nothing, so any number of threads gives the
-# same bits.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Following the rays of a tile
 
 
 TASKS = 64
@@ -357,10 +352,7 @@ def write_rays(rays, state, out, owners, several):
                     several[index, k] = state[place + (FIRST + k) * LANES]
 
 
-# Which Gaussians each ray meets and how, as lists, for what is fitted to recorded sweeps.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Lists of the Gaussians that each ray meets, for fitting to recorded sweeps
 
 
 @kernel(parallel=PARALLEL_LOOPS)

@@ -1,4 +1,4 @@
-"""The one call: a sweep of a LiDAR through Gaussians."""
+"""Casting a LiDAR sweep through Gaussians, of one instant or of a recorded scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..types import Instance, RenderError
 from .layout import AZIMUTH_BINS, layout_of
 from .types import CastBackend, CastRequest, Echo
 
-# How squarely surfaces face the LiDAR, and what they send back for it.
+# Intensity by the angle of incidence
 
 Array = NDArray[np.float32]
 _normals: weakref.WeakKeyDictionary[GaussianCloud, Array] = weakref.WeakKeyDictionary()
@@ -252,7 +252,7 @@ def _attributes(
     return tuple(checked)
 
 
-# A sweep through a scene as it was recorded: everything moves along its own trajectory.
+# Recorded scenes: everything moves along its own trajectory.
 
 Attributes = NDArray[np.float32]
 
@@ -347,7 +347,7 @@ def transforms_at(trajectory: Trajectory, times_us: Float) -> Float:
     return transform_from(positions, quaternions)
 
 
-# Kernels of casting made ready.
+# Warm-up
 
 
 def kernels_of_casting_on_disk() -> bool:

@@ -1,4 +1,9 @@
-"""What the kernels read, as NumPy types: the structures of ``kernels/beams.h``, field by field."""
+"""cast() on an NVIDIA GPU: prepare, deal to tiles, sort, follow the rays.
+
+Work space grows to the largest sweep so far. Clouds and the tables of a sensor are copied to the
+device once and stay while they live. NVRTC compiles ``kernels/``; the NumPy types mirror the
+structures of ``kernels/beams.h`` field by field.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +75,7 @@ SWEEP = np.dtype(
 )
 
 
-# The kernels of cast(), compiled by NVRTC.
+# Compilation
 
 FOLDER = Path(__file__).parent / "kernels"
 SOURCE = FOLDER / "cast.cu"
@@ -103,10 +108,7 @@ def _source() -> KernelSource:
     )
 
 
-# cast() on an NVIDIA GPU: prepare, deal to tiles, sort, follow the rays.
-#
-# What a sweep works in grows to what sweeps before have needed; clouds and the tables of a sensor are
-# copied to the device once and stay while they live.
+# The caster
 
 MAX_GAUSSIANS = 1 << 29
 MAX_PAIRS = 1 << 31

@@ -1,9 +1,8 @@
-"""How the rays of a LiDAR are laid out in tiles: bands of elevation, in them tiles by azimuth.
+"""Tiles of a LiDAR's rays: bands of elevation, cut into tiles by azimuth, and their lists.
 
 A tile is eight groups of eight rays. The groups of a tile differ in elevation, the rays of a group
-in azimuth, since what lies on the road is wide and low as a sensor sees it. Turning sensors fill
-tiles of eight rows by eight columns, tables are cut into tiles by sorting. Made once for each
-``Beams``.
+in azimuth, since objects on the road appear wide and low to a sensor. Turning sensors fill tiles of
+eight rows by eight columns, tables are cut into tiles by sorting. Made once for each ``Beams``.
 """
 
 from __future__ import annotations
@@ -298,7 +297,7 @@ def _difference(a: Float, b: Float) -> Float:
     return turned
 
 
-# What the kernels of cast() hand to each other.
+# Data that the kernels hand to each other
 
 RECORD = 16
 """float32 values of a record: one cache line for each Gaussian that a ray may meet."""
@@ -394,7 +393,7 @@ class Lights(NamedTuple):
     returns: NDArray[np.float32]
 
 
-# Lists of the records that each tile of rays may meet, from near to far.
+# Tile lists, from near to far
 
 TILE_CHUNKS = 8
 LOOK_AHEAD = 24

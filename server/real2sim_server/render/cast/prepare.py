@@ -1,8 +1,16 @@
-"""Eight Gaussians at a time: their whitening, and between which angles rays may meet them.
+"""From the Gaussians of one body to records of those that rays may meet, and at which angles.
 
-Angles are exact tangents to the ellipsoid alpha = 1/255 as seen by the sensor at the instant it
-looks at the centre, widened by how far it can move until it looks at the edges.
+The sensor moves while it turns, so the instant at which it looks at each Gaussian is found first.
+Where the sweep begins and ends the same place is seen twice, a turn apart; Gaussians there become
+two records, one for the tiles of either half of the sweep.
+
+Eight Gaussians are whitened and bounded at a time. Angles are exact tangents to the ellipsoid
+alpha = 1/255 as seen by the sensor when it looks at the centre, widened by its motion until it
+looks at the edges.
 """
+
+# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -143,7 +151,7 @@ def _spread(direction: Vector, rows: Sequence[Vector], reach: Lanes) -> Vector:
     return [dot(direction, column) * reach for column in columns]
 
 
-def _angles(  # noqa: PLR0917
+def _angles(
     sensor: Named, seen: list[Vector], gain: Lanes, along: Lanes, z: Lanes, square: Lanes
 ) -> dict[str, Lanes | Any]:
     """Bounds against the centre: ``left``, ``right``, ``down``, ``up`` [rad], how far they are
@@ -230,14 +238,7 @@ prepare_eight = eight_step(partial(_prepare, deformed=False), count=PREPARATION)
 prepare_eight_deformed = eight_step(partial(_prepare, deformed=True), count=PREPARATION)
 
 
-# From the Gaussians of one body to records of those that rays may meet, and where they do.
-#
-# The sensor moves while it turns: for each Gaussian the instant at which it is looked at is found
-# first. Where the sweep begins and ends the same place is seen twice, a turn apart; what lies there
-# becomes two records, one for the tiles of either half of the sweep.
-
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
-# ruff: noqa: PLR0917
+# Records of a body
 
 
 F32 = np.float32

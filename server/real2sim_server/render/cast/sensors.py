@@ -1,7 +1,15 @@
-"""From what light meets to what a LiDAR measures: detection limit, losses, range noise.
+"""From what light meets to what a LiDAR or a radar measures.
 
-Chance is a hash of the seed and the ray's number, so that a sweep has the same bits on any number
-of threads, and changing one ray changes no other.
+A LiDAR adds a detection limit, losses and range noise. Randomness is a hash of the seed and the
+ray's number, so a sweep has the same bits on any number of threads, and changing one ray changes no
+other.
+
+A radar adds reflected power, cells, a threshold, clutter and ghosts. A ray stands for its solid
+angle. Its patch has the radar cross section (RCS) of its area, seen from the sensor, times a factor
+by class and incidence: a lobe about the normal, and a floor for corners and edges. Powers of
+patches in one cell of range, azimuth, elevation and radial velocity add up; a cell above the
+threshold is one detection, at the power-weighted mean of its patches. Power falls with the fourth
+power of range: a target of REFERENCE_RCS is just detected at the radar's ``detection_range_m``.
 """
 
 from __future__ import annotations
@@ -113,15 +121,7 @@ def normal(seed: int, count: int) -> NDArray[np.float64]:
     return numbers
 
 
-# From what rays meet to what a radar detects: reflected power, cells, threshold, clutter, ghosts.
-#
-# A ray stands for its solid angle. The patch that it meets has the radar cross section (RCS) of its
-# area, seen from the sensor, times a share by class and incidence: a lobe about the normal, and a
-# floor for corners and edges. Powers of patches in one cell of range, azimuth, elevation and radial
-# velocity add up; a cell above the threshold is one detection, at the mean of its patches by power.
-#
-# Power falls with the fourth power of range: a target of REFERENCE_RCS is just detected at the
-# radar's ``detection_range_m``.
+# Radar
 
 REFERENCE_RCS = 10.0
 """[m^2], that of a car from behind."""

@@ -1,4 +1,4 @@
-"""What goes into cast() and what comes out."""
+"""Input and output of cast(), and the motion of sensor and bodies over a sweep."""
 
 from __future__ import annotations
 
@@ -119,11 +119,9 @@ class CastBackend(Protocol):
         ...
 
 
-# How the sensor and the bodies move over a sweep, in the frame of the sweep.
-#
-# That frame is the sensor's own at the middle instant. Each body is placed in it where it stands
-# then; at other instants the body is taken as still and the sensor as moved instead, so that a ray
-# meets it as it stands at the ray's own instant.
+# Motion in the frame of the sweep: the sensor's own at the middle instant. Each body is placed in it
+# as it stands then. At other instants the body counts as still and the sensor as moved, so a ray
+# meets the body as it stands at the ray's own instant.
 
 STILL = 1e-9
 """Poses that differ by less are the same."""
@@ -189,7 +187,7 @@ def _rates(to_sensor: Float, seconds: Float) -> tuple[Float, Float]:
     return np.where(speed > 1e-6, speed, 0.0), np.where(turn > 1e-6, turn, 0.0)
 
 
-# How fast what a ray meets moves.
+# Velocities of hit points
 
 
 def point_velocities(request: CastRequest, echo: Echo, hit: NDArray[np.bool_]) -> Image:
