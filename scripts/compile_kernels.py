@@ -22,8 +22,8 @@ def main() -> None:
 def compile_drawing() -> None:
     """Images, worlds and what plans in them."""
     from real2sim_server import render, world
-    from real2sim_server.render.cast.warm_up import warm_up_casting
-    from real2sim_server.render.lenses import warm_up_lenses
+    from real2sim_server.render.cast.call import warm_up_casting
+    from real2sim_server.render.frame import warm_up_lenses
 
     render.warm_up("cpu")
     render.warm_up_small_images("cpu")

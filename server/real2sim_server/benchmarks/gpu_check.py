@@ -37,10 +37,10 @@ from ..reconstruct.training.densify import DensifyOptions
 from ..reconstruct.training.schedule import TrainOptions
 from ..reconstruct.training.trainer import Trainer
 from ..render import Instance, RigView, encode_rgb, render_rigs, select_backend
-from ..render.backends.base import Backend, device_of
+from ..render.backend import Backend, device_of
 from ..render.cast import CastBackend, select_caster
 from ..render.cast.call import checked_request
-from ..render.jpeg import JpegEncoder, jpeg_encoder_for
+from ..render.images import JpegEncoder, jpeg_encoder_for
 from ..scene import Beams, Camera, Lidar, Sky
 from ..scene.camera import T_VEHICLE_OPTICAL
 from ..synthetic import CameraSpec, SyntheticConfig, generate_log

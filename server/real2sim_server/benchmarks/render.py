@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from ..render.backends.base import Backend
-from ..render.backends.reference import ReferenceBackend
-from ..render.backends.select import describe_backends, select_backend
+from ..render._reference import ReferenceBackend
+from ..render.backend import Backend
 from ..render.frame import warm_up
 from ..render.rasterize import rasterize
+from ..render.select import describe_backends, select_backend
 from ..render.types import Instance, RasterOptions, RenderOutput
 from ..scene import Sky
 from ..scene.io import read_splats

@@ -28,7 +28,7 @@ from .command import app
 from .options import JsonFile
 
 if TYPE_CHECKING:
-    from ..render.backends.nvrtc.usage import Usage
+    from ..render._cuda.launcher import Usage
 
 DISTRIBUTIONS = (
     "real2sim",
@@ -150,7 +150,7 @@ def _version(distribution: str) -> str:
 
 def _build_gpu(*, findings: dict[str, str], arch: list[str] | None) -> None:
     """Compile gsplat's kernels for ``arch``, or for the GPU of this machine."""
-    from ..render.backends.cuda.gsplat_build import build_kernels
+    from ..render._cuda.gsplat_build import build_kernels
 
     names = sorted({_capability(name) for name in arch or _own_architecture()})
     there = _compiled_already(names)
@@ -166,7 +166,7 @@ def _build_gpu(*, findings: dict[str, str], arch: list[str] | None) -> None:
 def _compiled_already(architectures: list[str]) -> Path | None:
     """The kernels for exactly these architectures, if they can be loaded."""
     from ..render import RenderError
-    from ..render.backends.cuda.gsplat_build import built_kernels, load_kernels
+    from ..render._cuda.gsplat_build import built_kernels, load_kernels
 
     for kernels in built_kernels():
         if sorted(kernels.architectures) != architectures:
@@ -202,9 +202,9 @@ def _capability(name: str) -> str:
 
 def _check_gpu(*, out: Path | None, json: Path | None) -> None:
     """Try everything on the GPU of this machine, and print what was found."""
-    from ..render.backends.nvrtc.needs import unmet_need
+    from ..render._cuda.needs import unmet_nvrtc_need
 
-    need = unmet_need()
+    need = unmet_nvrtc_need()
     if need is not None:
         raise CommandError(f"there is no GPU to check: {need.found}; {need.remedy}")
     from ..benchmarks import gpu_check
@@ -223,9 +223,8 @@ def _check_gpu(*, out: Path | None, json: Path | None) -> None:
 def _compile_serving(*, report: _Report, arch: list[str] | None) -> None:
     """Put down what each serving kernel takes on each architecture."""
     _require_compiler()
-    from ..render.backends.nvrtc.compile import ARCHITECTURES, compile_kernels
-    from ..render.backends.nvrtc.records import THREADS
-    from ..render.cast.cuda.compile import compile_kernels as compile_casting
+    from ..render._cuda.launcher import ARCHITECTURES, THREADS, compile_kernels
+    from ..render.cast.cuda import compile_kernels as compile_casting
 
     for architecture in _given(arch) or ARCHITECTURES:
         _, usages = compile_kernels(architecture)
@@ -250,7 +249,7 @@ def _compile_solver(*, report: _Report, arch: list[str] | None) -> None:
 
 
 def _require_compiler() -> None:
-    from ..render.backends.nvrtc.needs import compiler_needs
+    from ..render._cuda.needs import compiler_needs
 
     for need in compiler_needs():
         if not need.met:
@@ -264,7 +263,7 @@ def _given(arch: list[str] | None) -> list[str]:
 def _put_down(
     report: _Report, architecture: str, usages: Mapping[str, Usage], threads: int
 ) -> None:
-    from ..render.backends.nvrtc.usage import MULTIPROCESSORS
+    from ..render._cuda.launcher import MULTIPROCESSORS
 
     known = architecture in MULTIPROCESSORS
     for kernel, usage in usages.items():
@@ -285,8 +284,7 @@ def _inspected(findings: dict[str, str]) -> _Report:
     import torch
 
     from ..render import describe_backends, select_backend
-    from ..render.backends.cuda.needs import cuda_needs
-    from ..render.backends.nvrtc.needs import compiler_needs
+    from ..render._cuda.needs import compiler_needs, cuda_needs
 
     described, used = describe_backends(), select_backend("auto").name
     # Of use where somebody wants CUDA: where torch is built for it, or a driver is loaded.
@@ -308,9 +306,9 @@ def _inspected(findings: dict[str, str]) -> _Report:
 
 def _require_cuda(*, without_device: bool) -> None:
     """Leave with an error where CUDA is not usable, or not but for the device."""
-    from ..render.backends.cuda.needs import try_without_device, unmet_need
+    from ..render._cuda.needs import try_without_device, unmet_gsplat_need
 
-    need = unmet_need(without_device=without_device)
+    need = unmet_gsplat_need(without_device=without_device)
     if need is not None:
         raise CommandError(f"CUDA is not usable: {need.found}; {need.remedy}")
     try:

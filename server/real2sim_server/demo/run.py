@@ -13,7 +13,7 @@ from real2sim import Client, ReplyTimeoutError, connect
 from real2sim.planners import FollowRoute
 
 from ..console import StatusLine, console, print_figures, write_json
-from ..render.picture_file import write_png
+from ..render.images import write_png
 from ..scene.io import DEMO_SCENE as SCENE
 from .edits import StreetEdits, edit_street
 from .pictures import draw_map

@@ -20,8 +20,8 @@ from real2sim_proto.semantics import GROUND, STATIC, semantic_class
 
 from ..geometry.rotation import Float, quaternion_to_matrix
 from ..geometry.transform import invert_transform, transform_from
-from ..render.cast.recorded import Attributes, SweepScene, incidence_of, met_by_lidar, transforms_at
-from ..render.ground_class import TOLERANCE
+from ..render.cast.call import Attributes, SweepScene, incidence_of, met_by_lidar, transforms_at
+from ..render.lens import TOLERANCE
 from ..render.types import Instance
 from ..scene import Figure, GaussianCloud, Lidar, Scene, Stride, Trajectory
 from ..scene.spherical_harmonics import SH_C0

@@ -17,7 +17,7 @@ from ..render import (
     rasterize_batch,
     rasterize_worlds,
 )
-from ..render.quantize import to_uint8
+from ..render.images import to_uint8
 from ..scene import Camera
 from ..world.batch import BatchWorld
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ..logs import DrivingLog, open_log
-from ..render.backends import select_backend
-from ..render.picture_file import write_png
+from ..render.images import write_png
+from ..render.select import select_backend
 from ..scene import Scene
 from ..scene.io import save_scene
 from .evaluation import evaluate_views, render_logged_view

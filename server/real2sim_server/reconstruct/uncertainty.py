@@ -18,7 +18,8 @@ from torch import Tensor
 
 from ..logs import DrivingLog
 from ..render import Instance, RasterOptions, rasterize
-from ..render.backends import Backend, select_backend
+from ..render.backend import Backend
+from ..render.select import select_backend
 from ..scene import UNSEEN, Camera, Scene, Sky
 from ..scene.spherical_harmonics import SH_C0
 from .evaluation.rendering import scene_instances

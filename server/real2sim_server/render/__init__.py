@@ -1,28 +1,24 @@
 """From Gaussians to pictures: one rasterize() call, three backends."""
 
-from .backends import Backend, BackendStatus, describe_backends, select_backend
-from .encode import EncodedImage, encode_depth, encode_instance, encode_rgb
+from .backend import Backend
 from .frame import Frame, RigView, draws_together, render_cameras, render_rigs, warm_up
-from .levels import (
+from .images import EncodedImage, encode_depth, encode_instance, encode_rgb
+from .modalities import encode_image
+from .rasterize import View, rasterize, rasterize_batch, rasterize_worlds
+from .select import (
+    BackendStatus,
+    describe_backends,
     kernels_of_small_images_on_disk,
     levels_bytes,
     levels_estimate,
     make_levels,
     scene_levels_bytes,
+    select_backend,
     uses_levels,
     warm_up_small_images,
     without_levels,
 )
-from .modalities import encode_image
-from .rasterize import View, rasterize, rasterize_batch, rasterize_worlds
-from .types import (
-    Instance,
-    RasterOptions,
-    RenderError,
-    RenderOutput,
-    ScreenStatistics,
-    WorldViews,
-)
+from .types import Instance, RasterOptions, RenderError, RenderOutput, ScreenStatistics, WorldViews
 
 __all__ = [
     "Backend",

@@ -1,4 +1,4 @@
-"""What the cameras of a vehicle see at one instant."""
+"""Images of a vehicle's cameras at one instant, with lenses, labels and uncertainty."""
 
 from __future__ import annotations
 
@@ -6,30 +6,112 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import repeat
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from real2sim_proto.semantics import UNLABELED
 
-from .._numba import made
-from ..scene import Camera, CameraMotion
-from .backends.base import (
+from .._numba import is_on_disk, made
+from ..scene import UNSEEN, BrownConrady, Camera, CameraMotion, GaussianCloud, Shutter
+from ..scene.spherical_harmonics import SH_C0
+from .backend import (
     Backend,
     BatchBackend,
     FrameBackend,
     RasterRequest,
     check_optics,
     class_behind,
+    draws_lens,
     is_reduced,
+    no_lens,
 )
-from .backends.select import select_backend
-from .lens_view import LensView, tables_of
+from .images import to_uint8
+from .lens import LensView, tables_of
 from .modalities import modalities_drawn, modality_of, options_for
 from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
-from .types import Instance, RasterOptions, RenderError, RenderOutput, Sky
-from .uncertainty import UNCERTAINTY, uncertainty_request
+from .select import select_backend
+from .types import Instance, LabelOutput, RasterOptions, RenderError, RenderOutput, Sky, Window
+
+# Uncertainty: a pass with uncertainties in place of colours. Gaussians, sky and blending are those
+# of the colour image, so a pixel is the mean over its Gaussians, weighted by their share; merged
+# Gaussians of small images have the mean of their members. Backends treat it as a colour.
+
+UNCERTAINTY = "uncertainty"
+"""Name of the modality."""
+WITHOUT = (
+    "it is not known of this scene how well its training rays determine what it shows; train it "
+    "again, or run `real2sim fit-uncertainty SCENE LOG`"
+)
+"""Why a scene has no such images."""
+
+# Clouds and skies are immutable and shared, and backends keep what they prepare of each.
+_clouds: WeakKeyDictionary[GaussianCloud, GaussianCloud] = WeakKeyDictionary()
+_skies: WeakKeyDictionary[Sky, Sky] = WeakKeyDictionary()
+
+
+def uncertainty_request(request: RasterRequest) -> RasterRequest:
+    """The pass whose image's channels are the uncertainty, in [0, 1].
+
+    What has no uncertainties (an inserted asset, a shadow that an edit has made) counts as UNSEEN,
+    and so does what is behind everything where there is no sky.
+
+    Raises:
+        RenderError: nothing of what is drawn has any.
+    """
+    if all(instance.cloud.uncertainties is None for instance in request.instances):
+        raise RenderError(WITHOUT)
+    options = replace(
+        request.options,
+        background=(UNSEEN, UNSEEN, UNSEEN),
+        depth=False,
+        instance=False,
+        median_depth=False,
+    )
+    return replace(
+        request,
+        instances=tuple(map(shown_as_colour, request.instances)),
+        sky=None if request.sky is None else _sky(request.sky),
+        options=options,
+    )
+
+
+def shown_as_colour(instance: Instance) -> Instance:
+    """The instance with uncertainties in place of its colours."""
+    found = _clouds.get(instance.cloud)
+    if found is None:
+        cloud = instance.cloud.with_uncertainties()
+        assert cloud.uncertainties is not None
+        sh = _grey((cloud.uncertainties - 0.5) / SH_C0)[:, None].contiguous()
+        found = _clouds.setdefault(instance.cloud, replace(cloud, sh=sh, uncertainties=None))
+    return replace(instance, cloud=found, colour=None)
+
+
+def uncertainty_picture(uncertainty: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """RGB [H, W, 3] of an image [H, W] for people: from black (0) to pale yellow (UNSEEN)."""
+    import cv2
+
+    levels = np.rint(np.clip(uncertainty / UNSEEN, 0, 1) * 255).astype(np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO)[..., ::-1])
+
+
+def _sky(sky: Sky) -> Sky:
+    found = _skies.get(sky)
+    if found is None:
+        known = sky.uncertainties
+        faces = torch.full_like(sky.faces, UNSEEN) if known is None else _grey(known).contiguous()
+        found = _skies.setdefault(sky, Sky(faces))
+    return found
+
+
+def _grey(values: Tensor) -> Tensor:
+    """[..., 3]."""
+    return values[..., None].expand(*values.shape, 3)
+
 
 ROUNDING_KERNELS = 2
 """That :func:`warm_up` makes ready beside those of the backend."""
@@ -358,3 +440,142 @@ def _frames(view: RigView, members: Sequence[int], drawn: _Drawn) -> list[Frame]
         )
         for c, index in enumerate(members)
     ]
+
+
+# Lenses and rolling shutters: support and warm-up
+
+EVERYTHING = RasterOptions(median_depth=True)
+
+
+def refuse_lenses(backend: Backend, cameras: Sequence[Camera]) -> None:
+    """Raises RenderError where ``backend`` cannot draw one of the cameras."""
+    for camera in cameras:
+        if not camera.is_pinhole and not draws_lens(backend):
+            raise RenderError(no_lens(backend, camera))
+
+
+def kernels_of_lenses_on_disk() -> bool:
+    """Whether an earlier run left what :func:`warm_up_lenses` compiles longest."""
+    from ._cpu.ray_project import project_rays  # Imported only where it is needed.
+
+    return is_on_disk(project_rays)
+
+
+def warm_up_lenses(backend: str | Backend = "auto") -> None:
+    """Compile or load everything that a first frame through a lens or a rolling shutter would wait
+    for; takes half a minute the first time."""
+    chosen = select_backend(backend) if isinstance(backend, str) else backend
+    cloud = GaussianCloud(
+        means=torch.tensor([[0.0, 0.0, 3.0], [0.2, 0.1, 0.4]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        scales=torch.full((2, 3), 0.3),
+        opacities=torch.full((2,), 0.5),
+        sh=torch.zeros(2, 1, 3),
+    )
+    K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])
+    for shutter in (Shutter(), Shutter("top_to_bottom", 1000)):
+        camera = Camera("warm-up", 16, 16, K, np.eye(4), BrownConrady(), shutter)
+        sky = Sky.uniform((0.1, 0.2, 0.3))
+        render_cameras(
+            [Instance(cloud)], [camera], np.eye(4), sky=sky, options=EVERYTHING, backend=chosen
+        )
+
+
+# Labels: colours, depth and object of each pixel in one walk, also of objects as if alone
+
+FRONT = 0.2
+"""Transmittance at which the front of a pixel lies, of what labels show."""
+
+
+@runtime_checkable
+class LabelBackend(Protocol):
+    """A Backend that finds labels while it draws colours."""
+
+    def label(
+        self,
+        request: RasterRequest,
+        windows: Sequence[Sequence[Window]],
+        *,
+        level: float,
+        along_rays: bool = True,
+    ) -> list[LabelOutput]:
+        """Picture and labels of each camera.
+
+        Args:
+            request: without optics.
+            windows: of objects, one each, by camera.
+            level: transmittance at which the front of a pixel lies, the Gaussian that brings it
+                there or below; at most a half, which counts where it is not reached.
+            along_rays: whether depth is where a pixel's ray meets its front most, or the depth of
+                the front's centre.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledFrame:
+    """One camera's picture and labels, see LabelOutput.
+
+    Attributes:
+        rgb: [H, W, 3] uint8, the bytes of a picture alone.
+        depth: [H, W] float32 [m].
+        instance: [H, W] uint16.
+        alone: depths [h, w] float32 by window.
+        T_world_camera: [4, 4].
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    instance: NDArray[np.uint16]
+    alone: Sequence[NDArray[np.float32]]
+    T_world_camera: NDArray[np.float64]
+
+
+def labels_while_drawing(backend: Backend, cameras: Sequence[Camera]) -> bool:
+    """Whether :func:`label_cameras` can do it: others draw a pass for each label."""
+    return isinstance(backend, LabelBackend) and all(camera.is_pinhole for camera in cameras)
+
+
+def label_cameras(
+    instances: Sequence[Instance],
+    cameras: Sequence[Camera],
+    T_world_vehicle: NDArray[np.float64],
+    windows: Sequence[Sequence[Window]],
+    *,
+    sky: Sky | None,
+    backend: LabelBackend,
+) -> list[LabelledFrame]:
+    """Pictures and labels of ``cameras`` in their order.
+
+    Args:
+        instances: what is in the world, see rasterize().
+        cameras: pinholes on the vehicle.
+        T_world_vehicle: [4, 4] pose of the vehicle.
+        windows: of objects that are also asked for alone, by camera.
+        sky: behind everything.
+        backend: draws.
+
+    Raises:
+        RenderError: as rasterize().
+    """
+    frames: dict[int, LabelledFrame] = {}
+    for members in alike(cameras):
+        first = cameras[members[0]]
+        request = checked_request(
+            instances,
+            np.stack([cameras[index].viewmat(T_world_vehicle) for index in members]),
+            np.stack([cameras[index].K for index in members]),
+            (first.width, first.height),
+            sky=sky,
+            options=DEFAULT_OPTIONS,
+        )
+        outputs = backend.label(request, [windows[index] for index in members], level=FRONT)
+        for index, output in zip(members, outputs, strict=True):
+            frames[index] = LabelledFrame(
+                to_uint8(output.rgb),
+                output.depth,
+                output.instance,
+                output.alone,
+                cameras[index].pose(T_world_vehicle),
+            )
+    return [frames[index] for index in range(len(cameras))]

@@ -15,18 +15,10 @@ from torch import Tensor
 from ..geometry.rotation import is_rotation
 from ..geometry.transform import are_rigid
 from ..scene import GaussianCloud, TimeColour
-from .backends.base import Backend, BatchBackend, RasterRequest, check_optics, is_reduced
-from .backends.select import select_backend
-from .lens_view import LensView
-from .types import (
-    Detail,
-    Instance,
-    RasterOptions,
-    RenderError,
-    RenderOutput,
-    Sky,
-    WorldViews,
-)
+from .backend import Backend, BatchBackend, RasterRequest, check_optics, is_reduced
+from .lens import LensView
+from .select import select_backend
+from .types import Detail, Instance, RasterOptions, RenderError, RenderOutput, Sky, WorldViews
 
 DEFAULT_OPTIONS = RasterOptions()
 SMALL_IMAGES = RasterOptions(depth=False, instance=False, detail="auto")

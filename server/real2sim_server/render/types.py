@@ -1,10 +1,12 @@
-"""What goes into rasterize() and what comes out."""
+"""Input and output of rasterize()."""
 
 from __future__ import annotations
 
+import functools
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +145,7 @@ class RenderOutput:
             to 0.5 or below; 0 where it never does. None when not asked for.
         median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 where there is none, and
             without gradients. None when not asked for.
-        uncertainty: [C, H, W] float32, see :mod:`.uncertainty`; None where nobody asked.
+        uncertainty: [C, H, W] float32, see :mod:`.frame`; None where nobody asked.
         classes: [65536] uint8, of ``instance`` by id; None where nobody asked.
         behind: class of a pixel at which transmittance stays above 0.5.
         timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
@@ -203,3 +205,23 @@ class LabelOutput:
     instance: NDArray[np.uint16]
     alone: Sequence[NDArray[np.float32]]
     timing_ms: dict[str, float] = field(default_factory=dict)
+
+
+# Results cached for as long as an immutable object lives
+
+Source = TypeVar("Source")
+Made = TypeVar("Made")
+
+
+def weak_cache(make: Callable[[Source], Made]) -> Callable[[Source], Made]:
+    """``make``, which is called only for what it was not called for before."""
+    kept: weakref.WeakKeyDictionary[Source, Made] = weakref.WeakKeyDictionary()
+
+    @functools.wraps(make)
+    def get(source: Source) -> Made:
+        found = kept.get(source)
+        if found is None:
+            found = kept[source] = make(source)
+        return found
+
+    return get

@@ -21,7 +21,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import WITHOUT_SCENES, DeviceInfo, Readiness
 
 from ..render import Backend, describe_backends, select_backend
-from ..render.backends import device_of
+from ..render.backend import device_of
 from ..scene.io import DEMO_SCENE, SHIPPED_STREET, StagingLimits
 from ..settings import Settings
 from .accounts import Accounts

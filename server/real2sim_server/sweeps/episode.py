@@ -27,7 +27,7 @@ from real2sim_proto.plans import PLAN, Control, PoseCommand, TrajectoryPlan
 from ..edit import EditError, ScenarioState
 from ..policies.suite import Case
 from ..render import RasterOptions, View, rasterize_batch
-from ..render.quantize import to_uint8
+from ..render.images import to_uint8
 from ..scene import Camera, Scene
 from ..service.library.views import camera_infos
 from ..world import World, WorldError

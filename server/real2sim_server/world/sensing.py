@@ -16,11 +16,10 @@ from ..edit import ScenarioState
 from ..edit.compose import compose, met_background, met_object, sweep_of
 from ..geometry.rotation import Float, quaternion_to_matrix
 from ..geometry.transform import invert_transform
-from ..render.cast.detect import Sweep, detect
-from ..render.cast.radar import Patches, radar_detections
-from ..render.cast.recorded import Attributes, SweepScene, incidence_of, sensor_poses
+from ..render.cast.call import Attributes, SweepScene, incidence_of, sensor_poses
+from ..render.cast.sensors import Patches, Sweep, detect, radar_detections
 from ..render.cast.types import CastBackend, CastRequest, Echo
-from ..render.ground_class import TOLERANCE
+from ..render.lens import TOLERANCE
 from ..render.types import Instance
 from ..scene import Lidar, Scene
 from .ranging import Cloud, Mounted, MountedLidar, MountedRadar, in_frame

@@ -15,8 +15,8 @@ from real2sim_server.cli.device import chosen_backend
 from real2sim_server.console import CommandError
 from real2sim_server.reconstruct import ReconstructOptions, reconstruct
 from real2sim_server.render import RenderError, select_backend
-from real2sim_server.render.backends.cuda import gsplat_build
-from real2sim_server.render.backends.cuda.gsplat_build import BuiltKernels
+from real2sim_server.render._cuda import gsplat_build
+from real2sim_server.render._cuda.gsplat_build import BuiltKernels
 
 
 @pytest.fixture(autouse=True)
@@ -116,9 +116,9 @@ def test_doctor_says_what_the_serving_kernels_take_without_a_gpu(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("cuda.core")
-    from real2sim_server.render.backends.nvrtc import compile as compiling
-    from real2sim_server.render.backends.nvrtc.usage import Usage
-    from real2sim_server.render.cast.cuda import compile as casting
+    from real2sim_server.render._cuda import launcher as compiling
+    from real2sim_server.render._cuda.launcher import Usage
+    from real2sim_server.render.cast import cuda as casting
 
     taken = {"blend": Usage(64, 0, 0, 0), "find_seen": Usage(32, 0, 0, 0)}
     monkeypatch.setattr(compiling, "compile_kernels", lambda name: (b"", taken))
@@ -142,7 +142,7 @@ def test_doctor_says_what_the_solver_takes_in_both_precisions(
 ) -> None:
     pytest.importorskip("cuda.core")
     from real2sim_server.physics.backends.cuda import launcher as compiling
-    from real2sim_server.render.backends.nvrtc.usage import Usage
+    from real2sim_server.render._cuda.launcher import Usage
 
     def compile_kernels(precision: str, architecture: str) -> tuple[bytes, dict[str, Usage]]:
         return b"", {"advance_blocks": Usage(128 if precision == "single" else 256, 0, 0, 0)}
@@ -157,9 +157,9 @@ def test_doctor_says_what_the_solver_takes_in_both_precisions(
 
 
 def test_the_bench_of_the_solver_on_a_gpu_says_what_it_lacks() -> None:
-    from real2sim_server.render.backends.nvrtc.needs import unmet_need
+    from real2sim_server.render._cuda.needs import unmet_nvrtc_need
 
-    if unmet_need() is None:
+    if unmet_nvrtc_need() is None:
         pytest.skip("everything is here")
     arguments = ["bench", "physics", "--backend", "cuda"]
     done = CliRunner().invoke(build_app(), arguments, env={"COLUMNS": "300"})

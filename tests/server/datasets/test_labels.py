@@ -22,7 +22,7 @@ from real2sim_server.datasets.labels import (
 )
 from real2sim_server.datasets.labels.pixels import surface_mask
 from real2sim_server.datasets.labels.surface import body_of, on_surface
-from real2sim_server.render.ground_class import back_projected
+from real2sim_server.render.lens import back_projected
 from real2sim_server.scene import Camera, Trajectory
 
 CAMERA = Camera("c", 96, 64, np.array([[60.0, 0, 48], [0, 60, 32], [0, 0, 1]]), np.eye(4))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from real2sim_server.render.backends import Backend
+from real2sim_server.render.backend import Backend
 
 from . import gsplat_stand_in, pretended
 
@@ -24,12 +24,12 @@ def cuda_backend(
     device_counts: pretended.Counts, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Backend]:
     """The CUDA backend on the pretended device, gsplat by a stand-in."""
-    name = "real2sim_server.render.backends.cuda.backend"
+    name = "real2sim_server.render._cuda.gsplat"
     monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in.module())
     monkeypatch.delitem(sys.modules, name, raising=False)
-    from real2sim_server.render.backends.cuda import backend
+    from real2sim_server.render._cuda import gsplat
 
     for name_of_image in ("instance_image", "median_depth_image"):
-        monkeypatch.setattr(backend, name_of_image, getattr(gsplat_stand_in, name_of_image))
-    yield backend.CudaBackend(pretended.DEVICE)
+        monkeypatch.setattr(gsplat, name_of_image, getattr(gsplat_stand_in, name_of_image))
+    yield gsplat.CudaBackend(pretended.DEVICE)
     sys.modules.pop(name, None)

@@ -14,9 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from real2sim_server.render.backends.base import ALPHA_MIN
-from real2sim_server.render.backends.reference import _blend_image, _jacobian, _Splats
-from real2sim_server.render.backends.screen import ScreenWatch
+from real2sim_server.render._reference import _blend_image, _jacobian, _Splats
+from real2sim_server.render.backend import ALPHA_MIN, ScreenWatch
 from real2sim_server.scene.spherical_harmonics import evaluate_sh
 
 from .pretended import Pretended, held

@@ -8,9 +8,9 @@ from functools import partial
 import pytest
 
 from real2sim_server.benchmarks.gpu_check import PARTS, Devices, FrameCase, Scale, run
-from real2sim_server.render.backends import Backend
-from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
-from real2sim_server.render.cast.cuda.backend import CudaCaster
+from real2sim_server.render._cuda.serving import NvrtcBackend
+from real2sim_server.render.backend import Backend
+from real2sim_server.render.cast.cuda import CudaCaster
 
 from ..render.kernel_twin import COMPILER, NEEDS_COMPILER
 from . import pretended

@@ -15,7 +15,7 @@ from real2sim_server.render import (
     render_cameras,
     render_rigs,
 )
-from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
+from real2sim_server.render._cuda.serving import NvrtcBackend
 from real2sim_server.scene import Camera, GaussianCloud, Sky, TimeColour
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
 

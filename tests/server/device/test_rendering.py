@@ -7,7 +7,7 @@ import torch
 
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.render import Instance, RasterOptions, rasterize
-from real2sim_server.render.backends import Backend
+from real2sim_server.render.backend import Backend
 from real2sim_server.scene import GaussianCloud, Sky, TimeColour
 
 K = np.array([[60.0, 0, 30], [0, 64, 24], [0, 0, 1]])

@@ -13,9 +13,9 @@ from fastapi.testclient import TestClient
 
 from real2sim_proto import decode
 from real2sim_server.render import select_backend
-from real2sim_server.render.backends import Backend, BackendStatus, RegisteredBackend
-from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
-from real2sim_server.render.backends.select import BACKENDS
+from real2sim_server.render._cuda.serving import NvrtcBackend
+from real2sim_server.render.backend import Backend
+from real2sim_server.render.select import BACKENDS, BackendStatus, RegisteredBackend
 from real2sim_server.service.app import create_app
 from real2sim_server.settings import Settings
 

@@ -15,9 +15,9 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
 from real2sim_server.render import RenderOutput
-from real2sim_server.render.backends import Backend, RasterRequest
-from real2sim_server.render.backends.cpu.backend import CpuBackend
-from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
+from real2sim_server.render._cpu.backend import CpuBackend
+from real2sim_server.render._cuda.serving import NvrtcBackend
+from real2sim_server.render.backend import Backend, RasterRequest
 from real2sim_server.scene import Scene
 from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.metrics import Metrics

@@ -16,7 +16,7 @@ from real2sim_server.reconstruct.training.direction_options import DirectionOpti
 from real2sim_server.reconstruct.training.schedule import DensifyOptions, TrainOptions
 from real2sim_server.reconstruct.training.threads import one_torch_thread
 from real2sim_server.reconstruct.training.trainer import Trainer
-from real2sim_server.render.backends import Backend
+from real2sim_server.render.backend import Backend
 from real2sim_server.scene import GaussianCloud, Scene
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 

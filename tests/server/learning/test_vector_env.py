@@ -16,7 +16,7 @@ from real2sim_server.edit import ScenarioState
 from real2sim_server.learning import VectorDriveEnv, vector_env
 from real2sim_server.learning.batch_images import fitted
 from real2sim_server.render import rasterize
-from real2sim_server.render.quantize import to_uint8
+from real2sim_server.render.images import to_uint8
 from real2sim_server.render.rasterize import SMALL_IMAGES
 from real2sim_server.scene import Scene
 from real2sim_server.scene.io import read_packed

@@ -14,7 +14,7 @@ from real2sim_server.physics import SolverError
 from real2sim_server.physics.backends.cuda import launcher, source
 from real2sim_server.physics.backends.cuda.launcher import THREADS
 from real2sim_server.physics.backends.cuda.source import KERNELS, PRECISIONS
-from real2sim_server.render.backends.nvrtc.needs import compiler_needs
+from real2sim_server.render._cuda.needs import compiler_needs
 
 MISSING = next((need.found for need in compiler_needs() if not need.met), "")
 ALWAYS = ("single", "sm_90")

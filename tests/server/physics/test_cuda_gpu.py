@@ -10,12 +10,12 @@ import pytest
 from real2sim_server.physics import Box, FixedCorotated, Plane, Sand, Solver, SolverOptions
 from real2sim_server.physics import box_particles as lattice
 from real2sim_server.physics.body import Body
-from real2sim_server.render.backends.nvrtc.needs import unmet_need
+from real2sim_server.render._cuda.needs import unmet_nvrtc_need
 
 from .scenes import at
 from .test_backends import MATERIALS, STATE, crash, mixed
 
-NEED = unmet_need()
+NEED = unmet_nvrtc_need()
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.skipif(NEED is not None, reason=NEED.found if NEED else ""),

@@ -4,9 +4,13 @@ import pytest
 import torch
 
 from real2sim_server.render import RenderError, describe_backends, select_backend
-from real2sim_server.render.backends import BackendStatus, RegisteredBackend, register_backend
-from real2sim_server.render.backends.reference import ReferenceBackend
-from real2sim_server.render.backends.select import BACKENDS
+from real2sim_server.render._reference import ReferenceBackend
+from real2sim_server.render.select import (
+    BACKENDS,
+    BackendStatus,
+    RegisteredBackend,
+    register_backend,
+)
 
 from .backend_contract import check_contract
 

@@ -84,9 +84,9 @@ def test_cuda_draws_nothing_where_there_is_nothing() -> None:
 SIMULATION = """
 import numpy as np, torch
 from real2sim_server.render import Instance
-from real2sim_server.render.backends.base import RasterRequest, place_instances
-from real2sim_server.render.backends.cuda.instance import find_instances
-from real2sim_server.render.backends.reference import ReferenceBackend, _concatenate, _project
+from real2sim_server.render.backend import RasterRequest, place_instances
+from real2sim_server.render._cuda.gsplat_images import find_instances
+from real2sim_server.render._reference import ReferenceBackend, _concatenate, _project
 from real2sim_server.render.types import RasterOptions
 from real2sim_server.scene import GaussianCloud
 

@@ -11,11 +11,13 @@ import pytest
 import torch
 
 from real2sim_server._nvrtc import kernels_folder
-from real2sim_server.render import RenderError, select_backend
-from real2sim_server.render.backends import select
-from real2sim_server.render.backends.cuda import gsplat_build, needs
-from real2sim_server.render.backends.cuda.gsplat_build import BuiltKernels, build_kernels
-from real2sim_server.render.backends.cuda.slim_gsplat import write_slim_sources
+from real2sim_server.render import RenderError, select, select_backend
+from real2sim_server.render._cuda import gsplat_build, needs
+from real2sim_server.render._cuda.gsplat_build import (
+    BuiltKernels,
+    build_kernels,
+    write_slim_sources,
+)
 
 VERSIONS = {"gsplat": "1.5.3", "numba-cuda": "0.30.4"}
 
@@ -53,7 +55,7 @@ def have_built(*architectures: str) -> None:
 
 
 def test_kernels_that_are_not_compiled_are_to_be_built(machine: dict[str, str]) -> None:
-    need = needs.unmet_need()
+    need = needs.unmet_gsplat_need()
     assert need is not None
     assert need.name == "kernels"
     assert need.remedy == "real2sim doctor --build-gpu"
@@ -61,7 +63,7 @@ def test_kernels_that_are_not_compiled_are_to_be_built(machine: dict[str, str]) 
 
 def test_with_compiled_kernels_nothing_is_missing(machine: dict[str, str]) -> None:
     have_built("8.0", "9.0")
-    assert needs.unmet_need() is None
+    assert needs.unmet_gsplat_need() is None
 
 
 def test_a_gsplat_that_brings_its_kernels_needs_none_built(
@@ -69,12 +71,12 @@ def test_a_gsplat_that_brings_its_kernels_needs_none_built(
 ) -> None:
     (tmp_path / "csrc.cpython-311-x86_64-linux-gnu.so").touch()
     monkeypatch.setattr(needs, "gsplat_package", lambda: tmp_path)
-    assert needs.unmet_need() is None
+    assert needs.unmet_gsplat_need() is None
 
 
 def test_kernels_of_other_devices_do_not_count(machine: dict[str, str]) -> None:
     have_built("8.0")
-    need = needs.unmet_need()
+    need = needs.unmet_gsplat_need()
     assert need is not None
     assert "8.0 only" in need.found
 
@@ -84,7 +86,7 @@ def test_a_missing_library_is_named_with_what_installs_it(
     machine: dict[str, str], name: str
 ) -> None:
     del machine[name]
-    need = needs.unmet_need()
+    need = needs.unmet_gsplat_need()
     assert need is not None
     assert name in need.found
     assert "real2sim[server,cuda]" in need.remedy
@@ -92,7 +94,7 @@ def test_a_missing_library_is_named_with_what_installs_it(
 
 def test_a_gsplat_with_other_functions_is_refused(machine: dict[str, str]) -> None:
     machine["gsplat"] = "1.6.0"
-    need = needs.unmet_need()
+    need = needs.unmet_gsplat_need()
     assert need is not None
     assert "1.6.0" in need.found
 
@@ -102,8 +104,8 @@ def test_an_image_lacks_no_more_than_the_device(
 ) -> None:
     have_built("9.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert needs.unmet_need(without_device=True) is None
-    need = needs.unmet_need()
+    assert needs.unmet_gsplat_need(without_device=True) is None
+    need = needs.unmet_gsplat_need()
     assert need is not None
     assert need.of_device
     assert "driver" in need.remedy
@@ -178,9 +180,9 @@ def test_of_gsplat_only_what_is_called_is_compiled(tmp_path: Path) -> None:
     package = tmp_path / "gsplat"
     sources = package / "cuda" / "csrc"
     sources.mkdir(parents=True)
-    from real2sim_server.render.backends.cuda import slim_gsplat
+    from real2sim_server.render._cuda import gsplat_build
 
-    for name in slim_gsplat.SOURCES:
+    for name in gsplat_build.SOURCES:
         (sources / name).write_text(RASTERIZATION if name == "Rasterization.cpp" else "")
     (package / "cuda" / "ext.cpp").write_text(
         'm.def("adam", &gsplat::adam);\nm.def(\n "intersect_tile", &gsplat::intersect_tile\n);\n'

@@ -10,11 +10,10 @@ import torch
 
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.render import Instance, rasterize
-from real2sim_server.render.backends.base import RasterRequest, place_instances
-from real2sim_server.render.backends.cpu import backend as cpu
-from real2sim_server.render.backends.cpu.cull import all_chunks, bounds_of, seen_chunks
-from real2sim_server.render.backends.cpu.inputs import view_of
-from real2sim_server.render.backends.cpu.records import CHUNK
+from real2sim_server.render._cpu import backend as cpu
+from real2sim_server.render._cpu.drawing import all_chunks, bounds_of, seen_chunks, view_of
+from real2sim_server.render._cpu.records import CHUNK
+from real2sim_server.render.backend import RasterRequest, place_instances
 from real2sim_server.render.types import RasterOptions
 from real2sim_server.scene import GaussianCloud
 

@@ -20,7 +20,7 @@ from real2sim_server.render import (
     rasterize_batch,
     rasterize_worlds,
 )
-from real2sim_server.render.backends.cpu.detail.hierarchy import hierarchy_of
+from real2sim_server.render._cpu.detail_levels import hierarchy_of
 from real2sim_server.render.rasterize import views_of
 from real2sim_server.render.types import SMALL_IMAGE_PIXELS
 from real2sim_server.scene import GaussianCloud, Scene, Sky, TimeColour

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from real2sim_server.render import Instance, RenderOutput, rasterize
-from real2sim_server.render.backends.base import place_instances
-from real2sim_server.render.backends.cpu.inputs import cluster_of, places_of
-from real2sim_server.render.quantize import solid_depth, to_uint8
+from real2sim_server.render._cpu.drawing import cluster_of, places_of
+from real2sim_server.render.backend import place_instances
+from real2sim_server.render.images import solid_depth, to_uint8
 from real2sim_server.scene import GaussianCloud, Sky
 
 K = np.array([[[200.0, 0, 100], [0, 200, 75], [0, 0, 1]]])
@@ -90,12 +90,12 @@ def test_bits_are_the_same_in_a_new_process_with_one_thread() -> None:
 def test_pictures_made_in_bands_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     instances = scene()
     whole = digest(draw(instances))
-    monkeypatch.setattr("real2sim_server.render.backends.cpu.drawing.LIST_BUDGET", 2000)
+    monkeypatch.setattr("real2sim_server.render._cpu.drawing.LIST_BUDGET", 2000)
     assert digest(draw(instances)) == whole
 
 
 def test_a_picture_drawn_in_pieces_is_the_same_whatever_is_drawn_between(monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr("real2sim_server.render.backends.cpu.drawing.PIECE_PIXELS", 4000)
+    monkeypatch.setattr("real2sim_server.render._cpu.drawing.PIECE_PIXELS", 4000)
     instances = scene()
     whole, other = digest(draw(instances)), digest(draw(instances[1:]))
     between = []
@@ -109,7 +109,7 @@ def test_a_picture_drawn_in_pieces_is_the_same_whatever_is_drawn_between(monkeyp
 
 
 def test_bytes_and_depths_made_in_pieces_are_the_same(monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr("real2sim_server.render.quantize.PIECE", 777)
+    monkeypatch.setattr("real2sim_server.render.images.PIECE", 777)
     output, pieces = draw(scene()), []
     assert output.depth is not None
     whole = to_uint8(output.rgb), solid_depth(output.depth, output.alpha)

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from real2sim_proto.cameras import CameraEffects
-from real2sim_server.render.effects import to_display, to_light, with_effects
+from real2sim_server.render.images import to_display, to_light, with_effects
 
 GREY = np.full((40, 60, 3), 100, np.uint8)
 RAMP = np.tile(np.arange(256, dtype=np.uint8)[None, :, None], (8, 1, 3))

@@ -15,7 +15,7 @@ from real2sim_server.render import (
     encode_instance,
     encode_rgb,
 )
-from real2sim_server.render.jpeg import (
+from real2sim_server.render.images import (
     CPU_ONLY,
     NvjpegEncoder,
     disproof,

@@ -6,17 +6,17 @@ import numba
 import numpy as np
 import pytest
 
-from real2sim_server.render.backends.cpu.footprint import (
+from real2sim_server.render._cpu.lanes import LANES
+from real2sim_server.render._cpu.project import (
     FIELD,
     FIELD_MASK,
+    PROJECTION,
     ellipse_columns,
     footprints_of_eight,
     tile_columns,
     tile_rows,
 )
-from real2sim_server.render.backends.cpu.lanes import LANES
-from real2sim_server.render.backends.cpu.project_lanes import PROJECTION
-from real2sim_server.render.backends.cpu.records import (
+from real2sim_server.render._cpu.records import (
     EXPONENT_LIMIT,
     EXTENT_X,
     EXTENT_Y,

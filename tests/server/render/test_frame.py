@@ -24,7 +24,7 @@ from real2sim_server.render import (
     select_backend,
     warm_up,
 )
-from real2sim_server.render.quantize import solid_depth, to_uint8
+from real2sim_server.render.images import solid_depth, to_uint8
 from real2sim_server.scene import Camera, GaussianCloud, Sky
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
 

@@ -11,8 +11,8 @@ import torch
 
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.render import Instance, RasterOptions, describe_backends, rasterize
-from real2sim_server.render.backends.base import RasterRequest
-from real2sim_server.render.backends.cuda.screen import track_screen
+from real2sim_server.render._cuda.gsplat import track_screen
+from real2sim_server.render.backend import RasterRequest
 from real2sim_server.scene import GaussianCloud, Sky
 
 CUDA = next(status for status in describe_backends() if status.name == "cuda")

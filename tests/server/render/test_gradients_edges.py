@@ -181,7 +181,7 @@ def test_passes_in_flight_do_not_disturb_each_other(backend: str) -> None:
 
 
 def test_work_space_is_used_again_once_a_pass_is_gone() -> None:
-    from real2sim_server.render.backends.cpu.backend import CpuBackend
+    from real2sim_server.render._cpu.backend import CpuBackend
 
     backend = CpuBackend()
     for _ in range(4):

@@ -6,7 +6,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from real2sim_server.render.backends.cpu.lanes import LANES, Planes, logarithm, mask_bits, mask_of
+from real2sim_server.render._cpu.lanes import LANES, Planes, logarithm, mask_bits, mask_of
 
 
 @intrinsic

@@ -11,7 +11,7 @@ import pytest
 from real2sim_server import demo
 from real2sim_server.edit import posed_instances
 from real2sim_server.render import rasterize
-from real2sim_server.render.lens_view import LensView
+from real2sim_server.render.lens import LensView
 from real2sim_server.scene import BrownConrady, Camera, CameraMotion, Fisheye, FTheta, Shutter
 from real2sim_server.scene.camera_motion import turned
 from real2sim_server.scene.io.packed import read_packed

@@ -17,11 +17,11 @@ from real2sim_server.render import (
     render_cameras,
     select_backend,
 )
-from real2sim_server.render.backends.cpu.drawing import Drawing
-from real2sim_server.render.backends.cpu.ray_drawing import RayDrawing
-from real2sim_server.render.backends.cpu.records import EXTENT_X, EXTENT_Y
-from real2sim_server.render.backends.reference import ReferenceBackend
-from real2sim_server.render.lens_view import LensView
+from real2sim_server.render._cpu.drawing import Drawing
+from real2sim_server.render._cpu.ray_drawing import RayDrawing
+from real2sim_server.render._cpu.records import EXTENT_X, EXTENT_Y
+from real2sim_server.render._reference import ReferenceBackend
+from real2sim_server.render.lens import LensView
 from real2sim_server.scene import (
     BrownConrady,
     Camera,

@@ -22,13 +22,12 @@ from real2sim_server.render import (
     rasterize_worlds,
     render_cameras,
 )
-from real2sim_server.render.backends import RasterRequest
-from real2sim_server.render.backends.nvrtc import backend as backend_module
-from real2sim_server.render.backends.nvrtc import records
-from real2sim_server.render.backends.nvrtc.backend import NvrtcBackend
-from real2sim_server.render.backends.nvrtc.memory import tile_passes
-from real2sim_server.render.backends.nvrtc.needs import unmet_need
-from real2sim_server.render.backends.nvrtc.tables import tables_of
+from real2sim_server.render._cuda import launcher
+from real2sim_server.render._cuda import serving as backend_module
+from real2sim_server.render._cuda.frame_memory import tables_of, tile_passes
+from real2sim_server.render._cuda.needs import unmet_nvrtc_need
+from real2sim_server.render._cuda.serving import NvrtcBackend
+from real2sim_server.render.backend import RasterRequest
 from real2sim_server.render.rasterize import checked_request, views_of
 from real2sim_server.scene import Camera, GaussianCloud, Sky, TimeColour
 
@@ -121,7 +120,9 @@ def test_pictures_are_those_of_the_reference(
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(unmet_need() is not None, reason="no GPU that the kernels can be compiled for")
+@pytest.mark.skipif(
+    unmet_nvrtc_need() is not None, reason="no GPU that the kernels can be compiled for"
+)
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_a_gpu_gives_the_bits_of_the_cpu(serving: NvrtcBackend, mode: str) -> None:
     options = RasterOptions(rasterize_mode=mode)
@@ -187,7 +188,7 @@ def test_sessions_share_the_background_and_keep_their_own_objects(serving: Nvrtc
     background = cloud(0)
     worlds = [[Instance(background), Instance(cloud(seed, bands=4), POSE, seed)] for seed in (3, 4)]
     requests = [requests_of([(45, 37)], world)[0] for world in worlds]
-    tables = tables_of(requests, serving._residence, serving._launcher)
+    tables = tables_of(requests, serving._device_scene, serving._launcher)
     assert tables.objects["cameras"].tolist() == [4, 2, 2]
     for request, images in zip(requests, serving.frames(requests, ["rgb"]), strict=True):
         [alone] = serving.frames([request], ["rgb"])
@@ -323,7 +324,7 @@ def test_functions_of_the_kernels_are_exact_to_single_precision(
 def test_structures_have_the_sizes_of_the_source() -> None:
     sizes = (ctypes.c_uint32 * 4)()
     twin().sizes(sizes)
-    types = (records.OBJECT, records.PLACEMENT, records.CAMERA, records.FRAME)
+    types = (launcher.OBJECT, launcher.PLACEMENT, launcher.CAMERA, launcher.FRAME)
     assert list(sizes) == [kind.itemsize for kind in types]
 
 

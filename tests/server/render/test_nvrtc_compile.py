@@ -9,9 +9,9 @@ import pytest
 from real2sim_server import _nvrtc
 from real2sim_server._nvrtc import KernelSource
 from real2sim_server.render import RenderError
-from real2sim_server.render.backends.nvrtc import compile as compiling
-from real2sim_server.render.backends.nvrtc.needs import compiler_needs, unmet_need
-from real2sim_server.render.backends.nvrtc.usage import Usage
+from real2sim_server.render._cuda import launcher as compiling
+from real2sim_server.render._cuda.launcher import Usage
+from real2sim_server.render._cuda.needs import compiler_needs, unmet_nvrtc_need
 
 MISSING = next((need.found for need in compiler_needs() if not need.met), "")
 needs_nvrtc = pytest.mark.skipif(bool(MISSING), reason=MISSING)
@@ -72,7 +72,7 @@ def test_usage_that_leaves_half_of_the_threads_is_said() -> None:
 
 
 def test_a_machine_without_a_gpu_says_what_the_backend_needs() -> None:
-    need = unmet_need()
+    need = unmet_nvrtc_need()
     if need is None:
         pytest.skip("everything is here")
     assert need.remedy

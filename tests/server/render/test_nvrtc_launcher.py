@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.render.backends.nvrtc import launcher as launcher_module
-from real2sim_server.render.backends.nvrtc.launcher import CudaLauncher
+from real2sim_server.render._cuda import launcher as launcher_module
+from real2sim_server.render._cuda.launcher import CudaLauncher
 from real2sim_server.service.engine import _loses_device
 
 

@@ -15,7 +15,7 @@ from real2sim_server.render import (
     encode_image,
     render_cameras,
 )
-from real2sim_server.render.uncertainty import uncertainty_picture
+from real2sim_server.render.frame import uncertainty_picture
 from real2sim_server.scene import UNSEEN, Camera, GaussianCloud, Sky
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
 

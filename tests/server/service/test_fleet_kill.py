@@ -18,7 +18,7 @@ import pytest
 import sqlalchemy as sa
 
 import real2sim
-from real2sim_server.render.cast.warm_up import warm_up_casting
+from real2sim_server.render.cast.call import warm_up_casting
 from real2sim_server.scene.io import save_scene
 
 from ..ports import reserved_port

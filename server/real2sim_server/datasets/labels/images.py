@@ -13,8 +13,7 @@ from real2sim_proto.semantics import SKY, UNLABELED
 
 from ...geometry.rotation import Float
 from ...render import Backend, render_cameras, select_backend
-from ...render.frame import classes_of
-from ...render.labels import label_cameras, labels_while_drawing
+from ...render.frame import classes_of, label_cameras, labels_while_drawing
 from ...render.types import Window
 from ...scene import Camera, Scene
 from ..drive import Moment

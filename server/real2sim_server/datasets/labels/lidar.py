@@ -12,7 +12,7 @@ from real2sim_proto.semantics import GROUND, STATIC, semantic_class
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...render.cast import CastBackend, CastRequest, Echo, Sweep, detect
-from ...render.ground_class import TOLERANCE
+from ...render.lens import TOLERANCE
 from ...scene import Ground, Lidar
 from ..drive import Drive, Moment
 from .boxes import ObjectBox

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
-from ...render.ground_class import back_projected
+from ...render.lens import back_projected
 from .boxes import ObjectBox
 from .images import CameraImages
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..._files import atomic_file
 from ...logs import DrivingLog, same_part
 from ...render import Frame
-from ...render.uncertainty import uncertainty_picture
+from ...render.frame import uncertainty_picture
 from ...scene import Camera, Scene
 from ..logged_view import image_time
 from .pictures import (

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...geometry.rotation import Float
 from ...logs import DrivingLog
 from ...render.cast import Echo, recorded_sweep
-from ...render.cast.detect import drop_probability
+from ...render.cast.sensors import drop_probability
 from ...scene import Beams, Lidar, Scene
 from ...synthetic import SyntheticConfig
 from ...synthetic.log import LIDAR_ELEVATION, LIDAR_POSITION, SyntheticLog

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...logs import DrivingLog
-from ...render.cast.cpu.backend import CpuCaster
-from ...render.cast.recorded import recorded_scene, sensor_poses
+from ...render.cast.call import recorded_scene, sensor_poses
+from ...render.cast.cpu import CpuCaster
 from ...render.cast.types import CastRequest, Meetings
 from ...scene import Beams, Lidar, Scene
 from .gaussians import SurfaceTable

@@ -12,7 +12,7 @@ from real2sim_proto.ranging import MAX_RAYS
 from ...geometry.rotation import Float
 from ...geometry.transform import apply_transform, invert_transform
 from ...logs import DrivingLog
-from ...render.cast.recorded import transforms_at
+from ...render.cast.call import transforms_at
 from ...scene import Beams, Detection, Lidar
 
 FAR = 250.0

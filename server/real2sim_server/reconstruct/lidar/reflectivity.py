@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...logs import DrivingLog
-from ...render.cast.incidence import facing_of_request
+from ...render.cast.call import facing_of_request
 from ...scene import Scene
 from ...scene.lidar_surfaces import MAX_REFLECTIVITY, RANGE_STEPS, RingResponse
 from .gaussians import SurfaceTable

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from ...render import Instance, RasterOptions, RenderOutput, rasterize
-from ...render.backends import Backend, device_of, select_backend
+from ...render.backend import Backend, device_of
+from ...render.select import select_backend
 from ...scene import Camera, GaussianCloud, Scene, Sky, TimeColour
 from . import gaussians as packing
 from .exposure import ImageGains

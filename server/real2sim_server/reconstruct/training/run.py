@@ -12,8 +12,8 @@ import numpy as np
 
 from ...logs import DrivingLog, check_log
 from ...logs.driving_log import SELECTION
-from ...render.backends import Backend
-from ...render.picture_file import write_png
+from ...render.backend import Backend
+from ...render.images import write_png
 from ...scene import Scene
 from ...scene.io import load_scene, save_scene
 from ..initialise.stage0 import initialise_scene

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ...logs import DrivingLog
-from ...render.backends import Backend
+from ...render.backend import Backend
 from ...scene import Scene
 from ...scene.spherical_harmonics import SH_C0
 from ..initialise.vehicle_body import scene_bodies

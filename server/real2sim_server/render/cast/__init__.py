@@ -4,9 +4,16 @@
 of it (a :class:`Sweep`). Nothing here is compiled before the first call.
 """
 
-from .call import cast, prepare_rays, select_caster
-from .detect import Sweep, detect
-from .recorded import SweepScene, recorded_scene, recorded_sweep, sensor_poses
+from .call import (
+    SweepScene,
+    cast,
+    prepare_rays,
+    recorded_scene,
+    recorded_sweep,
+    select_caster,
+    sensor_poses,
+)
+from .sensors import Sweep, detect
 from .types import CastBackend, CastRequest, Echo, Return
 
 __all__ = [

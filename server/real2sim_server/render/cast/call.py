@@ -1,20 +1,86 @@
-"""The one call: a sweep of a LiDAR through Gaussians."""
+"""Casting a LiDAR sweep through Gaussians, of one instant or of a recorded scene."""
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import are_rigid
-from ...scene import Lidar
+from ..._numba import is_on_disk
+from ...geometry.rotation import Float, quaternion_to_matrix, slerp
+from ...geometry.transform import are_rigid, invert_transform, transform_from
+from ...scene import Beams, GaussianCloud, Lidar, Scene, Trajectory
+from .._cpu.drawing import array_of
 from ..types import Instance, RenderError
-from .incidence import attributes_towards
+from .layout import AZIMUTH_BINS, layout_of
 from .types import CastBackend, CastRequest, Echo
+
+# Intensity by the angle of incidence
+
+Array = NDArray[np.float32]
+_normals: weakref.WeakKeyDictionary[GaussianCloud, Array] = weakref.WeakKeyDictionary()
+
+
+def facing(cloud: GaussianCloud, beams: Beams, T_cloud_lidar: Float) -> Array:
+    """Cosine [N] of the angle between each Gaussian's shortest axis and the light on its centre.
+
+    Args:
+        cloud: in its own frame.
+        beams: of the sensor.
+        T_cloud_lidar: [S, 4, 4] pose of the sensor in that frame at each instant of the sweep.
+    """
+    means = array_of(cloud.means)
+    middle = invert_transform(T_cloud_lidar[len(T_cloud_lidar) // 2])[:2].astype(np.float32)
+    across = means @ middle[:, :3].T + middle[:, 3]
+    azimuth = np.arctan2(across[:, 1], across[:, 0])
+    bins = ((azimuth + np.float32(np.pi)) * np.float32(AZIMUTH_BINS / (2 * np.pi))).astype(np.int32)
+    slots = layout_of(beams).slot_of[np.clip(bins, 0, AZIMUTH_BINS - 1)]
+    away = means - T_cloud_lidar[:, :3, 3].astype(np.float32)[slots]
+    across_surface = np.abs(np.einsum("ni,ni->n", away, normals_of(cloud)))
+    distance = np.sqrt(np.einsum("ni,ni->n", away, away))
+    cosine: Array = across_surface / np.maximum(distance, np.float32(1e-6))
+    return cosine
+
+
+def facing_of_request(request: CastRequest) -> list[Array]:
+    """``facing`` of the Gaussians of each instance."""
+    return [_facing_of(request, index) for index in range(len(request.instances))]
+
+
+def attributes_towards(request: CastRequest, incidence: float) -> tuple[Array | None, ...]:
+    """Attributes of a request with the reflectivity that Gaussians have towards its sensor."""
+    alike = np.float32(incidence)
+    found: list[Array | None] = []
+    for index, given in enumerate(request.attributes):
+        if given is not None:
+            towards = given[:, 0] * (alike + (1 - alike) * _facing_of(request, index))
+            found.append(np.stack([towards, given[:, 1]], axis=1))
+        else:
+            found.append(None)
+    return tuple(found)
+
+
+def _facing_of(request: CastRequest, index: int) -> Array:
+    instance, poses = request.instances[index], request.object_poses[index]
+    placed = instance.T_world_object if poses is None else poses
+    T_cloud_world = np.eye(4) if placed is None else invert_transform(np.asarray(placed))
+    return facing(instance.cloud, request.lidar.beams, T_cloud_world @ request.T_world_lidar)
+
+
+def normals_of(cloud: GaussianCloud) -> Array:
+    """Shortest axes [N, 3]; kept as long as the cloud."""
+    known = _normals.get(cloud)
+    if known is None:
+        shortest = array_of(cloud.scales).argmin(1)
+        axes = quaternion_to_matrix(array_of(cloud.quats)).astype(np.float32)
+        normals = np.take_along_axis(axes, shortest[:, None, None], axis=2)[:, :, 0]
+        known = _normals[cloud] = np.ascontiguousarray(normals)
+    return known
 
 
 def cast(
@@ -87,7 +153,7 @@ def checked_request(
 def prepare_rays(lidar: Lidar) -> None:
     """Make what casting on the CPU keeps of a sensor's rays, on any thread: half a million of them
     take a second at their first sweep otherwise."""
-    from .cpu.layout import layout_of
+    from .layout import layout_of
 
     layout_of(lidar.beams)
 
@@ -106,7 +172,7 @@ def select_caster(name: str = "auto") -> CastBackend:
 
 
 def _cpu() -> CastBackend:
-    from .cpu.backend import CpuCaster
+    from .cpu import CpuCaster
 
     return CpuCaster()
 
@@ -118,12 +184,12 @@ def _reference() -> CastBackend:
 
 
 def _cuda() -> CastBackend:
-    from ..backends.nvrtc.needs import unmet_need
+    from .._cuda.needs import unmet_nvrtc_need
 
-    need = unmet_need()
+    need = unmet_nvrtc_need()
     if need is not None:
         raise RenderError(f"cast backend 'cuda': {need.found}; {need.remedy}")
-    from .cuda.backend import CudaCaster
+    from .cuda import CudaCaster
 
     return CudaCaster()
 
@@ -184,3 +250,135 @@ def _attributes(
             )
         checked.append(array)
     return tuple(checked)
+
+
+# Recorded scenes: everything moves along its own trajectory.
+
+Attributes = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class SweepScene:
+    """What rays may meet: one entry for each instance, as :func:`~.call.cast` takes them, and the
+    ``incidence`` of all."""
+
+    instances: tuple[Instance, ...]
+    poses: tuple[Float | None, ...]
+    attributes: tuple[Attributes | None, ...]
+    incidence: float = 1.0
+
+    def request(self, lidar: Lidar, T_world_lidar: ArrayLike) -> CastRequest:
+        """A sweep through it. Raises RenderError as :func:`~.call.cast` does."""
+        return checked_request(
+            self.instances,
+            lidar,
+            T_world_lidar,
+            object_poses=self.poses,
+            attributes=self.attributes,
+            incidence=self.incidence,
+        )
+
+
+def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "auto") -> Echo:
+    """What ``lidar`` on the recording vehicle meets in the sweep about ``t_us`` [us].
+
+    A scene's own set for LiDARs (``scene.lidar``) is met where there is one.
+    """
+    met = recorded_scene(scene, lidar, t_us)
+    request = met.request(lidar, sensor_poses(scene.ego, lidar, t_us))
+    return select_caster(backend).cast(request)
+
+
+def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:
+    """Background and the objects that exist at ``t_us``, and how they move over the sweep."""
+    times = t_us + lidar.beams.slots[0]
+    cloud, attributes = met_by_lidar(scene, None)
+    instances, known = [Instance(cloud)], [attributes]
+    moved: list[Float | None] = [None]
+    for index, (object_id, item) in enumerate(scene.objects.items()):
+        if not item.trajectory.covers(t_us):
+            continue
+        cloud, attributes = met_by_lidar(scene, object_id)
+        if item.figure is not None:
+            cloud, attributes = item.posed_at(t_us, item.trajectory), None
+        pose = item.trajectory.transform(t_us)
+        instances.append(Instance(cloud, pose, instance_id=index + 1))
+        moved.append(transforms_at(item.trajectory, times))
+        known.append(attributes)
+    return SweepScene(tuple(instances), tuple(moved), tuple(known), incidence_of(scene))
+
+
+def met_by_lidar(scene: Scene, object_id: str | None) -> tuple[GaussianCloud, Attributes | None]:
+    """Gaussians that a LiDAR meets of an object, or of the background, and their attributes."""
+    if scene.lidar is not None:
+        held = scene.lidar.background if object_id is None else scene.lidar.objects.get(object_id)
+        if held is not None:
+            return held.cloud, held.attributes.cpu().numpy()
+    return (scene.background if object_id is None else scene.object(object_id).cloud), None
+
+
+def incidence_of(scene: Scene) -> float:
+    """Share of light that the surfaces of a scene send back however they face the sensor."""
+    return 1.0 if scene.lidar is None else scene.lidar.incidence
+
+
+def sensor_poses(ego: Trajectory, lidar: Lidar, t_us: int) -> Float:
+    """``T_world_lidar`` [S, 4, 4] on a vehicle that drives along ``ego`` [T_world_vehicle]."""
+    return transforms_at(ego, t_us + lidar.beams.slots[0]) @ lidar.T_vehicle_lidar
+
+
+def transforms_at(trajectory: Trajectory, times_us: Float) -> Float:
+    """``T_fixed_moving`` [S, 4, 4] at any times [us].
+
+    Beyond its ends the path goes straight on with the speed it has there, for the parts of a sweep
+    before the first and after the last box.
+    """
+    known = trajectory.times_us.astype(np.float64)
+    if len(known) == 1:
+        pose = transform_from(trajectory.positions[0], trajectory.quaternions[0])
+        return np.broadcast_to(pose, (len(times_us), 4, 4))
+    after = np.clip(np.searchsorted(known, times_us), 1, len(known) - 1)
+    part = (times_us - known[after - 1]) / (known[after] - known[after - 1])
+    first, last = trajectory.positions[after - 1], trajectory.positions[after]
+    positions = first + part[:, None] * (last - first)
+    quaternions = slerp(
+        trajectory.quaternions[after - 1], trajectory.quaternions[after], np.clip(part, 0.0, 1.0)
+    )
+    return transform_from(positions, quaternions)
+
+
+# Warm-up
+
+
+def kernels_of_casting_on_disk() -> bool:
+    """Whether an earlier run left what :func:`warm_up_casting` compiles."""
+    from .blend import follow_rays  # Imported only where it is needed.
+
+    return is_on_disk(follow_rays)
+
+
+def warm_up_casting() -> None:
+    """Compile or load everything that a first sweep would wait for; takes twenty seconds the first
+    time."""
+    cloud = GaussianCloud(
+        means=torch.tensor([[3.0, 0.0, 0.0], [0.4, 0.1, 0.2]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        scales=torch.full((2, 3), 0.3),
+        opacities=torch.full((2,), 0.9),
+        sh=torch.zeros(2, 1, 3),
+    )
+    covars = torch.eye(3).repeat(2, 1, 1) * 0.09
+    turning = Beams.spinning(np.array([0.0, 0.1]), columns=32)
+    table = Beams(np.zeros(8), np.linspace(-0.1, 0.1, 8), np.zeros(8))
+    for beams in (turning, table):
+        for returns in (1, 3):
+            lidar = Lidar("warm-up", beams, returns=returns, divergence=(1e-3, 1e-3))
+            moving = np.tile(np.eye(4), (len(beams.slots[0]), 1, 1))
+            moving[:, 0, 3] = np.linspace(0.0, 0.1, len(moving))
+            cast(
+                [Instance(cloud), Instance(cloud, np.eye(4), 1, covars=covars)],
+                lidar,
+                moving,
+                object_poses=[None, moving],
+                attributes=[np.full((2, 2), 0.5, np.float32), None],
+            )

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..._files import atomic_file
 from ...scene import Lidar
-from ..picture_file import write_png
-from .detect import Sweep
+from ..images import write_png
+from .sensors import Sweep
 
 SUFFIXES = (".ply", ".npz", ".png")
 TOP_SIZE = 800

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...geometry.rotation import Float
 from ...geometry.transform import invert_transform
-from ..backends.base import ALPHA_MAX, ALPHA_MIN
+from ..backend import ALPHA_MAX, ALPHA_MIN
 from ..types import Instance
 from .types import ECHO_MIN, HALF_LIGHT, TRANSMITTANCE_MIN, CastRequest, Echo, Return
 

@@ -1,4 +1,4 @@
-"""What goes into cast() and what comes out."""
+"""Input and output of cast(), and the motion of sensor and bodies over a sweep."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.rotation import Float
+from ...geometry.transform import apply_transform, invert_transform
 from ...scene import Lidar
 from ..types import Instance
 
@@ -116,3 +117,109 @@ class CastBackend(Protocol):
     def cast(self, request: CastRequest) -> Echo:
         """Follow every ray."""
         ...
+
+
+# Motion in the frame of the sweep: the sensor's own at the middle instant. Each body is placed in it
+# as it stands then. At other instants the body counts as still and the sensor as moved, so a ray
+# meets the body as it stands at the ray's own instant.
+
+STILL = 1e-9
+"""Poses that differ by less are the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Ways in which the sensor moves against bodies.
+
+    Attributes:
+        of_body: for each instance the way; 0 is against what stands still.
+        to_sensor: [ways, S, 4, 4], from the frame of the sweep to the sensor's at each instant.
+        speed, turn: [ways], at most [m/s], [rad/s].
+        linear, offset: for each instance [3, 3] and [3], from its cloud's frame to that of the
+            sweep, scale included.
+    """
+
+    of_body: list[int]
+    to_sensor: Float
+    speed: Float
+    turn: Float
+    linear: list[Float]
+    offset: list[Float]
+
+
+def motions_of(request: CastRequest) -> Motion:
+    """The ways of a request."""
+    seconds = request.lidar.beams.slots[0] * 1e-6
+    middle = len(seconds) // 2
+    T_lidar_world = invert_transform(request.T_world_lidar)
+    T_sweep_world, T_world_sweep = T_lidar_world[middle], request.T_world_lidar[middle]
+    ways = [T_lidar_world @ T_world_sweep]
+    of_body, linear, offset = [], [], []
+    for instance, poses in zip(request.instances, request.object_poses, strict=True):
+        placed, way = instance.T_world_object, 0
+        T_world_object = np.eye(4) if placed is None else np.asarray(placed, dtype=np.float64)
+        if poses is not None:
+            T_world_object = poses[middle]
+            if np.abs(poses - T_world_object).max() > STILL:
+                way = len(ways)
+                T_object_sweep = invert_transform(T_world_object) @ T_world_sweep
+                ways.append(T_lidar_world @ poses @ T_object_sweep)
+        T_sweep_object = T_sweep_world @ T_world_object
+        of_body.append(way)
+        linear.append(T_sweep_object[:3, :3] * np.asarray(instance.scale))
+        offset.append(T_sweep_object[:3, 3])
+    to_sensor = np.stack(ways)
+    speed, turn = _rates(to_sensor, seconds)
+    return Motion(of_body, to_sensor, speed, turn, linear, offset)
+
+
+def _rates(to_sensor: Float, seconds: Float) -> tuple[Float, Float]:
+    """Largest speed and turn of each way over its instants."""
+    if len(seconds) < 2:
+        return np.zeros(len(to_sensor)), np.zeros(len(to_sensor))
+    places = invert_transform(to_sensor)
+    steps = np.maximum(np.diff(seconds), 1e-9)
+    moved = np.linalg.norm(np.diff(places[..., :3, 3], axis=1), axis=-1)
+    turned = places[:, 1:, :3, :3].swapaxes(-1, -2) @ places[:, :-1, :3, :3]
+    # |A - I| of a turn by a small angle is sqrt(2) times the angle.
+    angle = np.linalg.norm(turned - np.eye(3), axis=(-2, -1)) / np.sqrt(2)
+    speed, turn = (moved / steps).max(1), (angle / steps).max(1)
+    return np.where(speed > 1e-6, speed, 0.0), np.where(turn > 1e-6, turn, 0.0)
+
+
+# Velocities of hit points
+
+
+def point_velocities(request: CastRequest, echo: Echo, hit: NDArray[np.bool_]) -> Image:
+    """Velocity [..., 3] [m/s] in the world of the point that each ray meets; 0 elsewhere.
+
+    That of the body's own motion between the instants before and after the ray's.
+    """
+    lidar = request.lidar
+    times, slots = lidar.beams.slots
+    velocity = np.zeros((*lidar.shape, 3), np.float32)
+    if len(times) < 2:
+        return velocity
+    before = np.clip(slots - 1, 0, len(times) - 1)
+    after = np.clip(slots + 1, 0, len(times) - 1)
+    firsts = np.cumsum([0, *(len(i.cloud) for i in request.instances)])
+    for index, poses in enumerate(request.object_poses):
+        if poses is None:
+            continue
+        of_body = (echo.member >= firsts[index]) & (echo.member < firsts[index + 1]) & hit
+        if not of_body.any():
+            continue
+        slot = slots[of_body]
+        ray = (lidar.beams.directions * echo.range[..., None])[of_body]
+        world = _each(request.T_world_lidar[slot], ray)
+        local = _each(invert_transform(poses[slot]), world)
+        moved = _each(poses[after[of_body]], local) - _each(poses[before[of_body]], local)
+        seconds = (times[after[of_body]] - times[before[of_body]]) * 1e-6
+        velocity[of_body] = moved / seconds[:, None]
+    return velocity
+
+
+def _each(transforms: Float, points: Float) -> Float:
+    """Points [N, 3], each by its own transform [N, 4, 4]."""
+    moved: Float = apply_transform(transforms, points[:, None])[:, 0]
+    return moved

@@ -21,7 +21,7 @@ from ...datasets.plan import ExportPlan, planned_cameras, planned_lidar, planned
 from ...datasets.variants import Variant
 from ...datasets.writers import writer_of
 from ...render import Backend, RenderOutput
-from ...render.backends.base import RasterRequest
+from ...render.backend import RasterRequest
 from ...render.cast import CastRequest, Echo, select_caster
 from ..engine import Engine, Lane, QueueFullError
 from ..http.problems import ServiceError

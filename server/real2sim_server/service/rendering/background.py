@@ -23,8 +23,13 @@ from ...render import (
     uses_levels,
     without_levels,
 )
-from ...render.lenses import kernels_of_lenses_on_disk, refuse_lenses, warm_up_lenses
-from ...render.uncertainty import UNCERTAINTY, shown_as_colour
+from ...render.frame import (
+    UNCERTAINTY,
+    kernels_of_lenses_on_disk,
+    refuse_lenses,
+    shown_as_colour,
+    warm_up_lenses,
+)
 from ...scene import Camera
 from ..engine import Engine
 from ..first_run import awaited, compile_beside

@@ -22,8 +22,7 @@ from real2sim_proto.episode import SensorSpec
 
 from ...geometry.rotation import Float
 from ...render import Instance, RigView
-from ...render.effects import Light, to_display, to_light
-from ...render.jpeg import JpegEncoder, turbo_jpeg
+from ...render.images import JpegEncoder, Light, to_display, to_light, turbo_jpeg
 from ...render.modalities import encode_image
 from ...scene import Camera, Lens, Shutter
 from ...scene.camera_motion import moved

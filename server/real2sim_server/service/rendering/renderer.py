@@ -35,13 +35,11 @@ from ...render import (
     warm_up,
     warm_up_small_images,
 )
-from ...render.backends import device_of
-from ...render.effects import with_effects
-from ...render.frame import at_once
-from ...render.ground_class import with_ground_seen
-from ...render.jpeg import JpegEncoder, jpeg_encoder_for, turbo_jpeg
+from ...render.backend import device_of
+from ...render.frame import UNCERTAINTY, WITHOUT, at_once
+from ...render.images import JpegEncoder, jpeg_encoder_for, turbo_jpeg, with_effects
+from ...render.lens import with_ground_seen
 from ...render.modalities import modality_names, modality_of, options_for
-from ...render.uncertainty import UNCERTAINTY, WITHOUT
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ..engine import Engine, Lane, lower_priority
 from ..http.metrics import Metrics

@@ -23,8 +23,8 @@ from real2sim_proto.operations import Operation
 from ...edit import EditError, instances_at, replay_operations
 from ...geometry.rotation import Float
 from ...render import Instance, RenderError
-from ...render.encode import encode_rgb
-from ...render.uncertainty import UNCERTAINTY, uncertainty_picture
+from ...render.frame import UNCERTAINTY, uncertainty_picture
+from ...render.images import encode_rgb
 from ...scene import Scene, SceneError
 from ..accounts import Account, RevokedError, admit_message, owner_name
 from ..engine import QueueFullError

@@ -14,7 +14,7 @@ from real2sim_proto.sessions import SessionRender
 
 from ...edit import ScenarioState
 from ...render.cast import CastBackend, prepare_rays, select_caster
-from ...render.cast.warm_up import kernels_of_casting_on_disk, warm_up_casting
+from ...render.cast.call import kernels_of_casting_on_disk, warm_up_casting
 from ...render.modalities import modality_of
 from ...scene import Camera, Scene
 from ...world import World

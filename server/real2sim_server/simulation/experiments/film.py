@@ -18,7 +18,7 @@ from ...geometry.transform import apply_transform
 from ...physics.colliders import Box, Plane
 from ...physics.errors import PhysicsError
 from ...render import Instance, RasterOptions, render_cameras
-from ...render.picture_file import write_png
+from ...render.images import write_png
 from ...render.video import video_file
 from ...scene import Camera, GaussianCloud
 from ..body import BodyMode

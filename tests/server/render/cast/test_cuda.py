@@ -10,11 +10,11 @@ import torch
 
 from real2sim_server.geometry.transform import transform_from
 from real2sim_server.render import Instance, RenderError
-from real2sim_server.render.backends.nvrtc.needs import unmet_need
+from real2sim_server.render._cuda.needs import unmet_nvrtc_need
 from real2sim_server.render.cast import Echo, cast, select_caster
+from real2sim_server.render.cast import cuda as cuda_cast
 from real2sim_server.render.cast.call import checked_request
-from real2sim_server.render.cast.cuda import records
-from real2sim_server.render.cast.cuda.backend import CudaCaster
+from real2sim_server.render.cast.cuda import CudaCaster
 from real2sim_server.render.cast.types import CastRequest
 from real2sim_server.scene import Beams, Lidar
 
@@ -105,11 +105,11 @@ def test_what_lies_beyond_the_range_is_not_met() -> None:
 def test_the_structures_are_those_of_the_kernels() -> None:
     sizes = (ctypes.c_uint32 * 3)()
     cast_twin().sizes(sizes)
-    expected = [records.MET_BYTES, records.BODY.itemsize, records.SWEEP.itemsize]
+    expected = [cuda_cast.MET_BYTES, cuda_cast.BODY.itemsize, cuda_cast.SWEEP.itemsize]
     assert list(sizes) == expected
 
 
-@pytest.mark.skipif(unmet_need() is None, reason="there is a GPU")
+@pytest.mark.skipif(unmet_nvrtc_need() is None, reason="there is a GPU")
 def test_without_a_gpu_it_is_refused_with_what_it_needs() -> None:
     instances, _ = scattered()
     lidar = Lidar("any", SENSORS["spinning"], min_range=1.0, max_range=40.0)
@@ -118,7 +118,9 @@ def test_without_a_gpu_it_is_refused_with_what_it_needs() -> None:
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(unmet_need() is not None, reason="no GPU that the kernels can be compiled for")
+@pytest.mark.skipif(
+    unmet_nvrtc_need() is not None, reason="no GPU that the kernels can be compiled for"
+)
 def test_a_gpu_meets_what_the_cpu_meets() -> None:
     request = sweep(SENSORS["spinning"])
     on_gpu, on_cpu = CudaCaster().cast(request), select_caster("cpu").cast(request)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from real2sim_server.render.backends.nvrtc.compile import ARCHITECTURES
-from real2sim_server.render.backends.nvrtc.needs import compiler_needs
-from real2sim_server.render.cast.cuda.compile import KERNELS, compile_kernels
+from real2sim_server.render._cuda.launcher import ARCHITECTURES
+from real2sim_server.render._cuda.needs import compiler_needs
+from real2sim_server.render.cast.cuda import KERNELS, compile_kernels
 
 MISSING = next((need.found for need in compiler_needs() if not need.met), "")
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from real2sim_server.render.cast import CastRequest, Echo, detect
-from real2sim_server.render.cast.detect import drop_probability, normal, uniform
+from real2sim_server.render.cast.sensors import drop_probability, normal, uniform
 from real2sim_server.render.types import Instance
 from real2sim_server.scene import Beams, Detection, GaussianCloud, Lidar
 

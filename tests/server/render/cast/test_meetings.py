@@ -9,7 +9,7 @@ import torch
 from real2sim_server.render import Instance, RenderError
 from real2sim_server.render.cast import cast
 from real2sim_server.render.cast.call import checked_request
-from real2sim_server.render.cast.cpu.backend import CpuCaster
+from real2sim_server.render.cast.cpu import CpuCaster
 from real2sim_server.scene import Beams, GaussianCloud, Lidar
 
 LIDAR = Lidar("fan", Beams(np.linspace(-0.2, 0.2, 40), np.zeros(40), np.zeros(40)))

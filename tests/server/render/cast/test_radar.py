@@ -7,7 +7,7 @@ import pytest
 
 from real2sim_proto.ranging import RadarModel
 from real2sim_proto.semantics import SEMANTIC_CLASSES
-from real2sim_server.render.cast.radar import (
+from real2sim_server.render.cast.sensors import (
     CLUTTER_KIND,
     GHOST_KIND,
     REFERENCE_RCS,

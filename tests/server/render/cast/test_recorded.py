@@ -14,8 +14,8 @@ from real2sim_server.edit.apply import apply_operations
 from real2sim_server.edit.compose import sweep_of
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.render.cast import cast, detect, recorded_sweep, sensor_poses
+from real2sim_server.render.cast.call import transforms_at
 from real2sim_server.render.cast.files import ply_bytes, sweep_picture, write_sweep
-from real2sim_server.render.cast.recorded import transforms_at
 from real2sim_server.scene import (
     Beams,
     CameraRig,

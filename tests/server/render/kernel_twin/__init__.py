@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from real2sim_server.render.backends.nvrtc.compile import FOLDER
+from real2sim_server.render._cuda.launcher import FOLDER
 
 HERE = Path(__file__).parent
 COMPILER = shutil.which("g++")

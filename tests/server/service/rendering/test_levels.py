@@ -10,7 +10,7 @@ import pytest
 from real2sim_proto.episode import SensorSpec
 from real2sim_server.edit import ScenarioState, things_at_start
 from real2sim_server.render import levels_bytes, scene_levels_bytes, select_backend
-from real2sim_server.render.backends.cpu.detail import hierarchy
+from real2sim_server.render._cpu import detail_levels
 from real2sim_server.service.http.problems import ServiceError
 from real2sim_server.service.library.budgets import MemoryBudget
 from real2sim_server.service.rendering.background import DetailLevels
@@ -25,13 +25,13 @@ SMALL = {"action": "control", "sensors": [{"camera": "front", "detail": "auto"}]
 def makers(monkeypatch) -> list[str]:
     """Names of the threads on which levels were made."""
     names: list[str] = []
-    make = hierarchy.make_hierarchy
+    make = detail_levels.make_hierarchy
 
     def noted(*cloud):
         names.append(threading.current_thread().name)
         return make(*cloud)
 
-    monkeypatch.setattr(hierarchy, "make_hierarchy", noted)
+    monkeypatch.setattr(detail_levels, "make_hierarchy", noted)
     return names
 
 

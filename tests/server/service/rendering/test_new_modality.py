@@ -13,7 +13,7 @@ from real2sim_proto import decode
 from real2sim_proto.episode import SensorSpec
 from real2sim_server.edit import ScenarioState, instances_at
 from real2sim_server.render import RenderOutput, select_backend
-from real2sim_server.render.encode import EXACT_CODECS, encode_lossless
+from real2sim_server.render.images import EXACT_CODECS, encode_lossless
 from real2sim_server.render.modalities import SensorModality, register, unregister
 from real2sim_server.scene import Scene
 from real2sim_server.service.engine import Engine

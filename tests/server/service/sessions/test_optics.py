@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.render.lenses import warm_up_lenses
+from real2sim_server.render.frame import warm_up_lenses
 
 pytestmark = pytest.mark.network
 

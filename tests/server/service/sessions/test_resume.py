@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import real2sim
-from real2sim_server.render.cast.warm_up import warm_up_casting
+from real2sim_server.render.cast.call import warm_up_casting
 from real2sim_server.scene.io import save_scene
 from tests.waiting import LIMIT_S
 

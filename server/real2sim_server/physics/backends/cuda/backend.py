@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....geometry.rotation import Float
-from ....render.backends.nvrtc.needs import unmet_need
+from ....render._cuda.needs import unmet_nvrtc_need
 from ...colliders import Collider
 from ...contact import AXES, POINT, SPEED, SPIN
 from ...errors import ParticleError, SolverError
@@ -57,7 +57,7 @@ class CudaSolverBackend:
     name = "cuda"
 
     def __init__(self, launcher: Callable[[str], Launcher] | None = None) -> None:
-        need = unmet_need() if launcher is None else None
+        need = unmet_nvrtc_need() if launcher is None else None
         if need is not None:
             raise SolverError(
                 f"backend 'cuda' is not usable here: {need.found}; {need.remedy}; it needs an "

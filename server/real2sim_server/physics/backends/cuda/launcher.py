@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ...._nvrtc import KernelSource
-from ....render.backends.nvrtc.usage import Usage, usage_of
+from ....render._cuda.launcher import Usage, usage_of
 from ...errors import SolverError
 from .source import FOLDER, KERNELS, SOURCE, solver_source
 

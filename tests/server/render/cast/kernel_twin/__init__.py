@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from real2sim_server.render.cast.cuda.compile import FOLDER
+from real2sim_server.render.cast.cuda import FOLDER
 
 from ...kernel_twin import KernelTwin, compiled_twin
 

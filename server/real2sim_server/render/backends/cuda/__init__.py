@@ -1,1 +1,0 @@
-"""The CUDA backend: gsplat behind the same call."""

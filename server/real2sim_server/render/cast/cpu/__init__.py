@@ -1,1 +1,0 @@
-"""The CPU backend of cast(): Numba kernels on all cores."""

@@ -1,1 +1,0 @@
-"""The CUDA backend of cast(): kernels of our own, compiled by NVRTC."""

@@ -1,0 +1,456 @@
+"""From rendered arrays to files and bytes: camera effects, quantization, encoding.
+
+Effects work on linear light: sRGB display values are linearised first and encoded again afterwards.
+The functions are pure and run on any thread.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import threading
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import DTypeLike, NDArray
+from torch import Tensor
+
+from real2sim_proto.cameras import CameraEffects, NoiseSpec
+
+from .._files import atomic_file
+from .._numba import PARALLEL_LOOPS, kernel
+from .types import RenderError
+
+# JPEG by libjpeg-turbo, or by nvJPEG on the GPU that drew the image
+
+JpegEncoder = Callable[[NDArray[np.uint8], int], bytes]
+"""Bytes of an image [H, W, 3] uint8, C order, at a quality of 1 to 100; on any thread."""
+
+CPU_ONLY: Final = -99999
+"""Device by which nvImageCodec works without a GPU, by libjpeg-turbo."""
+PROOF_QUALITY = 95
+PROOF_LEVELS = 12
+"""Of 255, by which no channel of the smooth sample may differ after decoding."""
+
+log = logging.getLogger(__name__)
+
+
+def turbo_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """By libjpeg-turbo on this thread, 4:4:4."""
+    import simplejpeg
+
+    encoded: bytes = simplejpeg.encode_jpeg(image, quality, "RGB", "444")
+    return encoded
+
+
+class NvjpegEncoder:
+    """Jpegs 4:4:4 by nvJPEG. An image that it cannot encode is encoded by libjpeg-turbo.
+
+    Each thread has an encoder of its own, and with it a CUDA stream: encoders of nvImageCodec
+    are not for several threads at once.
+
+    Args:
+        device: number of the GPU, or CPU_ONLY.
+
+    Raises:
+        ImportError: nvImageCodec is not installed.
+    """
+
+    def __init__(self, device: int) -> None:
+        from nvidia import nvimgcodec
+
+        self._codec: Any = nvimgcodec
+        self._device = device
+        self._own = threading.local()
+        self._failed = False
+
+    def __call__(self, image: NDArray[np.uint8], quality: int) -> bytes:
+        """See JpegEncoder."""
+        try:
+            return self.encode(image, quality)
+        except RenderError as error:
+            if not self._failed:
+                self._failed = True
+                log.warning("jpegs are made by libjpeg-turbo where %s", error)
+            return turbo_jpeg(image, quality)
+
+    def encode(self, image: NDArray[np.uint8], quality: int) -> bytes:
+        """By nvJPEG alone.
+
+        Raises:
+            RenderError: it could not.
+        """
+        codec = self._codec
+        params = codec.EncodeParams(
+            quality_type=codec.QualityType.QUALITY,
+            quality_value=quality,
+            chroma_subsampling=codec.ChromaSubsampling.CSS_444,
+        )
+        try:
+            picture = codec.as_image(image)
+            if self._device != CPU_ONLY:
+                picture = picture.cuda()
+            stream = self._encoder().encode(picture, "jpeg", params=params)
+        except RuntimeError as error:
+            raise RenderError(f"nvJPEG failed: {error}") from error
+        if stream is None:
+            raise RenderError(f"nvJPEG gave nothing for an image {list(image.shape)}")
+        return bytes(stream)
+
+    def _encoder(self) -> Any:
+        own: Any = getattr(self._own, "encoder", None)
+        if own is None:
+            # One thread of its own: the encoders of several images are several threads already.
+            own = self._codec.Encoder(device_id=self._device, max_num_cpu_threads=1)
+            self._own.encoder = own
+        return own
+
+
+def jpeg_encoder_for(device: torch.device) -> tuple[JpegEncoder, str]:
+    """What encodes images that were drawn on ``device``, and why.
+
+    nvJPEG on a GPU, where it is installed and gives back a sample as it was; libjpeg-turbo
+    everywhere else.
+    """
+    if device.type != "cuda":
+        return turbo_jpeg, "libjpeg-turbo: images are drawn on the CPU"
+    try:
+        encoder = NvjpegEncoder(device.index or 0)
+    except ImportError:
+        return turbo_jpeg, (
+            "libjpeg-turbo: nvImageCodec is not installed; pip install 'real2sim[server,cuda]'"
+        )
+    wrong = disproof(encoder)
+    if wrong is not None:
+        return turbo_jpeg, f"libjpeg-turbo: {wrong}"
+    return encoder, "nvJPEG"
+
+
+def disproof(encoder: NvjpegEncoder) -> str | None:
+    """What is wrong with the jpeg of a sample; None where its colours are right."""
+    import simplejpeg
+
+    rows, columns = np.mgrid[0:48, 0:64].astype(np.uint8)
+    sample = np.ascontiguousarray(np.dstack([4 * columns, 5 * rows, 255 - 2 * (rows + columns)]))
+    try:
+        decoded = simplejpeg.decode_jpeg(encoder.encode(sample, PROOF_QUALITY), "RGB")
+    except (RenderError, ValueError) as error:
+        return str(error)
+    if decoded.shape != sample.shape:
+        return f"nvJPEG gave a picture {list(decoded.shape)} for one {list(sample.shape)}"
+    off = int(np.abs(decoded.astype(int) - sample).max())
+    return None if off <= PROOF_LEVELS else f"nvJPEG is off by {off} of 255 levels"
+
+
+RGB_CODECS = ("raw", "jpeg", "png")
+EXACT_CODECS = ("raw", "png")
+DEPTH_PNG_UNIT = 1 / 256
+"""Metres of one level of a depth png, as in KITTI: 4 mm steps up to 255.99 m."""
+UNCERTAINTY_PNG_UNIT = 1 / 65535
+"""Of one level of an uncertainty png."""
+PNG_COMPRESSION = 1
+"""zlib level; higher ones are several times slower and shrink pictures little more. With runs alone
+and one filter for all rows (Paeth's) pictures take two thirds of the time, and less room."""
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedImage:
+    """Bytes of one image and what is needed to read them.
+
+    Attributes:
+        data: the bytes; of codec ``raw`` the array in C order, little-endian.
+        codec: ``raw``, ``jpeg`` or ``png``.
+        dtype: of the decoded array: ``uint8``, ``uint16`` or ``float32``. Depth as ``uint16``
+            is in steps of DEPTH_PNG_UNIT, uncertainty in steps of UNCERTAINTY_PNG_UNIT.
+        shape: of the decoded array.
+    """
+
+    data: bytes
+    codec: str
+    dtype: str
+    shape: tuple[int, ...]
+
+
+def encode_rgb(
+    image: NDArray[np.uint8], codec: str, *, quality: int = 90, jpeg: JpegEncoder = turbo_jpeg
+) -> bytes:
+    """RGB [H, W, 3] uint8 as raw bytes, jpeg (4:4:4, no loss beyond ``quality``) or png.
+
+    Raises:
+        RenderError: another codec, an image of another dtype or shape, or a quality outside 1 to
+            100.
+    """
+    _check_codec("rgb", codec, RGB_CODECS)
+    _check_array("rgb", image, np.uint8, 3)
+    contiguous = np.ascontiguousarray(image)
+    if codec == "raw":
+        return contiguous.tobytes()
+    if codec == "png":
+        return _png(contiguous[..., ::-1])
+    if not 1 <= quality <= 100:
+        raise RenderError(f"quality must be 1 to 100, not {quality!r}")
+    return jpeg(contiguous, quality)
+
+
+def encode_depth(depth: NDArray[np.float32], codec: str, *, name: str = "depth") -> bytes:
+    """Depth [H, W] float32 [m] as raw float32, or 16-bit png in steps of DEPTH_PNG_UNIT.
+
+    In a png a hit is never 0, and everything beyond the range has the largest level. Messages call
+    the image ``name``.
+    """
+    _check_codec(name, codec, EXACT_CODECS)
+    _check_array(name, depth, np.float32, 2)
+    if codec == "raw":
+        return depth.astype("<f4", order="C", copy=False).tobytes()
+    levels = np.clip(np.rint(depth / DEPTH_PNG_UNIT), 1, np.iinfo(np.uint16).max)
+    return _png(np.where(depth > 0, levels, 0).astype(np.uint16))
+
+
+def encode_uncertainty(image: NDArray[np.float32], codec: str) -> bytes:
+    """Uncertainty [H, W] float32 in [0, 1] as raw float32, or 16-bit png in steps of
+    UNCERTAINTY_PNG_UNIT."""
+    _check_codec("uncertainty", codec, EXACT_CODECS)
+    _check_array("uncertainty", image, np.float32, 2)
+    if codec == "raw":
+        return image.astype("<f4", order="C", copy=False).tobytes()
+    return _png(np.rint(np.clip(image, 0, 1) / UNCERTAINTY_PNG_UNIT).astype(np.uint16))
+
+
+def encode_instance(instance: NDArray[np.uint16], codec: str) -> bytes:
+    """Instance ids [H, W] uint16 as raw uint16 or 16-bit png."""
+    return encode_lossless(instance, codec, name="instance", dtype=np.dtype("<u2"))
+
+
+def encode_lossless(image: NDArray[Any], codec: str, *, name: str, dtype: np.dtype[Any]) -> bytes:
+    """An image [H, W] of uint8 or uint16 as raw values, little-endian, or as png.
+
+    Args:
+        image: of ``dtype``.
+        codec: ``raw`` or ``png``.
+        name: of the modality, for messages.
+        dtype: of a pixel.
+
+    Raises:
+        RenderError: another codec, or an image of another dtype or shape.
+    """
+    _check_codec(name, codec, EXACT_CODECS)
+    _check_array(name, image, dtype, 2)
+    if codec == "raw":
+        return image.astype(dtype, order="C", copy=False).tobytes()
+    return _png(image)
+
+
+def _check_codec(name: str, codec: str, codecs: tuple[str, ...]) -> None:
+    if codec not in codecs:
+        raise RenderError(f"{name} cannot be encoded as {codec!r}; allowed are {list(codecs)}")
+
+
+def _check_array(name: str, image: NDArray[Any], dtype: DTypeLike, ndim: int) -> None:
+    fits = image.dtype == dtype and image.ndim == ndim and (ndim == 2 or image.shape[2] == 3)
+    if not fits or image.size == 0:
+        shape = "[H, W, 3]" if ndim == 3 else "[H, W]"
+        raise RenderError(
+            f"{name} must be {shape} {np.dtype(dtype)}, not {list(image.shape)} {image.dtype}"
+        )
+
+
+def _png(image: NDArray[Any]) -> bytes:
+    import cv2
+
+    runs = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    paeth = [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH]
+    options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION, *runs, *paeth]
+    done, encoded = cv2.imencode(".png", image, options)
+    if not done:
+        raise RenderError(f"png encoding failed for an image {list(image.shape)} {image.dtype}")
+    return bytes(encoded)
+
+
+# Quantization of blended floats, one pass each
+
+SOLID_ALPHA = 0.5
+"""A pixel below this alpha counts as nothing hit."""
+
+
+PIECE = 1 << 21
+"""Numbers that are converted in one go: a few milliseconds."""
+
+
+def to_uint8(rgb: Tensor, *, between: Callable[[], object] | None = None) -> NDArray[np.uint8]:
+    """RGB [..., H, W, 3] float32 as uint8: clamped to [0, 1], halves rounded up, NaN to 0.
+
+    Images on a GPU are rounded there and brought over as bytes.
+
+    Args:
+        rgb: of any number of images.
+        between: called between pieces of the work.
+    """
+    if rgb.device.type != "cpu":
+        rounded = (rgb.nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).byte()
+        return _on_host(rounded)
+    values = np.ascontiguousarray(rgb.detach().numpy())
+    levels = np.empty(values.shape, np.uint8)
+    given, result = values.reshape(-1), levels.reshape(-1)
+    for piece in _pieces(len(given), between):
+        _round_to_bytes(given[piece], result[piece])
+    return levels
+
+
+def solid_depth(
+    depth: Tensor, alpha: Tensor, *, between: Callable[[], object] | None = None
+) -> NDArray[np.float32]:
+    """Depth [..., H, W] float32 [m], 0 where ``alpha`` is below SOLID_ALPHA; ``between`` is called
+    between pieces of the work."""
+    if depth.device.type != "cpu":
+        return _on_host(depth.where(alpha >= SOLID_ALPHA, 0.0))
+    values = np.ascontiguousarray(depth.detach().numpy())
+    kept = np.empty_like(values)
+    cover = np.ascontiguousarray(alpha.detach().numpy())
+    given, covers, result = values.reshape(-1), cover.reshape(-1), kept.reshape(-1)
+    for piece in _pieces(len(given), between):
+        _keep_solid(given[piece], covers[piece], result[piece])
+    return kept
+
+
+def _on_host(image: Tensor) -> NDArray[Any]:
+    """By memory that a GPU writes to without help, several times as fast as any other."""
+    if image.device.type != "cuda":
+        return image.cpu().numpy()
+    held = torch.empty(image.shape, dtype=image.dtype, pin_memory=True)
+    return held.copy_(image).numpy()
+
+
+def _pieces(length: int, between: Callable[[], object] | None) -> Iterator[slice]:
+    """All of it, or what is done between two calls of ``between``."""
+    if between is None:
+        yield slice(None)
+        return
+    for first in range(0, length, PIECE):
+        yield slice(first, first + PIECE)
+        between()
+
+
+@kernel(parallel=PARALLEL_LOOPS)
+def _round_to_bytes(values: NDArray[np.float32], levels: NDArray[np.uint8]) -> None:
+    for i in prange(values.shape[0]):
+        value = values[i]
+        clamped = value if value > np.float32(0) else np.float32(0)
+        clamped = clamped if clamped < np.float32(1) else np.float32(1)
+        levels[i] = np.uint8(np.int32(clamped * np.float32(255) + np.float32(0.5)))
+
+
+@kernel(parallel=PARALLEL_LOOPS)
+def _keep_solid(
+    depth: NDArray[np.float32], alpha: NDArray[np.float32], kept: NDArray[np.float32]
+) -> None:
+    for i in prange(depth.shape[0]):
+        kept[i] = depth[i] if alpha[i] >= np.float32(SOLID_ALPHA) else np.float32(0)
+
+
+# Files, written atomically
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an RGB image uint8 [H, W, 3] as PNG; folders on the way are made.
+
+    Raises:
+        RenderError: the image has another shape or dtype.
+        OSError: the file cannot be written.
+    """
+    data = encode_rgb(image, "png")
+    with atomic_file(path) as file:
+        file.write(data)
+
+
+__all__ = ["write_png"]
+
+
+# Camera effects
+
+Light = NDArray[np.float32]
+STEPS = 1 << 14
+"""Of the table that gives display values to light."""
+
+
+def with_effects(
+    rgb: NDArray[np.uint8], effects: CameraEffects, camera: str, t_us: int
+) -> NDArray[np.uint8]:
+    """An image [H, W, 3] as the camera gives it; motion blur has been drawn already.
+
+    Args:
+        rgb: as drawn.
+        effects: of the camera.
+        camera: its name; noise differs between cameras and instants.
+        t_us: instant [us].
+    """
+    light = to_light(rgb)
+    if effects.vignetting is not None:
+        light *= _falloff(rgb.shape[:2], effects.vignetting)[..., None]
+    gains = np.array(effects.white_balance or (1.0, 1.0, 1.0)) * 2.0**effects.exposure_ev
+    light *= gains.astype(np.float32)
+    if effects.noise is not None:
+        light += _noise(light, effects.noise, camera, t_us)
+    image = to_display(light, None if effects.tone_curve is None else tuple(effects.tone_curve))
+    if effects.jpeg_quality is not None:
+        image = _through_jpeg(image, effects.jpeg_quality)
+    return image
+
+
+def to_light(rgb: NDArray[np.uint8]) -> Light:
+    """Linear light, 1 for white."""
+    return _light_of_levels()[rgb]
+
+
+def to_display(light: Light, tone_curve: tuple[float, ...] | None = None) -> NDArray[np.uint8]:
+    """Display values of linear light, cut at black and white."""
+    index = np.clip(light * (STEPS - 1) + 0.5, 0, STEPS - 1).astype(np.uint16)
+    levels: NDArray[np.uint8] = _levels_of_light(tone_curve)[index]
+    return levels
+
+
+@functools.cache
+def _light_of_levels() -> Light:
+    value = np.arange(256) / 255
+    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return light.astype(np.float32)
+
+
+@functools.lru_cache(maxsize=64)
+def _levels_of_light(tone_curve: tuple[float, ...] | None) -> NDArray[np.uint8]:
+    light = np.arange(STEPS) / (STEPS - 1)
+    value = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+    if tone_curve is not None:
+        value = np.interp(value, np.linspace(0, 1, len(tone_curve)), tone_curve)
+    return (np.clip(value, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+@functools.lru_cache(maxsize=16)
+def _falloff(size: tuple[int, int], numbers: tuple[float, float, float]) -> Light:
+    height, width = size
+    y, x = np.ogrid[:height, :width]
+    r2 = (x + 0.5 - width / 2) ** 2 + (y + 0.5 - height / 2) ** 2
+    r2 = r2 / ((width**2 + height**2) / 4)
+    a, b, c = numbers
+    return np.maximum(1 + r2 * (a + r2 * (b + r2 * c)), 0).astype(np.float32)
+
+
+def _noise(light: Light, noise: NoiseSpec, camera: str, t_us: int) -> Light:
+    """Of a generator that counts: the same on any thread, whatever was drawn before."""
+    key = np.array([noise.seed, zlib.crc32(camera.encode())], np.uint64)
+    counter = np.array([0, 0, 0, t_us & (2**64 - 1)], np.uint64)
+    generator = np.random.Generator(np.random.Philox(key=key, counter=counter))
+    sigma = np.sqrt(noise.photon * np.maximum(light, 0) + noise.read**2)
+    return (sigma * generator.standard_normal(light.shape, np.float32)).astype(np.float32)
+
+
+def _through_jpeg(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    import simplejpeg
+
+    data = encode_rgb(np.ascontiguousarray(image), "jpeg", quality=quality)
+    return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB"))

@@ -1,0 +1,316 @@
+"""Sensor modalities: the images that a camera produces, and their registry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .images import (
+    EXACT_CODECS,
+    RGB_CODECS,
+    SOLID_ALPHA,
+    EncodedImage,
+    JpegEncoder,
+    encode_depth,
+    encode_instance,
+    encode_lossless,
+    encode_rgb,
+    encode_uncertainty,
+    solid_depth,
+    to_uint8,
+    turbo_jpeg,
+)
+from .types import RasterOptions, RenderError, RenderOutput
+
+SWITCHES = ("depth", "instance", "median_depth")
+"""Fields of RasterOptions that turn an image of the pass on."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModality:
+    """One kind of image of a camera, from the rasterizer's output to bytes.
+
+    Attributes:
+        name: as sensors ask for it.
+        dtype: of a raw pixel; little-endian.
+        channels: trailing shape of an image: ``(3,)`` is [H, W, 3], ``()`` is [H, W].
+        codecs: that it can be encoded with; ``jpeg`` becomes ``png`` where it is not among them.
+        pixels: images [C, H, W, *channels] of a pass, of ``dtype``.
+        encode: bytes of an image by codec and quality; raises RenderError for an image of another
+            dtype or shape.
+        switch: field of RasterOptions without which the pass does not draw it; None for none.
+        encoded_dtypes: dtype of the decoded array by codec, where it is not ``dtype``.
+    """
+
+    name: str
+    dtype: np.dtype[Any]
+    channels: tuple[int, ...]
+    codecs: tuple[str, ...]
+    pixels: Callable[[RenderOutput], NDArray[Any]]
+    encode: Callable[[NDArray[Any], str, int], bytes]
+    switch: str | None = None
+    encoded_dtypes: dict[str, str] = field(default_factory=dict)
+
+    def shape(self, width: int, height: int) -> tuple[int, ...]:
+        """Of an image of that size [px]."""
+        return (height, width, *self.channels)
+
+    def raw_bytes(self, width: int, height: int) -> int:
+        """Size of a raw image."""
+        return int(np.prod(self.shape(width, height))) * self.dtype.itemsize
+
+
+_registry: dict[str, SensorModality] = {}
+
+
+def register(modality: SensorModality) -> SensorModality:
+    """Make a modality known under its name.
+
+    Raises:
+        ValueError: the name is taken, or ``raw`` and ``png`` are not among the codecs, or the
+            rasterizer has no such switch.
+    """
+    if modality.name in _registry:
+        raise ValueError(f"there is a modality {modality.name!r} already")
+    if not {"raw", "png"} <= set(modality.codecs):
+        raise ValueError(f"modality {modality.name!r} must know the codecs 'raw' and 'png'")
+    if modality.switch is not None and modality.switch not in SWITCHES:
+        raise ValueError(f"switch {modality.switch!r} is none of {', '.join(SWITCHES)}")
+    _registry[modality.name] = modality
+    return modality
+
+
+def unregister(name: str) -> None:
+    """Forget a modality, for tests that register one."""
+    del _registry[name]
+
+
+def modality_names() -> tuple[str, ...]:
+    """All modalities in the order of their registration."""
+    return tuple(_registry)
+
+
+def modality_of(name: str) -> SensorModality:
+    """The modality of that name. Raises RenderError, naming those there are."""
+    found = _registry.get(name)
+    if found is None:
+        allowed = ", ".join(repr(known) for known in _registry)
+        raise RenderError(f"unknown modality {name!r}; allowed are {allowed}")
+    return found
+
+
+def options_for(names: Iterable[str], options: RasterOptions) -> RasterOptions:
+    """``options`` with the switches of a pass that draws these modalities."""
+    wanted = {modality_of(name).switch for name in names}
+    return replace(
+        options,
+        depth="depth" in wanted,
+        instance="instance" in wanted,
+        median_depth="median_depth" in wanted,
+    )
+
+
+def modalities_drawn(options: RasterOptions) -> tuple[str, ...]:
+    """``rgb``, and what the switches of a pass add to it."""
+    return ("rgb", *(switch for switch in SWITCHES if getattr(options, switch)))
+
+
+def encode_image(
+    image: NDArray[Any],
+    modality: str,
+    codec: str,
+    *,
+    quality: int = 90,
+    jpeg: JpegEncoder = turbo_jpeg,
+) -> EncodedImage:
+    """Encode an image of a modality; lossless ones become png where jpeg is asked for.
+
+    Args:
+        image: as the modality has it: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` or
+            ``median_depth`` [m], [H, W] uint16 ``instance``, [H, W] uint8 ``semantic``, or [H, W]
+            float32 ``uncertainty``.
+        modality: name of a registered one.
+        codec: ``raw``, ``jpeg`` or ``png``.
+        quality: of jpeg, 1 to 100.
+        jpeg: makes the bytes of a jpeg.
+
+    Raises:
+        RenderError: unknown modality or codec, or an image of another kind.
+    """
+    kind = modality_of(modality)
+    if codec == "jpeg" and codec not in kind.codecs:
+        codec = "png"
+    if codec == "jpeg":
+        data = encode_rgb(image, codec, quality=quality, jpeg=jpeg)
+    else:
+        data = kind.encode(image, codec, quality)
+    dtype = kind.encoded_dtypes.get(codec, kind.dtype.name)
+    return EncodedImage(data, codec, dtype, image.shape)
+
+
+# Colour
+
+
+def _rgb_pixels(output: RenderOutput) -> NDArray[np.uint8]:
+    return to_uint8(output.rgb, between=output.between)
+
+
+def _encode_rgb(image: NDArray[Any], codec: str, quality: int) -> bytes:
+    return encode_rgb(image, codec, quality=quality)
+
+
+RGB = register(
+    SensorModality(
+        name="rgb",
+        dtype=np.dtype(np.uint8),
+        channels=(3,),
+        codecs=RGB_CODECS,
+        pixels=_rgb_pixels,
+        encode=_encode_rgb,
+    )
+)
+
+
+# Depth along the z axis of the camera [m]; 0 without a hit
+
+
+def _depth_pixels(output: RenderOutput) -> NDArray[np.float32]:
+    if output.depth is None:
+        raise RenderError("the pass has drawn no depth")
+    return solid_depth(output.depth, output.alpha, between=output.between)
+
+
+def _encode_depth(image: NDArray[Any], codec: str, _quality: int) -> bytes:
+    return encode_depth(image, codec)
+
+
+DEPTH = register(
+    SensorModality(
+        name="depth",
+        dtype=np.dtype("<f4"),
+        channels=(),
+        codecs=EXACT_CODECS,
+        pixels=_depth_pixels,
+        encode=_encode_depth,
+        switch="depth",
+        encoded_dtypes={"png": "uint16"},
+    )
+)
+
+
+# Ids of the objects in front; 0 is background.
+
+
+def _instance_pixels(output: RenderOutput) -> NDArray[np.uint16]:
+    if output.instance is None:
+        raise RenderError("the pass has drawn no instances")
+    pixels: NDArray[np.uint16] = output.instance.cpu().numpy()
+    return pixels
+
+
+def _encode_instance(image: NDArray[Any], codec: str, _quality: int) -> bytes:
+    return encode_instance(image, codec)
+
+
+INSTANCE = register(
+    SensorModality(
+        name="instance",
+        dtype=np.dtype("<u2"),
+        channels=(),
+        codecs=EXACT_CODECS,
+        pixels=_instance_pixels,
+        encode=_encode_instance,
+        switch="instance",
+    )
+)
+
+
+# Depth of the Gaussian at half of the light [m]; 0 without one. The expected depth is a mean over a
+# pixel and lies between two surfaces at the edge of one; this is the depth of one of them.
+
+
+def _median_depth_pixels(output: RenderOutput) -> NDArray[np.float32]:
+    if output.median_depth is None:
+        raise RenderError("the pass has drawn no median depth")
+    pixels: NDArray[np.float32] = output.median_depth.cpu().numpy()
+    return pixels
+
+
+def _encode_median_depth(image: NDArray[Any], codec: str, _quality: int) -> bytes:
+    return encode_depth(image, codec, name="median_depth")
+
+
+MEDIAN_DEPTH = register(
+    SensorModality(
+        name="median_depth",
+        dtype=np.dtype("<f4"),
+        channels=(),
+        codecs=EXACT_CODECS,
+        pixels=_median_depth_pixels,
+        encode=_encode_median_depth,
+        switch="median_depth",
+        encoded_dtypes={"png": "uint16"},
+    )
+)
+
+
+# Classes: of objects by their category, the background, the sky
+
+SEMANTIC_DTYPE = np.dtype(np.uint8)
+
+
+def _semantic_pixels(output: RenderOutput) -> NDArray[np.uint8]:
+    if output.instance is None or output.classes is None:
+        raise RenderError("the pass has drawn no classes")
+    found: NDArray[np.uint8] = output.classes[output.instance.cpu().numpy()]
+    # Alpha reaches one half where a Gaussian takes half of the light, and there alone.
+    found[(output.alpha < SOLID_ALPHA).cpu().numpy()] = output.behind
+    return found
+
+
+def _encode_semantic(image: NDArray[Any], codec: str, _quality: int) -> bytes:
+    return encode_lossless(image, codec, name="semantic", dtype=SEMANTIC_DTYPE)
+
+
+SEMANTIC = register(
+    SensorModality(
+        name="semantic",
+        dtype=SEMANTIC_DTYPE,
+        channels=(),
+        codecs=EXACT_CODECS,
+        pixels=_semantic_pixels,
+        encode=_encode_semantic,
+        switch="instance",
+    )
+)
+
+
+# Expected error of a colour in [0, 1] as a mean of its channels, in every pixel, the sky included
+
+
+def _uncertainty_pixels(output: RenderOutput) -> NDArray[np.float32]:
+    if output.uncertainty is None:
+        raise RenderError("the pass has drawn no uncertainty")
+    pixels: NDArray[np.float32] = output.uncertainty.detach().clamp(0, 1).cpu().numpy()
+    return pixels
+
+
+def _encode_uncertainty(image: NDArray[Any], codec: str, _quality: int) -> bytes:
+    return encode_uncertainty(image, codec)
+
+
+UNCERTAINTY = register(
+    SensorModality(
+        name="uncertainty",
+        dtype=np.dtype("<f4"),
+        channels=(),
+        codecs=EXACT_CODECS,
+        pixels=_uncertainty_pixels,
+        encode=_encode_uncertainty,
+        encoded_dtypes={"png": "uint16"},
+    )
+)
