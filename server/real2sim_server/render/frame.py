@@ -114,7 +114,7 @@ def _grey(values: Tensor) -> Tensor:
 
 
 ROUNDING_KERNELS = 2
-"""That :func:`warm_up` makes ready beside those of the backend."""
+"""Number of kernels that :func:`warm_up` prepares in addition to those of the backend."""
 
 
 def at_once() -> None:
@@ -145,23 +145,23 @@ class Frame:
 
     @property
     def rgb(self) -> NDArray[np.uint8]:
-        """The colour image. Raises KeyError where it was not asked for."""
+        """The colour image. Raises KeyError where it was not requested."""
         return self.images["rgb"]
 
     @property
     def depth(self) -> NDArray[np.float32] | None:
-        """The depth image; None when not asked for."""
+        """The depth image; None when not requested."""
         return self.images.get("depth")
 
     @property
     def instance(self) -> NDArray[np.uint16] | None:
-        """The instance image; None when not asked for."""
+        """The instance image; None when not requested."""
         return self.images.get("instance")
 
 
 @dataclass(frozen=True, eq=False)
 class RigView:
-    """What the cameras of a vehicle look at.
+    """The cameras of a vehicle and the scene before them.
 
     Attributes:
         instances: what is in its world.
@@ -295,7 +295,7 @@ def _request(
     options: RasterOptions,
     between: Callable[[], object] | None,
 ) -> RasterRequest:
-    """Of cameras of one size. Raises RenderError."""
+    """A request for cameras of one size. Raises RenderError."""
     vehicle = _vehicle_pose(view.T_world_vehicle)
     cameras = [view.cameras[index] for index in members]
     optics = None if cameras[0].is_pinhole else _optics(view, cameras[0], vehicle)
@@ -346,7 +346,7 @@ class _Drawn:
 def _drawn(
     requests: Sequence[RasterRequest], modalities: Sequence[str], backend: Backend
 ) -> Iterator[_Drawn]:
-    """What comes of each request; uncertainty by a pass of its own."""
+    """The output of each request; uncertainty takes a pass of its own."""
     if UNCERTAINTY not in modalities:
         yield from _drawn_in_colour(requests, modalities, backend)
         return

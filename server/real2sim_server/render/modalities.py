@@ -56,7 +56,7 @@ class SensorModality:
     encoded_dtypes: dict[str, str] = field(default_factory=dict)
 
     def shape(self, width: int, height: int) -> tuple[int, ...]:
-        """Of an image of that size [px]."""
+        """Shape of an image of that size [px]."""
         return (height, width, *self.channels)
 
     def raw_bytes(self, width: int, height: int) -> int:
@@ -95,7 +95,7 @@ def modality_names() -> tuple[str, ...]:
 
 
 def modality_of(name: str) -> SensorModality:
-    """The modality of that name. Raises RenderError, naming those there are."""
+    """The modality of that name. Raises RenderError, which lists the known ones."""
     found = _registry.get(name)
     if found is None:
         allowed = ", ".join(repr(known) for known in _registry)
@@ -127,7 +127,7 @@ def encode_image(
     quality: int = 90,
     jpeg: JpegEncoder = turbo_jpeg,
 ) -> EncodedImage:
-    """Encode an image of a modality; lossless ones become png where jpeg is asked for.
+    """Encode an image of a modality; lossless ones become png where jpeg is requested.
 
     Args:
         image: as the modality has it: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` or

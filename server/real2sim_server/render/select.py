@@ -28,7 +28,7 @@ class BackendStatus:
     """Whether a backend can be used here.
 
     Attributes:
-        name: by which it is asked for.
+        name: by which it is selected.
         usable: whether select_backend() would return it.
         reason: why, or why not.
         remedy: what to do to make it usable; empty when it is.
@@ -42,7 +42,7 @@ class BackendStatus:
 
 @dataclass(frozen=True)
 class RegisteredBackend:
-    """A backend that can be asked for by name.
+    """A backend that can be selected by name.
 
     Attributes:
         status: whether it can be used here; imports and starts nothing that takes long.
@@ -210,7 +210,7 @@ def uses_levels(backend: Backend, width: int, height: int, detail: Detail) -> bo
 
 
 def without_levels(things: Iterable[Instance]) -> list[Instance]:
-    """Those whose levels of detail are still to be made."""
+    """Instances whose levels of detail do not exist yet."""
     return [
         thing
         for thing in things

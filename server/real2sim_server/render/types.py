@@ -18,7 +18,7 @@ from ..scene import GaussianCloud, Sky, TimeColour
 
 Detail = Literal["full", "auto"]
 SMALL_IMAGE_PIXELS = 128 * 128
-"""Images of at most so many pixels are small."""
+"""Maximum number of pixels of a small image."""
 
 
 class RenderError(ValueError):
@@ -145,8 +145,8 @@ class RenderOutput:
             to 0.5 or below; 0 where it never does. None when not asked for.
         median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 where there is none, and
             without gradients. None when not asked for.
-        uncertainty: [C, H, W] float32, see :mod:`.frame`; None where nobody asked.
-        classes: [65536] uint8, of ``instance`` by id; None where nobody asked.
+        uncertainty: [C, H, W] float32, see :mod:`.frame`; None where not requested.
+        classes: [65536] uint8, of ``instance`` by id; None where not requested.
         behind: class of a pixel at which transmittance stays above 0.5.
         timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
         screen: sizes and gradients on the image; None when not asked for or without gradients.
@@ -179,7 +179,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Window:
-    """Pixels [top:bottom, left:right] of an image in which an object is also asked for alone."""
+    """Pixels [top:bottom, left:right] of an image in which an object is also requested alone."""
 
     instance_id: int
     left: int
@@ -214,7 +214,7 @@ Made = TypeVar("Made")
 
 
 def weak_cache(make: Callable[[Source], Made]) -> Callable[[Source], Made]:
-    """``make``, which is called only for what it was not called for before."""
+    """``make`` with its results cached by weak reference to the source."""
     kept: weakref.WeakKeyDictionary[Source, Made] = weakref.WeakKeyDictionary()
 
     @functools.wraps(make)

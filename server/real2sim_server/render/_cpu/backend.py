@@ -115,7 +115,7 @@ class CpuBackend:
 
     @contextmanager
     def _work_space(self) -> Iterator[Workspace]:
-        """Space that nobody else uses, also not who interrupts the block on its own thread."""
+        """Work space for this block alone, even if another request interrupts it."""
         with self._lock:
             space = self._idle_spaces.pop() if self._idle_spaces else Workspace()
             try:

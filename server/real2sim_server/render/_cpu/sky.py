@@ -24,7 +24,10 @@ HALF = F32(0.5)
 CLEAR = F32(1e-5)
 """Nothing of the sky is seen through less than this."""
 TASKS = 16
-"""Rows are dealt to this many tasks in turn; rows of open sky cost more than others."""
+"""Rows are dealt to this many tasks in turn; rows of open sky cost more than others.
+
+A power of two, so that the owner of a row is its lowest bits.
+"""
 
 
 @kernel(parallel=PARALLEL_LOOPS)
@@ -174,8 +177,6 @@ def add_ray_sky(faces, turn, rays, rgb, alpha):
 
 
 # Backward pass
-
-"""A power of two, so that the owner of a row is its lowest bits."""
 
 I32 = np.int32
 OWNER = I32(TASKS - 1)

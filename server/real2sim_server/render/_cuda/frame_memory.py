@@ -163,7 +163,7 @@ def _shared(first: Sequence[Instance], second: Sequence[Instance]) -> int:
 
 
 def _is_same(a: Instance, b: Instance) -> bool:
-    """Whether two instances look the same, as far as that can be told on the host."""
+    """Whether two instances look the same, judged by host data alone."""
     if a is b:
         return True
     timeless = a.colour is b.colour and (a.colour is None or a.t_us == b.t_us)
@@ -282,7 +282,7 @@ def _sums_before(counts: NDArray[np.integer]) -> NDArray[np.int64]:
 ALIGNMENT = 256
 REPORT_BYTES = COUNTERS * 4
 SORT_BLOCKS = 512
-"""At most so many blocks share a list that is sorted."""
+"""Maximum number of blocks that share a sorted list."""
 MAX_PAIRS = 1 << 31
 PAIRS_PER_SPLAT = 4
 """Room for tiles of each splat, to begin with."""

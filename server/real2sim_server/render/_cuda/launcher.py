@@ -150,7 +150,7 @@ class Usage:
     spilled: int
 
     def occupancy(self, architecture: str, of_block: int = THREADS) -> float:
-        """Share of a multiprocessor's threads that can be at work at once, in blocks of so many.
+        """Occupancy: share of a multiprocessor's threads active with blocks of this size.
 
         Raises:
             KeyError: for an architecture that MULTIPROCESSORS does not know.

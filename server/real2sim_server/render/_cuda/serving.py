@@ -37,7 +37,7 @@ DEPTH_PASSES = 4
 MAX_PIXELS = 1 << 30
 """Of a frame: the kernels count them by 32 bits, and memory is limited."""
 SEEN_SHARE = 4
-"""At first one in so many Gaussians of each camera is thought to be seen."""
+"""The first estimate: one in this many Gaussians is visible to a camera."""
 FINISHED = {
     "rgb": "bytes",
     "depth": "solid",

@@ -119,8 +119,8 @@ class CastBackend(Protocol):
         ...
 
 
-# Motion in the frame of the sweep: the sensor's own at the middle instant. Each body is placed in it
-# as it stands then. At other instants the body counts as still and the sensor as moved, so a ray
+# Motion in the frame of the sweep, the sensor's own at the middle instant. Each body is placed in
+# it as it stands then. At other instants the body counts as still and the sensor as moved, so a ray
 # meets the body as it stands at the ray's own instant.
 
 STILL = 1e-9
