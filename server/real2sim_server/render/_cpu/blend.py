@@ -137,10 +137,8 @@ def _blend_intrinsic(extras: int) -> Any:
     with exponent = (sharpness (lane + offset))^2 + rest; returns zero when all are finished.
     """
 
-    def blend(  # type: ignore[no-untyped-def]
-        typingctx, pixels, half, sharpness, offset, rest, red, green, blue, depth, instance
-    ):
-        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def blend(typingctx, pixels, half, sharpness, offset, rest, red, green, blue, depth, instance):
+        def generate(context, builder, signature, arguments):
             array = context.make_array(signature.args[0])(context, builder, arguments[0])
             state = Planes(builder, array.data, arguments[1], planes=PLANES)
             return _build_blend(builder, state, list(arguments[2:]), extras)
@@ -158,15 +156,13 @@ blend_all = _blend_intrinsic(7)
 
 
 @intrinsic
-def touched_halves(  # type: ignore[no-untyped-def]
-    typingctx, x, y, sharpness, slope, falloff, level
-):
+def touched_halves(typingctx, x, y, sharpness, slope, falloff, level):
     """Bits of the half rows of a 16x16 tile that one record may touch: 16 left ones, 16 right.
 
     ``x``, ``y`` is the first pixel centre of the tile as seen from the record's centre [px].
     """
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         x, y, sharpness, slope, falloff, level = (splat(builder, value) for value in arguments)
         numbers = lane_numbers(builder)
         i64 = ir.IntType(64)

@@ -90,7 +90,7 @@ class _Splat:
 
 
 @intrinsic
-def blend_backward(  # type: ignore[no-untyped-def]
+def blend_backward(
     typingctx,
     pixels,
     tile,
@@ -121,7 +121,7 @@ def blend_backward(  # type: ignore[no-untyped-def]
         Bits of the half rows of which all pixels are finished.
     """
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         first, last = signature.args[0], signature.args[-1]
         data = context.make_array(first)(context, builder, arguments[0]).data
         target = context.make_array(last)(context, builder, arguments[-1]).data

@@ -239,7 +239,7 @@ class TrainingPasses:
         placement = place_instances(request.instances, request.viewmats.cpu())
         fixed = Placement(*(tensor.detach() for tensor in vars(placement).values()))
         training = TrainingPass(request, fixed)
-        rgb, alpha, depth = _Rasterization.apply(  # type: ignore[no-untyped-call]
+        rgb, alpha, depth = _Rasterization.apply(
             self,
             training,
             placement.linear,

@@ -111,12 +111,10 @@ def _crossed(before: Lanes, after: Lanes, level: Lanes | float) -> Any:
 
 
 @intrinsic
-def blend_label(  # type: ignore[no-untyped-def]
-    typingctx, pixels, half, sharpness, offset, rest, red, green, blue, front, level
-):
+def blend_label(typingctx, pixels, half, sharpness, offset, rest, red, green, blue, front, level):
     """Colours and front of eight pixels; zero when all of them are finished."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
         state = Planes(builder, array.data, arguments[1], planes=LABEL_PLANES)
         scalars = list(arguments[2:])
@@ -126,12 +124,10 @@ def blend_label(  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def blend_own(  # type: ignore[no-untyped-def]
-    typingctx, own, place, sharpness, offset, rest, front, level
-):
+def blend_own(typingctx, own, place, sharpness, offset, rest, front, level):
     """Front of eight pixels among the records of one object; zero when all are finished."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
         state = Planes(builder, array.data, arguments[1], planes=OWN_PLANES)
         scalars = list(arguments[2:])
@@ -141,12 +137,12 @@ def blend_own(  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def blend_both(  # type: ignore[no-untyped-def]
+def blend_both(
     typingctx, pixels, half, own, place, sharpness, offset, rest, red, green, blue, front, level
 ):
     """Both of these at the price of one alpha; the bits of the own pixels are eight higher."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
         state = Planes(builder, array.data, arguments[1], planes=LABEL_PLANES)
         array = context.make_array(signature.args[2])(context, builder, arguments[2])

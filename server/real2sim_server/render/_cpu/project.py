@@ -121,8 +121,8 @@ def eight_step(build: Callable[[Planes, Named, Named], Any], *, count: int) -> A
         count: of the planes.
     """
 
-    def step(typingctx, planes, lanes, view, cluster):  # type: ignore[no-untyped-def]
-        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def step(typingctx, planes, lanes, view, cluster):
+        def generate(context, builder, signature, arguments):
             array = context.make_array(planes)(context, builder, arguments[0])
             eight = Planes(builder, array.data, I64(0), planes=count)
             known = (
@@ -304,7 +304,7 @@ BIT_LENGTHS = np.uint64(sum(b.bit_length() << 4 * b for b in range(1, 16)))
 
 
 @intrinsic
-def footprints_of_eight(typingctx, planes, lanes, view, found):  # type: ignore[no-untyped-def]
+def footprints_of_eight(typingctx, planes, lanes, view, found):
     """Write the footprints of eight records to ``found`` [8] int64.
 
     Args:
@@ -316,7 +316,7 @@ def footprints_of_eight(typingctx, planes, lanes, view, found):  # type: ignore[
         Bits of those that may touch a tile.
     """
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         data = context.make_array(planes)(context, builder, arguments[0]).data
         eight = Planes(builder, data, I64(0), planes=PROJECTION)
         named = Named(context, builder, view, arguments[2])

@@ -120,8 +120,8 @@ def _ray_intrinsic(extras: int, *, moving: bool) -> Any:
     In kernels: blend(pixels, half, record); returns zero when all are finished.
     """
 
-    def blend(typingctx, pixels, half, record):  # type: ignore[no-untyped-def]
-        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def blend(typingctx, pixels, half, record):
+        def generate(context, builder, signature, arguments):
             array = context.make_array(signature.args[0])(context, builder, arguments[0])
             state = Planes(builder, array.data, arguments[1], planes=RAY_PLANES)
             row = context.make_array(signature.args[2])(context, builder, arguments[2])

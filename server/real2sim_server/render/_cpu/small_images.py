@@ -18,7 +18,7 @@ from typing import TypedDict
 import numba
 import numpy as np
 import torch
-from numba import carray, prange
+from numba import carray, prange  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
 from ..._numba import PARALLEL_LOOPS, func

@@ -143,8 +143,8 @@ def _cast_intrinsic(*, returns: bool) -> Any:
     """In kernels: cast(rays, state, group, values, index, near, far, pulse); bits of the rays of
     the group that go on."""
 
-    def cast(typingctx, rays, state, bank, group, values, index, near, far, pulse):  # type: ignore[no-untyped-def]
-        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def cast(typingctx, rays, state, bank, group, values, index, near, far, pulse):
+        def generate(context, builder, signature, arguments):
             def data(number: int) -> Any:
                 kind = signature.args[number]
                 return context.make_array(kind)(context, builder, arguments[number]).data
@@ -176,10 +176,10 @@ cast_returns = _cast_intrinsic(returns=True)
 
 
 @intrinsic
-def close_group(typingctx, state, group):  # type: ignore[no-untyped-def]
+def close_group(typingctx, state, group):
     """Take the last echo of each ray of a group."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
         held = Planes(builder, array.data, arguments[1], planes=STATE)
         close_echo(held, held.load(ECHO + 1).compare(">", 0.0))
@@ -189,10 +189,10 @@ def close_group(typingctx, state, group):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def met_groups(typingctx, lows, highs, low, high):  # type: ignore[no-untyped-def]
+def met_groups(typingctx, lows, highs, low, high):
     """Bits of the eight groups of a tile that reach into elevations from ``low`` to ``high``."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         bounds = []
         for number in range(2):
             array = context.make_array(signature.args[number])(context, builder, arguments[number])
@@ -205,11 +205,11 @@ def met_groups(typingctx, lows, highs, low, high):  # type: ignore[no-untyped-de
 
 
 @intrinsic
-def place_rays(typingctx, directions, group, frame, rays, bank):  # type: ignore[no-untyped-def]
+def place_rays(typingctx, directions, group, frame, rays, bank):
     """Turn eight directions [8, 3, 8] of a tile by frames [8, 12], a row for each ray, and write
     their origins and directions to ``rays``."""
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):
         def data(number: int) -> Any:
             kind = signature.args[number]
             return context.make_array(kind)(context, builder, arguments[number]).data
