@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..geometry.rotation import matrix_to_quaternion, yaw_quaternion
-from ..geometry.transform import transform_from
+from ..geometry.transform import matrix_to_quaternion, transform_from, yaw_quaternion
 from ..render.types import Instance
 from ..scene import Camera, GaussianCloud, Sky
 from ..scene.camera import T_VEHICLE_OPTICAL

@@ -25,8 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..geometry.rotation import yaw_quaternion
-from ..geometry.transform import transform_from
+from ..geometry.transform import transform_from, yaw_quaternion
 from ..physics.body import Body, box_particles
 from ..physics.colliders import Plane
 from ..physics.materials import FixedCorotated

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.rotation import Float
-from ..geometry.transform import transform_from
+from ..geometry.transform import Float, transform_from
 from ..physics.body import box_particles
 from ..physics.colliders import Plane
 from ..simulation.body import DeformableBody

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..geometry.rotation import matrix_to_quaternion
+from ..geometry.transform import matrix_to_quaternion
 from ..scene import CameraRig, Scene, SceneObject, Trajectory
 from .gaussian_street import CAR_SIZE, StreetScene, street_scene
 

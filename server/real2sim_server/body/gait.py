@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float, matrix_to_quaternion
+from ..geometry.transform import Float, matrix_to_quaternion
 from .limbs import LATERAL, UP, about, aim, bend, frame, partial_turn, smooth, unit
 from .model import JOINTS, Body
 from .skinning import Pose

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 
 UP = np.array([0.0, 0.0, 1.0])
 LATERAL = np.array([0.0, 1.0, 0.0])

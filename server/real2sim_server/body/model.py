@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 
 _SIDED = ("clavicle", "upper_arm", "forearm", "hand", "thigh", "calf", "foot", "ball")
 

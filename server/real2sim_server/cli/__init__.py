@@ -5,7 +5,6 @@ imports what it needs when it runs.
 """
 
 from . import (
-    backup,
     bench,
     calibrate,
     demo,
@@ -15,8 +14,7 @@ from . import (
     export,
     export_dataset,
     film,
-    fit_lidar,
-    fit_uncertainty,
+    fit,
     ground,
     import_,
     log_info,
@@ -25,7 +23,6 @@ from . import (
     render,
     replay,
     run,
-    search,
     serve,
     simulate,
     store,
@@ -44,7 +41,6 @@ app.add_typer(bench.app, name="bench")
 
 __all__ = [
     "app",
-    "backup",
     "bench",
     "calibrate",
     "demo",
@@ -54,8 +50,7 @@ __all__ = [
     "export",
     "export_dataset",
     "film",
-    "fit_lidar",
-    "fit_uncertainty",
+    "fit",
     "ground",
     "import_",
     "log_info",
@@ -64,7 +59,6 @@ __all__ = [
     "render",
     "replay",
     "run",
-    "search",
     "serve",
     "simulate",
     "store",

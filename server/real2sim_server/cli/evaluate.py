@@ -9,7 +9,6 @@ import typer
 
 from ..console import CommandError, console, print_figures, staged_progress, write_json
 from .command import command
-from .device import chosen_backend
 from .options import (
     JsonFile,
     LogFormat,
@@ -17,6 +16,7 @@ from .options import (
     RenderDevice,
     SceneBundle,
     Sequence,
+    chosen_backend,
 )
 
 if TYPE_CHECKING:

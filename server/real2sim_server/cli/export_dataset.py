@@ -12,16 +12,15 @@ import typer
 
 from ..console import CommandError, console, print_figures, staged_progress, write_json
 from .command import command
-from .device import chosen_backend
-from .options import JsonFile, RenderBackend, RenderDevice, SceneBundle
+from .options import JsonFile, RenderBackend, RenderDevice, SceneBundle, chosen_backend
 
 if TYPE_CHECKING:
     from real2sim_proto.jobs import DatasetSweep
 
     from ..datasets.drive import Drive
-    from ..datasets.labels.noise import BoxNoise
+    from ..datasets.labels.boxes import BoxNoise
     from ..datasets.perturbed import Perturbation
-    from ..datasets.variants import Variant
+    from ..datasets.plan import Variant
     from ..edit import AssetLookup, ScenarioState
     from ..scene import Scene
 
@@ -107,8 +106,7 @@ def export_dataset(
     from ..datasets.export import estimate
     from ..datasets.export import export_dataset as export
     from ..datasets.makers import ClipMakers
-    from ..datasets.plan import ExportPlan
-    from ..datasets.rig import read_rig
+    from ..datasets.plan import ExportPlan, read_rig
     from ..executors import executor_of
     from ..scene.io import load_scene
 
@@ -206,7 +204,7 @@ def _swept(
 ) -> tuple[list[Variant], dict[str, Any]]:
     """What is exported, and what decided on it."""
     from ..datasets.drive import ScenarioDrive
-    from ..datasets.variants import Variant, swept
+    from ..datasets.plan import Variant, swept
 
     drive, made_of = _drive(scene, operations, episode, assets)
     if sweep is None:
@@ -287,7 +285,7 @@ def _perturbation(text: str) -> Perturbation:
 
 
 def _noise(text: str) -> BoxNoise:
-    from ..datasets.labels.noise import BoxNoise
+    from ..datasets.labels.boxes import BoxNoise
 
     given = _numbers("--noise", text, ("position", "size", "heading", "missed", "false"))
     if "heading" in given:

@@ -9,8 +9,7 @@ import typer
 
 from ..console import CommandError, console, staged_progress
 from .command import command
-from .device import chosen_backend
-from .options import RenderBackend, RenderDevice, SceneBundle
+from .options import RenderBackend, RenderDevice, SceneBundle, chosen_backend
 
 
 @command("film")

@@ -1,17 +1,30 @@
-"""What the commands do alike that fit something of a scene to the log it was made of."""
+"""``real2sim fit-lidar`` and ``fit-uncertainty``: fit properties of a scene to its log."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from ..console import print_figures, staged_progress, write_json
+from .command import command
+from .options import (
+    JsonFile,
+    LogFormat,
+    RenderBackend,
+    RenderDevice,
+    SceneBundle,
+    Sequence,
+    chosen_backend,
+)
 
 if TYPE_CHECKING:
     from ..logs import DrivingLog
     from ..scene import Scene
+
 
 Fitted = tuple["Scene", dict[str, Any]]
 """The scene with what was fitted, and figures of the fit."""
@@ -54,3 +67,82 @@ def fit_scene(
     figures = {"scene": str(target), **fitted}
     print_figures(f"{target.name}, {what}", figures)
     write_json(files.json, figures)
+
+
+# ``real2sim fit-lidar``: what LiDARs see of a scene, from the sweeps of its log.
+
+
+@command("fit-lidar")
+def fit_lidar(
+    *,
+    scene: SceneBundle,
+    log: Annotated[Path, typer.Argument(help="Folder of the driving log it was made of.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Bundle to write; the scene itself.")
+    ] = None,
+    surfaces: Annotated[
+        Path | None,
+        typer.Option(help="initial.r2s of its training folder, which spares making it again."),
+    ] = None,
+    steps: Annotated[
+        int, typer.Option(min=0, help="Steps of learning; about a second of one core each.")
+    ] = 60,
+    log_format: LogFormat = None,
+    sequence: Sequence = None,
+    json: JsonFile = None,
+) -> None:
+    """Give a scene surfaces for LiDARs, learned from the recorded sweeps, with reflectivity."""
+    from dataclasses import asdict
+
+    from ..reconstruct.lidar import fit_lidar_surfaces
+    from ..scene.io import load_scene
+
+    def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
+        made, report = fit_lidar_surfaces(
+            loaded,
+            opened,
+            surfaces=load_scene(surfaces) if surfaces else None,
+            steps=steps,
+            on_progress=on_progress,
+        )
+        figures = asdict(report)
+        del figures["timing_s"]
+        return made, figures
+
+    fit_scene(FitFiles(scene, log, out, log_format, sequence, json), "surfaces for LiDARs", fit)
+
+
+# ``real2sim fit-uncertainty``: how well the images of a log tell what a scene shows.
+
+
+@command("fit-uncertainty")
+def fit_uncertainty(
+    *,
+    scene: SceneBundle,
+    log: Annotated[Path, typer.Argument(help="Folder of the driving log it was made of.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Bundle to write; the scene itself.")
+    ] = None,
+    views: Annotated[int, typer.Option(min=1, max=10_000, help="Images to compare.")] = 48,
+    backend: RenderBackend = "auto",
+    device: RenderDevice = None,
+    log_format: LogFormat = None,
+    sequence: Sequence = None,
+    json: JsonFile = None,
+) -> None:
+    """Give a scene images of its uncertainty, as training does with new ones."""
+    from dataclasses import asdict
+
+    from ..reconstruct.uncertainty import fit_uncertainties
+
+    def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
+        made, report = fit_uncertainties(
+            loaded,
+            opened,
+            views=views,
+            backend=chosen_backend(backend, device),
+            on_view=lambda done, total: on_progress("views", done, total),
+        )
+        return made, asdict(report)
+
+    fit_scene(FitFiles(scene, log, out, log_format, sequence, json), "uncertainty", fit)

@@ -12,7 +12,7 @@ from .command import command
 from .options import JsonFile, SceneBundle
 
 if TYPE_CHECKING:
-    from ..geometry.rotation import Float
+    from ..geometry.transform import Float
     from ..logs import DrivingLog
     from ..scene import Ground, Scene
     from ..scene.ground_fit import RoadPlane

@@ -18,7 +18,6 @@ from ..console import (
     write_json,
 )
 from .command import command
-from .device import chosen_backend
 from .options import (
     JsonFile,
     LogCameras,
@@ -30,6 +29,7 @@ from .options import (
     RenderBackend,
     RenderDevice,
     Sequence,
+    chosen_backend,
     log_selection,
 )
 

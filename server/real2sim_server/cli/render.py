@@ -12,8 +12,7 @@ import typer
 from .._files import atomic_file
 from ..console import CommandError, console, print_figures, write_json
 from .command import command
-from .device import chosen_backend
-from .options import JsonFile, RenderBackend, RenderDevice, SceneBundle
+from .options import JsonFile, RenderBackend, RenderDevice, SceneBundle, chosen_backend
 
 if TYPE_CHECKING:
     from ..edit.state import ScenarioState

@@ -23,8 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float
-from ..geometry.transform import invert_transform
+from ..geometry.transform import Float, invert_transform
 from ..render import Backend, encode_image
 from ..render.cast import CastBackend, select_caster
 from ..scene import Camera
@@ -46,13 +45,10 @@ from .labels import (
     seen_points,
     views_of,
 )
-from .labels.boxes import in_frame
-from .labels.keypoints import keypoints_at, keypoints_in_image
-from .labels.noise import noisy_boxes
-from .labels.views import ObjectView
+from .labels.boxes import in_frame, noisy_boxes
+from .labels.views import ObjectView, keypoints_at, keypoints_in_image
 from .perturbed import PerturbedDrive, perturbed
-from .plan import ExportPlan, PlannedClip, planned_lidar
-from .variants import Variant
+from .plan import ExportPlan, PlannedClip, Variant, planned_lidar
 
 POINT = np.dtype(
     [

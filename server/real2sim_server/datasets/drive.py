@@ -12,13 +12,18 @@ import numpy as np
 
 from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
 from ..edit.compose import NO_STRIDES, met_background, met_object, sweep_of
-from ..geometry.rotation import Float, matrix_to_quaternion
+from ..geometry.transform import Float, matrix_to_quaternion
 from ..render.cast.call import SweepScene, incidence_of, sensor_poses, transforms_at
 from ..render.types import Instance
 from ..scene import Lidar, Scene, Stride, Trajectory
 from ..world import World
 from ..world.recording.recording import Recording
-from .errors import DatasetError
+
+# --- Errors --------------------------------------------------------------------------------------
+
+
+class DatasetError(ValueError):
+    """An export that cannot be made; the message says what was given and what is allowed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -14,19 +16,89 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ..render import Backend
-from ..scene import Scene
+from ..render import Backend, encode_image
+from ..scene import Camera, Scene
 from .clips import Clip, write_shard
-from .drive import Drive
-from .errors import DatasetError
+from .drive import DatasetError, Drive
 from .labels import HOW
 from .labels.points import ROOF
 from .makers import ClipMakers
-from .plan import ExportPlan, PlannedClip, planned_cameras, planned_lidar, planned_shards
-from .previews import write_previews
-from .statistics import statistics_of
-from .variants import Variant
+from .plan import ExportPlan, PlannedClip, Variant, planned_cameras, planned_lidar, planned_shards
 from .writers import LabelledDrive, writer_of
+from .writers.pictures import labels_sheet
+
+# --- Previews ------------------------------------------------------------------------------------
+
+# Some sheets of labels over pictures, to look at first.
+
+MOST = 6
+QUALITY = 85
+
+
+def write_previews(clips: Sequence[Clip], cameras: Sequence[Camera], folder: Path) -> None:
+    """Sheets of up to MOST frames, spread evenly over clips and cameras, as jpg in ``folder``."""
+    frames = [(clip, frame) for clip in clips for frame in clip.frames]
+    count = min(MOST, len(frames) * len(cameras))
+    folder.mkdir(exist_ok=True)
+    for number in range(count):
+        clip, frame = frames[(2 * number + 1) * len(frames) // (2 * count)]
+        camera = cameras[number % len(cameras)]
+        data = encode_image(labels_sheet(clip, camera, frame), "rgb", "jpeg", quality=QUALITY).data
+        (folder / f"{number}.jpg").write_bytes(data)
+
+
+# --- Statistics ----------------------------------------------------------------------------------
+
+# Boxes counted by class, distance and visible share.
+
+ZONE_M, ZONES = 20, 5
+"""Distances from the ego are counted in zones of so many metres; the last has all beyond."""
+
+
+def statistics_of(clips: Sequence[Clip]) -> dict[str, Any]:
+    """Boxes by category, and by category and distance from the ego; those in images by category
+    and visibility; objects and frames."""
+    boxes: Counter[str] = Counter()
+    distances: dict[str, Counter[int]] = {}
+    seen: dict[str, Counter[int]] = {}
+    objects: dict[str, set[tuple[str, str]]] = {}
+    for clip in clips:
+        for frame in clip.frames:
+            categories = {o["object_id"]: o["category"] for o in frame["objects"]}
+            for subject in frame["objects"]:
+                category = subject["category"]
+                boxes[category] += 1
+                x, y = subject["T_ego_object"][0][3], subject["T_ego_object"][1][3]
+                zone = min(int(math.hypot(x, y) / ZONE_M), ZONES - 1)
+                distances.setdefault(category, Counter())[zone] += 1
+                objects.setdefault(category, set()).add((clip.name, subject["object_id"]))
+            for view in (v for views in frame["views"].values() for v in views):
+                level = min(int(view["visibility"] * 5), 4)
+                seen.setdefault(categories[view["object_id"]], Counter())[level] += 1
+    return {
+        "frames": sum(len(clip.frames) for clip in clips),
+        "boxes": dict(sorted(boxes.items())),
+        "tracks": {name: len(objects[name]) for name in sorted(objects)},
+        "boxes_by_distance": _named(distances, _zone_name),
+        "boxes_in_images_by_visibility": _named(seen, _level_name),
+    }
+
+
+def _named(counts: dict[str, Counter[int]], name: Any) -> dict[str, dict[str, int]]:
+    return {
+        category: {name(k): counts[category][k] for k in sorted(counts[category])}
+        for category in sorted(counts)
+    }
+
+
+def _zone_name(zone: int) -> str:
+    near = zone * ZONE_M
+    return f"{near} m and more" if zone == ZONES - 1 else f"{near} to {near + ZONE_M} m"
+
+
+def _level_name(level: int) -> str:
+    return f"{level * 20} to {level * 20 + 20} %"
+
 
 FORMAT = "real2sim-dataset"
 VERSION = 1

@@ -18,9 +18,8 @@ from pathlib import Path
 from .._files import unpack_tar
 from ..executors import Executor, ExecutorError
 from .clips import write_shard
-from .errors import DatasetError
-from .plan import ExportPlan, PlannedClip, planned_cameras
-from .variants import Variant
+from .drive import DatasetError
+from .plan import ExportPlan, PlannedClip, Variant, planned_cameras
 
 Recipe = Callable[[], Sequence[Variant]]
 """Makes the variants of an export; it can be pickled, and every worker finds its files."""

@@ -16,8 +16,7 @@ import numpy as np
 
 from ..edit import ObjectState, PlacedObjects
 from ..geometry.box import box_penetration
-from ..geometry.rotation import Float
-from ..geometry.transform import invert_transform
+from ..geometry.transform import Float, invert_transform
 from ..scene import Lidar, Scene
 from .drive import Drive, MetSweep, Moment
 

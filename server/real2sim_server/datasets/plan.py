@@ -1,25 +1,231 @@
-"""What is exported of a drive: cameras, instants, clips and splits."""
+"""What is exported: the sensors, instants, clips, splits and variants of a drive."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from real2sim_proto.jobs import DatasetSweep, SweptValues
+from real2sim_proto.operations import Operation
+
+from ..edit import EditError, ScenarioState, apply_operations
 from ..geometry.transform import transform_from
-from ..scene import Camera, Lidar, LidarError
+from ..scene import Camera, CameraRig, Lidar, LidarError, Scene, SceneError
+from ..scene.camera import T_VEHICLE_OPTICAL
 from ..scene.lidar_catalogue import catalogue_lidar, lidar_from_values
-from .drive import Drive
-from .errors import DatasetError
-from .labels.noise import BoxNoise
+from .drive import DatasetError, Drive, ScenarioDrive
+from .labels.boxes import BoxNoise
 from .labels.points import ROOF
 from .perturbed import Perturbation
-from .rig import cameras_of
-from .variants import Variant
+
+# --- Rig -----------------------------------------------------------------------------------------
+
+# Sensors of a data set from a file: cameras of the scene or your own, and a LiDAR.
+
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+
+
+class RigCamera(BaseModel):
+    """A camera of a rig file: one of the scene by its name, or one of its own where ``hfov_deg``
+    is given, which looks along the vehicle's x axis where nothing turns it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}$")]
+    width: Annotated[int, Field(ge=16, le=8192)] | None = None
+    height: Annotated[int, Field(ge=16, le=8192)] | None = None
+    hfov_deg: Annotated[float, Field(gt=1, lt=170)] | None = None
+    position: tuple[float, float, float] = (1.5, 0.0, 1.5)
+    yaw_deg: Degrees = 0.0
+    pitch_deg: Degrees = 0.0
+    roll_deg: Degrees = 0.0
+
+
+class Rig(BaseModel):
+    """A rig file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    cameras: Annotated[list[RigCamera], Field(min_length=1, max_length=64)]
+    lidar: str | dict[str, Any] | None = None
+
+
+def read_rig(path: Path) -> dict[str, Any]:
+    """The values of a rig file. Raises DatasetError for what is none."""
+    try:
+        values = json.loads(path.read_bytes())
+        Rig.model_validate(values)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: is no rig file ({error})") from error
+    return dict(values)
+
+
+def cameras_of(values: Mapping[str, Any], rig: CameraRig) -> list[Camera]:
+    """The cameras that a rig file names, in its order.
+
+    Raises:
+        DatasetError: values that are no rig, a camera that the scene lacks, or the same name twice.
+    """
+    try:
+        asked = Rig.model_validate(values).cameras
+    except ValidationError as error:
+        raise DatasetError(f"rig: {error}") from error
+    names = [camera.name for camera in asked]
+    if len(set(names)) != len(names):
+        raise DatasetError(f"rig: a camera's name stands for one camera only, not {names}")
+    return [_camera(camera, rig) for camera in asked]
+
+
+def _camera(asked: RigCamera, rig: CameraRig) -> Camera:
+    if asked.hfov_deg is None:
+        if asked.name not in rig.names:
+            known = ", ".join(rig.names) or "none"
+            raise DatasetError(
+                f"rig: camera {asked.name!r}; the scene has {known}; give hfov_deg, width and "
+                "height for one of your own"
+            )
+        camera = rig[asked.name]
+        return camera if asked.width is None else camera.resized(asked.width)
+    if asked.width is None or asked.height is None:
+        raise DatasetError(f"rig: camera {asked.name!r} with hfov_deg wants width and height")
+    focal = asked.width / (2 * math.tan(math.radians(asked.hfov_deg) / 2))
+    K = np.array([[focal, 0, asked.width / 2], [0, focal, asked.height / 2], [0, 0, 1.0]])
+    pose = transform_from(asked.position, (1.0, 0.0, 0.0, 0.0))
+    pose[:3, :3] = _turn(asked) @ T_VEHICLE_OPTICAL[:3, :3]
+    try:
+        return Camera(asked.name, asked.width, asked.height, K, pose)
+    except SceneError as error:
+        raise DatasetError(f"rig: {error}") from error
+
+
+def _turn(asked: RigCamera) -> Any:
+    """Yaw to the left, then pitch upwards, then roll to the right, about the camera's own axes."""
+    yaw, pitch, roll = (math.radians(a) for a in (asked.yaw_deg, asked.pitch_deg, asked.roll_deg))
+    about_z = [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
+    about_y = [
+        [math.cos(pitch), 0, -math.sin(pitch)],
+        [0, 1, 0],
+        [math.sin(pitch), 0, math.cos(pitch)],
+    ]
+    about_x = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
+    return np.array(about_z) @ np.array(about_y) @ np.array(about_x)
+
+
+# --- Variants ------------------------------------------------------------------------------------
+
+# The same drive many times, each with other values in its edits.
+
+MAX_VARIANTS = 1000
+_OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """One drive of a sweep.
+
+    Attributes:
+        drive: that is exported.
+        values: of the parameters; empty where nothing is swept.
+    """
+
+    drive: Drive
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+def swept(scene: Scene, state: ScenarioState, sweep: DatasetSweep, seed: int) -> list[Variant]:
+    """The variants of a scenario: every combination of lists and ranges, each with ``draws`` draws
+    of what has a distribution.
+
+    Args:
+        scene: of the scenario.
+        state: before the edits of the sweep.
+        sweep: parameters, and edits in which ``"$name"`` stands for one's value.
+        seed: of the draws.
+
+    Raises:
+        DatasetError: more than MAX_VARIANTS, an edit that names no parameter, parameters that no
+            edit names, or values that make no edits or edits that cannot be made, which are named.
+    """
+    _check_names(sweep)
+    variants = []
+    for values in _combinations(sweep, seed):
+        try:
+            edits = _OPERATIONS.validate_python(_filled(sweep.operations, values))
+            edited = apply_operations(state, edits).state
+        except ValidationError as error:
+            raise DatasetError(f"sweep: {dict(values)} make no edits ({error})") from error
+        except EditError as error:
+            raise DatasetError(f"sweep: {dict(values)}: {error}") from error
+        variants.append(Variant(ScenarioDrive(scene, edited), values))
+    return variants
+
+
+def _check_names(sweep: DatasetSweep) -> None:
+    named = set(_names(sweep.operations))
+    given = set(sweep.parameters)
+    if named - given:
+        known = ", ".join(sweep.parameters)
+        raise DatasetError(
+            f"sweep: an edit has ${min(named - given)}; there are the parameters {known}"
+        )
+    if given - named:
+        raise DatasetError(f"sweep: no edit has ${min(given - named)}")
+
+
+def _names(value: Any) -> list[str]:
+    if isinstance(value, str) and value.startswith("$"):
+        return [value[1:]]
+    if isinstance(value, Mapping):
+        return [name for part in value.values() for name in _names(part)]
+    return [name for part in value for name in _names(part)] if isinstance(value, list) else []
+
+
+def _filled(value: Any, values: Mapping[str, Any]) -> Any:
+    if isinstance(value, str) and value.startswith("$"):
+        return values[value[1:]]
+    if isinstance(value, Mapping):
+        return {key: _filled(part, values) for key, part in value.items()}
+    return [_filled(part, values) for part in value] if isinstance(value, list) else value
+
+
+def _combinations(sweep: DatasetSweep, seed: int) -> list[dict[str, Any]]:
+    grid = {name: _grid(p) for name, p in sweep.parameters.items() if not p.is_drawn}
+    drawn = {name: p for name, p in sweep.parameters.items() if p.is_drawn}
+    draws = sweep.draws if drawn else 1
+    count = int(np.prod([len(values) for values in grid.values()], initial=1)) * draws
+    if count > MAX_VARIANTS:
+        raise DatasetError(f"the sweep has {count} variants; {MAX_VARIANTS} is the most")
+    rng = np.random.default_rng([seed, len(drawn)])
+    return [
+        dict(zip(grid, point, strict=True)) | {name: _draw(p, rng) for name, p in drawn.items()}
+        for point in itertools.product(*grid.values())
+        for _ in range(draws)
+    ]
+
+
+def _grid(values: SweptValues) -> Sequence[Any]:
+    if values.values is not None:
+        return values.values
+    assert values.range is not None
+    first, last, count = values.range
+    return [float(value) for value in np.linspace(first, last, count)]
+
+
+def _draw(values: SweptValues, rng: np.random.Generator) -> float:
+    if values.uniform is not None:
+        return float(rng.uniform(*values.uniform))
+    assert values.normal is not None
+    return float(rng.normal(*values.normal))
+
 
 MAX_FRAMES = 100_000
 

@@ -4,23 +4,199 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from real2sim import Client, ReplyTimeoutError, connect
-from real2sim.planners import FollowRoute
+from real2sim.planners import EpisodeSummary, FollowRoute, Planner, run_episode
+from real2sim_proto.operations import Duplicate, Operation, Translate
 
 from ..console import StatusLine, console, print_figures, write_json
+from ..geometry.box import box_corners
+from ..geometry.transform import transform_from
 from ..render.images import write_png
+from ..render.video import video_file
 from ..scene.io import DEMO_SCENE as SCENE
-from .edits import StreetEdits, edit_street
-from .pictures import draw_map
 from .worker import starting_worker
 
 if TYPE_CHECKING:
-    from .drive import FilmedDrive
+    from real2sim import DriveSession, Observation
+    from real2sim_proto.scenes import ObjectInfo, SceneInfo
+
+
+# --- Edits ---------------------------------------------------------------------------------------
+
+# One car moved, another duplicated, both to free places.
+
+AHEAD = (6.0, 45.0)
+"""How far ahead of the start a car must be to be edited [m]; there the camera sees it well."""
+
+WIDTH = 960
+
+
+@dataclass(frozen=True)
+class StreetEdits:
+    """What was edited, and how it looks.
+
+    Attributes:
+        moved, duplicated: ids of the two cars that were edited.
+        before, after: RGB uint8 [H, W, 3] of the same camera.
+        logged: [L, 2] path of the recording vehicle [m].
+        footprints: (id, corners [4, 2] at the start [m], whether it was edited) of every object.
+        gaussians: of the whole scene.
+    """
+
+    moved: str
+    duplicated: str
+    before: NDArray[np.uint8]
+    after: NDArray[np.uint8]
+    logged: NDArray[np.float64]
+    footprints: list[tuple[str, NDArray[np.float64], bool]]
+    gaussians: int
+
+
+def edit_street(scenario: Any, scene: SceneInfo, *, camera: str) -> StreetEdits:
+    """Move one standing car and duplicate another, with the pictures before and after."""
+    before = scenario.preview(camera=camera, width=WIDTH, codec="jpeg").array
+    candidates = _standing_cars(scenario.info.objects, scene)
+    moved = _apply_first_without_overlap(scenario, _moves(candidates))
+    others = [car for car in candidates if car.object_id != moved.object_id]
+    copied = _apply_first_without_overlap(scenario, _copies(others or candidates))
+    after = scenario.preview(camera=camera, width=WIDTH, codec="jpeg").array
+    objects = scenario.refresh().info.objects
+    original = {info.object_id for info in scene.objects}
+    edited = {moved.object_id} | {o.object_id for o in objects if o.object_id not in original}
+    return StreetEdits(
+        moved=moved.object_id,
+        duplicated=copied.object_id,
+        before=before,
+        after=after,
+        logged=np.array(scene.ego.positions if scene.ego else [])[:, :2],
+        footprints=[(o.object_id, _footprint(o), o.object_id in edited) for o in objects],
+        gaussians=scene.gaussians,
+    )
+
+
+def _standing_cars(objects: Sequence[ObjectInfo], scene: SceneInfo) -> list[ObjectInfo]:
+    """Standing cars ahead of the start, nearest first."""
+    start = np.array(scene.ego.positions[0]) if scene.ego else np.zeros(3)
+    found = []
+    for info in objects:
+        if info.trajectory is None or info.trajectory.times_us[0] > scene.start_us:
+            continue
+        places = np.array(info.trajectory.positions)
+        ahead = places[0, 0] - start[0]
+        if np.ptp(places, axis=0).max() < 0.3 and AHEAD[0] < ahead < AHEAD[1]:
+            found.append((ahead, info))
+    return [info for _, info in sorted(found, key=lambda pair: pair[0])]
+
+
+def _moves(cars: Sequence[ObjectInfo]) -> Iterator[Operation]:
+    """A car out of its parking space into the lane beside it, facing as before."""
+    for car in cars:
+        position = np.array(car.trajectory.positions[0]) if car.trajectory else np.zeros(3)
+        inward = -np.sign(position[1]) * (car.size[1] + 0.9)
+        for along in (0.0, 3.0, -3.0, 6.0):
+            yield Translate(object_id=car.object_id, x=along, y=float(inward), frame="world")
+
+
+def _copies(cars: Sequence[ObjectInfo]) -> Iterator[Operation]:
+    """A second car one or two lengths before or behind."""
+    for car in cars:
+        for lengths in (1.25, -1.25, 2.5, -2.5):
+            yield Duplicate(object_id=car.object_id, x=lengths * car.size[0], frame="object")
+
+
+def _apply_first_without_overlap(scenario: Any, operations: Iterator[Operation]) -> Any:
+    """Try operations as dry runs; apply the first that gets no warning, else the very first."""
+    first: Operation | None = None
+    for operation in operations:
+        first = first or operation
+        if not scenario.apply([operation], dry_run=True).warnings:
+            first = operation
+            break
+    if first is None:
+        raise RuntimeError("the demo street has no standing car ahead of the start")
+    scenario.apply([first])
+    return first
+
+
+def _footprint(info: ObjectInfo) -> NDArray[np.float64]:
+    assert info.trajectory is not None
+    pose = transform_from(info.trajectory.positions[0], info.trajectory.quaternions[0])
+    corners = box_corners(pose, info.size)
+    return corners[[0, 1, 3, 2], :2]
+
+
+# --- Pictures ------------------------------------------------------------------------------------
+
+Image = NDArray[np.uint8]
+
+CAPTION_BACKGROUND = (32, 36, 44)
+EGO_COLOR = "#1f6feb"
+OBJECT_COLOR = "#8b949e"
+EDITED_COLOR = "#d1495b"
+
+
+def mosaic(images: Sequence[Image], caption: str) -> Image:
+    """Images of one height side by side, over a line of text."""
+    row = np.concatenate(images, axis=1)
+    bar = np.full((24, row.shape[1], 3), CAPTION_BACKGROUND, dtype=np.uint8)
+    cv2.putText(
+        bar, caption, (8, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (235, 235, 235), 1, cv2.LINE_AA
+    )
+    return np.concatenate([row, bar], axis=0)
+
+
+def draw_map(
+    path: Path,
+    *,
+    logged: NDArray[np.float64],
+    driven: NDArray[np.float64],
+    boxes: Sequence[tuple[str, NDArray[np.float64], bool]],
+) -> None:
+    """A top-down plot of the drive.
+
+    Args:
+        path: PNG to write.
+        logged: [L, 2] path of the recording vehicle, world [m].
+        driven: [N, 2] path of the controlled vehicle, world [m].
+        boxes: (id, footprint [4, 2] in the world [m], whether it was edited).
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(12, 4.2), dpi=120)
+    for name, corners, edited in boxes:
+        color = EDITED_COLOR if edited else OBJECT_COLOR
+        axes.fill(corners[:, 0], corners[:, 1], color=color, alpha=0.55 if edited else 0.35)
+        if edited:
+            x, y = corners.mean(axis=0)
+            axes.annotate(name, (x, y + 1.6), color=color, fontsize=8, ha="center")
+    axes.plot(logged[:, 0], logged[:, 1], color="black", lw=1, ls="--", label="recorded")
+    axes.plot(driven[:, 0], driven[:, 1], color=EGO_COLOR, lw=2.5, alpha=0.8, label="driven")
+    axes.set_aspect("equal")
+    margin = 15.0
+    axes.set_xlim(driven[:, 0].min() - margin, driven[:, 0].max() + margin)
+    axes.set_ylim(driven[:, 1].min() - margin, driven[:, 1].max() + margin)
+    axes.set_xlabel("x, forward at the start [m]")
+    axes.set_ylabel("y, left [m]")
+    axes.set_title("the drive from above; edited objects in red")
+    axes.legend(loc="upper left", frameon=False)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    plt.close(figure)
+
 
 CAMERAS = ("front_left", "front", "front_right")
 STEP_US = 100_000
@@ -42,7 +218,6 @@ def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
     with starting_worker(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
         # Loading libraries and unpacking take as long as the worker takes to start.
         _prepare_street(out, scenes, steps, clock, from_log=from_log)
-        from .drive import drive_through
 
         with connect(worker.url) as client:
             with clock("start the worker"):
@@ -188,3 +363,78 @@ def _keep_serving(url: str, scenario_id: str) -> None:
             time.sleep(3600)
     except KeyboardInterrupt:
         console.print("stopped")
+
+
+# --- Drive ---------------------------------------------------------------------------------------
+
+STILLS = 3
+FILM_WIDTH = 960
+"""Of the film; encoding the stills' size would take longer than rendering it."""
+
+
+@dataclass
+class FilmedDrive:
+    """A driven episode.
+
+    Attributes:
+        summary: figures of the episode.
+        path: [N, 2] world positions of the vehicle, one a step [m].
+        stills: a few frames of the film, by step.
+    """
+
+    summary: EpisodeSummary
+    path: NDArray[np.float64]
+    stills: dict[int, Image] = field(default_factory=dict)
+
+
+def drive_through(
+    session: DriveSession,
+    planner: Planner,
+    *,
+    cameras: Sequence[str],
+    steps: int,
+    dt_us: int,
+    video_path: Path,
+) -> FilmedDrive:
+    """Let ``planner`` drive ``steps`` steps and film all cameras side by side.
+
+    Args:
+        session: not yet opened; it is closed afterwards.
+        planner: who drives.
+        cameras: from left to right as they are to be shown.
+        steps, dt_us: number and length [us] of clock steps.
+        video_path: WebM file to write.
+    """
+    path: list[tuple[float, float]] = []
+    stills: dict[int, Image] = {}
+    wanted = {round(steps * (i + 1) / (STILLS + 1)) for i in range(STILLS)}
+    with session, video_file(video_path, frames_per_second=1e6 / dt_us) as film:
+
+        def watch(obs: Observation) -> None:
+            caption = (
+                f"t {obs.t_us * 1e-6:5.1f} s   {obs.ego.speed * 3.6:4.1f} km/h   "
+                f"step {obs.step}   {obs.command}"
+            )
+            picture = mosaic([obs.image(camera) for camera in cameras], caption)
+            film.add(_shrunk(picture))
+            path.append(obs.ego.position[:2])
+            if obs.step in wanted:
+                stills[obs.step] = picture
+
+        summary = run_episode(
+            session,
+            planner,
+            steps=steps,
+            sensors=list(cameras),
+            on_observation=watch,
+            seed=0,
+            dt_us=dt_us,
+            privileged=True,
+        )
+    return FilmedDrive(summary=summary, path=np.array(path), stills=stills)
+
+
+def _shrunk(picture: Image) -> Image:
+    height, width = picture.shape[:2]
+    size = FILM_WIDTH, round(height * FILM_WIDTH / width)
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.box import bottom_centres
-from ..geometry.rotation import Float, yaw_quaternion
-from ..geometry.transform import invert_transform, transform_from
+from ..geometry.transform import Float, invert_transform, transform_from, yaw_quaternion
 from ..render.types import Instance
 from ..scene import UNSEEN, GaussianCloud, Ground, Scene
 from ..scene.spherical_harmonics import SH_C0

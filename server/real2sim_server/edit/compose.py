@@ -18,8 +18,7 @@ from real2sim_proto.base import Pose
 from real2sim_proto.operations import EraseRegion
 from real2sim_proto.semantics import GROUND, STATIC, semantic_class
 
-from ..geometry.rotation import Float, quaternion_to_matrix
-from ..geometry.transform import invert_transform, transform_from
+from ..geometry.transform import Float, invert_transform, quaternion_to_matrix, transform_from
 from ..render.cast.call import Attributes, SweepScene, incidence_of, met_by_lidar, transforms_at
 from ..render.lens import TOLERANCE
 from ..render.types import Instance

@@ -24,8 +24,7 @@ from real2sim_proto.operations import (
 )
 
 from ..geometry.box import bottom_centres
-from ..geometry.rotation import Float, multiply_quaternions, quaternion_to_matrix
-from ..geometry.transform import transform_from
+from ..geometry.transform import Float, multiply_quaternions, quaternion_to_matrix, transform_from
 from ..scene import Ground, Trajectory
 from .state import EditError, ObjectState, ScenarioState
 from .tracks import sample_poses

@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 
 from real2sim_proto.semantics import CLASS_OF_CATEGORY
 
-from ..geometry.rotation import Float, quaternion_to_matrix
-from ..geometry.transform import apply_transform, invert_transform
+from ..geometry.transform import Float, apply_transform, invert_transform, quaternion_to_matrix
 from ..scene import Camera, Trajectory
 from .drawing import points_in_box
 from .driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack

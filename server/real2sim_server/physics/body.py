@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float
-from ..geometry.transform import apply_transform, is_rigid
+from ..geometry.transform import Float, apply_transform, is_rigid
 from .errors import MaterialError, ParticleError
 from .materials import Material
 

@@ -20,8 +20,7 @@ from ..datasets.clips import Clip
 from ..datasets.labels.futures import STEP_US
 from ..edit import ScenarioState
 from ..edit.compose import instances_at
-from ..geometry.rotation import quaternion_yaw
-from ..geometry.transform import transform_from
+from ..geometry.transform import quaternion_yaw, transform_from
 from ..logs import DrivingLog
 from ..render import render_cameras, select_backend
 from ..scene import Scene, Trajectory

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import quaternion_yaw
+from ..geometry.transform import quaternion_yaw
 from ..render import RasterOptions, render_cameras, select_backend
 from ..render.video import video_file
 from ..scene import Scene

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.box import box_corners
-from ..geometry.rotation import Float
-from ..geometry.transform import apply_transform, invert_transform
+from ..geometry.transform import Float, apply_transform, invert_transform
 from ..logs import DrivingLog, LidarSweep, ObjectTrack
 from ..scene import Camera, Scene
 

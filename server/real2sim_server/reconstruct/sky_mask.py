@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from ..logs import DrivingLog, LidarSweep
 from ..scene import Camera
 from .logged_view import image_time, points_in_camera, resized, tracks_mask

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from ..scene.camera_motion import turned
 from ..scene.spherical_harmonics import evaluate_sh
 from .backend import (

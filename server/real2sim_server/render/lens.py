@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.semantics import GROUND, STATIC
 
-from ..geometry.rotation import Float, quaternion_to_matrix
-from ..geometry.transform import invert_transform
+from ..geometry.transform import Float, invert_transform, quaternion_to_matrix
 from ..scene import Camera, Ground
 from ..scene.camera_motion import CameraMotion
 from .types import weak_cache

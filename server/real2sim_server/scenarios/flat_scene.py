@@ -12,7 +12,7 @@ import torch
 
 from real2sim_proto.storyboard import MapRoads, Storyboard
 
-from ..geometry.rotation import Float, yaw_quaternion
+from ..geometry.transform import Float, yaw_quaternion
 from ..maps import read_map
 from ..scene import (
     Camera,

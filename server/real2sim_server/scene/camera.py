@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float
-from ..geometry.transform import invert_transform, is_rigid
+from ..geometry.transform import Float, invert_transform, is_rigid
 from .errors import SceneError
 from .lens import Lens
 from .shutter import GLOBAL, Shutter

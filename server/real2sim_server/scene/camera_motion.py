@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, matrix_to_quaternion, quaternion_to_matrix, slerp
+from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix, slerp
 from .camera import Camera
 
 ROUNDS = 11

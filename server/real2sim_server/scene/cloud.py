@@ -9,8 +9,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..geometry.rotation import matrix_to_quaternion, quaternion_to_matrix
-from ..geometry.transform import is_rigid
+from ..geometry.transform import is_rigid, matrix_to_quaternion, quaternion_to_matrix
 from .errors import SceneError
 from .spherical_harmonics import rotate_sh
 

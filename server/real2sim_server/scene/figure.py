@@ -29,7 +29,7 @@ from torch import Tensor
 from ..body import JOINTS, Body, body_model, joint_transforms, keypoints, skin
 from ..body.gait import LEAD, STANDING, Gait, GaitStyle, plan_gait, stride_length
 from ..body.skinning import joint_positions
-from ..geometry.rotation import Float, matrix_to_quaternion, quaternion_to_matrix, quaternion_yaw
+from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix, quaternion_yaw
 from .cloud import GaussianCloud
 from .errors import SceneError
 from .figure_kernels import pose_gaussians

@@ -11,7 +11,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .errors import SceneError
 from .ground_kernels import height_at, heights_at, normals_at, pose_at
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .errors import SceneError
 from .road import turned
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .errors import SceneError
 from .lane import DRIVABLE, TRAVELLED, Area, Lane, LanePlace, Signal, StopLine
 from .lane_index import LaneIndex

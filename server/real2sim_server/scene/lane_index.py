@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .lane import Lane
 from .lane_kernels import count_cells, fill_cells
 

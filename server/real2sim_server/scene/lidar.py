@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from real2sim_proto.ranging import MAX_RAYS
 
-from ..geometry.rotation import Float
-from ..geometry.transform import is_rigid
+from ..geometry.transform import Float, is_rigid
 from .errors import LidarError
 
 MAX_SLOTS = 2048

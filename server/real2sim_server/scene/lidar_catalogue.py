@@ -23,7 +23,7 @@ from real2sim_proto.ranging import (
     TableBeams,
 )
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .errors import LidarError
 from .lidar import Beams, Detection, Lidar
 

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, quaternion_yaw
+from ..geometry.transform import Float, quaternion_yaw
 from .cloud import GaussianCloud
 from .ground import Ground
 from .trajectory import Trajectory

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..body import JOINTS, Body, body_model, joint_transforms, skin
 from ..body.gait import GaitStyle, plan_gait
-from ..geometry.rotation import Float, matrix_to_quaternion
+from ..geometry.transform import Float, matrix_to_quaternion
 from .asset import Asset
 from .cloud import GaussianCloud
 from .errors import SceneError

@@ -10,8 +10,7 @@ import numpy as np
 
 from real2sim_proto.ranging import RadarModel
 
-from ..geometry.rotation import Float
-from ..geometry.transform import is_rigid
+from ..geometry.transform import Float, is_rigid
 from .errors import RadarError
 from .lidar import Beams, Lidar
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .errors import SceneError
 
 

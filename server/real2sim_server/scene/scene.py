@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..geometry.box import box_corners
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .camera import CameraRig
 from .cloud import GaussianCloud
 from .colour import TimeColour

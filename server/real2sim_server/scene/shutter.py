@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.cameras import ShutterDirection
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .errors import SceneError
 
 DIRECTIONS = get_args(ShutterDirection)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 
 SH_C0 = 0.28209479177387814
 """The constant basis function: colour = SH_C0 * sh[0] + 0.5."""

@@ -8,8 +8,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import Float, matrix_to_quaternion, slerp
-from ..geometry.transform import apply_transform, are_rigid, invert_transform, transform_from
+from ..geometry.transform import (
+    Float,
+    apply_transform,
+    are_rigid,
+    invert_transform,
+    matrix_to_quaternion,
+    slerp,
+    transform_from,
+)
 from .errors import SceneError, TimeOutOfRangeError
 
 MOVING_DISTANCE, MOVING_SPREAD = 2.0, 0.5

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float
-from ..geometry.transform import invert_transform
+from ..geometry.transform import Float, invert_transform
 from ..physics.colliders import Box, HeightField
 from ..scene import GaussianCloud, Ground, Scene
 from ..scene.obstacles import CELL, HIGHEST, OPAQUE, OccupiedCells, RecordedWay, occupied_cells

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.box import box_penetration
-from ..geometry.rotation import Float
-from ..geometry.transform import apply_transform
+from ..geometry.transform import Float, apply_transform
 from ..physics.body import Body, Particles
 from ..physics.colliders import Collider, Solid
 from ..physics.materials import Material

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from ..geometry.rotation import Float, quaternion_to_matrix
+from ..geometry.transform import Float, quaternion_to_matrix
 from ..scene import GaussianCloud, Scene, SceneObject, Trajectory
 from .playback import PlacedObject, PlacedObjects
 

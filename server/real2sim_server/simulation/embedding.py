@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, matrix_to_quaternion, quaternion_to_matrix
+from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix
 from ..scene import GaussianCloud
 from ..scene.spherical_harmonics import sh_basis
 

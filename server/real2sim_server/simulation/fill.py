@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..geometry.rotation import Float, quaternion_to_matrix
+from ..geometry.transform import Float, quaternion_to_matrix
 from ..physics.body import Particles
 from ..physics.errors import ParticleError
 from ..physics.model import check_memory

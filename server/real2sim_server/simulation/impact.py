@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float
-from ..geometry.transform import apply_transform
+from ..geometry.transform import Float, apply_transform
 from ..physics.body import Particles, box_particles
 from ..physics.colliders import Box, Collider
 from ..physics.materials import Material

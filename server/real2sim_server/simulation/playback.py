@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.semantics import semantic_class
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from ..physics.errors import PhysicsError
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene, Trajectory

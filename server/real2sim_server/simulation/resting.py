@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from ..physics.colliders import Collider
 from .body import BodyMode, DeformableBody
 from .rigid import RigidMotion, clearance, rotation_of

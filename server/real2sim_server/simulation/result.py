@@ -14,8 +14,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from .._files import atomic_folder
-from ..geometry.rotation import Float
-from ..geometry.transform import transform_from
+from ..geometry.transform import Float, transform_from
 from ..physics.errors import PhysicsError
 from .breakage import Breakage
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.box import box_penetration
-from ..geometry.rotation import Float
-from ..geometry.transform import apply_transform, is_rigid
+from ..geometry.transform import Float, apply_transform, is_rigid
 from ..physics.body import Particles
 from ..physics.colliders import Collider, Solid, TriangleMesh
 from ..physics.errors import PhysicsError

@@ -21,7 +21,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from ..physics.body import Particles
 from ..physics.errors import ParticleError
 from ..physics.materials import Material, NeoHookean, Snow, Structure

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .materials import DOOR, PLAIN, ROOF, WALL, WINDOW
 from .mesh import MeshBuilder
 

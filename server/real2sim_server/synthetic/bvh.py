@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import func, kernel
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .mesh import Mesh
 
 BINS = 12

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import func
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .bvh import STACK_SIZE
 
 EPSILON = 1e-9

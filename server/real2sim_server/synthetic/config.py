@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.rotation import yaw_quaternion
-from ..geometry.transform import transform_from
+from ..geometry.transform import transform_from, yaw_quaternion
 from ..scene import Camera, CameraRig
 from ..scene.camera import T_VEHICLE_OPTICAL
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from real2sim_proto.lanes import LaneKind
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from ..scene import Area, Lane, LaneGraph, StopLine
 from .street import FACADE, KERB, LANE, Street
 

@@ -17,7 +17,7 @@ from ..body import Body, Pose, body_model, joint_transforms, keypoints, skin
 from ..body.bicycle import Ride, plan_ride
 from ..body.gait import Gait, GaitStyle, plan_gait
 from ..body.skinning import joint_positions
-from ..geometry.rotation import Float, yaw_quaternion
+from ..geometry.transform import Float, yaw_quaternion
 from ..scene import Trajectory
 from .config import SyntheticConfig
 from .street import KERB, KERB_HEIGHT, Street

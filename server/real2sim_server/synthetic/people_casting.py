@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..body.bicycle import CRANK, FRAME, RIM, SADDLE, SURFACES, TYRE, Ride
 from ..body.skinning import vertex_normals
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .bvh import Geometry, append_geometry, refit
 from .materials import PLAIN
 from .mesh import Mesh

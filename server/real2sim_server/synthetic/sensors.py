@@ -12,7 +12,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from .._numba import func, kernel
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .casting import Instances, cast, new_stack
 from .light import tone
 from .shading import RaycastWorld, ray_colour, surface_at

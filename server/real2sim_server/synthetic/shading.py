@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import func
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .bodywork import body_surface, wheel_surface
 from .casting import is_blocked, rotate
 from .light import SUN_B, SUN_G, SUN_R, SUN_X, SUN_Y, SUN_Z, ambient, mirrored, sky_colour

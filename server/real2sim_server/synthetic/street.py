@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 
 LANE = 3.4
 """Width of a driving lane [m]."""

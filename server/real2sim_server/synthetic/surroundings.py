@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..geometry.rotation import Float
+from ..geometry.transform import Float
 from .buildings import Facade, add_house, design_house
 from .materials import BARK, EARTH, KERB_STONE, LEAVES, PAVING, PLAIN, ROAD, SIGN
 from .mesh import Mesh, MeshBuilder

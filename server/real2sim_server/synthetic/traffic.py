@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import Float, slerp, yaw_quaternion
-from ..geometry.transform import transform_from
+from ..geometry.transform import Float, slerp, transform_from, yaw_quaternion
 from ..scene import Trajectory
 from .config import SyntheticConfig
 from .materials import PARKING_BAY

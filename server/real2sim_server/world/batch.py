@@ -111,7 +111,7 @@ class Tracks(NamedTuple):
         sizes: [N, 3] float64 [m].
         driven: [N] bool, those that IDM drives.
         path_ends: [N + 1] int64, where the path of each begins in ``paths``.
-        paths: [P, KNOT] float64, see :mod:`..path_kernels`.
+        paths: [P, KNOT] float64, see :mod:`.path`.
         desired: [N] float64 [m/s].
         idm: [5] float64: headway [s], gap [m], acceleration, braking, lateral acceleration
             [m/s^2].
@@ -133,7 +133,7 @@ class Road(NamedTuple):
 
     Attributes:
         heights, frame: of the ground, see ``scene.ground_kernels``.
-        route: knots of the recorded way, see :mod:`..path_kernels`.
+        route: knots of the recorded way, see :mod:`.path`.
         line_points, line_ends, lane_points, lane_ends: of the route and of other lanes, see
             ``scoring.road_kernels``.
         half_widths: [2] float64, of both [m].

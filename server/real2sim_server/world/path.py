@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import kernel
-from ..geometry.rotation import quaternion_to_matrix, quaternion_yaw
+from ..geometry.transform import quaternion_to_matrix, quaternion_yaw
 from ..scene import Trajectory
 
 KNOT = 11
@@ -323,7 +323,7 @@ class LoggedPath:
         positions: [P, 3] float64, world [m].
         yaws: [P] float64, heading, continuous (not wrapped) [rad].
         ups: [P, 3] float64, unit floor normals.
-        knots: [P, 11] float64, all of that as :mod:`.path_kernels` wants it.
+        knots: [P, 11] float64, in the layout that the kernels above read.
     """
 
     def __init__(self, ego: Trajectory) -> None:

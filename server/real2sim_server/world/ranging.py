@@ -15,14 +15,14 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.base import Pose
 from real2sim_proto.ranging import LidarModel, LidarSpec, RadarModel, RadarSpec
 
-from ..geometry.rotation import (
+from ..geometry.transform import (
     Float,
     matrix_to_quaternion,
     quaternion_to_matrix,
     slerp,
+    transform_from,
     yaw_quaternion,
 )
-from ..geometry.transform import transform_from
 from ..scene import Beams, Lidar, LidarError, Radar, RadarError
 from ..scene.lidar_catalogue import catalogue_lidar, lidar_of
 from ..scene.radar import catalogue_radar

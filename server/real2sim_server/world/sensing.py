@@ -14,8 +14,7 @@ from real2sim_proto.semantics import GROUND, STATIC
 
 from ..edit import ScenarioState
 from ..edit.compose import compose, met_background, met_object, sweep_of
-from ..geometry.rotation import Float, quaternion_to_matrix
-from ..geometry.transform import invert_transform
+from ..geometry.transform import Float, invert_transform, quaternion_to_matrix
 from ..render.cast.call import Attributes, SweepScene, incidence_of, sensor_poses
 from ..render.cast.sensors import Patches, Sweep, detect, radar_detections
 from ..render.cast.types import CastBackend, CastRequest, Echo

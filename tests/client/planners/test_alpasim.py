@@ -19,7 +19,7 @@ from real2sim.planners._ftheta import Ftheta
 from real2sim.planners.alpasim import AlpasimDriver
 from real2sim.planners.peer import PeerError
 from real2sim_proto.scenes import CameraInfo
-from real2sim_server.geometry.rotation import quaternion_to_matrix
+from real2sim_server.geometry.transform import quaternion_to_matrix
 from tests.waiting import LIMIT_S
 
 from . import rig

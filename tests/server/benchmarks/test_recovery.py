@@ -10,8 +10,7 @@ from real2sim.planners.learned import PolicyShape
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.benchmarks import recovery
 from real2sim_server.datasets.drive import ScenarioDrive
-from real2sim_server.datasets.plan import planned_shards
-from real2sim_server.datasets.variants import Variant
+from real2sim_server.datasets.plan import Variant, planned_shards
 from real2sim_server.edit import ScenarioState
 
 OPTIONS = recovery.RecoveryBenchOptions(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from real2sim_server.cli.backup import backup, restore
+from real2sim_server.cli.store import backup, restore
 from real2sim_server.console import CommandError
 from real2sim_server.service.storage.backup import BackupError
 from real2sim_server.service.storage.connection import StateFolderError, owned_folder

@@ -15,8 +15,7 @@ import pytest
 from real2sim_proto.episode import ResetSpec
 from real2sim_server.cli import export_dataset as command
 from real2sim_server.console import CommandError
-from real2sim_server.datasets.drive import EpisodeDrive
-from real2sim_server.datasets.errors import DatasetError
+from real2sim_server.datasets.drive import DatasetError, EpisodeDrive
 from real2sim_server.datasets.export import estimate, export_dataset, work_folder
 from real2sim_server.datasets.plan import planned_clips
 from real2sim_server.edit import ScenarioState

@@ -13,7 +13,7 @@ from real2sim_proto.operations import Insert
 from real2sim_server.body.model import KEYPOINTS
 from real2sim_server.datasets.drive import ScenarioDrive
 from real2sim_server.datasets.export import export_dataset
-from real2sim_server.datasets.labels.keypoints import HIDDEN, VISIBLE, keypoints_at
+from real2sim_server.datasets.labels.views import HIDDEN, VISIBLE, keypoints_at
 from real2sim_server.datasets.plan import ExportPlan
 from real2sim_server.edit import ScenarioState, apply_operations
 from real2sim_server.scene.person import person_asset

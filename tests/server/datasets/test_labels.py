@@ -20,8 +20,8 @@ from real2sim_server.datasets.labels import (
     projected_box,
     views_of,
 )
+from real2sim_server.datasets.labels.images import body_of, on_surface
 from real2sim_server.datasets.labels.pixels import surface_mask
-from real2sim_server.datasets.labels.surface import body_of, on_surface
 from real2sim_server.render.lens import back_projected
 from real2sim_server.scene import Camera, Trajectory
 

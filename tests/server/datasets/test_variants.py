@@ -13,13 +13,18 @@ from real2sim_proto.jobs import DatasetSweep
 from real2sim_server.cli import export_dataset as command
 from real2sim_server.console import CommandError
 from real2sim_server.datasets.clips import Clip
-from real2sim_server.datasets.errors import DatasetError
+from real2sim_server.datasets.drive import DatasetError
 from real2sim_server.datasets.export import export_dataset
 from real2sim_server.datasets.labels import boxes_at, ego_future
-from real2sim_server.datasets.labels.noise import BoxNoise, noisy_boxes
+from real2sim_server.datasets.labels.boxes import BoxNoise, noisy_boxes
 from real2sim_server.datasets.perturbed import Perturbation, PerturbedDrive, perturbed
-from real2sim_server.datasets.plan import ExportPlan, planned_cameras, planned_lidar, planned_shards
-from real2sim_server.datasets.variants import swept
+from real2sim_server.datasets.plan import (
+    ExportPlan,
+    planned_cameras,
+    planned_lidar,
+    planned_shards,
+    swept,
+)
 from real2sim_server.geometry.transform import invert_transform
 
 PLAN = ExportPlan(

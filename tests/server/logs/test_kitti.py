@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from real2sim_server.geometry.rotation import matrix_to_quaternion, quaternion_yaw
-from real2sim_server.geometry.transform import apply_transform, invert_transform
+from real2sim_server.geometry.transform import (
+    apply_transform,
+    invert_transform,
+    matrix_to_quaternion,
+    quaternion_yaw,
+)
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, check_log, open_log
 from real2sim_server.logs.images import write_image
 from real2sim_server.logs.readers.kitti_tracking import EARTH_RADIUS

@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.rotation import matrix_to_quaternion
-from real2sim_server.geometry.transform import apply_transform, invert_transform, transform_from
+from real2sim_server.geometry.transform import (
+    apply_transform,
+    invert_transform,
+    matrix_to_quaternion,
+    transform_from,
+)
 from real2sim_server.logs import LogError, check_log, inspect_log, open_log, write_native_log
 from real2sim_server.logs.readers.native import POSE_KEYS
 from real2sim_server.scene import Trajectory

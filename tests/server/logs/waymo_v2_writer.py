@@ -19,8 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_server.geometry.rotation import Float, matrix_to_quaternion, quaternion_yaw, slerp
-from real2sim_server.geometry.transform import apply_transform, invert_transform, transform_from
+from real2sim_server.geometry.transform import (
+    Float,
+    apply_transform,
+    invert_transform,
+    matrix_to_quaternion,
+    quaternion_yaw,
+    slerp,
+    transform_from,
+)
 from real2sim_server.logs.driving_log import DrivingLog, LidarSweep, LogError
 from real2sim_server.logs.images import encode_image
 from real2sim_server.logs.readers.waymo_common import CAMERA_NAMES, FRONT, TOP, angles

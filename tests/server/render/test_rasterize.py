@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.rotation import (
+from real2sim_server.geometry.transform import (
+    invert_transform,
     matrix_to_quaternion,
     multiply_quaternions,
     quaternion_to_matrix,
+    transform_from,
 )
-from real2sim_server.geometry.transform import invert_transform, transform_from
 from real2sim_server.render import Instance, RasterOptions, RenderError, RenderOutput, rasterize
 from real2sim_server.scene import GaussianCloud, Sky, TimeColour
 

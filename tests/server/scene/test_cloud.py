@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.rotation import quaternion_to_matrix
-from real2sim_server.geometry.transform import apply_transform, transform_from
+from real2sim_server.geometry.transform import apply_transform, quaternion_to_matrix, transform_from
 from real2sim_server.scene import UNSEEN, GaussianCloud, SceneError
 from real2sim_server.scene.spherical_harmonics import sh_basis
 

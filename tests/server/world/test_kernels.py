@@ -16,8 +16,7 @@ from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 from real2sim_server.edit import tracks
 from real2sim_server.geometry import box_kernels
 from real2sim_server.geometry.box import box_penetration
-from real2sim_server.geometry.rotation import quaternion_yaw, yaw_quaternion
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry.transform import quaternion_yaw, transform_from, yaw_quaternion
 from real2sim_server.world import boxes as world_boxes
 from real2sim_server.world import path, warm_up
 from real2sim_server.world.driving import entries

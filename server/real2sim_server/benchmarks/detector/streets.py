@@ -22,8 +22,7 @@ from ...console import CommandError
 from ...datasets.clips import Clip
 from ...datasets.labels.views import without_blobs
 from ...datasets.perturbed import Perturbation
-from ...datasets.plan import ExportPlan
-from ...datasets.variants import Variant, swept
+from ...datasets.plan import ExportPlan, Variant, swept
 from ...edit import ScenarioState
 from ...geometry.box import box_penetration
 from ...scene import Camera, Scene

@@ -5,12 +5,10 @@ drive has; :data:`HOW` says which label from what.
 """
 
 from .boxes import ObjectBox, boxes_at, projected_box
-from .flow import flow_between
 from .futures import ego_future, ego_state, futures_at
 from .how import HOW
-from .images import CameraImages, draw_moment
-from .lidar import lidar_points
-from .points import SeenPoints, points_in_boxes, seen_points
+from .images import CameraImages, draw_moment, flow_between
+from .points import SeenPoints, lidar_points, points_in_boxes, seen_points
 from .views import CameraView, ObjectView, views_of
 
 __all__ = [

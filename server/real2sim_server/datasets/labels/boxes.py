@@ -1,16 +1,17 @@
-"""3D boxes at an instant, and where they are in an image."""
+"""3D boxes at an instant: where they are in an image, and as a detector would find them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ...edit import ObjectState, PlacedObjects
 from ...geometry.box import box_corners
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform, invert_transform
+from ...geometry.transform import Float, apply_transform, invert_transform
 from ...scene import Camera
 
 NEAR = 0.1
@@ -107,3 +108,86 @@ def in_frame(box: ObjectBox, T_frame_world: Float) -> tuple[Float, Float]:
     """``T_frame_object`` [4, 4] and the velocity [3] along the axes of another frame [m/s]."""
     velocity = apply_transform(T_frame_world, np.stack([box.velocity, np.zeros(3)]))
     return T_frame_world @ box.T_world_object, velocity[0] - velocity[1]
+
+
+# --- Noise ---------------------------------------------------------------------------------------
+
+# Jittered, missed and false boxes.
+
+CAR_SIZE = (4.5, 1.8, 1.5)
+REACH = 60.0
+"""False detections are up to so far from the ego [m]."""
+
+
+@dataclass(frozen=True)
+class BoxNoise:
+    """Errors of a detector.
+
+    Attributes:
+        position: standard deviation of each coordinate of the centre [m].
+        size: of each edge, as a share of it.
+        heading: [rad].
+        missed: share of boxes that are not found.
+        false: mean number of boxes in a frame where nothing is.
+    """
+
+    position: float = 0.0
+    size: float = 0.0
+    heading: float = 0.0
+    missed: float = 0.0
+    false: float = 0.0
+
+
+def noisy_boxes(
+    boxes: Sequence[ObjectBox], in_ego: Sequence[Float], noise: BoxNoise, seed: Sequence[int]
+) -> list[dict[str, Any]]:
+    """Detections of a frame: category, ``T_ego_object``, size, score and object id, None of false
+    ones.
+
+    Args:
+        boxes: of the frame.
+        in_ego: their poses [4, 4] in the ego frame.
+        noise: of the detector.
+        seed: the same gives the same detections.
+    """
+    rng = np.random.default_rng(list(seed))
+    found = []
+    for box, pose in zip(boxes, in_ego, strict=True):
+        missed, score = rng.random() < noise.missed, rng.beta(8, 2)
+        shift, stretch, turn = rng.standard_normal(3), rng.standard_normal(3), rng.standard_normal()
+        if missed:
+            continue
+        moved = pose @ _about_z(turn * noise.heading)
+        moved[:3, 3] += shift * noise.position
+        size = np.array(box.size) * np.clip(1 + stretch * noise.size, 0.2, 5.0)
+        found.append(_detection(box.object_id, box.category, moved, size, score))
+    categories = sorted({box.category for box in boxes}) or ["car"]
+    for _ in range(int(rng.poisson(noise.false))):
+        category = categories[int(rng.integers(len(categories)))]
+        sizes = [box.size for box in boxes if box.category == category] or [CAR_SIZE]
+        size = np.array(sizes[0])
+        pose = _about_z(rng.uniform(-math.pi, math.pi))
+        away, around = REACH * math.sqrt(rng.random()), rng.uniform(-math.pi, math.pi)
+        pose[:3, 3] = away * math.cos(around), away * math.sin(around), size[2] / 2
+        found.append(_detection(None, category, pose, size, rng.beta(2, 5)))
+    return found
+
+
+def _detection(
+    object_id: str | None, category: str, pose: Float, size: Float, score: float
+) -> dict[str, Any]:
+    return {
+        "object_id": object_id,
+        "category": category,
+        "T_ego_object": pose.tolist(),
+        "size": size.tolist(),
+        "score": float(score),
+    }
+
+
+def _about_z(angle: float) -> Float:
+    matrix = np.eye(4)
+    matrix[0, 0] = matrix[1, 1] = math.cos(angle)
+    matrix[1, 0] = math.sin(angle)
+    matrix[0, 1] = -matrix[1, 0]
+    return matrix

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ...edit import ObjectState, PlacedObjects
-from ...geometry.rotation import Float, matrix_to_quaternion, quaternion_yaw
-from ...geometry.transform import invert_transform
+from ...geometry.transform import Float, invert_transform, matrix_to_quaternion, quaternion_yaw
 from ...world.path import LoggedPath, command_ahead, route_ahead
 from ..drive import Drive
 

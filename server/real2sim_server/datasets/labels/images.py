@@ -1,26 +1,131 @@
-"""The images of an instant, from one walk per camera where the backend can."""
+"""The images of an instant, from one pass per camera where the backend can; optical flow."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from real2sim_proto.semantics import SKY, UNLABELED
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float, invert_transform
 from ...render import Backend, render_cameras, select_backend
 from ...render.frame import classes_of, label_cameras, labels_while_drawing
 from ...render.types import Window
 from ...scene import Camera, Scene
 from ..drive import Moment
-from .boxes import ObjectBox, boxes_at
-from .pixels import tell_apart
-from .surface import bodies_of
-from .windows import object_windows
+from .boxes import Box2D, ObjectBox, boxes_at, projected_box
+from .pixels import BODY, TYRE, carry, on_bodies, tell_apart
+
+# --- Windows -------------------------------------------------------------------------------------
+
+# The part of an image in which all of an object shows.
+
+MARGIN = 0.1
+"""Gaussians of an object reach beyond its box: by this share of its projection, at least 8 px."""
+
+
+def object_windows(
+    boxes: Sequence[ObjectBox], camera: Camera, T_world_camera: Float
+) -> list[Window]:
+    """Windows of the objects that are in an image, in their order."""
+    found = []
+    for box in boxes:
+        whole = projected_box(box.T_world_object, box.size, camera, T_world_camera)
+        if whole is not None:
+            window = window_about(box.instance_id, whole, camera)
+            if window.left < window.right and window.top < window.bottom:
+                found.append(window)
+    return found
+
+
+def window_about(instance_id: int, whole: Box2D, camera: Camera) -> Window:
+    """Whole pixels about a projected box."""
+    wide = max(8.0, MARGIN * (whole[2] - whole[0]))
+    high = max(8.0, MARGIN * (whole[3] - whole[1]))
+    # Boxes that reach behind the camera have corners at enormous places.
+    return Window(
+        instance_id,
+        math.floor(min(max(whole[0] - wide, 0.0), float(camera.width))),
+        math.floor(min(max(whole[1] - high, 0.0), float(camera.height))),
+        math.ceil(max(min(whole[2] + wide, float(camera.width)), 0.0)),
+        math.ceil(max(min(whole[3] + high, float(camera.height)), 0.0)),
+    )
+
+
+# --- Surfaces ------------------------------------------------------------------------------------
+
+# A reconstructed object holds the dark ground below it too, which moves with it. Those pixels
+# are the ground's; the object's box tells where they are, and for road vehicles the wheels below it.
+
+"""Surface may lie so far outside of the box [m]: boxes are as exact as who drew them."""
+
+CLEARANCE = 0.12
+"""What is less above the box's lowest face, below it too, is the ground [m]."""
+
+SILL = 0.11
+"""Below this share of a road vehicle's height are its wheels alone, and between them the shadow."""
+
+WHEELED = {
+    "car": (0.15, 0.22, 0.3, 0.3),
+    "van": (0.11, 0.16, 0.33, 0.3),
+    "truck": (0.15, 0.145, 0.36, 0.26),
+    "bus": (0.12, 0.155, 0.29, 0.26),
+    "trailer": (0.15, 0.145, 0.36, 0.26),
+}
+"""Of road vehicles: where their sides end below and the radius of their wheels as shares of the
+height, how far the axles are ahead of the centre and behind it as shares of the length."""
+
+AXLES = 0.18, 0.43
+"""Wheels lie between these shares of the length, ahead of the centre and behind."""
+
+CONTACT = 0.08
+"""Of wheels, what is less above the box's lowest face is the ground [m]."""
+
+
+def on_surface(
+    points: NDArray[np.floating], T_world_object: Float, box: ObjectBox
+) -> NDArray[np.bool_]:
+    """Which points [N, 3] of the world are of an object's surface, [N] bool.
+
+    Args:
+        points: at its pixels.
+        T_world_object: [4, 4] of the box, at the instant of the points.
+        box: gives size and category.
+    """
+    found = np.empty(len(points), np.bool_)
+    on_bodies(np.asarray(points, np.float64), body_of(box, T_world_object), found)
+    return found
+
+
+def bodies_of(boxes: Sequence[ObjectBox]) -> Float:
+    """What kernels take of boxes, [K, BODY], see ``is_surface``."""
+    found = np.empty((len(boxes), BODY))
+    for row, box in zip(found, boxes, strict=True):
+        row[:] = body_of(box, box.T_world_object)
+    return found
+
+
+def body_of(box: ObjectBox, T_world_object: Float) -> Float:
+    """One of :func:`bodies_of`, at another pose."""
+    half = np.asarray(box.size) / 2
+    to_object = invert_transform(T_world_object)[:3]
+    lowest = -half[2] + min(CLEARANCE, half[2] / 4)
+    limits: tuple[float, ...] = lowest, lowest, *[0.0] * 7
+    if box.category in WHEELED:
+        aside, (inner, outer) = half[1] - TYRE, AXLES
+        sill = max(lowest, (2 * SILL - 1) * half[2])
+        long, _, high = box.size
+        side, radius, front, rear = WHEELED[box.category]
+        seen = side * high, radius * high, front * long, rear * long
+        limits = -half[2] + CONTACT, sill, aside, inner * long, outer * long, *seen
+    return np.concatenate([to_object.ravel(), half, [MARGIN, *limits]])
+
 
 MODALITIES = ("rgb", "median_depth", "instance")
 IDS = 1 << 16
@@ -148,3 +253,62 @@ def slots_of(boxes: Sequence[ObjectBox]) -> NDArray[np.int16]:
     for slot, box in enumerate(boxes):
         slots[box.instance_id] = slot
     return slots
+
+
+# --- Flow ----------------------------------------------------------------------------------------
+
+# From depth and poses, in both directions, with what is hidden in the other image.
+
+BLOCK = np.ones((3, 3), np.uint8)
+
+
+def flow_between(
+    here: CameraImages,
+    there: CameraImages,
+    boxes_here: Sequence[ObjectBox],
+    boxes_there: Sequence[ObjectBox],
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Where the surface of each pixel of ``here`` is in the image ``there`` of the same camera.
+
+    Objects are carried by their poses, all else stands still. What has no depth lies infinitely
+    far away (sky).
+
+    Returns:
+        Flow [H, W, 2] float32 [px]; valid [H, W] bool, False where the surface is behind the
+        camera then or its object is no longer there; occluded [H, W] bool, where the flow is valid
+        and the other image shows something else at its end, or ends before.
+    """
+    shape = here.depth.shape
+    flow, valid = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
+    occluded = np.empty(shape, np.bool_)
+    motions, slots = _motions(here, there, boxes_here, boxes_there)
+    # Metres lie between two rows of a road far away: its surface is met between neighbours.
+    low, high = (spread(there.depth, BLOCK) for spread in (cv2.erode, cv2.dilate))
+    shown = low, high, there.instance
+    carry(here.depth, here.instance, slots, motions, shown, flow, valid, occluded)
+    return flow, valid, occluded
+
+
+def _motions(
+    here: CameraImages,
+    there: CameraImages,
+    boxes_here: Sequence[ObjectBox],
+    boxes_there: Sequence[ObjectBox],
+) -> tuple[NDArray[np.float32], NDArray[np.int16]]:
+    """Of what stands and of each object, and which one each instance id has, see :func:`carry`."""
+    to_camera = invert_transform(there.T_world_camera)
+    later = {box.instance_id: box for box in boxes_there}
+    slots = np.zeros(IDS, np.int16)
+    moved = [np.eye(4)]
+    for box in boxes_here:
+        other = later.get(box.instance_id)
+        slots[box.instance_id] = -1 if other is None else len(moved)
+        if other is not None:
+            moved.append(other.T_world_object @ invert_transform(box.T_world_object))
+    inverse = np.linalg.inv(here.camera.K)
+    motions = np.empty((len(moved), 3, 4), np.float32)
+    for row, motion in zip(motions, moved, strict=True):
+        between = to_camera @ motion @ here.T_world_camera
+        row[:, :3] = there.camera.K @ between[:3, :3] @ inverse
+        row[:, 3] = there.camera.K @ between[:3, 3]
+    return motions, slots

@@ -1,10 +1,9 @@
 """Writers of public formats, one module each."""
 
-from ..errors import DatasetError
+from ..drive import DatasetError
 from .argoverse2 import Argoverse2Writer
 from .coco import CocoWriter
-from .kitti import KittiWriter
-from .kitti_raw import KittiRawWriter
+from .kitti import KittiRawWriter, KittiWriter
 from .labels import LabelsWriter
 from .mcap import McapWriter
 from .ncore import NCoreWriter

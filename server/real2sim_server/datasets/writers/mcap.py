@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.rotation import Float, matrix_to_quaternion
+from ...geometry.transform import Float, matrix_to_quaternion
 from ...render import encode_image
 from ...scene import Camera
 from ...world.recording.mcap_file import json_channel, stamp_of
 from ..clips import Clip
-from ..errors import DatasetError
+from ..drive import DatasetError
 from .writer import LabelledDrive, objects_of
 
 QUALITY = 95

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.semantics import GROUND
 
-from ...geometry.rotation import Float, matrix_to_quaternion
-from ...geometry.transform import apply_transform, invert_transform
+from ...geometry.transform import Float, apply_transform, invert_transform, matrix_to_quaternion
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip

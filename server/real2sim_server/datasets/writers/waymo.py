@@ -21,8 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from real2sim_proto.semantics import SEMANTIC_CLASSES
 
-from ...geometry.rotation import Float, matrix_to_quaternion, quaternion_yaw
-from ...geometry.transform import apply_transform
+from ...geometry.transform import Float, apply_transform, matrix_to_quaternion, quaternion_yaw
 from ...logs.readers.waymo_common import (
     CAMERA_NAMES,
     FRONT,
@@ -50,7 +49,7 @@ from ...render import encode_image
 from ...scene import Camera
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ..clips import Clip
-from ..errors import DatasetError
+from ..drive import DatasetError
 from .nuscenes import FRONT as AHEAD
 from .nuscenes import channels_of
 from .writer import LabelledDrive, objects_of

@@ -13,8 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import invert_transform
+from ...geometry.transform import Float, invert_transform
 from ...scene import BrownConrady, Camera, SceneError, Shutter, Trajectory
 from ...scene.camera import Optics
 from ...scene.shutter import GLOBAL

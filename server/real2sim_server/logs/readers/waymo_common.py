@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform, invert_transform
+from ...geometry.transform import Float, apply_transform, invert_transform
 from ...scene import Camera, CameraRig, Shutter, Trajectory
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ...scene.shutter import DIRECTIONS, GLOBAL, MAX_READOUT_US

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from .clusters import LidarCluster
 
 # --- Motion --------------------------------------------------------------------------------------

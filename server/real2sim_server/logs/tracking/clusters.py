@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform
+from ...geometry.transform import Float, apply_transform
 from ..driving_log import LidarSweep
 
 # --- Ground of a sweep ---------------------------------------------------------------------------

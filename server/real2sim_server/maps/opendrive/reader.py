@@ -13,7 +13,7 @@ import numpy as np
 
 from real2sim_proto.lanes import SignalKind
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...scene.lane import TRAVELLED, Area, Lane, Signal, StopLine
 from ...scene.lane_graph import LaneGraph
 from ...scene.road import Road, RoadLane

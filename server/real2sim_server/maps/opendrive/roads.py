@@ -13,7 +13,7 @@ from scipy.special import fresnel
 
 from real2sim_proto.lanes import LaneKind
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ..reader import MapError, integer, number
 
 # --- Plan view -----------------------------------------------------------------------------------

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import invert_transform
+from ...geometry.transform import Float, invert_transform
 from ...logs import ObjectTrack
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Scene

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform, invert_transform
+from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera, Ground, Scene
 from ..logged_view import image_time, points_in_camera, resized, tracks_mask

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...logs import DrivingLog
 from ...scene import Camera, Scene
 from ..logged_view import image_time, resized

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from torch import Tensor
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...scene import GaussianCloud, Scene
 from ...scene.cloud import SH_DEGREES
 from ...scene.errors import SceneError

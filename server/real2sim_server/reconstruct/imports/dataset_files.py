@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import simplejpeg
 
-from ...geometry.rotation import Float
-from ...geometry.transform import is_rigid
+from ...geometry.transform import Float, is_rigid
 from .checkpoint import CheckpointError
 
 PNG_MAGIC = b"\x89PNG"

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...scene import Sky
 from ...scene.sky import face_directions
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...scene import Camera, CameraRig
 from ...scene.errors import SceneError
 from .checkpoint import CheckpointError

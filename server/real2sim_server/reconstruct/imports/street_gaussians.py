@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.rotation import Float, yaw_quaternion
-from ...geometry.transform import transform_from
+from ...geometry.transform import Float, transform_from, yaw_quaternion
 from ...scene import GaussianCloud, Scene, SceneObject, Sky, Trajectory
 from .checkpoint import (
     DIRECTIONS_WARNING,

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform
+from ...geometry.transform import Float, apply_transform
 from ...scene.trajectory import leads_anywhere
 from .checkpoint import CheckpointError
 from .dataset_files import read_json

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from .points import PointSet
 from .surfels import Surfels
 from .vehicle_body import VehicleBody

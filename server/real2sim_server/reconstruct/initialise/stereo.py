@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform, invert_transform
+from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
 from ..logged_view import resized

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, matrix_to_quaternion
+from ...geometry.transform import Float, matrix_to_quaternion
 
 NEIGHBOURS = 20
 CHUNK = 50_000

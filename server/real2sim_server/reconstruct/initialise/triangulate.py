@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import invert_transform
+from ...geometry.transform import Float, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
 from ..logged_view import resized

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...scene import SceneObject, Trajectory
 
 FROM_ABOVE = (0.0, 0.0, 0.25)

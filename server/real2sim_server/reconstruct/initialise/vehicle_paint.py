@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from .inpainting import GREY, fill_from_mirror
 from .vehicle_body import PAINT_REACH, VehicleBody
 from .vehicle_light import brightness, fit_light

@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...synthetic.vehicles import VehicleShape, roof_heights
 from .inpainting import MIN_OBSERVED, modal_colour
 

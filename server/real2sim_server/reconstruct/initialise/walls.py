@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from .surfels import Surfels
 
 CELL = 0.25

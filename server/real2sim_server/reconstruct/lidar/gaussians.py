@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.rotation import quaternion_to_matrix
+from ...geometry.transform import quaternion_to_matrix
 from ...scene import GaussianCloud, LidarSurfaces, Reflector, Scene
 
 Array = NDArray[np.float32]

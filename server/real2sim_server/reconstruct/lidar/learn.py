@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import invert_transform
+from ...geometry.transform import Float, invert_transform
 from ...logs import DrivingLog
 from ...scene import Lidar, Scene
 from .gaussians import SurfaceTable

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform, invert_transform
+from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog, ObjectTrack
 from ...scene import GaussianCloud, Scene
 from ..initialise.accumulate import SHELL, drive_path, near_box, on_recording_vehicle

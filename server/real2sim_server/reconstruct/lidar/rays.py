@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.ranging import MAX_RAYS
 
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform, invert_transform
+from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render.cast.call import transforms_at
 from ...scene import Beams, Detection, Lidar

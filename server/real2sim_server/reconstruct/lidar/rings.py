@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.ranging import MAX_RAYS
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...scene import Beams, Lidar
 from ...scene.lidar import wrapped
 from .rays import RecordedRays

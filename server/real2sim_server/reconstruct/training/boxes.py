@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.rotation import (
+from ...geometry.transform import (
     Float,
     multiply_quaternions,
     quaternion_to_matrix,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ...geometry.rotation import Float, matrix_to_quaternion
+from ...geometry.transform import Float, matrix_to_quaternion
 from ...scene import GaussianCloud, SceneObject
 from ...scene.spherical_harmonics import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours

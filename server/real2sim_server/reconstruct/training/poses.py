@@ -9,8 +9,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry.rotation import Float, multiply_quaternions, quaternion_to_matrix, yaw_quaternion
-from ...geometry.transform import transform_from
+from ...geometry.transform import (
+    Float,
+    multiply_quaternions,
+    quaternion_to_matrix,
+    transform_from,
+    yaw_quaternion,
+)
 from ...scene import Scene, Trajectory
 from .losses import second_differences
 

@@ -12,8 +12,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..._numba import is_on_disk
-from ...geometry.rotation import Float, quaternion_to_matrix, slerp
-from ...geometry.transform import are_rigid, invert_transform, transform_from
+from ...geometry.transform import (
+    Float,
+    are_rigid,
+    invert_transform,
+    quaternion_to_matrix,
+    slerp,
+    transform_from,
+)
 from ...scene import Beams, GaussianCloud, Lidar, Scene, Trajectory
 from .._cpu.drawing import array_of
 from ..types import Instance, RenderError

@@ -14,7 +14,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ..._numba import PARALLEL_LOOPS
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...scene import Beams
 from ...scene.lidar import wrapped
 from .._cpu.lanes import LANES, inlined, kernel, prefetch

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..._files import atomic_file, atomic_folder
-from ...geometry.rotation import Float
-from ...geometry.transform import invert_transform
+from ...geometry.transform import Float, invert_transform
 from ..cloud import GaussianCloud
 from ..errors import SceneError
 from ..scene import Scene, SceneObject

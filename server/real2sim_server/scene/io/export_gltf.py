@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.rotation import Float, matrix_to_quaternion
-from ...geometry.transform import invert_transform
+from ...geometry.transform import Float, invert_transform, matrix_to_quaternion
 from ..camera import Camera
 from ..cloud import GaussianCloud
 from ..scene import Scene, SceneObject

@@ -24,7 +24,7 @@ from starlette.routing import Match
 from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, RETRYABLE, ErrorCode, Problem
 from real2sim_proto.errors import ProblemDetail, title_of
 
-from ...datasets.errors import DatasetError
+from ...datasets.drive import DatasetError
 from ...edit import EditError
 from ...physics.errors import PhysicsError
 from ...render import RenderError

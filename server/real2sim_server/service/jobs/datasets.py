@@ -15,10 +15,9 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import DatasetRequest
 
 from ...datasets.export import MANIFEST, PREVIEW, Estimate, estimate, export_dataset, work_folder
-from ...datasets.labels.noise import BoxNoise
+from ...datasets.labels.boxes import BoxNoise
 from ...datasets.perturbed import Perturbation
-from ...datasets.plan import ExportPlan, planned_cameras, planned_lidar, planned_shards
-from ...datasets.variants import Variant
+from ...datasets.plan import ExportPlan, Variant, planned_cameras, planned_lidar, planned_shards
 from ...datasets.writers import writer_of
 from ...render import Backend, RenderOutput
 from ...render.backend import RasterRequest

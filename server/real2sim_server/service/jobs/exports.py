@@ -15,7 +15,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.jobs import ExportRequest
 
-from ...geometry.rotation import Float
+from ...geometry.transform import Float
 from ...render import Instance
 from ...render.video import VideoError, VideoFile
 from ...scene import Scene

@@ -25,8 +25,7 @@ from real2sim_proto.operations import (
 
 from ...edit import ObjectState, ScenarioState
 from ...edit.compose import composed_background, contact_shadows
-from ...geometry.rotation import Float, quaternion_to_matrix
-from ...geometry.transform import transform_from
+from ...geometry.transform import Float, quaternion_to_matrix, transform_from
 from ...physics.colliders import (
     Box,
     Capsule,

@@ -22,8 +22,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.assets import AssetInfo, AssetUpload
 
 from ...edit.appearance import Colour, ambient_colour, contact_shadow, relighting_gain, relit
-from ...geometry.rotation import Float
-from ...geometry.transform import invert_transform
+from ...geometry.transform import Float, invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
 from ...scene import Asset, BundleError, Figure, GaussianCloud, Ground, Scene, Trajectory
 from ...scene.io import (
@@ -193,7 +192,7 @@ class AssetLibrary:
             ]
 
     def add(self, asset: Asset, *, claim: str | None = None) -> AssetInfo:
-        """Keep an asset; ``claim`` as in :mod:`.claims`.
+        """Keep an asset; ``claim`` as in :mod:`.imports`.
 
         Raises:
             ServiceError: ALREADY_EXISTS: assets never change, because scenarios rely on them.
@@ -384,7 +383,7 @@ def import_asset(
         asset_id: of the asset.
         limits: of the process that reads the file.
         quota: of the library.
-        claim: of the request, see :mod:`.claims`.
+        claim: of the request, see :mod:`.imports`.
 
     Raises:
         ServiceError: IMPORT_FAILED with the reason, PAYLOAD_TOO_LARGE for what comes out of the

@@ -103,7 +103,7 @@ def import_scene(
         name: of the new scene.
         limits: of the process that reads.
         quota: of the scene folder.
-        claim: of the request, see :mod:`.claims`; what it has made already stays as it is.
+        claim: of the request; what it has made already stays as it is.
 
     Raises:
         ServiceError: IMPORT_FAILED when it cannot be read or written, PAYLOAD_TOO_LARGE for what

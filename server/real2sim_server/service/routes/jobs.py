@@ -22,7 +22,7 @@ from real2sim_proto.jobs import (
 from real2sim_proto.sweeps import SweepRequest
 
 from ...datasets.drive import EpisodeDrive, ScenarioDrive
-from ...datasets.variants import Variant, swept
+from ...datasets.plan import Variant, swept
 from ...edit import ScenarioState, instances_at
 from ...scene import Scene
 from ...world.recording.recording import Recording, RecordingError, recording_of_bytes

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...geometry.box import box_penetration
-from ...geometry.rotation import Float
-from ...geometry.transform import apply_transform
+from ...geometry.transform import Float, apply_transform
 from ...physics.colliders import Box, Collider, HeightField, Plane
 from ...physics.errors import PhysicsError
 from ...physics.materials import FixedCorotated

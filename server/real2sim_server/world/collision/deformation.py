@@ -23,8 +23,7 @@ from real2sim_proto.semantics import semantic_class
 
 from ...edit import ObjectState
 from ...edit.compose import cloud_of
-from ...geometry.rotation import Float, yaw_quaternion
-from ...geometry.transform import transform_from
+from ...geometry.transform import Float, transform_from, yaw_quaternion
 from ...physics.colliders import Box
 from ...physics.errors import PhysicsError
 from ...render.types import Instance

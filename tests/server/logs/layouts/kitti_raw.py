@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from real2sim_server.geometry.rotation import matrix_to_quaternion, quaternion_yaw
-from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.geometry.transform import (
+    invert_transform,
+    matrix_to_quaternion,
+    quaternion_yaw,
+)
 from real2sim_server.logs import DrivingLog
 from real2sim_server.logs.readers.kitti_tracking import EARTH_RADIUS
 

@@ -24,8 +24,11 @@ import real2sim
 from real2sim._alpasim_messages import RENDERER, RENDERER_METHODS, messages
 from real2sim.renderers.alpasim import AlpasimRenderer
 from real2sim.renderers.scene_link import SceneLink
-from real2sim_server.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix
-from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.geometry.transform import (
+    invert_transform,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+)
 
 pytestmark = pytest.mark.network
 

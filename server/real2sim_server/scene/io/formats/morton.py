@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ....geometry.rotation import Float
+from ....geometry.transform import Float
 
 BITS = 21
 _SPREAD = (

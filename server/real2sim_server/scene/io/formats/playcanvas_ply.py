@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...._files import atomic_file
-from ....geometry.rotation import Float
+from ....geometry.transform import Float
 from ...cloud import SH_DEGREES, GaussianCloud
 from ...errors import BundleError
 from ...spherical_harmonics import SH_C0

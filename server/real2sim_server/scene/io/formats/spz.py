@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...._files import atomic_file
-from ....geometry.rotation import Float
+from ....geometry.transform import Float
 from ...cloud import GaussianCloud
 from ...errors import BundleError, SceneError
 from .spz_container import (

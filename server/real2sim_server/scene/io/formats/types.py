@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ....geometry.rotation import Float
+from ....geometry.transform import Float
 from ...cloud import GaussianCloud
 from ...errors import BundleError, BundleTooLargeError
 
