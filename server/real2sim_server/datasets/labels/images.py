@@ -61,8 +61,9 @@ def window_about(instance_id: int, whole: Box2D, camera: Camera) -> Window:
 # --- Surfaces ------------------------------------------------------------------------------------
 
 # A reconstructed object holds the dark ground below it too, which moves with it. Those pixels
-# are the ground's; the object's box tells where they are, and for road vehicles the wheels below it.
+# are the ground's; the object's box tells where they are, for road vehicles also their wheels.
 
+SURFACE_MARGIN = 0.1
 """Surface may lie so far outside of the box [m]: boxes are as exact as who drew them."""
 
 CLEARANCE = 0.12
@@ -124,7 +125,7 @@ def body_of(box: ObjectBox, T_world_object: Float) -> Float:
         side, radius, front, rear = WHEELED[box.category]
         seen = side * high, radius * high, front * long, rear * long
         limits = -half[2] + CONTACT, sill, aside, inner * long, outer * long, *seen
-    return np.concatenate([to_object.ravel(), half, [MARGIN, *limits]])
+    return np.concatenate([to_object.ravel(), half, [SURFACE_MARGIN, *limits]])
 
 
 MODALITIES = ("rgb", "median_depth", "instance")

@@ -229,9 +229,10 @@ def _write_lines(path: Path, lines: Sequence[str]) -> None:
 
 # --- Raw data ------------------------------------------------------------------------------------
 
-# A drive for each clip and camera, with GPS/IMU records and tracklets. Source: Geiger et al., "Vision
-# meets Robotics: The KITTI Dataset", IJRR 2013, and the raw data's development kit. Camera, scanner and scans are as
-# above; the GPS/IMU unit is the ego's origin. Boxes turn about the scanner's vertical axis only.
+# A drive for each clip and camera, with GPS/IMU records and tracklets. Source: Geiger et al.,
+# "Vision meets Robotics: The KITTI Dataset", IJRR 2013, and the raw data's development kit. Camera,
+# scanner and scans are as above; the GPS/IMU unit is the ego's origin. Boxes turn about the
+# scanner's vertical axis only.
 
 DAY = "2011_09_26"
 LATITUDE, LONGITUDE, ALTITUDE = 49.0, 8.4, 110.0
