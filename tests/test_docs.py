@@ -19,7 +19,7 @@ from real2sim_proto import HTTP_STATUS, RETRYABLE, ErrorCode
 from tests.pages import BLOCK
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-FOLDERS = (REPOSITORY, REPOSITORY / "docs", REPOSITORY / "docs/site")
+FOLDERS = (REPOSITORY, *(REPOSITORY / name for name in ("docs", "docs/extending", "docs/site")))
 PAGES = sorted(page for folder in FOLDERS for page in folder.glob("*.md"))
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s#]+)(?:#[^)\s]*)?\)")
 CALL = re.compile(r"(?:[A-Z_0-9]+=\S+ )*(?:\S*/bin/)?real2sim (.*)")

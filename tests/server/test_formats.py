@@ -37,6 +37,7 @@ from real2sim_server.datasets.writers import WRITERS
 from real2sim_server.demo.street import unpack_street
 from real2sim_server.logs import open_log
 from real2sim_server.maps import read_map
+from real2sim_server.render.modalities import unregister
 from real2sim_server.scene import GaussianCloud, Trajectory
 from real2sim_server.scene.io import save_asset
 from real2sim_server.scene.io.document import (
@@ -277,6 +278,16 @@ def test_people(
         np.testing.assert_allclose(steps[0, :2], [5.6, 0.1], atol=1e-6)
         assert names["scenario"].history().entries[-1].operations[0].op == "set_gait"
         names["client"].close()
+
+
+def test_extending_images(page: Callable[[str], Page]) -> None:
+    with page("docs/extending/images.md") as images:
+        alpha = images.python("SensorModality")["ALPHA"]
+        unregister("alpha")
+        png = alpha.encode(np.arange(6, dtype=np.uint8).reshape(2, 3), "png", 90)
+        decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert decoded.tolist() == [[0, 1, 2], [3, 4, 5]]
+        assert alpha.shape(3, 2) == (2, 3)
 
 
 MESSAGES = {
