@@ -13,7 +13,7 @@ from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
-LIMIT_S = 600
+LIMIT_S = 1800
 PACKAGES = ("proto", "client", "server")
 
 

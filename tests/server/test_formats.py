@@ -56,7 +56,7 @@ from real2sim_server.settings import OTHER_VARIABLES, Settings
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 from tests.pages import LIMIT_S, REPOSITORY, Page
 
-pytestmark = pytest.mark.network
+pytestmark = [pytest.mark.network, pytest.mark.timeout(5400)]
 
 
 def without_numbers(text: str) -> str:

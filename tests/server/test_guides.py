@@ -25,7 +25,7 @@ from real2sim_server.service.serve import running_worker
 from real2sim_server.settings import Settings
 from tests.pages import LIMIT_S, REPOSITORY, Page
 
-pytestmark = pytest.mark.network
+pytestmark = [pytest.mark.network, pytest.mark.timeout(5400)]
 
 
 def picture(path: Path) -> np.ndarray:

@@ -162,7 +162,7 @@ def contact_shadow(
     forward = T_world_object[:3, 0]
     yaw = np.arctan2(forward[1], forward[0])
     level_ground = transform_from([bottom[0], bottom[1], height + LIFT], yaw_quaternion(float(yaw)))
-    footprint = (size[0] + 2 * SHADOW_MARGIN, size[1] + 2 * MARGIN, 1.0)
+    footprint = (size[0] + 2 * SHADOW_MARGIN, size[1] + 2 * SHADOW_MARGIN, 1.0)
     return Instance(_decal(level, str(device)), level_ground, instance_id=0, scale=footprint)
 
 

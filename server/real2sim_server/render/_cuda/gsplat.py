@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
-import gsplat
 import torch
 from torch import Tensor
 
@@ -207,6 +206,8 @@ class CudaBackend:
         )
 
     def _place(self, instance: Instance, placement: Placement, index: int) -> _World:
+        import gsplat
+
         cloud = self._on_device(instance.cloud)
         if instance.colour is not None:
             cloud = instance.colour.to(self.device).at(cloud, instance.t_us)
@@ -241,6 +242,8 @@ class CudaBackend:
         return self._resident[cloud]
 
     def _covariances(self, instance: Instance, cloud: GaussianCloud) -> Tensor:
+        import gsplat
+
         if instance.covars is not None:
             return instance.covars.to(self.device)
         covars: Tensor
@@ -287,6 +290,8 @@ def _blend(
     if len(world.means) == 0:
         empty = torch.zeros(shape, device=world.means.device)
         return empty[..., None].repeat(1, 1, 1, 3), empty, empty if options.depth else None, None
+    import gsplat
+
     images, alphas, meta = gsplat.rasterization(
         means=world.means,
         quats=None,

@@ -109,6 +109,157 @@ def cpla() -> Fields:
     return board([("adult", "pedestrian", ADULT)], init)
 
 
+# --- Lanes ---------------------------------------------------------------------------------------
+
+
+@case(
+    "lanes", "Cut-in: a car moves in from the left, close ahead", gap=12.0, speed=7.0, duration=2.0
+)
+def cut_in() -> Fields:
+    """Slower than the ego, so that its gap shrinks."""
+    init = put("cutter", ahead(35.0, lanes=1, orientation=ALONG), "$speed")
+    move = event("move_in", near("cutter", "$gap"), change(0, "Ego", "$duration"))
+    return board([("cutter", "car", CAR)], init, cutter=[move])
+
+
+@case("lanes", "Cut-in and brake: a car moves in close ahead, and brakes there",
+    gap=10.0, speed=8.0, duration=1.5, braking=6.0,
+)  # fmt: skip
+def cut_in_brake() -> Fields:
+    """Brakes as soon as it is in the ego's lane."""
+    init = put("cutter", ahead(25.0, lanes=1, orientation=ALONG), "$speed")
+    move = event("move_in", near("cutter", "$gap"), change(0, "Ego", "$duration"))
+    brake = event("brake", done("move_in"), speed_to(0.0, "$braking"))
+    return board([("cutter", "car", CAR)], init, cutter=[move, brake])
+
+
+@case(
+    "lanes",
+    "Cut-out: the car ahead moves out before one that stands",
+    gap=14.0,
+    speed=9.0,
+    reveal=25.0,
+)
+def cut_out() -> Fields:
+    """What stands is hidden by a van until then."""
+    init = put("leader", ahead("${$gap + 6}"), "$speed")
+    init += put("standing", ahead(80.0))
+    far = near("standing", "$reveal", of="leader")
+    out = event("move_out", far, change(1, "leader", 2.0))
+    entities = [("leader", "van", VAN), ("standing", "car", CAR)]
+    return board(entities, init, leader=[out])
+
+
+@case("lanes", "Pull out: a parked car pulls out before the ego",
+    ahead=45.0, time=2.0, acceleration=2.5, speed=6.0, length=10.0,
+)  # fmt: skip
+def pull_out() -> Fields:
+    """From beside the lane; sideways by the way that it has driven."""
+    init = put("parked", beside("$ahead", -2.8))
+    how = {"shape": "sinusoidal", "dimension": "distance", "value": "$length"}
+    aside = {"kind": "lane_change", "lane": 0, "relative_to": "Ego", "dynamics": how}
+    out = event("pull_out", in_time("parked", "$time"), speed_to("$speed", "$acceleration"), aside)
+    return board([("parked", "car", CAR)], init, parked=[out])
+
+
+@case("lanes", "LSS overtaking: a faster car overtakes and comes back close ahead",
+    behind=20.0, speed=15.0, duration=2.5,
+)  # fmt: skip
+def lss_overtaking() -> Fields:
+    """Euro NCAP's overtaking vehicle, which comes back early."""
+    init = put("overtaker", ahead("${-1 * $behind}", lanes=1, orientation=ALONG), "$speed")
+    past = when(
+        {
+            "kind": "distance", "entities": ["overtaker"], "measure": "euclidean",
+            "position": {"kind": "relative_object", "entity": "Ego", "dx": 9.0, "dy": 3.5},
+            "rule": "less_or_equal", "value": 2.5,
+        }
+    )  # fmt: skip
+    back = event("come_back", past, change(0, "Ego", "$duration"))
+    return board([("overtaker", "car", CAR)], init, overtaker=[back])
+
+
+@case("lanes", "LSS lane keeping: the ego begins headed over the line", offset=0.5, heading=0.05)
+def lss_keep() -> Fields:
+    """Euro NCAP's drift of 0.2 to 0.6 m/s sideways: at 10 m/s as much as 0.02 to 0.06 rad."""
+    there = ahead(0.0, offset="$offset", orientation={"h": "$heading", "relative": True})
+    return board([], [{"entity": "Ego", "action": {"kind": "teleport", "position": there}}])
+
+
+# --- Oncoming ------------------------------------------------------------------------------------
+
+
+@case("oncoming", "Wrong way: a car comes towards the ego in its lane", ahead=90.0, speed=8.0)
+def wrong_way() -> Fields:
+    """In the middle of the lane, all the way."""
+    against = ahead("$ahead", orientation=AGAINST)
+    return board([("ghost", "car", CAR)], put("ghost", against, "$speed"))
+
+
+@case(
+    "oncoming",
+    "CCFhos: a car comes towards the ego, half in its lane",
+    ahead=120.0,
+    speed=13.9,
+    offset=0.9,
+)
+def ccfhos() -> Fields:
+    """Euro NCAP CCFhos: head-on, straight; overlap of a half."""
+    against = ahead("$ahead", offset="$offset", orientation=AGAINST)
+    return board([("target", "car", CAR)], put("target", against, "$speed"))
+
+
+@case("oncoming", "CCFhol: an oncoming car overtakes and comes into the ego's lane",
+    ahead=120.0, speed=11.0, slow=6.0, distance=80.0, duration=2.0,
+)  # fmt: skip
+def ccfhol() -> Fields:
+    """Euro NCAP CCFhol: head-on, lane change; here it is the other car that changes lanes."""
+    init = put("overtaken", ahead("${$ahead - 30}", lanes=1), "$slow")
+    init += put("overtaker", ahead("$ahead", lanes=1), "$speed")
+    out = event("move_out", near("overtaker", "$distance"), change(0, "Ego", "$duration"))
+    entities = [("overtaken", "van", VAN), ("overtaker", "car", CAR)]
+    return board(entities, init, overtaker=[out])
+
+
+@case("oncoming", "LSS oncoming: an oncoming car drifts over into the ego's lane",
+    ahead=90.0, speed=8.0, distance=45.0, drift=2.0,
+)  # fmt: skip
+def lss_oncoming() -> Fields:
+    """Euro NCAP's oncoming vehicle, which is the one that drifts here."""
+    init = put("oncoming", ahead("$ahead", lanes=1), "$speed")
+    how = {"shape": "sinusoidal", "acceleration": 0.8}
+    aside = {"kind": "lane_offset", "offset": "$drift", **how}
+    return board(
+        [("oncoming", "car", CAR)], init,
+        oncoming=[event("drift", near("oncoming", "$distance"), aside)],
+    )  # fmt: skip
+
+
+@case("oncoming", "CCFtap: an oncoming car that waits turns left across the ego's path",
+    ahead=50.0, time=2.2, radius=7.0, acceleration=3.0, speed=7.0,
+)  # fmt: skip
+def ccftap() -> Fields:
+    """Euro NCAP CCFtap: front turn across path; here it is the other car that turns.
+
+    By default it is in the middle of the ego's lane when the ego comes.
+    """
+    init = put("turner", ahead("${$ahead + $radius}", lanes=1))
+    corner = [(0.0, 0.0, 1.0), ("$radius", 0.0, 0.7071067811865476), ("$radius", "$radius", 1.0)]
+    quarter = {
+        "shape": "nurbs",
+        "order": 3,
+        "knots": [0.0, 0.0, 0.0, 1.0, 1.0, 1.0],
+        "points": [
+            {"position": from_entity("turner", x, y), "weight": weight} for x, y, weight in corner
+        ],
+    }
+    turn = {"kind": "follow_trajectory", "name": "left_turn", "curve": quarter}
+    limit = {"shape": "linear", "dimension": "rate", "value": "$acceleration"}
+    go = {"kind": "speed", "speed": "$speed", "dynamics": limit}
+    start = in_time("turner", "$time")
+    return board([("turner", "car", CAR)], init, turner=[event("turn", start, turn, go)])
+
+
 # --- Crossing ------------------------------------------------------------------------------------
 
 # A crossing actor starts when the ego reaches the distance from which both meet; the actor then is
@@ -268,154 +419,3 @@ def _crossing(
     at = in_time("crosser", f"${{{way} / $speed}}")
     cross = event("cross", at, walk, {"kind": "speed", "speed": "$speed"})
     return board(entities, init, crosser=[cross, *more])
-
-
-# --- Lanes ---------------------------------------------------------------------------------------
-
-
-@case(
-    "lanes", "Cut-in: a car moves in from the left, close ahead", gap=12.0, speed=7.0, duration=2.0
-)
-def cut_in() -> Fields:
-    """Slower than the ego, so that its gap shrinks."""
-    init = put("cutter", ahead(35.0, lanes=1, orientation=ALONG), "$speed")
-    move = event("move_in", near("cutter", "$gap"), change(0, "Ego", "$duration"))
-    return board([("cutter", "car", CAR)], init, cutter=[move])
-
-
-@case("lanes", "Cut-in and brake: a car moves in close ahead, and brakes there",
-    gap=10.0, speed=8.0, duration=1.5, braking=6.0,
-)  # fmt: skip
-def cut_in_brake() -> Fields:
-    """Brakes as soon as it is in the ego's lane."""
-    init = put("cutter", ahead(25.0, lanes=1, orientation=ALONG), "$speed")
-    move = event("move_in", near("cutter", "$gap"), change(0, "Ego", "$duration"))
-    brake = event("brake", done("move_in"), speed_to(0.0, "$braking"))
-    return board([("cutter", "car", CAR)], init, cutter=[move, brake])
-
-
-@case(
-    "lanes",
-    "Cut-out: the car ahead moves out before one that stands",
-    gap=14.0,
-    speed=9.0,
-    reveal=25.0,
-)
-def cut_out() -> Fields:
-    """What stands is hidden by a van until then."""
-    init = put("leader", ahead("${$gap + 6}"), "$speed")
-    init += put("standing", ahead(80.0))
-    far = near("standing", "$reveal", of="leader")
-    out = event("move_out", far, change(1, "leader", 2.0))
-    entities = [("leader", "van", VAN), ("standing", "car", CAR)]
-    return board(entities, init, leader=[out])
-
-
-@case("lanes", "Pull out: a parked car pulls out before the ego",
-    ahead=45.0, time=2.0, acceleration=2.5, speed=6.0, length=10.0,
-)  # fmt: skip
-def pull_out() -> Fields:
-    """From beside the lane; sideways by the way that it has driven."""
-    init = put("parked", beside("$ahead", -2.8))
-    how = {"shape": "sinusoidal", "dimension": "distance", "value": "$length"}
-    aside = {"kind": "lane_change", "lane": 0, "relative_to": "Ego", "dynamics": how}
-    out = event("pull_out", in_time("parked", "$time"), speed_to("$speed", "$acceleration"), aside)
-    return board([("parked", "car", CAR)], init, parked=[out])
-
-
-@case("lanes", "LSS overtaking: a faster car overtakes and comes back close ahead",
-    behind=20.0, speed=15.0, duration=2.5,
-)  # fmt: skip
-def lss_overtaking() -> Fields:
-    """Euro NCAP's overtaking vehicle, which comes back early."""
-    init = put("overtaker", ahead("${-1 * $behind}", lanes=1, orientation=ALONG), "$speed")
-    past = when(
-        {
-            "kind": "distance", "entities": ["overtaker"], "measure": "euclidean",
-            "position": {"kind": "relative_object", "entity": "Ego", "dx": 9.0, "dy": 3.5},
-            "rule": "less_or_equal", "value": 2.5,
-        }
-    )  # fmt: skip
-    back = event("come_back", past, change(0, "Ego", "$duration"))
-    return board([("overtaker", "car", CAR)], init, overtaker=[back])
-
-
-@case("lanes", "LSS lane keeping: the ego begins headed over the line", offset=0.5, heading=0.05)
-def lss_keep() -> Fields:
-    """Euro NCAP's drift of 0.2 to 0.6 m/s sideways: at 10 m/s as much as 0.02 to 0.06 rad."""
-    there = ahead(0.0, offset="$offset", orientation={"h": "$heading", "relative": True})
-    return board([], [{"entity": "Ego", "action": {"kind": "teleport", "position": there}}])
-
-
-# --- Oncoming ------------------------------------------------------------------------------------
-
-
-@case("oncoming", "Wrong way: a car comes towards the ego in its lane", ahead=90.0, speed=8.0)
-def wrong_way() -> Fields:
-    """In the middle of the lane, all the way."""
-    against = ahead("$ahead", orientation=AGAINST)
-    return board([("ghost", "car", CAR)], put("ghost", against, "$speed"))
-
-
-@case(
-    "oncoming",
-    "CCFhos: a car comes towards the ego, half in its lane",
-    ahead=120.0,
-    speed=13.9,
-    offset=0.9,
-)
-def ccfhos() -> Fields:
-    """Euro NCAP CCFhos: head-on, straight; overlap of a half."""
-    against = ahead("$ahead", offset="$offset", orientation=AGAINST)
-    return board([("target", "car", CAR)], put("target", against, "$speed"))
-
-
-@case("oncoming", "CCFhol: an oncoming car overtakes and comes into the ego's lane",
-    ahead=120.0, speed=11.0, slow=6.0, distance=80.0, duration=2.0,
-)  # fmt: skip
-def ccfhol() -> Fields:
-    """Euro NCAP CCFhol: head-on, lane change; here it is the other car that changes lanes."""
-    init = put("overtaken", ahead("${$ahead - 30}", lanes=1), "$slow")
-    init += put("overtaker", ahead("$ahead", lanes=1), "$speed")
-    out = event("move_out", near("overtaker", "$distance"), change(0, "Ego", "$duration"))
-    entities = [("overtaken", "van", VAN), ("overtaker", "car", CAR)]
-    return board(entities, init, overtaker=[out])
-
-
-@case("oncoming", "LSS oncoming: an oncoming car drifts over into the ego's lane",
-    ahead=90.0, speed=8.0, distance=45.0, drift=2.0,
-)  # fmt: skip
-def lss_oncoming() -> Fields:
-    """Euro NCAP's oncoming vehicle, which is the one that drifts here."""
-    init = put("oncoming", ahead("$ahead", lanes=1), "$speed")
-    how = {"shape": "sinusoidal", "acceleration": 0.8}
-    aside = {"kind": "lane_offset", "offset": "$drift", **how}
-    return board(
-        [("oncoming", "car", CAR)], init,
-        oncoming=[event("drift", near("oncoming", "$distance"), aside)],
-    )  # fmt: skip
-
-
-@case("oncoming", "CCFtap: an oncoming car that waits turns left across the ego's path",
-    ahead=50.0, time=2.2, radius=7.0, acceleration=3.0, speed=7.0,
-)  # fmt: skip
-def ccftap() -> Fields:
-    """Euro NCAP CCFtap: front turn across path; here it is the other car that turns.
-
-    By default it is in the middle of the ego's lane when the ego comes.
-    """
-    init = put("turner", ahead("${$ahead + $radius}", lanes=1))
-    corner = [(0.0, 0.0, 1.0), ("$radius", 0.0, 0.7071067811865476), ("$radius", "$radius", 1.0)]
-    quarter = {
-        "shape": "nurbs",
-        "order": 3,
-        "knots": [0.0, 0.0, 0.0, 1.0, 1.0, 1.0],
-        "points": [
-            {"position": from_entity("turner", x, y), "weight": weight} for x, y, weight in corner
-        ],
-    }
-    turn = {"kind": "follow_trajectory", "name": "left_turn", "curve": quarter}
-    limit = {"shape": "linear", "dimension": "rate", "value": "$acceleration"}
-    go = {"kind": "speed", "speed": "$speed", "dynamics": limit}
-    start = in_time("turner", "$time")
-    return board([("turner", "car", CAR)], init, turner=[event("turn", start, turn, go)])
