@@ -177,7 +177,7 @@ class PackedTracks(Generic[T]):
 
     @property
     def arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Float]:
-        """Ends, times [us] and knots of all trajectories, as :func:`.track_kernels.poses_at` takes
+        """Ends, times [us] and knots of all trajectories, as :func:`.poses_at` takes
         them."""
         return self._ends, self._times, self._knots
 

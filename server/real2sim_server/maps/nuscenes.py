@@ -16,7 +16,6 @@ from .reader import MapError, damage_named, head_of, joined, read_json
 STEP_M = 1.0
 MAX_PIECE_M = 10_000.0
 WIDTHS_M = (2.0, 8.0)
-LIGHT_REACH_M = 40.0
 
 
 class NuScenesMapReader:

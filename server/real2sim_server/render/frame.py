@@ -264,7 +264,7 @@ def draws_together(backend: Backend, modalities: Iterable[str]) -> bool:
 def warm_up(backend: str | Backend = "auto") -> None:
     """Compile or load everything a first frame would wait for, which takes half a minute the first
     time; for small images and clouds of few Gaussians there is
-    :func:`~.levels.warm_up_small_images`."""
+    :func:`~.select.warm_up_small_images`."""
     made.expect(ROUNDING_KERNELS)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
     chosen.warm_up()

@@ -253,37 +253,12 @@ def back_projected(
 
 def with_ground(
     semantic: NDArray[np.uint8],
-    points: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    ground: Ground,
-    *,
-    tolerance: float = TOLERANCE,
-) -> NDArray[np.uint8]:
-    """A semantic image [H, W] in which the ground has its own class.
-
-    Args:
-        semantic: in which the ground is ``static`` as the rest of the background.
-        points: [H, W, 3] of the world at the median depth of the same pass [m].
-        depth: [H, W] that depth [m], 0 where nothing is.
-        ground: of the scene.
-        tolerance: what is nearer to the ground's height shows it [m].
-    """
-    found = semantic.copy()
-    background = (semantic == STATIC) & (depth > 0)
-    shown = points[background]
-    above = shown[:, 2] - ground.height_at(shown[:, :2])
-    found[background] = np.where(np.abs(above) < tolerance, GROUND, STATIC)
-    return found
-
-
-def with_ground_seen(
-    semantic: NDArray[np.uint8],
     depth: NDArray[np.float32],
     camera: Camera,
     T_world_camera: Float,
     ground: Ground,
 ) -> NDArray[np.uint8]:
-    """The same by any camera, also with a lens; points are found of the background alone.
+    """A semantic image [H, W] in which the ground has its own class, for any camera or lens.
 
     Args:
         semantic: [H, W], in which the ground is ``static``.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +17,6 @@ MAX_SLOTS = 2048
 """Instants of a sweep at which poses are taken: 0.05 ms apart at 10 Hz, 0.4 mm at 15 m/s."""
 MAX_RANGE_M = 2000.0
 MAX_DIVERGENCE = 0.1
-ReturnMode = Literal["median", "first", "strongest", "last"]
 
 
 @dataclass(frozen=True, eq=False)

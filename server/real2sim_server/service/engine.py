@@ -216,7 +216,7 @@ class Engine:
 
     Everything that computes runs here, so that kernels never compete for cores and the event loop
     never waits for them. Jobs are plain functions; their exceptions travel to the caller. Jobs of a
-    lane run in the order they came, lanes take turns, see :class:`.lanes.Lanes`. A long job calls
+    lane run in the order they came, lanes take turns, see :class:`.Lanes`. A long job calls
     :meth:`give_way` between its pieces, and more urgent ones run there and then. Jobs that can be
     done in one go are, where they wait together; none waits for one to come.
 

@@ -20,7 +20,7 @@ from ..world.storyboard.run import object_ids_of
 
 @kernel
 def signed_gaps_into(box, centres, yaws, sizes, found):
-    """See :func:`.gaps.signed_gaps`; into ``found`` [K]."""
+    """See :func:`.signed_gaps`; into ``found`` [K]."""
     x, y, yaw, length, width = box
     c, s = math.cos(yaw), math.sin(yaw)
     for k in range(len(yaws)):

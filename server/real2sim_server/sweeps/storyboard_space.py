@@ -223,7 +223,7 @@ def with_storyboard(
     Args:
         fields: of the file.
         folder: that the name is relative to.
-        scenes: folder of bundles, as of :func:`~.scenes.open_scene`.
+        scenes: folder of bundles, as of :func:`~.open_scene`.
 
     Raises:
         CommandError: no such scenario, or one that is no space; the sentence says why.

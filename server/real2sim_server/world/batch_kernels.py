@@ -331,7 +331,7 @@ def deviation(motion, new_motion, dt, limits, size):
 
 @kernel(parallel=PARALLEL_LOOPS, nogil=True)
 def routes_ahead(route, motions, places, spacing, found):
-    """Waypoints [W, N, 2] float32 of all worlds, see :func:`..path_kernels.waypoints`."""
+    """Waypoints [W, N, 2] float32 of all worlds, see :func:`.path.waypoints`."""
     for w in prange(motions.shape[0]):
         pose = (motions[w, 0], motions[w, 1], motions[w, 2])
         found[w] = waypoints(route, places[w, S], pose, found.shape[1], spacing)

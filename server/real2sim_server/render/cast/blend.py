@@ -242,7 +242,6 @@ __all__ = [
 TASKS = 64
 LOOK_AHEAD = 4
 F32 = np.float32
-ALL_GROUPS = (1 << GROUPS) - 1
 
 
 @kernel(parallel=PARALLEL_LOOPS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .elements import DIMENSIONS, FRAMES, PLACES, SHAPES, SIDES, Part
-from .read_conditions import Fields, Positions, plain_value
+from .read_conditions import Fields, Positions, plain_value, signal_phase, signal_state
 
 MODES = {"position": "position", "follow": "follow"}
 """Trajectories and dynamics are followed exactly in both: 'follow' only allows to deviate."""
@@ -199,15 +199,10 @@ class Actions:
         return {"kind": "add_entity", "entity": entity, "position": place}
 
     def _signal_state(self, part: Part) -> Fields:
-        return {
-            "kind": "signal_state", "signal": part.text("name"), "state": part.text("state"),
-        }  # fmt: skip
+        return signal_state(part)
 
     def _signal_phase(self, part: Part) -> Fields:
-        return {
-            "kind": "signal_phase", "controller": part.text("trafficSignalControllerRef"),
-            "phase": part.text("phase"),
-        }  # fmt: skip
+        return signal_phase(part)
 
     def _variable(self, part: Part) -> Fields:
         name = part.optional("variableRef") or part.text("parameterRef")

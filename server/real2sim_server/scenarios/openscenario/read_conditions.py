@@ -218,6 +218,17 @@ _SHAPES: dict[str, Callable[[Positions, Part], Fields]] = {
 }
 
 
+def signal_state(part: Part) -> Fields:
+    """The state of one traffic signal, as an action sets it and a condition expects it."""
+    return {"kind": "signal_state", "signal": part.text("name"), "state": part.text("state")}
+
+
+def signal_phase(part: Part) -> Fields:
+    """The phase of a signal controller, as an action sets it and a condition expects it."""
+    controller = part.text("trafficSignalControllerRef")
+    return {"kind": "signal_phase", "controller": controller, "phase": part.text("phase")}
+
+
 def plain_value(text: str) -> bool | float | str:
     """A text as the value that it looks like."""
     if text in {"true", "false"}:
@@ -279,15 +290,10 @@ class Conditions:
         return {"kind": "variable", "variable": part.text(name), "rule": rule, "value": value}
 
     def _signal(self, part: Part) -> Fields:
-        return {
-            "kind": "signal_state", "signal": part.text("name"), "state": part.text("state"),
-        }  # fmt: skip
+        return signal_state(part)
 
     def _controller(self, part: Part) -> Fields:
-        return {
-            "kind": "signal_phase", "controller": part.text("trafficSignalControllerRef"),
-            "phase": part.text("phase"),
-        }  # fmt: skip
+        return signal_phase(part)
 
     # --- of entities ----------------------------------------------------------------------------
 

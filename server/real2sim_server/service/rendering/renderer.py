@@ -38,7 +38,7 @@ from ...render import (
 from ...render.backend import device_of
 from ...render.frame import UNCERTAINTY, WITHOUT, at_once
 from ...render.images import JpegEncoder, jpeg_encoder_for, turbo_jpeg, with_effects
-from ...render.lens import with_ground_seen
+from ...render.lens import with_ground
 from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ..engine import Engine, Lane, lower_priority
@@ -383,7 +383,7 @@ def _with_ground(image: RenderedImage, scene: Scene, frame: Frame, camera: Camer
 
     def found() -> NDArray[np.uint8]:
         depth = frame.images["median_depth"]
-        return with_ground_seen(image.pixels, depth, camera, frame.T_world_camera, scene.ground)
+        return with_ground(image.pixels, depth, camera, frame.T_world_camera, scene.ground)
 
     made = FollowingImage(image.pixels, image.ready, found)
     return replace(image, pixels=made.pixels, ready=made.ready)

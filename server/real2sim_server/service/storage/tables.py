@@ -233,7 +233,7 @@ class SessionRow:
     Attributes:
         worker_id: who has it now.
         scenario_id, scenario_revision: what it began from; None for the bare scene.
-        token_hash: of the token that opens it, as :func:`~.tokens.token_hash` makes it.
+        token_hash: of the token that opens it, as :func:`~..tokens.token_hash` makes it.
         closed_us, reason: None while it is open.
         owner: name of the token that it was made with.
         epoch: how often it was taken over.

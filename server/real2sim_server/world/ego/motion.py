@@ -33,14 +33,14 @@ SLOW = 0.1
 """Below this speed the steering angle cannot be derived from the motion [m/s]."""
 
 Schedules = tuple[Float, Float, Float, Float]
-"""See :func:`.driving.prepare_schedule`."""
+"""See :func:`..driving.prepare_schedule`."""
 
 NO_PLAN = np.empty((0, 6))
 NOTHING_PENDING = np.empty((0, 2))
 
 
 class Motion(NamedTuple):
-    """Planar state of the vehicle: a :class:`.driving.PlanarState`, and delayed commands.
+    """Planar state of the vehicle: a :class:`..driving.PlanarState`, and delayed commands.
 
     Attributes:
         pending: commands on their way to the wheels, newest first; one for each 10 ms of delay.
@@ -77,7 +77,7 @@ class Motion(NamedTuple):
 
 
 class ControlLaw(NamedTuple):
-    """Gives commands to the vehicle, see :func:`.driving.advance_vehicle`.
+    """Gives commands to the vehicle, see :func:`..driving.advance_vehicle`.
 
     Attributes:
         kind: HOLD, PURSUIT, LQR or ILQR.
@@ -105,7 +105,7 @@ def constant_law(command: Command) -> ControlLaw:
 def advance_motion(
     motion: Motion, law: ControlLaw, spec: EgoSpec, dt_us: int, *, since: float = 0.0
 ) -> Motion:
-    """The vehicle ``dt_us`` later, see :func:`.driving.advance_vehicle`.
+    """The vehicle ``dt_us`` later, see :func:`..driving.advance_vehicle`.
 
     Args:
         motion: now.

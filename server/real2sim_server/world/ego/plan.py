@@ -132,7 +132,7 @@ class SinglePose(NamedTuple):
         return SinglePose(int(trajectory.times_us[0]), *trajectory.poses[0].tolist())
 
     def before(self, start_us: int, at_us: int) -> tuple[float, float, float, float]:
-        """As :func:`.driving.plan_curve` takes it for a plan that begins at ``start_us`` and whose
+        """As :func:`..driving.plan_curve` takes it for a plan that begins at ``start_us`` and whose
         pose is for ``at_us``; none where it is too old to say how fast that plan goes."""
         if not 0 < at_us - self.at_us <= MAX_GAP_US:
             return NO_POSE

@@ -341,7 +341,7 @@ def record(
         scene_hash: of the scene's bundle.
         scenario: id and revision.
         state: of that scenario.
-        no_action_impact: for NeuroNCAP, see :func:`~.history.no_action_impact`.
+        no_action_impact: for NeuroNCAP, see :func:`~.replay.no_action_impact`.
     """
     instants: list[Instant] = []
     digests: list[str] = []

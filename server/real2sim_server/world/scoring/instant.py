@@ -184,7 +184,7 @@ class ScoringContext:
 
     @property
     def road_lines(self) -> tuple[Lines, Lines]:
-        """Points of the route and of the lanes, as :func:`.road_kernels.off_road` takes them."""
+        """Points of the route and of the lanes, as :func:`.road.off_road` takes them."""
         return self._route_points, self._lane_points
 
     def off_road(self, ego: EgoSample) -> tuple[float, int]:

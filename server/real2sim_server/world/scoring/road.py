@@ -171,7 +171,7 @@ class RoadMap:
     def off_road(
         self, middle: tuple[float, float, float], size: tuple[float, float, float]
     ) -> tuple[float, int]:
-        """As :func:`.road_kernels.off_road`: how far the worst corner of a box is off the road
+        """As :func:`.off_road`: how far the worst corner of a box is off the road
         [m], and how many of its quarters have their middle on it."""
         x, y, yaw = middle
         cos, sin = math.cos(yaw), math.sin(yaw)

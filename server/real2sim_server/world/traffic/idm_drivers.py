@@ -386,7 +386,7 @@ class CutIn:
         else:
             start, after, since = began
             began = (start, after, since + surroundings.dt)
-            offset = start * (1.0 - _smooth(began[2] / self.spec.duration))
+            offset = start * (1.0 - _eased(began[2] / self.spec.duration))
             rate = _towards(self.speed, after, CUT_BRAKING, surroundings.dt)
         s, speed = advance_along(self.s, self.speed, rate, surroundings.dt)
         drift = (offset - self.offset) / surroundings.dt
@@ -546,9 +546,3 @@ def _on_route(
 def _towards(speed: float, wanted: float, most: float, dt: float) -> float:
     """Acceleration [m/s^2] to a wanted speed within a limit."""
     return min(max((wanted - speed) / dt, -most), most)
-
-
-def _smooth(progress: float) -> float:
-    """0 to 1 with slopes and curvatures of 0 at both ends: a lane change in unit time."""
-    u = min(max(progress, 0.0), 1.0)
-    return u * u * u * (10 - 15 * u + 6 * u * u)
