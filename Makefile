@@ -30,7 +30,7 @@ WITH_TORCH := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cub
 	nvidia-cufile nvidia-curand nvidia-cusolver nvidia-cusparse nvidia-cusparselt-cu13 \
 	nvidia-nccl-cu13 nvidia-nvjitlink nvidia-nvshmem-cu13 nvidia-nvtx
 
-.PHONY: demo check test kernels kernels-drawing kernels-learning kernels-physics test-slow system-packages lint lint-studio format schema coverage bench pins docs clean
+.PHONY: demo check test kernels kernels-drawing kernels-learning kernels-physics test-slow system-packages sync lint lint-studio format schema coverage bench pins docs clean
 
 demo: $(STAMP)
 	$(BIN)/real2sim demo --out out/demo
@@ -38,7 +38,7 @@ demo: $(STAMP)
 check: lint
 	$(PYTEST) $(PARALLEL) $(FAST)
 
-test: $(STAMP)
+test: sync
 	$(PYTEST) $(PARALLEL)
 
 # Compile the kernels that tests load from disk; make -j compiles the parts in parallel.
@@ -56,10 +56,13 @@ system-packages:
 	DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends \
 	  chromium-headless-shell postgresql haproxy buildah debootstrap
 
-lint: $(STAMP)
+# The sync client, from the async one.
+sync: $(STAMP)
+	$(BIN)/python client/hatch_build.py
+
+lint: sync
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
-	$(BIN)/python scripts/unasync.py --check
 	$(BIN)/mypy -p real2sim_proto -p real2sim -p real2sim_server
 
 # The studio's JavaScript; needs Node.js 20.
@@ -69,7 +72,6 @@ lint-studio:
 	npm run --silent format:check
 
 format: $(STAMP)
-	$(BIN)/python scripts/unasync.py
 	$(BIN)/ruff check --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
 
@@ -84,9 +86,9 @@ coverage: $(STAMP)
 # and what comes with it are apart: builds for CPU and CUDA differ.
 pins: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(BIN)/uv pip compile pyproject.toml --quiet --extra server --extra postgres \
+	$(BIN)/uv pip compile pyproject.toml --quiet --extra postgres \
 	  --extra objects --extra tracing -c constraints.txt \
-	  --generate-hashes --universal --python-version 3.11 --no-annotate --no-header \
+	  --generate-hashes --universal --python-version 3.11 --no-annotate --no-header --no-emit-package real2sim \
 	  $(patsubst %,--no-emit-package %,$(WITH_TORCH)) -o docker/requirements.txt
 	$(BIN)/python scripts/third_party.py
 
@@ -97,10 +99,10 @@ bench: $(STAMP)
 	$(BIN)/real2sim bench render --json out/bench_render.json
 	$(BIN)/real2sim bench serve --json out/bench_serve.json
 
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml client/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
-	  -c constraints.txt -e '.[server,dev,docs]'
+	  -c constraints.txt -e client -e '.[dev,docs]'
 	@touch $@
 
 clean:

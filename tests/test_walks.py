@@ -1,4 +1,4 @@
-"""First days with Real2Sim, from its wheel, in an empty home: a policy, and a drive of one's own.
+"""First days with Real2Sim, from its wheels, in an empty home: a policy, and a drive of one's own.
 
 Who deploys a worker has a test in ``test_docker.py``.
 """
@@ -26,7 +26,7 @@ INSTALL_S = 900
 
 @dataclass
 class Home:
-    """An empty home with an environment in which the wheel is installed."""
+    """An empty home with an environment in which the wheels are installed."""
 
     folder: Path
     bin: Path
@@ -52,15 +52,16 @@ class Home:
 
 @pytest.fixture(scope="module")
 def bin_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of an environment that has the wheel, and what pip brings for it."""
+    """Of an environment that has the wheels, and what pip brings for it."""
     root = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
-    subprocess.run([*pip, "wheel", "--no-deps", "-w", root, REPOSITORY], check=True)
-    (wheel,) = root.glob("*.whl")
+    sources = [REPOSITORY / "client", REPOSITORY]
+    subprocess.run([*pip, "wheel", "--no-deps", "-w", root, *sources], check=True)
+    (wheel,) = root.glob("real2sim-*.whl")
     subprocess.run([sys.executable, "-m", "venv", root / "venv"], check=True)
     own = [root / "venv/bin/python", "-m", "pip", "--disable-pip-version-check", "-q"]
     pins = ["-c", REPOSITORY / "constraints.txt"]
-    install = [*own, "install", "--no-compile", *pins, f"{wheel}[server]"]
+    install = [*own, "install", "--no-compile", *pins, "--find-links", root, f"{wheel}[server]"]
     subprocess.run(install, check=True, timeout=INSTALL_S)
     return root / "venv" / "bin"
 

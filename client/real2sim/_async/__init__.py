@@ -1,1 +1,1 @@
-"""The async client; ``scripts/unasync.py`` makes the sync client in ``_sync`` from it."""
+"""The async client; ``client/hatch_build.py`` makes the sync client in ``_sync`` from it."""

@@ -1,1 +1,1 @@
-"""The sync client; all but ``concurrency`` is made from ``_async`` by ``scripts/unasync.py``."""
+"""The sync client; all but ``concurrency`` is made from ``_async`` by ``client/hatch_build.py``."""
