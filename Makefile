@@ -75,9 +75,12 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
 
+# The contract as files, in out/contract, and their hashes, which a test compares.
 schema: $(STAMP)
-	$(BIN)/python -m real2sim_proto.schema proto/schema
-	$(BIN)/python -m real2sim_server.service.write_openapi docs/openapi.json
+	rm -rf out/contract
+	$(BIN)/python -m real2sim_proto.schema out/contract/schema
+	$(BIN)/python -m real2sim_server.service.write_openapi out/contract/openapi.json
+	cd out/contract && sha256sum openapi.json schema/*.json > ../../proto/contract.sha256
 
 coverage: $(STAMP)
 	$(PYTEST) $(PARALLEL) --cov --cov-report=html:out/coverage --cov-report=term

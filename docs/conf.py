@@ -30,6 +30,8 @@ os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 
 import real2sim  # noqa: E402 - of this checkout
 from real2sim.version import VERSION  # noqa: E402
+from real2sim_proto.schema import write_schemas  # noqa: E402
+from real2sim_server.service.write_openapi import write as write_openapi  # noqa: E402
 
 project = "Real2Sim"
 author = "the Real2Sim authors"
@@ -79,9 +81,7 @@ ROOT_PAGES = {
 }
 """Pages of the site that show a file at the root of the repository, before their own text."""
 
-SHOWN_AS = {file: f"docs/{page}.md" for page, file in ROOT_PAGES.items()} | {
-    "proto/schema": "docs/api/messages.rst"
-}
+SHOWN_AS = {file: f"docs/{page}.md" for page, file in ROOT_PAGES.items()}
 
 ALIAS = re.compile(r"TypeAliasForwardRef\('(\w+)'\)")
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
@@ -93,10 +93,18 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", list_fields)
     app.connect("autodoc-process-signature", show_signature)
     app.connect("autodoc-skip-member", skip_constrained)
+    app.connect("build-finished", write_contract)
     for name in real2sim.__all__:
         # Links tell where a class is defined, which is in private modules.
         if inspect.isclass(value := getattr(real2sim, name)):
             value.__module__ = "real2sim"
+
+
+def write_contract(app: Sphinx, error: Exception | None) -> None:
+    """Put the schemas of all messages and the OpenAPI document on the site."""
+    if error is None:
+        write_schemas(Path(app.outdir) / "schema")
+        write_openapi(Path(app.outdir) / "openapi.json")
 
 
 def show_root_page(app: Sphinx, page: str, text: list[str]) -> None:

@@ -1,8 +1,8 @@
 """JSON Schema of every message, for planners in other languages.
 
-``python -m real2sim_proto.schema DIR`` writes one file a message; the committed copies live in
-``proto/schema`` and a test holds them against the models. A file is whole in itself, save that it
-refers to ``Storyboard.json`` beside it where a storyboard may stand.
+``python -m real2sim_proto.schema DIR`` writes one file per message, as the documentation site shows
+them. Each file is complete, except that storyboards are in ``Storyboard.json``, to which the others
+refer.
 """
 
 from __future__ import annotations
@@ -164,5 +164,4 @@ def write_schemas(folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    for written in write_schemas(Path(sys.argv[1] if len(sys.argv) > 1 else "proto/schema")):
-        print(written)
+    write_schemas(Path(sys.argv[1]))

@@ -18,4 +18,4 @@ def write(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/openapi.json"))
+    write(Path(sys.argv[1]))
