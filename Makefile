@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-SOURCES := proto client server tests scripts docs/conf.py docs/images/make.py
+SOURCES := proto client server benchmarks tests scripts docs/conf.py docs/images/make.py
 # Cache bytecode even where the environment says not to: else every test process compiles it anew.
 unexport PYTHONDONTWRITEBYTECODE
 # Without -q, so that the header shows the random seed; --randomly-seed=N repeats that order.
@@ -63,7 +63,7 @@ sync: $(STAMP)
 lint: sync
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
-	$(BIN)/mypy -p real2sim_proto -p real2sim -p real2sim_server
+	$(BIN)/mypy -p real2sim_proto -p real2sim -p real2sim_server -p real2sim_bench
 
 # The studio's JavaScript; needs Node.js 20.
 lint-studio:

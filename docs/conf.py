@@ -24,7 +24,7 @@ from pydantic_core import PydanticUndefined
 from sphinx.application import Sphinx
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(REPOSITORY / folder) for folder in ("proto", "client", "server")]
+sys.path[:0] = [str(REPOSITORY / folder) for folder in ("proto", "client", "server", "benchmarks")]
 # What autodoc imports must not look for a device.
 os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 

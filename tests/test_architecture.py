@@ -50,12 +50,11 @@ LAYERS = (
     "policies",
     "sweeps",
     "learning",
-    "benchmarks",
     "cli",
 )
 """Packages and single modules of the server, lowest first: each imports only those before it."""
 
-PLAY_THEIR_OWN_USER = {"demo", "policies", "sweeps", "benchmarks", "cli"}
+PLAY_THEIR_OWN_USER = {"demo", "policies", "sweeps", "cli"}
 """Only these use the client SDK, since there the program plays its own user."""
 
 APART = {"write_openapi"}

@@ -5,7 +5,6 @@ imports what it needs when it runs.
 """
 
 from . import (
-    bench,
     calibrate,
     demo,
     doctor,
@@ -37,11 +36,9 @@ from .command import app
 
 app.add_typer(token.app, name="token")
 app.add_typer(store.app, name="store")
-app.add_typer(bench.app, name="bench")
 
 __all__ = [
     "app",
-    "bench",
     "calibrate",
     "demo",
     "doctor",

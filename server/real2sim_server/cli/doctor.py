@@ -207,7 +207,7 @@ def _check_gpu(*, out: Path | None, json: Path | None) -> None:
     need = unmet_nvrtc_need()
     if need is not None:
         raise CommandError(f"there is no GPU to check: {need.found}; {need.remedy}")
-    from ..benchmarks import gpu_check
+    from . import gpu_check
 
     check = gpu_check.run(gpu_check.this_gpu(), on_part=lambda part: console.print(f"{part} ..."))
     text = check.markdown()

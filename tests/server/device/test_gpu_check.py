@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from real2sim_server.benchmarks.gpu_check import PARTS, Devices, FrameCase, Scale, run
+from real2sim_server.cli.gpu_check import PARTS, Devices, FrameCase, Scale, run
 from real2sim_server.render._cuda.serving import NvrtcBackend
 from real2sim_server.render.backend import Backend
 from real2sim_server.render.cast.cuda import CudaCaster

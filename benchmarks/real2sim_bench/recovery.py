@@ -1,0 +1,302 @@
+"""``real2sim bench recovery``: what recovery data is worth to a planner that learns from images.
+
+The project's learned planner is trained twice on exports of one scene, of the same number of
+frames and for as long: on the recorded path alone, and on the path with ``--perturb``. Both then
+drive from the same starts beside the path, in the same scene. A planner that is told the way stands
+beside them: what it cannot do from a start, nobody can be taught.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from real2sim.observation import Observation
+from real2sim.planners import FollowRoute, LearnedPolicy
+from real2sim.planners.learned import PolicyShape
+from real2sim_proto.episode import Randomization, ResetSpec, StartRandomization
+from real2sim_proto.plans import TrajectoryPlan
+from real2sim_server.console import CommandError, print_figures, staged_progress
+from real2sim_server.datasets.drive import ScenarioDrive
+from real2sim_server.datasets.export import export_dataset
+from real2sim_server.datasets.perturbed import Perturbation
+from real2sim_server.datasets.plan import ExportPlan
+from real2sim_server.demo.street import SHIPPED
+from real2sim_server.edit import ScenarioState
+from real2sim_server.policies.cloning import LAYOUT, exported_examples, save_policy, train_network
+from real2sim_server.scene import Camera, Scene
+from real2sim_server.scene.io import load_scene, read_packed
+from real2sim_server.sweeps.episode import draw_frames, observation_of
+from real2sim_server.world import World
+from real2sim_server.world.common import Draws
+from real2sim_server.world.path import LoggedPath
+
+Figures = dict[str, Any]
+Report = Callable[[str, int, int], None]
+
+ALONE, WITH, TOLD = "path alone", "with recovery data", "told the route"
+COPIES = 4
+"""Starts beside the path of each clip."""
+CLIP_S, RECOVER_S = 1.0, 2.5
+PERIOD_US = 100_000
+"""Between frames and between steps."""
+AT_ONCE = 16
+"""Worlds whose images are drawn in one call."""
+INSTANTS = 8
+"""At which episodes begin."""
+SEED_STEP = 1_000_003
+FAR_SHARE, MOST_DRAWS = 0.75, 100_000
+"""Starts are at least this share of the largest one away; so many are drawn to find them."""
+OFFSET_M, TURNED = 0.5, math.radians(5)
+"""Within these of the recorded path at its end, an episode has come back."""
+LEAST_WAY = 0.5
+"""And it has driven at least this share of the way that was recorded in the time."""
+
+
+@dataclass(frozen=True)
+class RecoveryBenchOptions:
+    """How much is measured.
+
+    Attributes:
+        scene: bundle; None for the demo's street.
+        episodes: of each planner.
+        seconds: of each.
+        plan_s: how far plans reach [s].
+        lateral, heading: largest distance of starts from the path, and turn [m], [rad].
+        epochs: of training.
+        seed: of exports, training and starts.
+        camera: that the planner sees.
+    """
+
+    scene: Path | None = None
+    episodes: int = 64
+    seconds: float = 4.0
+    plan_s: float = 3.0
+    lateral: float = 1.0
+    heading: float = math.radians(8)
+    epochs: int = 300
+    seed: int = 0
+    camera: str = "front"
+
+
+class Planner(Protocol):
+    """What drives an episode."""
+
+    def reset(self, obs: Observation) -> None:
+        """Before the first plan."""
+
+    def plan(self, obs: Observation) -> TrajectoryPlan:
+        """At each step."""
+        ...
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an episode ended.
+
+    Attributes:
+        success: back on the path, without contact and on the road.
+        contact, off_road: whether there was any.
+        offset: from the path at the end [m].
+    """
+
+    success: bool
+    contact: bool
+    off_road: bool
+    offset: float
+
+
+def run(options: RecoveryBenchOptions | None = None) -> Figures:
+    """Export, train, drive, print and return all figures."""
+    options = options or RecoveryBenchOptions()
+    scene = read_packed(SHIPPED) if options.scene is None else load_scene(options.scene)
+    shape = PolicyShape(camera=options.camera)
+    figures: Figures = {"scene": scene.name, "episodes of each": options.episodes}
+    with tempfile.TemporaryDirectory() as folder, staged_progress() as report:
+        trained = _trained(scene, shape, options, Path(folder), report)
+        for name, (file, learning) in trained.items():
+            driven = partial(report, f"drive: {name}")
+            pilots = [LearnedPolicy(file) for _ in range(options.episodes)]
+            ends = drive_all(scene, pilots, options, camera=_camera(scene, shape), report=driven)
+            figures[name] = _summary(ends) | learning
+        told = [FollowRoute(speed=_mean_speed(scene)) for _ in range(options.episodes)]
+        figures[TOLD] = _summary(drive_all(scene, told, options))
+    share = {name: figures[name]["success"] for name in (ALONE, WITH)}
+    figures["gain"] = share[WITH] - share[ALONE]
+    print_figures("success from starts beside the path", figures)
+    return figures
+
+
+def _trained(
+    scene: Scene, shape: PolicyShape, options: RecoveryBenchOptions, folder: Path, report: Report
+) -> dict[str, tuple[Path, Figures]]:
+    """Files of weights, and what training says, by name."""
+    sets = {}
+    for name, plan in _plans(shape, options).items():
+        drive = ScenarioDrive(scene, ScenarioState.of(scene))
+        label = partial(_only_frames, report, f"export: {name}")
+        sets[name] = export_dataset(drive, plan, folder / name, on_progress=label)
+    found = {}
+    for name, parts in ((ALONE, ["dense"]), (WITH, ["path", "beside"])):
+        dataset = exported_examples([sets[part] for part in parts], shape)
+        weights, learned = train_network(
+            dataset,
+            shape,
+            epochs=options.epochs,
+            seed=options.seed,
+            on_progress=partial(report, f"learn: {name}"),
+        )
+        file = folder / f"{parts[-1]}.safetensors"
+        save_policy(weights, shape, file)
+        found[name] = (file, {"examples": len(dataset.images), **learned})
+    return found
+
+
+def _plans(shape: PolicyShape, options: RecoveryBenchOptions) -> dict[str, ExportPlan]:
+    """As many frames on the path alone as on the path and beside it together."""
+    beside = Perturbation(
+        lateral_sigma=options.lateral / 2,
+        heading_sigma=options.heading / 2,
+        recover_s=RECOVER_S,
+        copies=COPIES,
+    )
+    path = ExportPlan(
+        formats=(LAYOUT,),
+        cameras=(shape.camera,),
+        width=2 * shape.width,
+        period_us=PERIOD_US,
+        clip_s=CLIP_S,
+        seed=options.seed,
+        flow=False,
+    )
+    dense = replace(path, period_us=PERIOD_US // (COPIES + 1))
+    return {"dense": dense, "path": path, "beside": replace(path, perturb=beside)}
+
+
+def _only_frames(report: Report, name: str, stage: str, done: int, total: int) -> None:
+    if stage == "frames":
+        report(name, done, total)
+
+
+def drive_all(
+    scene: Scene,
+    planners: Sequence[Planner],
+    options: RecoveryBenchOptions,
+    *,
+    camera: Camera | None = None,
+    report: Callable[[int, int], None] = lambda _done, _total: None,
+) -> list[Outcome]:
+    """Let each planner drive from a start of its own, the same for every call.
+
+    Args:
+        scene: as it was recorded.
+        planners: one an episode; they see ``camera``.
+        options: of starts and length.
+        camera: None where they look at nothing.
+        report: called with (steps done, all).
+    """
+    worlds = displaced_worlds(scene, len(planners), options)
+    steps = worlds[0].horizon
+    for step in range(steps):
+        for first in range(0, len(worlds), AT_ONCE):
+            part = [k for k in range(len(worlds))[first : first + AT_ONCE] if not worlds[k].over]
+            seen = _observations([worlds[k] for k in part], camera)
+            for k, obs in zip(part, seen, strict=True):
+                if step == 0:
+                    planners[k].reset(obs)
+                worlds[k].step(planners[k].plan(obs))
+        report(step + 1, steps)
+    return [_outcome(world) for world in worlds]
+
+
+def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) -> list[World]:
+    """Episodes that begin at instants evenly over the drive, at least FAR_SHARE of what is asked
+    for beside the path and turned, where nothing else is.
+
+    Raises:
+        CommandError: the scene is too short, or hardly a start is free.
+    """
+    found: list[World] = []
+    for seed in range(options.seed * SEED_STEP, options.seed * SEED_STEP + MOST_DRAWS):
+        draws = Draws(seed)
+        least = {"start.lateral": options.lateral, "start.heading": options.heading}
+        if any(abs(draws.around(w, name, 0)) < FAR_SHARE * w for name, w in least.items()):
+            continue
+        world = _world(scene, seed, len(found) % INSTANTS, options)
+        # Where the first draw is not free the world draws another.
+        if all(abs(world.sampled[name]) >= FAR_SHARE * w for name, w in least.items()):
+            found.append(world)
+        if len(found) == count:
+            return found
+    raise CommandError(
+        f"{len(found)} of {count} starts of {options.lateral:g} m beside the path of scene "
+        f"{scene.name!r} are free"
+    )
+
+
+def _world(scene: Scene, seed: int, instant: int, options: RecoveryBenchOptions) -> World:
+    steps = round(options.seconds * 1e6 / PERIOD_US)
+    # Frames whose plan the drive does not cover teach nothing: nobody has seen the road there.
+    last_us = scene.end_us - round(options.plan_s * 1e6) - steps * PERIOD_US
+    if last_us <= scene.start_us:
+        seconds = (scene.end_us - scene.start_us) * 1e-6
+        raise CommandError(
+            f"scene {scene.name!r} is {seconds:.1f} s long; episodes of {options.seconds:g} s and "
+            f"plans of {options.plan_s:g} s need more"
+        )
+    share = instant / (INSTANTS - 1)
+    start = StartRandomization(lateral=options.lateral, heading=options.heading)
+    spec = ResetSpec(
+        seed=seed,
+        start_us=scene.start_us + round(share * (last_us - scene.start_us)),
+        dt_us=PERIOD_US,
+        horizon=steps,
+        randomization=Randomization(start=start),
+    )
+    return World(scene, ScenarioState.of(scene), spec)
+
+
+def _observations(worlds: Sequence[World], camera: Camera | None) -> list[Observation]:
+    """What sessions would show."""
+    blind = [observation_of(world) for world in worlds]
+    if camera is None or not worlds:
+        return blind
+    frames = zip(blind, draw_frames(worlds, camera), strict=True)
+    return [replace(obs, frames={camera.name: {"rgb": frame}}) for obs, frame in frames]
+
+
+def _outcome(world: World) -> Outcome:
+    motion, start_us = world.motion, world.spec.start_us or 0
+    near = world.route.nearest(motion.x, motion.y)
+    turned = math.remainder(motion.yaw - near.yaw, math.tau)
+    start, end = (world.scene.ego.pose(t)[0] for t in (start_us, world.t_us))
+    recorded = float(np.linalg.norm(np.subtract(end, start)[:2]))
+    contact, off_road = world.terminated, world.accumulator.off_road
+    back = abs(near.offset) <= OFFSET_M and abs(turned) <= TURNED
+    on = world.accumulator.distance >= LEAST_WAY * recorded
+    return Outcome(not contact and not off_road and back and on, contact, off_road, near.offset)
+
+
+def _summary(ends: Sequence[Outcome]) -> Figures:
+    return {
+        "success": sum(end.success for end in ends) / len(ends),
+        "contact": sum(end.contact for end in ends) / len(ends),
+        "off_road": sum(end.off_road for end in ends) / len(ends),
+        "offset_median_m": float(np.median([abs(end.offset) for end in ends])),
+    }
+
+
+def _camera(scene: Scene, shape: PolicyShape) -> Camera:
+    return scene.rig[shape.camera].resized(2 * shape.width)
+
+
+def _mean_speed(scene: Scene) -> float:
+    seconds = (scene.end_us - scene.start_us) * 1e-6
+    return LoggedPath(scene.ego).length / seconds

@@ -1,0 +1,26 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from real2sim_bench import edit
+
+pytestmark = pytest.mark.network
+
+
+@pytest.mark.slow
+def test_a_short_run_finds_all_edits_again_after_kills(capsys):
+    figures = edit.run(edit.EditBenchOptions(operations=40, gaussians=20_000))
+
+    assert json.loads(json.dumps(figures)) == figures
+    assert figures["append_ms"]["count"] == 40
+    assert figures["open_ms"]["count"] == edit.OPENINGS
+    assert "append" in capsys.readouterr().out
+
+
+def test_edits_are_as_many_as_asked_and_the_same_each_time():
+    first, again = (edit._edits(["a", "b"], 333) for _ in range(2))
+
+    assert len(first) == 333
+    assert first == again
