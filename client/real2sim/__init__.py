@@ -28,15 +28,12 @@ if TYPE_CHECKING:
     from real2sim_proto.ranging import LidarSpec, RadarSpec
 
     from ._async.client import AsyncClient, connect_async
-    from ._async.drive_session import AsyncDriveSession
-    from ._sync.assets import Assets
+    from ._async.sessions import AsyncDriveSession
     from ._sync.client import Client, connect
-    from ._sync.drive_session import DriveSession
-    from ._sync.jobs import Job, Jobs
+    from ._sync.jobs import Job, Jobs, Sweeps
     from ._sync.scenarios import Scenario, Scenarios, SceneObject
-    from ._sync.scenes import Scenes
-    from ._sync.sessions import Sessions
-    from ._sync.sweeps import Sweeps
+    from ._sync.scenes import Assets, Scenes
+    from ._sync.sessions import DriveSession, Sessions
     from .clouds import LidarCloud, PointCloud, RadarCloud
     from .env import DriveEnv
     from .errors import (
@@ -133,12 +130,12 @@ __all__ = [
 ]
 
 _ELSEWHERE = {
-    "Assets": "real2sim._sync.assets",
+    "Assets": "real2sim._sync.scenes",
     "AsyncClient": "real2sim._async.client",
-    "AsyncDriveSession": "real2sim._async.drive_session",
+    "AsyncDriveSession": "real2sim._async.sessions",
     "Client": "real2sim._sync.client",
     "Control": "real2sim_proto.plans",
-    "DriveSession": "real2sim._sync.drive_session",
+    "DriveSession": "real2sim._sync.sessions",
     "Frame": "real2sim.images",
     "Image": "real2sim.images",
     "Job": "real2sim._sync.jobs",
@@ -156,7 +153,7 @@ _ELSEWHERE = {
     "Scenes": "real2sim._sync.scenes",
     "SensorSpec": "real2sim_proto.episode",
     "Sessions": "real2sim._sync.sessions",
-    "Sweeps": "real2sim._sync.sweeps",
+    "Sweeps": "real2sim._sync.jobs",
     "TrajectoryPlan": "real2sim_proto.plans",
     "View": "real2sim.observation",
     "connect": "real2sim._sync.client",

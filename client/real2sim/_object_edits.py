@@ -46,10 +46,9 @@ from real2sim_proto.operations import (
 from real2sim_proto.scenes import ObjectInfo
 from real2sim_proto.storyboard import Storyboard
 
-from ._call import checked, instant_us
-from ._guidance import Handle
+from ._calls import checked, instant_us
+from ._handles import Handle, ScenarioState
 from ._poses import pose_between, pose_matrix, quaternion_of
-from ._scenario_state import ScenarioState
 
 R = TypeVar("R")
 Vector = tuple[float, float, float]

@@ -14,7 +14,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from ._commands import adapter, drive, edit, ros2, scenario, scenes, status
+from ._commands import adapter, drive, scenario, scenes
 
 COMMAND_GROUP = "real2sim.commands"
 DEBUG_VARIABLE = "REAL2SIM_DEBUG"
@@ -55,7 +55,7 @@ def build_app() -> typer.Typer:
         rich_markup_mode="markdown",
     )
     app.callback(invoke_without_command=True)(_options)
-    for module in (status, scenes, scenario, edit, drive, ros2, adapter):
+    for module in (scenes, scenario, drive, adapter):
         app.add_typer(module.app)
     own = ", ".join(f"`{name}`" for name in typer.main.get_group(app).commands)
     app.info.epilog = (

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ._guidance import Handle
+from ._handles import Handle
 from .errors import MalformedReplyError
 from .images import matrix_from_wire, write_atomically
 

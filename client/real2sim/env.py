@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from real2sim_proto.plans import Control
 
-from ._references import ScenarioRef, SceneRef
-from ._sensors import LidarSensor, RadarSensor, Sensor
+from ._handles import ScenarioRef, SceneRef
+from ._requests import LidarSensor, RadarSensor, Sensor
 from ._sync.client import connect
 from .clouds import PointCloud
 from .observation import Observation

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.base import Named
 
-from ._guidance import Handle
+from ._handles import Handle
 from .clouds import LidarCloud, PointCloud, RadarCloud, clouds_by_sensor
 from .errors import MalformedReplyError
 from .images import Frame, frames_by_camera

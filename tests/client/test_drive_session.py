@@ -231,7 +231,7 @@ def test_what_the_worker_refuses_for_now_is_sent_again_after_the_time_it_asks_fo
     worker: FakeWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[float] = []
-    monkeypatch.setattr("real2sim._sync.reconnecting.sleep", waited.append)
+    monkeypatch.setattr("real2sim._sync.transport.sleep", waited.append)
     with connect(worker) as client, client.session(scene="street", reconnect=240.0) as session:
         session.reset()
         for code in ("STORAGE_UNAVAILABLE", "TOO_MANY_REQUESTS retry", "TOO_MANY_SESSIONS"):

@@ -6,7 +6,7 @@ import pytest
 
 import real2sim
 from real2sim._session_state import is_away, is_transient
-from real2sim._sync.reconnecting import outlast, reconnect
+from real2sim._sync.transport import outlast, reconnect
 from real2sim.errors import ErrorDetails, error_for
 
 
@@ -30,7 +30,7 @@ def test_what_a_worker_or_its_proxy_answers_may_pass(status, code, passes):
 
 def test_a_worker_is_tried_until_it_is_there_again(monkeypatch):
     bad_gateway = error_for(ErrorDetails(502, "UNKNOWN", "bad gateway"))
-    monkeypatch.setattr("real2sim._sync.reconnecting.sleep", lambda _seconds: None)
+    monkeypatch.setattr("real2sim._sync.transport.sleep", lambda _seconds: None)
     outcomes = [real2sim.UnreachableError("nobody"), bad_gateway, None]
 
     def connect() -> None:
@@ -53,7 +53,7 @@ def test_a_refusal_is_final():
     ("status", "code"), [(503, "STORAGE_UNAVAILABLE"), (503, "UNKNOWN")], ids=["worker", "proxy"]
 )
 def test_a_store_that_is_away_is_waited_for(monkeypatch, status, code):
-    monkeypatch.setattr("real2sim._sync.reconnecting.sleep", lambda _seconds: None)
+    monkeypatch.setattr("real2sim._sync.transport.sleep", lambda _seconds: None)
     away = error_for(ErrorDetails(status, code, "away"))
     outcomes = [away, away, "obs"]
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from real2sim._retry import RetryPolicy, parse_retry_after
+from real2sim._calls import RetryPolicy, parse_retry_after
 
 
 def test_delays_double_up_to_the_longest():

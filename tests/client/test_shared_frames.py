@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from real2sim import MalformedReplyError, _shared_frames
-from real2sim._shared_frames import SharedFrames
+from real2sim import MalformedReplyError, _session_state
+from real2sim._session_state import SharedFrames
 from real2sim.images import frame_from_wire
 from real2sim_proto.drive import Frame, SharedMemory, Welcome
 from real2sim_proto.shared_memory import HEADER_BYTES, MAGIC
@@ -23,7 +23,7 @@ OFFER = SharedMemory(name=NAME, slots=2, slot_bytes=SLOT)
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """Holds the memory of a worker: ramps of greys in two slots."""
-    monkeypatch.setattr(_shared_frames, "FOLDER", str(tmp_path))
+    monkeypatch.setattr(_session_state, "FOLDER", str(tmp_path))
     header = (MAGIC + b"s" * 32).ljust(HEADER_BYTES, b"\0")
     (tmp_path / NAME).write_bytes(header + bytes(range(2 * SLOT)))
     return tmp_path

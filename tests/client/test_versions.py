@@ -8,11 +8,9 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from real2sim._models import read_fields, read_json, sent_fields
+from real2sim._calls import Reply, model_of, read_fields, read_json, sent_fields
 from real2sim._protocol import ProtocolState, server_message
-from real2sim._replies import Reply, model_of
-from real2sim._requests import create_session, export_scenario
-from real2sim._sensors import reset_spec
+from real2sim._requests import create_session, export_scenario, reset_spec
 from real2sim.errors import MalformedReplyError
 from real2sim_proto import decode, encode
 from real2sim_proto.drive import CLIENT_MESSAGE, SERVER_MESSAGE, Action, Obs, Reset, Welcome

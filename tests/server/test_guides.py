@@ -16,7 +16,7 @@ import yaml
 
 import real2sim
 from real2sim.planners import FollowRoute, run_episode
-from real2sim.renderers.scene_link import read_links
+from real2sim.renderers.linked_scene import read_links
 from real2sim_server.demo.street import unpack_street
 from real2sim_server.policies.suite import load_suite
 from real2sim_server.scene.lidar_catalogue import read_lidar

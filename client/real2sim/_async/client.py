@@ -10,19 +10,15 @@ from real2sim_proto import PROTOCOL_VERSION
 from real2sim_proto.scenes import Fleet, Readiness, ServerInfo
 
 from .. import _requests
-from .._guidance import Handle
-from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
+from .._handles import Handle, ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
+from .._http import Target, resolve_target
 from .._session_state import SessionPlan
-from .._target import Target, resolve_target
 from ..errors import CapacityError, ProtocolMismatchError, ReplyTimeoutError, UnreachableError
-from .assets import AsyncAssets
 from .concurrency import sleep
-from .drive_session import AsyncDriveSession
-from .jobs import AsyncJobs
+from .jobs import AsyncJobs, AsyncSweeps
 from .scenarios import AsyncScenarios
-from .scenes import AsyncScenes
-from .sessions import AsyncSessions
-from .sweeps import AsyncSweeps
+from .scenes import AsyncAssets, AsyncScenes
+from .sessions import AsyncDriveSession, AsyncSessions
 from .transport import AsyncTransport
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 from websockets.asyncio.client import ClientConnection as AsyncSocket
 from websockets.asyncio.client import connect as connect_socket
 
-from .._guidance import Handle
+from .._handles import Handle
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""Jobs: long work on the worker, followed from here."""
+"""Jobs, sweeps and searches: long work on the worker, followed from the client."""
 
 from __future__ import annotations
 
@@ -16,24 +16,30 @@ from real2sim_proto.jobs import (
     ExportRequest,
     JobInfo,
 )
+from real2sim_proto.operations import Operation
 from real2sim_proto.sessions import SessionInfo
+from real2sim_proto.storyboard import Storyboard
+from real2sim_proto.sweeps import StopRule, SweepRequest
 
 from .. import _requests
-from .._call import checked
-from .._job_state import JobBase, OnProgress, poll_delays, require_success
-from .._references import (
+from .._calls import checked
+from .._handles import (
+    JobBase,
+    OnProgress,
     ScenarioRef,
     SceneRef,
     job_id_of,
     optional_scenario_id,
+    optional_scene_name,
+    poll_delays,
+    require_success,
+    scene_name,
     session_and_token,
 )
-from .._references import optional_scene_name as name_of
 from .._session_state import SessionBase
 from ..images import write_atomically
-from .collection import AsyncCollection
 from .concurrency import run_blocking, sleep
-from .transport import AsyncTransport
+from .transport import AsyncCollection, AsyncTransport
 
 
 class AsyncJobs(AsyncCollection[JobInfo]):
@@ -101,7 +107,7 @@ class AsyncJobs(AsyncCollection[JobInfo]):
         fields = {
             "camera": camera,
             "scenario": optional_scenario_id(scenario),
-            "scene": name_of(scene),
+            "scene": optional_scene_name(scene),
             "simulation": None if simulation is None else job_id_of(simulation),
             "width": width,
             "start_us": start_us,
@@ -178,7 +184,7 @@ class AsyncJobs(AsyncCollection[JobInfo]):
         fields = {
             "kind": "dataset",
             "scenario": optional_scenario_id(scenario),
-            "scene": name_of(scene),
+            "scene": optional_scene_name(scene),
             "session": session_id,
             "recording": None if recording is None else base64.b64encode(recording).decode(),
             "formats": list(formats),
@@ -276,3 +282,164 @@ class AsyncJob(JobBase):
         content = await self._transport.send(_requests.job_file(self.job_id, name))
         await run_blocking(write_atomically, Path(path), content)
         return Path(path)
+
+
+# Sweeps and searches: many variants of a case, driven on the worker.
+
+
+class AsyncSweeps:
+    """``client.sweeps``.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> case = {"scene": "street", "reset": {"horizon": 5}}
+        >>> case["reset"]["agents"] = {"drivers": {"car_red": {"kind": "hard_brake"}}}
+        >>> gap = {"path": "agents.drivers.car_red.delay", "low": 0.0, "high": 0.4}
+    """
+
+    def __init__(self, transport: AsyncTransport) -> None:
+        self._transport = transport
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._transport.target})"
+
+    async def start(
+        self,
+        scene: SceneRef,
+        *,
+        parameters: Mapping[str, Any] | None = None,
+        corner_case: str | None = None,
+        openscenario: str | Path | None = None,
+        storyboard: Storyboard | Mapping[str, Any] | None = None,
+        ego: str | None = None,
+        leave_out: Sequence[str] = (),
+        reset: Mapping[str, Any] | None = None,
+        operations: Sequence[Operation | Mapping[str, Any]] = (),
+        method: str | Mapping[str, Any] = "sobol",
+        seeds: Sequence[int] = (0,),
+        planners: Sequence[str] = ("idm",),
+        stop: StopRule | Mapping[str, Any] | None = None,
+        metrics: Sequence[str] = (),
+        worst: int = 3,
+        rank_by: str = "criticality",
+    ) -> AsyncJob:
+        """Start driving points of a parameter space, without images unless planners need some.
+
+        The job leaves ``episodes.parquet``, a row an episode, and of the ``worst`` in its result
+        ``EPISODE.r2e`` (a recording) and, of a scenario, ``EPISODE.xosc``.
+
+        Args:
+            scene: its name.
+            parameters: by name, as of ``real2sim sweep``: ``{"low": 2, "high": 20}`` and others,
+                with a ``path`` into ``reset``, or without one where the scenario has the parameter.
+            corner_case, openscenario, storyboard: what happens, at most one: a case of the gallery,
+                the text of an OpenSCENARIO file or its path, a storyboard in the scene's frame.
+            ego: entity of the file that is the ego; default: ``Ego``.
+            leave_out: elements of the file to leave out.
+            reset: options of the episodes.
+            operations: edits of the scene.
+            method: ``sobol``, ``halton``, ``latin_hypercube``, ``random``, ``grid``, or one with
+                its fields: ``{"kind": "grid", "levels": 5}``.
+            seeds: each point is driven with each.
+            planners: ``follow_route``, ``pid``, ``idm``, ``depth_sampling``.
+            stop: when enough is known, such as ``{"at_fault": 10}``.
+            metrics: scores that get columns.
+            worst: so many episodes leave recordings, by ``rank_by`` from the highest on.
+            rank_by: a column.
+
+        Raises:
+            ValueError: a field that is not allowed.
+
+        Examples:
+            >>> method = {"kind": "grid", "levels": 2}
+            >>> job = await client.sweeps.start(**case, parameters={"gap": gap}, method=method)
+            >>> job = await job.wait(timeout=300.0)
+            >>> job.result["episodes"]
+            2
+            >>> path = await job.download("episodes.parquet", folder / "episodes.parquet")
+        """
+        given = {
+            "parameters": dict(parameters or {}),
+            "method": method,
+            "seeds": list(seeds),
+            "planners": list(planners),
+            "stop": stop,
+            "metrics": list(metrics),
+            "worst": worst,
+            "rank_by": rank_by,
+            "operations": list(operations),
+            "reset": dict(reset or {}),
+            **_scenario(corner_case, openscenario, storyboard, ego, leave_out),
+        }
+        return await self._started(scene, given)
+
+    async def search(
+        self,
+        scene: SceneRef,
+        *,
+        planner: str,
+        parameters: Mapping[str, Any] | None = None,
+        corner_case: str | None = None,
+        openscenario: str | Path | None = None,
+        storyboard: Storyboard | Mapping[str, Any] | None = None,
+        ego: str | None = None,
+        leave_out: Sequence[str] = (),
+        reset: Mapping[str, Any] | None = None,
+        operations: Sequence[Operation | Mapping[str, Any]] = (),
+        episodes: int = 300,
+        seed: int = 0,
+        shrink: int = 3,
+        probability: int = 0,
+        films: int = 0,
+    ) -> AsyncJob:
+        """Start looking for collisions that are a planner's fault and could have been avoided.
+
+        The job leaves ``failures.json``, each failure as ``failure_01.xosc`` and ``.r2e``, and
+        ``failures.tar`` with a page, cases and films.
+
+        Args:
+            scene, parameters, corner_case, openscenario: as of :meth:`start`.
+            storyboard, ego, leave_out, reset, operations: likewise.
+            planner: ``follow_route``, ``pid``, ``idm`` or ``depth_sampling``.
+            episodes: that are driven at most, 20 or more.
+            seed: the same one finds the same failures.
+            shrink: failures whose boundary to going well is sought.
+            probability: episodes for how often the planner is at fault; 0: none.
+            films: failures that are filmed.
+
+        Raises:
+            ValueError: a field that is not allowed.
+
+        Examples:
+            >>> asked = {"planner": "idm", "parameters": {"gap": gap}, "episodes": 20}
+            >>> job = await client.sweeps.search(**case, **asked)
+            >>> job.info.kind, (await job.cancel()).info.state.value
+            ('sweep', 'cancelled')
+        """
+        method = {"kind": "search", "episodes": episodes, "seed": seed, "shrink": shrink}
+        given = {
+            "parameters": dict(parameters or {}),
+            "method": method | {"probability": probability, "films": films},
+            "planners": [planner],
+            "operations": list(operations),
+            "reset": dict(reset or {}),
+            **_scenario(corner_case, openscenario, storyboard, ego, leave_out),
+        }
+        return await self._started(scene, given)
+
+    async def _started(self, scene: SceneRef, given: Mapping[str, Any]) -> AsyncJob:
+        fields = {name: value for name, value in given.items() if value is not None}
+        call = _requests.create_sweep(checked(SweepRequest, scene=scene_name(scene), **fields))
+        return AsyncJob(self._transport, await self._transport.send(call))
+
+
+def _scenario(
+    corner_case: str | None,
+    openscenario: str | Path | None,
+    storyboard: Storyboard | Mapping[str, Any] | None,
+    ego: str | None,
+    leave_out: Sequence[str],
+) -> dict[str, Any]:
+    text = openscenario.read_text("utf-8") if isinstance(openscenario, Path) else openscenario
+    given = {"corner_case": corner_case, "openscenario": text, "storyboard": storyboard}
+    return {**given, "ego": ego, "leave_out": list(leave_out)}

@@ -25,7 +25,8 @@ from real2sim_proto.scenarios import (
 from real2sim_proto.scenes import ObjectInfo
 
 from .. import _requests
-from .._call import Call, ViewRequest, checked, instant_us
+from .._calls import Call, ViewRequest, checked, instant_us
+from .._handles import Objects, ScenarioRef, ScenarioState, SceneRef, scenario_id_of, scene_name
 from .._object_edits import (
     UPRIGHT,
     ObjectEdits,
@@ -34,14 +35,11 @@ from .._object_edits import (
     Vector,
     insertion,
 )
-from .._references import ScenarioRef, SceneRef, scenario_id_of, scene_name
-from .._scenario_state import Objects, ScenarioState
 from ..clouds import LidarCloud
 from ..images import Image, write_atomically
-from .collection import AsyncCollection
 from .concurrency import run_blocking
 from .jobs import AsyncJob
-from .transport import AsyncTransport
+from .transport import AsyncCollection, AsyncTransport
 
 
 class AsyncScenarios(AsyncCollection[ScenarioInfo]):

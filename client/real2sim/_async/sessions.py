@@ -1,11 +1,23 @@
-"""Sessions by plain requests, for scripts that need no socket."""
+"""Drive sessions: over a socket in lock step, or by plain requests.
+
+A session is used by one thread or task at a time.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import time
 from collections.abc import Mapping, Sequence
-from typing import Any, Unpack
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar, Unpack
 
+import websockets
+
+from real2sim_proto.drive import Edited, Envelope, Forked, Kept, Obs, Result
 from real2sim_proto.jobs import DriveRequest
+from real2sim_proto.operations import Operation
 from real2sim_proto.plans import Plan
 from real2sim_proto.sessions import (
     SessionClock,
@@ -16,9 +28,16 @@ from real2sim_proto.sessions import (
 )
 
 from .. import _requests
-from .._call import checked
-from .._references import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
-from .._sensors import (
+from .._calls import checked
+from .._handles import ScenarioRef, SceneRef, optional_scenario_id, optional_scene_name
+from .._protocol import (
+    PendingRequest,
+    check_subprotocol,
+    handshake_errors,
+    lost_connection,
+    socket_options,
+)
+from .._requests import (
     LidarSensor,
     RadarSensor,
     ResetOptions,
@@ -27,11 +46,21 @@ from .._sensors import (
     reset_spec,
     sensor_specs,
 )
-from .._session_state import SessionTokens
-from ..observation import View
-from .collection import AsyncCollection
+from .._session_state import (
+    LOST_ERRORS,
+    SessionBase,
+    SessionPlan,
+    SessionTokens,
+    is_away,
+    is_passing,
+    not_open,
+)
+from ..errors import Real2SimError, ReplyTimeoutError, StatusError
+from ..images import write_atomically
+from ..observation import Observation, View, observation_from_wire, view_from_frames
+from .concurrency import AsyncSocket, connect_socket, receive, run_blocking
 from .jobs import AsyncJob
-from .transport import AsyncTransport
+from .transport import AsyncCollection, AsyncTransport, outlast, reconnect
 
 
 class AsyncSessions(AsyncCollection[SessionInfo]):
@@ -219,3 +248,366 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         ranging = ranging_specs(lidars, radars)
         call = _requests.render_session(session_id, self._tokens.of(session_id), specs, ranging)
         return await self._transport.send(call)
+
+
+# Driving over the socket: one plan, one observation.
+
+A = TypeVar("A", bound=Envelope)
+
+
+class AsyncDriveSession(SessionBase):
+    """A session in lock step; made by :meth:`AsyncClient.session`.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> session = await client.session(scene="street").open()
+        >>> obs = await session.reset(seed=0, sensors=["front"])
+        >>> obs.step, obs.image("front").shape
+        (0, (64, 96, 3))
+
+        Used as ``async with client.session(scene="street") as session:`` it closes by itself.
+    """
+
+    def __init__(self, transport: AsyncTransport, plan: SessionPlan) -> None:
+        super().__init__(transport.target, plan)
+        self._transport = transport
+        self._socket: AsyncSocket | None = None
+        self._socket_stack = contextlib.AsyncExitStack()
+
+    async def open(self) -> Self:
+        """Create or join the session and shake hands; loading is over when this returns.
+
+        Raises:
+            UnreachableError: no worker answers.
+            NotFoundError: no such scene, scenario or session.
+            CapacityError: the worker is full.
+
+        Examples:
+            >>> other = await client.session(scene="street").open()
+            >>> other.cameras
+            ['front', 'left']
+            >>> result = await other.close()
+        """
+        session_id = self._plan.session_id
+        if session_id is None:
+            call = _requests.create_session(self._plan.scene, self._plan.scenario, None)
+            create = partial(self._transport.send, call)
+            self._info = await outlast(create, seconds=self._plan.reconnect, passes=is_away)
+            session_id, self._token = self._info.session_id, self._info.token
+        try:
+            await self._connect_first(session_id)
+        except BaseException:
+            await self._release()
+            raise
+        return self
+
+    async def reset(
+        self, *, sensors: Sequence[Sensor] = (), **options: Unpack[ResetOptions]
+    ) -> Observation:
+        """Start an episode and return its first observation.
+
+        Args:
+            sensors: camera names or specs; what every observation shows.
+            options: seed, start_us, dt_us, horizon, ego, action, agents, privileged, deadline_ms,
+                on_timeout, latency, on_collision and more; see
+                ``real2sim_proto.episode.ResetSpec``. ``lidars`` and ``radars`` are names of the
+                worker's catalogues, or specs.
+
+        Raises:
+            ValueError: an option that is not allowed.
+
+        Examples:
+            >>> obs = await session.reset(
+            ...     seed=7,
+            ...     sensors=[{"camera": "front", "modalities": ["rgb", "depth"], "width": 48}],
+            ...     action="control",
+            ...     privileged=True,
+            ... )
+            >>> obs.image("front", "depth").shape
+            (32, 48)
+            >>> sorted(agent.object_id for agent in obs.agents)
+            ['car_blue', 'car_red', 'post']
+            >>> obs = await session.reset(lidars=["vlp-16"], radars=["corner"])
+            >>> sweep, scan = obs.lidar("vlp-16"), obs.radar("corner")
+            >>> sweep.points.shape[1], sweep.t_us, scan.modality
+            (3, 0, 'radar')
+        """
+        spec = reset_spec(sensors, self._codec, options)
+        return await self._observe(self._protocol.reset(spec))
+
+    async def step(self, plan: Plan | Mapping[str, Any]) -> Observation:
+        """Send the plan for the newest observation; returns the next one.
+
+        After a ReplyTimeoutError the same plan may be sent again: the worker moves only once. A
+        plan that misses the episode's deadline is not applied; the observation that the worker
+        went on to is returned, with a ``deadline_missed`` event.
+
+        Raises:
+            NotResetError: no episode runs.
+            InvalidActionError: a plan of another kind than ``reset(action=...)`` said.
+            EpisodeOverError: the episode has ended.
+
+        Examples:
+            >>> ahead = [obs.t_us + 500_000, obs.t_us + 1_000_000]
+            >>> plan = real2sim.TrajectoryPlan(times_us=ahead, poses=[(2.5, 0, 0), (5, 0, 0)])
+            >>> obs = await session.step(plan)
+            >>> obs.step, obs.t_us
+            (1, 100000)
+        """
+        return await self._observe(self._protocol.action(plan))
+
+    async def receive(self, timeout: float | None = None) -> Observation:
+        """The next unsolicited observation: what an observer sees of the controller's loop.
+
+        Args:
+            timeout: seconds to wait; default: the client's.
+
+        Raises:
+            ReplyTimeoutError: none came in time.
+
+        Examples:
+            >>> spectator = client.join(session.session_id, token=session.token, role="observer")
+            >>> spectator = await spectator.open()
+            >>> plan = {"kind": "trajectory", "times_us": [1_000_000], "poses": [(5, 0, 0)]}
+            >>> obs = await session.step(plan)
+            >>> (await spectator.receive(timeout=10.0)).step
+            1
+            >>> await spectator.close()
+        """
+        seconds = self._target.timeout if timeout is None else timeout
+        until = time.monotonic() + seconds
+        while (message := self._protocol.take_unsolicited()) is None:
+            with lost_connection(self._target, "an observation"):
+                try:
+                    data = await receive(self._open_socket(), max(until - time.monotonic(), 0.0))
+                except TimeoutError:
+                    raise ReplyTimeoutError("observation", seconds) from None
+            self._protocol.handle_unsolicited(data)
+        return observation_from_wire(message)
+
+    async def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> Edited:
+        """Change this session's world before the next step; all operations apply, or none.
+
+        Raises:
+            ValueError: an operation that is not valid.
+            InvalidOperationError: an unknown object, or a result that is not allowed.
+
+        Examples:
+            >>> edited = await session.edit([{"op": "duplicate", "object_id": "car_red", "x": 9.0}])
+            >>> edited.created
+            ['car_red_copy1']
+        """
+        return await self._request(self._protocol.edit(operations))
+
+    async def render(
+        self,
+        sensors: Sequence[Sensor] = (),
+        *,
+        lidars: Sequence[LidarSensor] = (),
+        radars: Sequence[RadarSensor] = (),
+    ) -> View:
+        """Images of the current instant, and clouds of LiDARs and radars; never moves time.
+
+        Examples:
+            >>> view = await session.render(["left"])
+            >>> view.image("left").shape
+            (64, 96, 3)
+            >>> view = await session.render(lidars=[{"lidar": "top", "model": "vlp-16"}])
+            >>> view.lidar("top").frame
+            'sensor'
+        """
+        asked = sensor_specs(sensors, self._codec), ranging_specs(lidars, radars)
+        view = await self._request(self._protocol.render(*asked))
+        return view_from_frames(
+            view.frames,
+            t_us=view.t_us,
+            revision=view.revision,
+            timing=view.timing,
+            pixels=self._pixels_of(view.frames),
+            clouds=view.clouds,
+        )
+
+    async def steer(
+        self,
+        object_id: str,
+        times_us: Sequence[int],
+        poses: Sequence[tuple[float, float, float]],
+    ) -> int:
+        """Drive an object whose driver is ``external``; from which step on the plan holds.
+
+        Args:
+            object_id: named as external in ``reset(agents=...)``.
+            times_us: [N] absolute simulation times after the newest observation [us].
+            poses: [N] x [m], y [m], yaw [rad] of its box, world.
+
+        Examples:
+            >>> drivers = {"car_blue": {"kind": "external"}}
+            >>> obs = await session.reset(agents={"drivers": drivers})
+            >>> await session.steer("car_blue", [500_000, 1_000_000], [(10, 0, 0), (12, 1, 0.3)])
+            0
+        """
+        driven = await self._request(self._protocol.agent(object_id, times_us, poses))
+        return driven.step
+
+    async def snapshot(self, name: str) -> Kept:
+        """Keep the present instant under a name, to return to by :meth:`restore`.
+
+        Examples:
+            >>> kept = await session.snapshot("before")
+            >>> kept.step
+            0
+        """
+        return await self._request(self._protocol.snapshot(name))
+
+    async def restore(self, name: str) -> Observation:
+        """Go back to a snapshot; its observation.
+
+        Examples:
+            >>> kept = await session.snapshot("before")
+            >>> plan = {"kind": "trajectory", "times_us": [1_000_000], "poses": [(5, 0, 0)]}
+            >>> obs = await session.step(plan)
+            >>> (await session.restore("before")).step
+            0
+        """
+        return await self._observe(self._protocol.restore(name))
+
+    async def fork(self) -> Forked:
+        """Another session that goes on from this instant.
+
+        Examples:
+            >>> forked = await session.fork()
+            >>> branch = await client.join(forked.session_id, token=forked.token).open()
+            >>> branch.session_id != session.session_id
+            True
+            >>> await branch.close()
+        """
+        return await self._request(self._protocol.fork())
+
+    async def save_recording(self, path: Path | str, *, frames: bool = False) -> Path:
+        """Write the running episode to a file, to be replayed and scored again.
+
+        Args:
+            path: for example ``drive.r2e``.
+            frames: whether the images of its sensors are drawn once more and kept too.
+
+        Examples:
+            >>> path = await session.save_recording(folder / "drive.r2e")
+            >>> path.stat().st_size > 0
+            True
+        """
+        call = _requests.record_session(self.session_id, self._token, frames)
+        await run_blocking(write_atomically, Path(path), await self._transport.send(call))
+        return Path(path)
+
+    async def close(self) -> Result | None:
+        """End a session that this handle made, or leave one that it joined; idempotent.
+
+        Returns:
+            Final scores, where the worker could still give them.
+
+        Examples:
+            >>> result = await session.close()
+            >>> result.steps
+            0
+        """
+        if self._socket is not None and self._plan.session_id is None:
+            # A worker that is no longer there must not hold up who wants to leave.
+            with contextlib.suppress(Real2SimError):
+                self._result = await self._request(self._protocol.bye())
+        await self._release()
+        return self._result
+
+    async def __aenter__(self) -> Self:
+        return await self.open()
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    async def _observe(self, request: PendingRequest[Obs]) -> Observation:
+        obs = await self._request(request)
+        return observation_from_wire(obs, self._pixels_of(obs.frames))
+
+    async def _request(self, request: PendingRequest[A]) -> A:
+        """The answer to a request, once the worker takes it."""
+        seconds = self._plan.reconnect
+        return await outlast(partial(self._sent, request), seconds=seconds, passes=is_passing)
+
+    async def _sent(self, request: PendingRequest[A]) -> A:
+        """The answer to a request, over a new connection where the old one is lost."""
+        try:
+            return await self._exchange(request)
+        except LOST_ERRORS:
+            if not self._may_resend(request):
+                raise
+            connect = partial(self._connect, self.session_id)
+            await reconnect(self._close_socket, connect, seconds=self._plan.reconnect)
+            self._check_not_applied(request)
+            return await self._exchange(request)
+
+    async def _exchange(self, request: PendingRequest[A]) -> A:
+        socket = self._open_socket()
+        seconds = self._timeout_of(request)
+        with lost_connection(self._target, request.awaited):
+            await socket.send(request.encoded(self._slot_for(request)))
+            while True:
+                try:
+                    data = await receive(socket, seconds)
+                except TimeoutError:
+                    raise self._reply_timeout(request) from None
+                if (answer := self._protocol.read(data, request)) is not None:
+                    return answer
+
+    async def _connect_first(self, session_id: str) -> None:
+        """Connect; again where the connection is lost on the way, as later on."""
+        connect = partial(self._connect, session_id)
+        try:
+            await connect()
+        except LOST_ERRORS:
+            if self._plan.reconnect <= 0:
+                raise
+            await reconnect(self._close_socket, connect, seconds=self._plan.reconnect)
+
+    async def _connect(self, session_id: str) -> None:
+        with handshake_errors(self._target):
+            connection = connect_socket(**socket_options(self._target, session_id))
+            self._socket = await self._socket_stack.enter_async_context(connection)
+        check_subprotocol(self._socket.subprotocol)
+        self._use_memory(None)
+        self._welcome = await self._exchange(self._hello())
+        await self._attach()
+
+    async def _attach(self) -> None:
+        """Open the memory that the welcome offers, and prove it by its secret."""
+        memory = self._offered_memory()
+        if memory is None:
+            return
+        try:
+            await self._exchange(self._protocol.attach(memory.secret))
+        except StatusError as error:
+            self._without_memory(str(error))
+        else:
+            self._use_memory(memory)
+
+    def _open_socket(self) -> AsyncSocket:
+        if self._socket is None:
+            raise not_open()
+        return self._socket
+
+    async def _close_socket(self) -> None:
+        with contextlib.suppress(OSError, websockets.exceptions.WebSocketException):
+            await self._socket_stack.aclose()
+
+    async def _release(self) -> None:
+        """Close the socket, and end a session that has not been ended over it."""
+        await self._close_socket()
+        self._socket = self._memory = None
+        if self._info is not None and self._result is None:
+            token = self._target.token or self._info.token
+            with contextlib.suppress(Real2SimError):
+                await self._transport.send(_requests.delete_session(self._info.session_id, token))
+        self._info = None

@@ -1,17 +1,18 @@
-"""Sends calls and waits for their answers."""
+"""Sends requests and waits for their answers; collections; reconnecting."""
 
 from __future__ import annotations
 
-from typing import TypeVar
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import httpx2
 
-from .._call import Call, Request
-from .._http import Attempts, accepted_reply, client_options, http_errors, request_options
-from .._replies import Reply
-from .._target import Target
-from ..errors import Real2SimError
-from .concurrency import sleep
+from .._calls import Call, Reply, Request
+from .._http import Attempts, Target, accepted_reply, client_options, http_errors, request_options
+from .._session_state import MAX_RECONNECTS, backoff, is_transient
+from ..errors import Real2SimError, StatusError
+from .concurrency import Lookup, sleep
 
 T = TypeVar("T")
 
@@ -50,3 +51,88 @@ class AsyncTransport:
     async def close(self) -> None:
         """Close the connections."""
         await self._http.aclose()
+
+
+# Collections: scenes, scenarios, assets, jobs, sessions.
+
+
+class AsyncCollection(Lookup, Generic[T]):
+    """Lists what the worker has; iterating over it asks the worker once.
+
+    Examples:
+        >>> client = real2sim.connect_async()
+        >>> [info.scene async for info in client.scenes]
+        ['street']
+    """
+
+    def __init__(self, transport: AsyncTransport) -> None:
+        self._transport = transport
+
+    if TYPE_CHECKING:
+
+        async def list(self) -> Sequence[T]: ...
+
+    async def __aiter__(self) -> AsyncIterator[T]:
+        for one in await self.list():
+            yield one
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._transport.target})"
+
+
+# Reconnecting after a lost connection.
+
+A = TypeVar("A")
+
+
+async def outlast(
+    ask: Callable[[], Awaitable[A]], *, seconds: float, passes: Callable[[Real2SimError], bool]
+) -> A:
+    """Ask again while the worker refuses for now; each time nothing has happened.
+
+    Args:
+        ask: sends the same request each time.
+        seconds: within which the last try begins.
+        passes: whether an error is one to wait for.
+
+    Raises:
+        Real2SimError: of the last try, or one that does not pass.
+    """
+    until = time.monotonic() + seconds
+    for attempt in range(MAX_RECONNECTS):
+        try:
+            return await ask()
+        except Real2SimError as error:
+            asked = error.retry_after if isinstance(error, StatusError) else None
+            wait = backoff(attempt) if asked is None else asked
+            if not passes(error) or time.monotonic() + wait > until:
+                raise
+            await sleep(wait)
+    return await ask()
+
+
+async def reconnect(
+    close: Callable[[], Awaitable[None]], connect: Callable[[], Awaitable[None]], *, seconds: float
+) -> None:
+    """Close what is left of a connection and connect again; the worker may be restarting.
+
+    Args:
+        close: ends the connection as it is.
+        connect: makes the next one.
+        seconds: within which the last try begins.
+
+    Raises:
+        UnreachableError, CapacityError, ReplyTimeoutError: of the last try.
+        Real2SimError: the worker refuses.
+    """
+    until = time.monotonic() + seconds
+    for attempt in range(MAX_RECONNECTS):
+        await close()
+        try:
+            return await connect()
+        except Real2SimError as error:
+            wait = backoff(attempt)
+            if not is_transient(error) or time.monotonic() + wait > until:
+                raise
+            await sleep(wait)
+    return None

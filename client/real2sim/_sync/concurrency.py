@@ -9,7 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 from websockets.sync.client import ClientConnection as Socket
 from websockets.sync.client import connect as connect_socket
 
-from .._guidance import Handle
+from .._handles import Handle
 from ..errors import NotFoundError
 
 P = ParamSpec("P")

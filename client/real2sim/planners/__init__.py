@@ -21,12 +21,11 @@ Saved as ``my.py`` (its class alone), it also runs as ``real2sim drive --planner
 """
 
 from .depth_sampling import DepthSampling
-from .episode import EpisodeSummary, StageTimes, run_episode
 from .follow_route import FollowRoute
 from .idm import Idm
 from .learned import LearnedPolicy
 from .pid import PidFollowRoute
-from .planner import Needs, Planner, load_planner, needs_of
+from .planner import EpisodeSummary, Needs, Planner, StageTimes, load_planner, needs_of, run_episode
 
 __all__ = [
     "DepthSampling",

@@ -18,15 +18,8 @@ import numpy as np
 
 from real2sim_proto.plans import TrajectoryPlan
 
-from .._alpasim_messages import (
-    DRIVER,
-    DRIVER_METHODS,
-    GLOBAL_SHUTTER,
-    MAX_MESSAGE_BYTES,
-    messages,
-)
+from .._alpasim import DRIVER, DRIVER_METHODS, GLOBAL_SHUTTER, MAX_MESSAGE_BYTES, Ftheta, messages
 from .._poses import Matrix, quaternion_of
-from ._ftheta import Ftheta
 from .follow_route import Comfort, Path, delays_of_poses
 from .peer import (
     Look,

@@ -27,8 +27,7 @@ from real2sim_proto.plans import Control
 
 from .._poses import Matrix
 from ..images import Frame
-from ._carla_types import offer_stand_ins
-from ._resampled import Lookup, PinholeView, lookup_of
+from ._carla import Lookup, PinholeView, lookup_of, offer_stand_ins
 from .peer import PeerError, T_ego_camera, rgb_frames
 from .planner import Needs
 

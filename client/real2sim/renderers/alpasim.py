@@ -20,20 +20,13 @@ import numpy as np
 
 from real2sim_proto.scenes import CameraInfo, SceneState
 
-from .._alpasim_messages import (
-    GLOBAL_SHUTTER,
-    MAX_MESSAGE_BYTES,
-    RENDERER,
-    RENDERER_METHODS,
-    messages,
-)
+from .._alpasim import GLOBAL_SHUTTER, MAX_MESSAGE_BYTES, RENDERER, RENDERER_METHODS, messages
 from .._poses import Matrix, pose_matrix, quaternion_of
 from ..errors import CapacityError, NotFoundError, Real2SimError, UnreachableError
 from ..planners.alpasim import ALPASIM_CAMERAS
 from ..planners.peer import PeerError, cameras_for, looks_of
 from ..version import VERSION
-from .linked_scene import CameraView, LinkedScene
-from .scene_link import SceneLink
+from .linked_scene import CameraView, LinkedScene, SceneLink
 
 if TYPE_CHECKING:
     from .._sync.client import Client

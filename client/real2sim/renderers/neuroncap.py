@@ -27,13 +27,12 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from real2sim_proto.scenes import ObjectInfo
 
+from .._calls import describe
 from .._poses import Matrix, pose_between, pose_matrix
-from .._replies import describe
 from ..errors import NotFoundError, Real2SimError, UnreachableError
 from ..planners.neuroncap import NUSCENES_CAMERAS
 from ..planners.peer import Look, PeerError, cameras_for, looks_of
-from .linked_scene import CameraView, LinkedScene
-from .scene_link import SceneLink, camera_names
+from .linked_scene import CameraView, LinkedScene, SceneLink, camera_names
 
 if TYPE_CHECKING:
     from .._sync.client import Client

@@ -1,21 +1,33 @@
-"""The loop of the bridge: publish an observation, wait for a command, step."""
+"""The bridge's loop (publish an observation, wait for a command, step) and its ``rclpy`` node."""
 
 from __future__ import annotations
 
+import array
+import importlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from .commands import CommandError, of_ackermann, of_path, of_twist, standing
-from .messages import MessageBuilder, MessageTypes
+from ..errors import Real2SimError
+from .messages import (
+    CommandError,
+    MessageBuilder,
+    MessageTypes,
+    of_ackermann,
+    of_path,
+    of_twist,
+    standing,
+)
 
 if TYPE_CHECKING:
     from real2sim_proto.plans import Plan
 
-    from .._sensors import Sensor
-    from .._sync.drive_session import DriveSession
+    from .._requests import Sensor
+    from .._sync.sessions import DriveSession
     from ..observation import Observation
+
 
 COMMANDS: dict[str, tuple[str, str, Callable[[Any, Observation], Plan]]] = {
     "ackermann": ("/ackermann_cmd", "ackermann_msgs/msg/AckermannDriveStamped", of_ackermann),
@@ -149,3 +161,86 @@ class Ros2Bridge:
                 publish(f"/camera/{camera}/{where}", "sensor_msgs/msg/Image", image)
             info = builder.camera_info(next(iter(frames.values())))
             publish(f"/camera/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", info)
+
+
+# The node.
+
+PACKAGES = ("rclpy", "sensor_msgs", "nav_msgs", "geometry_msgs", "tf2_msgs", "rosgraph_msgs")
+
+
+class NoRosError(Real2SimError):
+    """ROS 2 is not there."""
+
+
+class RosNode:
+    """A node named ``real2sim``.
+
+    Attributes:
+        types: ROS' own message classes.
+    """
+
+    def __init__(self) -> None:
+        """Begin ROS.
+
+        Raises:
+            NoRosError: a package of ROS cannot be imported.
+        """
+        self._rclpy = _imported("rclpy")
+        for package in PACKAGES[1:]:
+            _imported(f"{package}.msg")
+        self._qos = _imported("rclpy.qos")
+        self._rclpy.init()
+        self._node = self._rclpy.create_node("real2sim")
+        self._publishers: dict[str, Any] = {}
+        self.types = MessageTypes(of=message_class, octets=_octets, numbers=list)
+
+    def publish(self, topic: str, type_name: str, message: Any) -> None:
+        """Send a message; newcomers get the last one of topics that stand still."""
+        publisher = self._publishers.get(topic)
+        if publisher is None:
+            durable = self._qos.DurabilityPolicy
+            policy = durable.TRANSIENT_LOCAL if topic in STANDS_STILL else durable.VOLATILE
+            profile = self._qos.QoSProfile(depth=1, durability=policy)
+            publisher = self._node.create_publisher(message_class(type_name), topic, profile)
+            self._publishers[topic] = publisher
+        publisher.publish(message)
+
+    def subscribe(self, topic: str, type_name: str, receive: Callable[[Any], None]) -> None:
+        """Call ``receive`` with every message, while the node spins."""
+        self._node.create_subscription(message_class(type_name), topic, receive, 1)
+
+    def spin(self, seconds: float) -> bool:
+        """Receive for at most so long, or until a message has come; whether ROS still runs."""
+        if not self._rclpy.ok():
+            return False
+        self._rclpy.spin_once(self._node, timeout_sec=max(seconds, 0.0))
+        return bool(self._rclpy.ok())
+
+    def close(self) -> None:
+        """End ROS."""
+        self._node.destroy_node()
+        self._rclpy.try_shutdown()
+
+
+@lru_cache(maxsize=64)
+def message_class(type_name: str) -> Any:
+    """ROS' class of a type such as ``sensor_msgs/msg/Image``. Raises NoRosError."""
+    package, _, name = type_name.split("/")
+    return getattr(_imported(f"{package}.msg"), name)
+
+
+def _imported(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0]
+        raise NoRosError(
+            f"the ROS 2 bridge needs {package}, which cannot be imported: {error}",
+            hint="install ROS 2 (docs.ros.org), source its setup.bash in this shell, and install "
+            f"ros-$ROS_DISTRO-{package.replace('_', '-')}; real2sim must be installed for the "
+            "Python of ROS",
+        ) from error
+
+
+def _octets(data: bytes) -> Any:
+    return array.array("B", data)

@@ -12,10 +12,9 @@ import grpc
 import numpy as np
 import pytest
 
-from real2sim._alpasim_messages import DRIVER, DRIVER_METHODS, messages
+from real2sim._alpasim import DRIVER, DRIVER_METHODS, Ftheta, messages
 from real2sim._poses import quaternion_of
 from real2sim.planners import load_planner, needs_of
-from real2sim.planners._ftheta import Ftheta
 from real2sim.planners.alpasim import AlpasimDriver
 from real2sim.planners.peer import PeerError
 from real2sim_proto.scenes import CameraInfo

@@ -15,7 +15,7 @@ from pathlib import Path
 import grpc
 import pytest
 
-from real2sim._alpasim_messages import DRIVER, DRIVER_METHODS
+from real2sim._alpasim import DRIVER, DRIVER_METHODS
 from real2sim.planners.alpasim import AlpasimDriver
 from tests.waiting import LIMIT_S
 

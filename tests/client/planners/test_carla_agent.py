@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from real2sim.planners import load_planner, needs_of
-from real2sim.planners._carla_types import STAND_INS, VehicleControl
-from real2sim.planners._resampled import PinholeView, lookup_of
+from real2sim.planners._carla import STAND_INS, PinholeView, VehicleControl, lookup_of
 from real2sim.planners.carla_agent import (
     CarlaAgent,
     camera_rotation,

@@ -14,10 +14,15 @@ import numpy as np
 import pytest
 
 from real2sim.images import Frame
-from real2sim.ros2.bridge import Ros2Bridge
-from real2sim.ros2.commands import CommandError, of_ackermann, of_path, of_twist
-from real2sim.ros2.messages import MessageBuilder, MessageTypes
-from real2sim.ros2.node import NoRosError, RosNode, message_class
+from real2sim.ros2.bridge import NoRosError, Ros2Bridge, RosNode, message_class
+from real2sim.ros2.messages import (
+    CommandError,
+    MessageBuilder,
+    MessageTypes,
+    of_ackermann,
+    of_path,
+    of_twist,
+)
 from real2sim_proto.drive import EgoState
 from real2sim_proto.scenes import CameraInfo
 

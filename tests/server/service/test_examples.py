@@ -29,13 +29,11 @@ import real2sim
 import real2sim.env
 import real2sim.planners
 import real2sim_proto
-from real2sim._async import assets as async_assets
 from real2sim._async import jobs as async_jobs
 from real2sim._async import scenarios as async_scenarios
 from real2sim._async import scenes as async_scenes
 from real2sim._async import sessions as async_sessions
-from real2sim._async import sweeps as async_sweeps
-from real2sim._sync import assets, jobs, scenarios, scenes, sessions, sweeps
+from real2sim._sync import jobs, scenarios, scenes, sessions
 from real2sim_server.scene.io import save_scene, write_splats
 from real2sim_server.service.serve import RunningWorker, running_worker
 from real2sim_server.settings import Settings
@@ -50,22 +48,22 @@ SDK_CLASSES: tuple[type, ...] = (
     scenarios.Scenarios,
     scenarios.Scenario,
     scenarios.SceneObject,
-    assets.Assets,
+    scenes.Assets,
     jobs.Jobs,
     jobs.Job,
     sessions.Sessions,
-    sweeps.Sweeps,
+    jobs.Sweeps,
     real2sim.DriveSession,
     real2sim.AsyncClient,
     async_scenes.AsyncScenes,
     async_scenarios.AsyncScenarios,
     async_scenarios.AsyncScenario,
     async_scenarios.AsyncSceneObject,
-    async_assets.AsyncAssets,
+    async_scenes.AsyncAssets,
     async_jobs.AsyncJobs,
     async_jobs.AsyncJob,
     async_sessions.AsyncSessions,
-    async_sweeps.AsyncSweeps,
+    async_jobs.AsyncSweeps,
     real2sim.AsyncDriveSession,
     real2sim.Image,
     real2sim.Frame,

@@ -21,9 +21,9 @@ import pytest
 import simplejpeg
 
 import real2sim
-from real2sim._alpasim_messages import RENDERER, RENDERER_METHODS, messages
+from real2sim._alpasim import RENDERER, RENDERER_METHODS, messages
 from real2sim.renderers.alpasim import AlpasimRenderer
-from real2sim.renderers.scene_link import SceneLink
+from real2sim.renderers.linked_scene import SceneLink
 from real2sim_server.geometry.transform import (
     invert_transform,
     matrix_to_quaternion,
