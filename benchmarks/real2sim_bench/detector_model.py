@@ -18,9 +18,9 @@ from torch.nn import functional
 # Average precision as COCO defines it, for one class.
 #
 # Source: Lin et al., "Microsoft COCO: Common Objects in Context", ECCV 2014, and its evaluation
-# page. Each detection, by falling score, matches the free object with the largest overlap. Precision
-# is made monotone, read at 101 recalls, and averaged over overlaps from 0.5 to 0.95. Detections of
-# ignored objects (small, hidden) do not count either.
+# page. Each detection, by falling score, matches the free object with the largest overlap.
+# Precision is made monotone, read at 101 recalls, and averaged over overlaps from 0.5 to 0.95.
+# Detections of ignored objects (small, hidden) do not count either.
 
 Boxes = NDArray[np.float64]
 """[K, 4] left, top, right, bottom [px]."""

@@ -5,9 +5,9 @@ Chromium on the PATH (or in ``CHROMIUM``) for the studio::
 
     .venv/bin/python docs/images/make.py [--work out/pictures] [NAME ...]
 
-NAME is one of demo, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars, people, jam;
-without one, all but jam are made. It takes about a quarter of an hour on two cores. ``jam`` trains
-for another ten, on the KITTI drive whose folder ``KITTI_LOG`` names.
+NAME is one of demo, film, scenario, studio, wall, pair, drop, crashes, ground, lenses, cars,
+people, jam; without one, all but jam are made. It takes about twenty minutes on two cores. ``jam``
+trains for another ten, on the KITTI drive whose folder ``KITTI_LOG`` names.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 import real2sim
+from real2sim.planners import FollowRoute
 from real2sim_proto.operations import Delete, Duplicate, Operation, Rotate, Translate
 from real2sim_server.demo.run import SCENE
 from real2sim_server.demo.street import DURATION_S, TRAINING_HZ, record_street, unpack_street
@@ -88,6 +90,62 @@ def demo(work: Path, _: Path) -> None:
     save("edit.jpg", np.concatenate([before, gap, after], axis=1), width=1200)
     save("drive.jpg", read(work / "demo" / "drive_050.png"), width=1200)
     save("map.png", read(work / "demo" / "map.png"), width=1000)
+
+
+def film(work: Path, scenes: Path) -> None:
+    """``film.webp``, the README's moving picture: an edit, a drive through it, a crash."""
+    frames: list[tuple[np.ndarray, int]] = []
+
+    def show(image: np.ndarray, caption: str, ms: int) -> None:
+        image = cv2.resize(image, (480, 320), interpolation=cv2.INTER_AREA)
+        cv2.rectangle(image, (0, 296), (480, 320), (44, 36, 32), -1)
+        cv2.putText(
+            image, caption, (10, 312), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (235,) * 3, 1, cv2.LINE_AA
+        )
+        frames.append((image[..., ::-1], ms))
+
+    with worker(work, scenes) as (client, _):
+        edited = client.scenarios.create(scene=SCENE, name="film")
+        view = {"camera": "front", "t_us": SHOWN_US, "width": 480}
+        for caption, operations in (("the recorded street", []), ("edit it ...", EDITS)):
+            for operation in operations or [None]:
+                if operation is not None:
+                    edited.apply([operation])
+                show(edited.preview(**view).array[..., ::-1], caption, 1000)
+        planner = FollowRoute(speed=8.0)
+        with client.session(scenario=edited) as session:
+            obs = session.reset(seed=0, sensors=["front"], privileged=True)
+            planner.reset(obs)
+            while not obs.over and obs.step < 72:
+                obs = session.step(planner.plan(obs))
+                if obs.step % 2 == 0:
+                    show(
+                        obs.image("front")[..., ::-1], "... let a policy drive through it ...", 100
+                    )
+    crash = work / "t_bone"
+    simulated = ("simulate", scenes / SCENE, "--out", crash, "--experiment", "t_bone")
+    command(*simulated, "--max-particles", "8000", "--no-film")
+    command("film", scenes / SCENE, crash, "--view", "near", "--slow", "4")
+    video = cv2.VideoCapture(str(crash / "film.mp4"))
+    shown = []
+    while (read_one := video.read())[0]:
+        shown.append(read_one[1])
+    for image in shown[:: max(1, len(shown) // 40)]:
+        cut = image.shape[0] * 3 // 2
+        left = max(0, (image.shape[1] - cut) // 2)
+        show(image[:, left : left + cut], "... or crash its vehicles", 100)
+    first, *others = (Image.fromarray(image) for image, _ in frames)
+    durations = [ms for _, ms in frames]
+    first.save(
+        HERE / "film.webp",
+        save_all=True,
+        append_images=others,
+        duration=durations,
+        loop=0,
+        quality=60,
+        method=6,
+    )
+    print(HERE / "film.webp")
 
 
 def scenario(work: Path, scenes: Path) -> None:
@@ -276,6 +334,7 @@ PICTURES = {
     make.__name__: make
     for make in (
         demo,
+        film,
         scenario,
         studio,
         wall,
