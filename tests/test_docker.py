@@ -108,7 +108,7 @@ def test_the_image_for_gpus_is_built_only_if_cuda_is_usable_but_for_the_device()
 
 @pytest.mark.parametrize("name", IMAGES)
 def test_an_image_can_share_a_database_server(name):
-    assert re.search(r"'(?:\.|real2sim)\[server,.*postgres.*\]'", (DOCKER / name).read_text())
+    assert re.search(r"'(?:\.|real2sim)\[.*postgres.*\]'", (DOCKER / name).read_text())
 
 
 def pins(path: Path) -> dict[str, str]:
@@ -135,12 +135,14 @@ def test_an_image_has_the_versions_that_are_tested():
 
 
 def test_whatever_a_worker_needs_is_pinned_for_images():
-    project = tomllib.loads((DOCKER.parent / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
+    folders = (DOCKER.parent / "client", DOCKER.parent)
+    sdk, project = (tomllib.loads((f / "pyproject.toml").read_text())["project"] for f in folders)
+    extras = project["optional-dependencies"] | {"server": sdk["dependencies"]}
     installed = re.search(r"'real2sim\[(.*)\]'", (DOCKER / "Dockerfile.cpu").read_text())
     needed = [*project["dependencies"], *(n for e in installed[1].split(",") for n in extras[e])]
     needed += [need for need in requires("torch") if "extra ==" not in need]
     names = {re.split(r"[><=~!\[; ]", need)[0].lower().replace("_", "-") for need in needed}
+    names.remove("real2sim")
     makefile = (DOCKER.parent / "Makefile").read_text().replace("\\\n", " ")
     with_torch = re.search(r"(?m)^WITH_TORCH := (.*)$", makefile)
     assert names - pins(IMAGE_PINS).keys() <= set(with_torch[1].split())
