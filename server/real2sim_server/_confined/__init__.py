@@ -6,7 +6,7 @@ time and written bytes, and can tell nothing but JSON or the files of a folder i
 it ends, the caller gets a value or an error that says why.
 """
 
-from .limits import Limits
 from .run import ConfinedError, run_confined
+from .starter import Limits
 
 __all__ = ["ConfinedError", "Limits", "run_confined"]

@@ -17,8 +17,7 @@ from typing import Any
 
 import structlog
 
-from .limits import MIB, Limits
-from .starter import OUT_OF_MEMORY, REQUEST_BYTES
+from .starter import MIB, OUT_OF_MEMORY, REQUEST_BYTES, Limits
 
 MAX_ANSWER_BYTES = 64 * MIB
 STARTING_S = 60.0

@@ -18,7 +18,7 @@ from ..render import render_cameras
 from ..render.cast import cast, detect
 from ..scene import BrownConrady, Camera, Fisheye, Shutter
 from ..scene.io import read_packed
-from ..scene.lidar_catalogue import catalogue_lidar
+from ..scene.range_sensors import catalogue_lidar
 from .gaussian_street import street_scene
 
 GAUSSIANS = 300_000

@@ -1,14 +1,13 @@
 """People among the objects of a scene: Gaussians that follow the joints of a body.
 
-The cluster of a person is stored in the rest pose of the body model. Its pose at an instant follows
-from the trajectory it goes along: footsteps are laid along the path by the distance covered
-(:mod:`real2sim_server.body.gait`), so that a person on another path, or at another speed, makes
-other steps. Poses are tabulated on the way, a piece at a time, and interpolated.
+A person's cluster is stored in the rest pose of the body model. The pose at an instant follows from
+the trajectory: footsteps are placed along the path by the distance covered
+(:mod:`real2sim_server.body.gait`), so a person on another path, or at another speed, takes other
+steps. Poses are tabulated on demand, one segment at a time, and interpolated. A person moved by
+something else walks straight on with every step of a :class:`Stride`.
 
-Whoever is moved by something else walks straight on with every step of a :class:`Stride`.
-
-Means go by linear blend skinning. A Gaussian is turned by the blended quaternion of its joints, the
-rotation nearest to the blended transforms, and keeps its scales.
+Linear blend skinning moves the means. The blended quaternion of the joints, the rotation nearest to
+the blended transforms, rotates a Gaussian; its scales stay.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -26,21 +25,82 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from .._numba import kernel
 from ..body import JOINTS, Body, body_model, joint_transforms, keypoints, skin
 from ..body.gait import LEAD, STANDING, Gait, GaitStyle, plan_gait, stride_length
 from ..body.skinning import joint_positions
 from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix, quaternion_yaw
 from .cloud import GaussianCloud
 from .errors import SceneError
-from .figure_kernels import pose_gaussians
 from .trajectory import Trajectory
+
+# Kernel: skinning of Gaussians.
+
+
+@kernel(nogil=True)
+def pose_gaussians(  # noqa: PLR0917
+    means: Any, quats: Any, joints: Any, weights: Any, turns: Any, shifts: Any
+) -> Any:
+    """Means [N, 3] and quaternions [N, 4] float32 of Gaussians on a posed body.
+
+    Args:
+        means, quats: [N, 3] and [N, 4] float32, of the rest pose.
+        joints, weights: [N, 4], which joints move a Gaussian, and by how much.
+        turns, shifts: [J, 4] ``wxyz`` and [J, 3]; a joint takes x to turn x + shift.
+    """
+    rows = np.empty((len(turns), 16))
+    for j in range(len(turns)):
+        w, x, y, z = turns[j, 0], turns[j, 1], turns[j, 2], turns[j, 3]
+        rows[j, 0] = 1 - 2 * (y * y + z * z)
+        rows[j, 1], rows[j, 2] = 2 * (x * y - w * z), 2 * (x * z + w * y)
+        rows[j, 3], rows[j, 4] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z)
+        rows[j, 5], rows[j, 6] = 2 * (y * z - w * x), 2 * (x * z - w * y)
+        rows[j, 7], rows[j, 8] = 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        for axis in range(3):
+            rows[j, 9 + axis] = shifts[j, axis]
+        rows[j, 12], rows[j, 13], rows[j, 14], rows[j, 15] = w, x, y, z
+    posed = np.empty((len(means), 3), np.float32)
+    turned = np.empty((len(means), 4), np.float32)
+    blend = np.empty(16)
+    for i in range(len(means)):
+        first, share = joints[i, 0], weights[i, 0]
+        for c in range(16):
+            blend[c] = share * rows[first, c]
+        for k in range(1, 4):
+            j, share = joints[i, k], weights[i, k]
+            if share == 0:
+                continue
+            for c in range(12):
+                blend[c] += share * rows[j, c]
+            # Both signs of a quaternion are one rotation: those of the first joint's side add up.
+            same = 0.0
+            for c in range(12, 16):
+                same += rows[j, c] * rows[first, c]
+            if same < 0:
+                share = -share
+            for c in range(12, 16):
+                blend[c] += share * rows[j, c]
+        x, y, z = means[i, 0], means[i, 1], means[i, 2]
+        for axis in range(3):
+            at = 3 * axis
+            posed[i, axis] = blend[at] * x + blend[at + 1] * y + blend[at + 2] * z + blend[9 + axis]
+        a, b, c_, d = blend[12], blend[13], blend[14], blend[15]
+        length = np.sqrt(a * a + b * b + c_ * c_ + d * d)
+        a, b, c_, d = a / length, b / length, c_ / length, d / length
+        w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        turned[i, 0] = a * w - b * x - c_ * y - d * z
+        turned[i, 1] = a * x + b * w + c_ * z - d * y
+        turned[i, 2] = a * y - b * z + c_ * w + d * x
+        turned[i, 3] = a * z + b * y - c_ * x + d * w
+    return posed, turned
+
 
 ROW_US = 20_000
 """Spacing of tabulated poses [us]; between them joints move straight on."""
 PIECE = 100
 """Poses that are tabulated at once."""
 KEPT_PIECES, KEPT_CLOUDS = 16, 4
-LONGEST_US = 3_600_000_000
+MAX_DURATION_US = 3_600_000_000
 """Who takes longer than this for a path stands [us]."""
 PACE, FASTEST = 0.05, 8.0
 """Spacing of the paces that striding is tabulated for, and the last of them [m/s]."""
@@ -370,7 +430,7 @@ class _Walk:
 
 def _gait(figure: Figure, trajectory: Trajectory) -> Gait:
     times, count = (trajectory.times_us - trajectory.start_us) * 1e-6, len(trajectory.times_us)
-    if trajectory.end_us - trajectory.start_us > LONGEST_US:
+    if trajectory.end_us - trajectory.start_us > MAX_DURATION_US:
         count = 1
     return plan_gait(
         figure.body,

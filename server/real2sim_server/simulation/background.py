@@ -1,6 +1,6 @@
 """Colliders of a scene: its ground, and upright boxes around the obstacles of its background.
 
-Solid cells are the closed loop's (``scene.obstacles``). Adjacent cells form one obstacle. Its
+Solid cells are the closed loop's (``scene.ground``). Adjacent cells form one obstacle. Its
 Gaussians are split along their length until a box seen from above fits each part: one for a pole,
 one for each side of a house, several for a curved hedge. The recording saw only one side of a wall,
 so boxes grow away from the recorded path.
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..geometry.transform import Float, invert_transform
 from ..physics.colliders import Box, HeightField
 from ..scene import GaussianCloud, Ground, Scene
-from ..scene.obstacles import CELL, HIGHEST, OPAQUE, OccupiedCells, RecordedWay, occupied_cells
+from ..scene.ground import CELL, HIGHEST, OPAQUE, OccupiedCells, RecordedWay, occupied_cells
 
 BACKGROUND = "background"
 """Names of these colliders begin with it."""

@@ -3,7 +3,7 @@
 It shares no code with the renderer of Gaussians, so that it can be its judge.
 """
 
-from .config import CameraSpec, SyntheticConfig
 from .log import SyntheticLog, generate_log, synthesize
+from .street import CameraSpec, SyntheticConfig
 
 __all__ = ["CameraSpec", "SyntheticConfig", "SyntheticLog", "generate_log", "synthesize"]

@@ -17,17 +17,19 @@ from ..geometry.transform import Float, apply_transform, invert_transform
 from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
 from ..logs.readers.native import write_native_log
 from ..scene import Camera, CameraMotion, CameraRig, Lidar
-from .bvh import build_geometry
-from .casting import Instances
-from .config import SyntheticConfig
-from .lanes import street_lanes
-from .people import PlannedPerson
-from .people_casting import PeopleCast, add_people
-from .people_truth import PeopleTruth, people_truth, trace_flow, trace_parts
-from .sensors import shoot_image, shoot_lidar, shoot_rays
-from .shading import RaycastWorld
+from .casting import Instances, build_geometry
+from .people_casting import (
+    PeopleCast,
+    PeopleTruth,
+    add_people,
+    people_truth,
+    trace_flow,
+    trace_parts,
+)
+from .sensors import RaycastWorld, shoot_image, shoot_lidar, shoot_rays
+from .street import SyntheticConfig, street_lanes
 from .surroundings import build_surroundings
-from .traffic import DrivePlan, PlannedVehicle, plan_drive, poses_at
+from .traffic import DrivePlan, PlannedPerson, PlannedVehicle, plan_drive, poses_at
 from .vehicles import SHAPES, build_vehicle, roof_heights, shape_row
 
 SWEEP_STEP_US = 4000.0

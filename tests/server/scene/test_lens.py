@@ -16,8 +16,7 @@ from real2sim_server.scene import (
     SceneError,
     Shutter,
 )
-from real2sim_server.scene.camera import Optics
-from real2sim_server.scene.camera_motion import project_moving
+from real2sim_server.scene.camera import Optics, project_moving
 from real2sim_server.scene.lens import lens_from, lens_values
 
 K = np.array([[900.0, 0, 641.5], [0, 880, 359.25], [0, 0, 1]])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from real2sim_server.scene import GaussianCloud, Ground, Trajectory
-from real2sim_server.scene.obstacles import RecordedWay, occupied_cells
+from real2sim_server.scene.ground import RecordedWay, occupied_cells
 from real2sim_server.world.path import LoggedPath
 
 

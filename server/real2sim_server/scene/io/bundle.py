@@ -16,17 +16,26 @@ from torch import Tensor
 
 from ...body.gait import GaitStyle
 from ..asset import Asset
-from ..cloud import GaussianCloud
-from ..colour import TimeColour
+from ..cloud import GaussianCloud, TimeColour
 from ..errors import BundleError, SceneError
 from ..figure import Figure
 from ..ground import Ground, of_bundle
 from ..ground_fit import BoxTrack, fit_scene_ground
 from ..lane_graph import LaneGraph
 from ..lidar_surfaces import RANGE_STEPS, LidarSurfaces, Reflector, RingResponse
-from ..scene import Scene, SceneObject
-from ..sky import Sky
-from .container import read_container, write_container
+from ..scene import Scene, SceneObject, Sky
+from .container import (
+    TensorFile,
+    cloud_shapes,
+    cloud_tensors,
+    figure_shapes,
+    figure_tensors,
+    read_container,
+    reflector_shapes,
+    reflector_tensors,
+    tensor_hashes,
+    write_container,
+)
 from .document import (
     UNCERTAINTIES,
     AssetContent,
@@ -48,17 +57,8 @@ from .document import (
     SceneDocument,
     SkyPart,
     TrajectoryPart,
-)
-from .lane_document import pack, unpack
-from .tensors import (
-    TensorFile,
-    cloud_shapes,
-    cloud_tensors,
-    figure_shapes,
-    figure_tensors,
-    reflector_shapes,
-    reflector_tensors,
-    tensor_hashes,
+    pack,
+    unpack,
 )
 
 BACKGROUND_FILE = "background.safetensors"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene import Scene
-from ...scene.obstacles import CELL, occupied_cells
+from ...scene.ground import CELL, occupied_cells
 from ..path import Float, LoggedPath
 from .bodies import BodyProperties, BodyState
 
@@ -559,7 +559,7 @@ _grids: WeakKeyDictionary[Scene, ObstacleGrid] = WeakKeyDictionary()
 def obstacle_grid(scene: Scene, path: LoggedPath) -> ObstacleGrid:
     """The grid of a scene's background; made once for each scene in memory.
 
-    Which cells are occupied is what :func:`~...scene.obstacles.occupied_cells` says, in simulations
+    Which cells are occupied is what :func:`~...scene.ground.occupied_cells` says, in simulations
     too.
 
     Args:
