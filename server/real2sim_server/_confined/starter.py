@@ -1,4 +1,4 @@
-"""The process that starts confined ones: it forks a child for each request and reads no file.
+"""The starter process: forks a confined child for each request and reads no file.
 
 A program that has its modules loaded forks in milliseconds, where a new interpreter takes seconds.
 The starter has one thread and one socket to the process that began it, and ends with that one.
@@ -39,7 +39,7 @@ _READ_AND_WRITE_OTHERS = 0b110
 
 @dataclass(frozen=True)
 class Limits:
-    """What one confined call may use.
+    """Limits of one confined call.
 
     Attributes:
         memory_bytes: address space beyond that of the program itself; files that are mapped count.
@@ -111,7 +111,7 @@ def _keep_capabilities(libc: ctypes.CDLL, kept: int) -> None:
 REQUEST_BYTES = 1 << 16
 OUT_OF_MEMORY = "out of memory"
 _MEMORY = ("allocate memory", "failed to map segment", "bad_alloc")
-"""Parts of messages of libraries that have no type of error for a lack of memory."""
+"""Message fragments of libraries without an error type for a lack of memory."""
 
 
 @dataclass
@@ -166,7 +166,7 @@ def _end_late(children: dict[int, _Child]) -> None:
 
 
 def _reap(children: dict[int, _Child]) -> None:
-    """Tell callers whose children are over how these ended."""
+    """Report the exit of finished children to their callers."""
     while children:
         pid, status = os.waitpid(-1, os.WNOHANG)
         if pid == 0:
@@ -179,7 +179,7 @@ def _reap(children: dict[int, _Child]) -> None:
 
 
 def _serve(control: socket.socket, children: dict[int, _Child]) -> bool:
-    """Start one child; False once the caller has gone."""
+    """Start one child; False if the caller has closed its socket."""
     message, descriptors, _, _ = socket.recv_fds(control, REQUEST_BYTES, 1)
     if not message:
         return False
@@ -246,7 +246,7 @@ def _outcome(target: str, arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _lacks_memory(error: BaseException | None) -> bool:
-    """Whether an error, or what it came from, is a lack of memory. torch has no type for it."""
+    """Whether an error, or its cause, is a lack of memory. torch has no type for it."""
     while error is not None:
         if isinstance(error, MemoryError) or any(sign in str(error) for sign in _MEMORY):
             return True

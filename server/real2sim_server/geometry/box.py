@@ -115,7 +115,7 @@ def _edge_overlaps(turn: Float, centre: Float, half_a: Float, half_b: Float) -> 
 # Kernels.
 
 MIN_OVERLAP = 1e-9
-"""Boxes that overlap by no more than this only touch [m]."""
+"""Maximum overlap of boxes that only touch [m]."""
 
 PARALLEL = 1e-6
 """Sine of the angle below which two edges span no axis of their own."""
@@ -149,7 +149,7 @@ def boxes_overlap(T_world_a: Any, size_a: Any, T_world_b: Any, size_b: Any) -> b
 
 @kernel
 def first_overlap(ways: Any, sizes: Any, covered: Any, reach: Any, standing: Any) -> Any:
-    """Number of the first of S samples at which two boxes on their ways share volume; S for none.
+    """Index of the first of S samples at which two moving boxes share volume; S for none.
 
     Args:
         ways: of both boxes, two [S, 4, 4] float64, ``T_world_box`` at the same times.

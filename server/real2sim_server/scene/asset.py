@@ -71,10 +71,10 @@ CLOTHES: dict[str, tuple[float, float, float]] = {
     "trousers": (0.16, 0.17, 0.22),
     "shoes": (0.1, 0.1, 0.1),
 }
-"""Names of what a person wears, and its colours unless told otherwise, RGB in [0, 1]."""
+"""Pieces of clothing and their default colours, RGB in [0, 1]."""
 
 WORN = ("long_hair", "skirt")
-"""What a person may have beside."""
+"""Optional garments."""
 OPACITY = 0.97
 THICKNESS = 0.004
 """Standard deviation along the normal [m]."""
@@ -99,7 +99,7 @@ def person_asset(
     gaussians: int = GAUSSIANS,
     style: GaitStyle | None = None,
 ) -> Asset:
-    """A person who walks wherever a trajectory leads.
+    """A person who walks along any trajectory.
 
     Args:
         asset_id: name of the asset.
@@ -107,7 +107,7 @@ def person_asset(
         height: of the person; default: of the build [m].
         clothes: colours that differ from ``CLOTHES``.
         worn: of ``WORN``.
-        gaussians: how many.
+        gaussians: their number.
         style: how the person walks.
 
     Raises:
@@ -184,7 +184,7 @@ def _areas(body: Body, triangles: NDArray[np.int64]) -> Float:
 def _bindings(
     body: Body, chosen: NDArray[np.int64], shares: Float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The four joints [N, 4] that matter most, and their weights."""
+    """The four joints [N, 4] with the largest weights, and these weights."""
     model = body.model
     full = np.zeros((len(chosen), len(JOINTS)))
     rows = np.arange(len(chosen))

@@ -30,7 +30,7 @@ MAX_READOUT_US = 200_000
 
 @dataclass(frozen=True)
 class Shutter:
-    """How an image is read out.
+    """The readout of an image.
 
     Attributes:
         direction: ``global``: all pixels at once; or which rows or columns come first.
@@ -58,23 +58,23 @@ class Shutter:
 
     @property
     def rolls(self) -> bool:
-        """Whether rows or columns are taken one after the other."""
+        """Whether rows or columns are exposed one after the other."""
         return self.direction != "global"
 
     @property
     def by_row(self) -> bool:
-        """Whether the pixels of a row are taken together, else those of a column."""
+        """Whether the pixels of a row are exposed together, else those of a column."""
         return self.direction in {"top_to_bottom", "bottom_to_top"}
 
     def line_times(self, width: int, height: int) -> NDArray[np.float64]:
-        """When each row (or column) is taken, 0 to 1 over the read-out; NCore's convention: the
+        """Exposure time of each row (or column), 0 to 1 over the readout; NCore's convention: the
         first at 0, the last at 1."""
         count = height if self.by_row else width
         times = np.arange(count) / max(count - 1, 1)
         return times if self.direction in {"top_to_bottom", "left_to_right"} else 1 - times
 
     def times_at(self, pixels: Float, width: int, height: int) -> Float:
-        """When the pixels at positions [..., 2] [px] are taken; beyond the image as its edge."""
+        """Exposure times of positions [..., 2] [px]; outside the image, those of its edge."""
         axis, count = (1, height) if self.by_row else (0, width)
         line = np.clip(np.floor(np.nan_to_num(pixels[..., axis])), 0, count - 1).astype(np.int64)
         return self.line_times(width, height)[line]
@@ -92,7 +92,7 @@ T_VEHICLE_OPTICAL = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What a camera's images were before they were freed of distortion; sizes are the camera's.
+    """The optics before the images were undistorted; sizes are the camera's.
 
     Attributes:
         K: [3, 3] float64 [px].
@@ -153,7 +153,7 @@ class Camera:
             self.as_recorded()
 
     def _check_lens(self, lens: Lens) -> None:
-        """Perspective images show something everywhere, others at least in their middle."""
+        """Perspective images cover all pixels, others at least the middle ones."""
         try:
             reach = lens.reach
         except SceneError as error:
@@ -263,18 +263,15 @@ class CameraRig:
 
 # Motion of a camera during readout.
 
-ROUNDS = 11
-"""Most rounds in which the row of a point and its time settle; each gains two digits."""
-
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """Where a camera is while an image is read out.
+    """Pose of a camera during the readout of an image.
 
-    Its place goes evenly along a straight line, its turn evenly about one axis.
+    The position moves uniformly along a straight line, the rotation uniformly about one axis.
 
     Attributes:
-        start, end: [4, 4] ``T_world_camera`` when the first and the last line are taken.
+        start, end: [4, 4] ``T_world_camera`` at the first and the last line.
     """
 
     start: Float
@@ -282,13 +279,13 @@ class CameraMotion:
 
     @classmethod
     def still(cls, pose: Float) -> CameraMotion:
-        """A camera that stands at ``pose`` [4, 4]."""
+        """A camera at rest at ``pose`` [4, 4]."""
         return cls(pose, pose)
 
     @classmethod
     def about(cls, pose: Float, linear: Float, angular: Float, seconds: float) -> CameraMotion:
-        """Of a camera that is at ``pose`` in the middle of ``seconds``, and moves at ``linear`` [3]
-        [m/s] and turns at ``angular`` [3] [rad/s], both in the world."""
+        """A camera at ``pose`` in the middle of ``seconds``, with velocity ``linear`` [3] [m/s] and
+        angular velocity ``angular`` [3] [rad/s], both in the world frame."""
         return cls(*(moved(pose, linear, angular, seconds * side) for side in (-0.5, 0.5)))
 
     @property
@@ -297,7 +294,7 @@ class CameraMotion:
         return not np.array_equal(self.start, self.end)
 
     def at(self, times: Float) -> tuple[Float, Float]:
-        """Turns [..., 3, 3] and places [..., 3] at ``times`` [...] from 0 to 1."""
+        """Rotations [..., 3, 3] and positions [..., 3] at ``times`` [...] from 0 to 1."""
         times = np.asarray(times, dtype=np.float64)
         ends = matrix_to_quaternion(np.stack([self.start[:3, :3], self.end[:3, :3]]))
         turns = quaternion_to_matrix(slerp(ends[0], ends[1], times))
@@ -312,7 +309,7 @@ class CameraMotion:
 
 
 def moved(pose: Float, linear: Any, angular: Any, seconds: float) -> Float:
-    """A pose [4, 4] after ``seconds`` of an even motion: ``linear`` [3] of its own origin [m/s],
+    """A pose [4, 4] after ``seconds`` of uniform motion: ``linear`` [3] of its own origin [m/s],
     ``angular`` [3] about it [rad/s], both in the world."""
     found = np.array(pose, dtype=np.float64)
     found[:3, :3] = turned(np.asarray(angular, dtype=np.float64) * seconds) @ found[:3, :3]
@@ -327,39 +324,3 @@ def turned(vector: Float) -> Float:
         return np.eye(3)
     axis = vector / angle
     return quaternion_to_matrix(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]))
-
-
-def project_moving(
-    camera: Camera,
-    motion: CameraMotion,
-    points: Float,
-    velocities: Float | None = None,
-) -> tuple[Float, NDArray[np.bool_], Float]:
-    """Where a camera with a rolling shutter sees points.
-
-    The row in which a point is seen says when it is seen, and the time says where: rounds settle
-    both.
-
-    Args:
-        camera: with its lens and shutter.
-        motion: of the camera.
-        points: [N, 3] in the world, in the middle of the read-out [m].
-        velocities: [N, 3] of the points [m/s]; None: they stand.
-
-    Returns:
-        Positions [N, 2] [px], whether they have any [N], and times [N] from 0 to 1.
-    """
-    shutter, size = camera.shutter, (camera.width, camera.height)
-    per_frame = 0.0 if velocities is None else velocities * (shutter.readout_us * 1e-6)
-    times = np.zeros(len(points))
-    for _ in range(ROUNDS if shutter.rolls else 1):
-        turns, places = motion.at(times)
-        seen = points + per_frame * (times - 0.5)[:, None]
-        own = np.einsum("nji,nj->ni", turns, seen - places)
-        pixels, valid = camera.project(own)
-        if not shutter.rolls:
-            break
-        before, times = times, shutter.times_at(pixels, *size)
-        if np.array_equal(before, times):
-            break
-    return pixels, valid, times

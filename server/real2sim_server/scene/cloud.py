@@ -122,7 +122,7 @@ def _spread_directions(count: int = 64) -> Float:
 
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 UNSEEN = 0.25
-"""Uncertainty of what no training ray has met: about the absolute error of a guessed colour."""
+"""Uncertainty where no training ray passed: about the absolute error of a guessed colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ class GaussianCloud:
         return int(self.means.shape[0])
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by name, without what is not known."""
+        """Its tensors by name, without absent ones."""
         named = ((field.name, getattr(self, field.name)) for field in fields(self))
         return {name: tensor for name, tensor in named if tensor is not None}
 
@@ -195,7 +195,7 @@ class GaussianCloud:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors live."""
+        """Device of the tensors."""
         return self.means.device
 
     @property
@@ -216,7 +216,7 @@ class GaussianCloud:
         )
 
     def to(self, device: torch.device | str) -> GaussianCloud:
-        """The cloud on another device; itself when it is there already."""
+        """The cloud on another device; itself if it is already there."""
         if torch.device(device) == self.device:
             return self
         return GaussianCloud(**{name: t.to(device) for name, t in self.tensors().items()})
@@ -226,7 +226,7 @@ class GaussianCloud:
         return GaussianCloud(**{name: t[index].contiguous() for name, t in self.tensors().items()})
 
     def by_importance(self) -> Tensor:
-        """Indices [N] int64, what covers most first: by opacity times the area [m^2] of the
+        """Indices [N] int64, largest coverage first: by opacity times the area [m^2] of the
         largest ellipse; equals keep their order."""
         largest = self.scales.sort(dim=1, descending=True).values[:, :2]
         return torch.argsort(self.opacities * largest.prod(dim=1), descending=True, stable=True)
@@ -303,7 +303,7 @@ class GaussianCloud:
         )
 
     def check_values(self, what: str) -> None:
-        """Look at every value, as is due where a cloud comes from outside.
+        """Check every value of a cloud from an untrusted source.
 
         Args:
             what: name of the cloud for the message.
@@ -357,7 +357,7 @@ BASES = ("cosine", "real_dft")
 
 @dataclass(frozen=True, eq=False)
 class TimeColour:
-    """What is added to the constant part of a cloud's colour as time goes by.
+    """Time-dependent offset of the constant part of a cloud's colour.
 
     At phase s, which goes from 0 at ``start_us`` to 1 at ``end_us`` and stays there, the SH
     coefficient ``sh[:, 0]`` becomes ``sh[:, 0] + sum_k coefficients[:, k] b_k(s)``, k from 0.
@@ -400,7 +400,7 @@ class TimeColour:
         return colour_basis(phase, int(self.coefficients.shape[1]), self.basis)
 
     def tones_of(self, times_us: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Values [M, F] at many instants [us], each row as :meth:`tones` gives it."""
+        """Values [M, F] at several instants [us]; each row equals :meth:`tones`."""
         phases = (times_us - self.start_us) / (self.end_us - self.start_us)
         return _basis_values(phases, int(self.coefficients.shape[1]), self.basis)
 
@@ -417,7 +417,7 @@ class TimeColour:
 
 
 def colour_basis(phase: float, count: int, basis: str) -> Tensor:
-    """Values [count] float32 of the basis functions at ``phase``, held to [0, 1]."""
+    """Values [count] float32 of the basis functions at ``phase``, clamped to [0, 1]."""
     return torch.from_numpy(_values_at(phase, count, basis).copy())
 
 

@@ -101,7 +101,7 @@ PIECE = 100
 """Poses that are tabulated at once."""
 KEPT_PIECES, KEPT_CLOUDS = 16, 4
 MAX_DURATION_US = 3_600_000_000
-"""Who takes longer than this for a path stands [us]."""
+"""People on longer trajectories stand still [us]."""
 PACE, FASTEST = 0.05, 8.0
 """Spacing of the paces that striding is tabulated for, and the last of them [m/s]."""
 STRIDE_ROWS = 48
@@ -112,7 +112,7 @@ SETTLING = 0.3
 
 
 class Stride(NamedTuple):
-    """How far somebody is in walking whom no trajectory leads.
+    """Walking state of a person without a trajectory.
 
     Attributes:
         steps: made so far; a foot swings over each whole one.
@@ -125,14 +125,14 @@ class Stride(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """How the Gaussians of an object follow a body that walks.
+    """Binding of an object's Gaussians to a walking body.
 
     Attributes:
         shape: [<= 12] coefficients of the body model's shapes.
         height: of the body [m].
         middle: height of the object's origin above the body's, which is on the ground [m].
         joints: [N, 4] uint8, joints that move a Gaussian.
-        weights: [N, 4] float32, and by how much; each row sums to one.
+        weights: [N, 4] float32 of these joints; each row sums to one.
         style: how it walks.
 
     Raises:
@@ -189,7 +189,7 @@ class Figure:
         return body
 
     def styled(self, **style: float) -> Figure:
-        """The same person walking otherwise; the same one again for the same style.
+        """The same person in another walking style; the same object for the same style.
 
         Args:
             style: fields of :class:`..body.gait.GaitStyle`; others stay.
@@ -209,7 +209,7 @@ class Figure:
         return self.joints.nbytes + self.weights.nbytes
 
     def check_values(self, what: str) -> None:
-        """Look at every value, as is due where a figure comes from outside.
+        """Check every value of a figure from an untrusted source.
 
         Args:
             what: name of the object for the message.
@@ -235,30 +235,30 @@ class Figure:
             )
 
     def posed(self, cloud: GaussianCloud, trajectory: Trajectory, t_us: int) -> GaussianCloud:
-        """``cloud`` in the pose that it has at ``t_us`` on its way along ``trajectory``.
+        """``cloud`` in its pose at ``t_us`` along ``trajectory``.
 
         Args:
             cloud: in the rest pose, frame of the object.
             trajectory: of the object; its origin is ``middle`` above the ground.
-            t_us: instant [us]; before and after the trajectory it stands as at its ends.
+            t_us: instant [us]; outside the trajectory the pose is that of the nearer end.
 
         Returns:
-            The same object again while nothing else of that person was asked for.
+            The same object as before, if the query repeats the last one of this person.
         """
         with self._lock:
             return self._walk(trajectory).cloud(cloud, t_us)
 
     def striding(self, cloud: GaussianCloud, stride: Stride) -> GaussianCloud:
-        """``cloud`` walking straight on, wherever it is moved.
+        """``cloud`` walking straight on, for callers that move it themselves.
 
         Args:
             cloud: in the rest pose, frame of the object.
-            stride: how far it is.
+            stride: walking state.
         """
         return self._binding.posed(cloud, *self._stride_joints(stride))
 
     def stride_at(self, trajectory: Trajectory, t_us: int) -> Stride:
-        """How far it is at ``t_us`` on its way along ``trajectory``, to go on from there."""
+        """Walking state at ``t_us`` along ``trajectory``, to continue from."""
         with self._lock:
             walk = self._walk(trajectory)
         seconds = float(np.clip(t_us - walk.start_us, 0, walk.span_us)) * 1e-6
@@ -266,7 +266,7 @@ class Figure:
         return Stride(steps, float(np.interp(seconds, walk.gait.times, walk.gait.speeds)))
 
     def strode(self, stride: Stride, *, speed: float, seconds: float) -> Stride:
-        """How far it is after ``seconds`` more at ``speed`` [m/s]; at an even one feet stand."""
+        """Walking state after ``seconds`` at ``speed`` [m/s]; constant speed keeps feet in place."""
         settled = math.exp(-seconds / SETTLING)
         pace = speed + (stride.pace - speed) * settled
         return Stride(stride.steps + seconds * speed / self._step_length(pace), pace)
@@ -277,9 +277,9 @@ class Figure:
         """COCO's 17 keypoints [17, 3], frame of the object [m].
 
         Args:
-            trajectory: that leads it.
-            t_us: instant on the way [us].
-            stride: how it walks where no trajectory leads it.
+            trajectory: of the object.
+            t_us: instant on the trajectory [us].
+            stride: walking state, in place of the trajectory.
         """
         if stride is not None:
             turns, places = self._stride_joints(stride)
@@ -294,7 +294,7 @@ class Figure:
         return points
 
     def _walk(self, trajectory: Trajectory) -> _Walk:
-        """The way along a trajectory, kept as long as that lives; under the lock."""
+        """The walk along a trajectory, cached for its lifetime; needs the lock."""
         walk = self._walks.get(trajectory)
         if walk is None:
             walk = self._walks[trajectory] = _Walk(self, trajectory)
@@ -388,7 +388,7 @@ class _Binding:
 
 
 class _Walk:
-    """A figure on its way along one trajectory: tabulated poses, and what was shown last."""
+    """A figure's walk along one trajectory: tabulated poses, and the last result."""
 
     def __init__(self, figure: Figure, trajectory: Trajectory) -> None:
         # No reference to the trajectory: the walk is kept as long as that lives.
@@ -402,7 +402,7 @@ class _Walk:
         )
 
     def cloud(self, cloud: GaussianCloud, t_us: int) -> GaussianCloud:
-        """``cloud`` at ``t_us``, from memory where it was asked for before."""
+        """``cloud`` at ``t_us``; repeated queries return the cached one."""
         key = (id(cloud), t_us)
         found = self.shown.get(key)
         if found is None or found[0] is not cloud:

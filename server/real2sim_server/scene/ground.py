@@ -113,16 +113,15 @@ def pose_at(heights: Any, frame: Any, x: float, y: float, yaw: float) -> Any:
 class Ground:
     """Heights on a grid in the world. Immutable and shared.
 
-    Between cell centres heights are bilinear; outside the grid the nearest place of its rim
-    counts. The ground has one height at each place: of a bridge and the road below it, it is the
-    one that was driven.
+    Heights are bilinear between cell centres; outside the grid the nearest point of its border
+    counts. Each position has one height: where a bridge crosses a road, that of the driven one.
 
     Attributes:
         origin: [2] float64, corner of cell (0, 0) [m].
         cell: edge of a cell [m].
         heights: [X, Y] float32, z at cell centres [m], finite; X and Y are at least 2.
         is_ground: [X, Y] bool, where ground is known: measured or driven, between measurements,
-            under boxes. Elsewhere heights are continued from there.
+            under boxes. Elsewhere heights are extrapolated.
 
     Raises:
         SceneError: shapes differ, a side is below 2, values are not finite, no positive cell.
@@ -166,7 +165,7 @@ class Ground:
         return found
 
     def height(self, x: float, y: float) -> float:
-        """z [m] at one place [m]: the same for one, in about a microsecond."""
+        """z [m] at one position [m], in about a microsecond."""
         found: float = height_at(*self.grid, x, y)
         return found
 
@@ -176,7 +175,7 @@ class Ground:
         return found
 
     def pose_on(self, x: float, y: float, yaw: float) -> Float:
-        """``T_world_vehicle`` [4, 4] float64 of a vehicle that stands at (x, y) [m].
+        """``T_world_vehicle`` [4, 4] float64 of a vehicle at (x, y) [m].
 
         Its x axis seen from above has heading ``yaw`` [rad]; its z axis is normal to the ground
         between its wheels.
@@ -209,7 +208,7 @@ class Ground:
 
     @cached_property
     def grid(self) -> tuple[NDArray[np.float32], Float]:
-        """What kernels take: the heights, and where and how large their cells are."""
+        """Arguments of the kernels: heights, and (x0, y0, cell size) of the grid."""
         return self.heights, np.append(self.first_centre, self.cell)
 
 
@@ -236,26 +235,26 @@ LOWEST, HIGHEST = 0.4, 1.6
 """Heights above the ground between which a Gaussian is in the way of a car [m]."""
 
 OPAQUE = 0.5
-"""Gaussians fainter than this do not count."""
+"""Minimum opacity of Gaussians that count."""
 
 FEWEST = 3
-"""Gaussians in a cell from which on it is occupied; fewer are floaters."""
+"""Minimum Gaussians in an occupied cell; fewer are floaters."""
 
 REACH = 40.0
-"""Distance from the recorded path within which cells are looked at [m]."""
+"""Maximum distance of cells from the recorded path [m]."""
 
 DRIVEN_HALF_WIDTH = 1.1
-"""The recorded vehicle drove through here, so there is nothing [m]."""
+"""Half width of the driven corridor, which is free [m]."""
 
 POSE_SPACING = 0.05
-"""Recorded poses nearer than this to the one before add nothing but noise [m]."""
+"""Minimum spacing of recorded poses; closer ones only add noise [m]."""
 
 STUB = 1.0
-"""Length given to the way of a vehicle that never moved [m]."""
+"""Path length of a parked vehicle [m]."""
 
 
 class Way(Protocol):
-    """What is needed of the recorded way of the ego."""
+    """The recorded path of the ego, as :func:`occupied_cells` needs it."""
 
     @property
     def s(self) -> Float:
@@ -275,7 +274,7 @@ class Way(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RecordedWay:
-    """The recorded way of the ego, poses that are apart only.
+    """The recorded path of the ego, without coincident poses.
 
     Attributes:
         s, positions, yaws: see :class:`Way`.
@@ -287,7 +286,7 @@ class RecordedWay:
 
     @classmethod
     def of(cls, ego: Trajectory) -> RecordedWay:
-        """The way of a trajectory; of a vehicle that never moved, a metre along its heading."""
+        """The path of a trajectory; for a parked vehicle, a metre along its heading."""
         kept = [0]
         for i, place in enumerate(ego.positions[:, :2]):
             if float(((place - ego.positions[kept[-1], :2]) ** 2).sum()) >= POSE_SPACING**2:
@@ -304,7 +303,7 @@ class RecordedWay:
 
 @dataclass(frozen=True, eq=False)
 class OccupiedCells:
-    """Cells of the ground in which something opaque stands.
+    """Ground cells that hold something opaque.
 
     Attributes:
         origin: [2] lowest corner [m].

@@ -187,14 +187,14 @@ class Road:
         return s, float(-(x - px) * np.sin(heading) + (y - py) * np.cos(heading))
 
     def moved(self, yaw: float, shift: Float) -> Road:
-        """The road turned about the z axis of the world by ``yaw`` [rad], then moved by ``shift``
+        """The road rotated about the world's z axis by ``yaw`` [rad], then moved by ``shift``
         [3] [m]."""
         points = turned(self.points, yaw) + shift
         return replace(self, points=points, headings=self.headings + yaw)
 
 
 def turned(points: Float, yaw: float) -> Float:
-    """Points [N, 3] turned about the z axis by ``yaw`` [rad]."""
+    """Points [N, 3] rotated about the z axis by ``yaw`` [rad]."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     found: Float = points @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return found
@@ -216,14 +216,14 @@ LANE_KINDS: tuple[str, ...] = get_args(LaneKind)
 AREA_KINDS: tuple[str, ...] = get_args(AreaKind)
 SIGNAL_KINDS: tuple[str, ...] = get_args(SignalKind)
 TRAVELLED: frozenset[str] = frozenset({"driving", "bus"})
-"""Lanes that cars drive along."""
+"""Kinds of lanes that cars drive along."""
 DRIVABLE: frozenset[str] = TRAVELLED | {"bicycle", "shoulder", "parking"}
-"""Lanes whose surface a car may touch."""
+"""Kinds of lanes whose surface a car may touch."""
 SAME_PLACE_M = 1e-6
 
 
 class LanePlace(NamedTuple):
-    """A place in a lane's own coordinates.
+    """A position in a lane's own coordinates.
 
     Attributes:
         lane_id: the lane.
@@ -242,7 +242,7 @@ class LanePlace(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """One lane, in the direction that its traffic drives.
+    """A lane, in its driving direction.
 
     Attributes:
         lane_id: unique in the graph.
@@ -317,12 +317,12 @@ class Lane:
 
     @property
     def turn(self) -> float:
-        """By how much its direction changes from start to end, either way [rad]."""
+        """Absolute change of direction from start to end [rad]."""
         return abs(float(self.headings[-1] - self.headings[0]))
 
     @cached_property
     def rims(self) -> tuple[Float, Float]:
-        """Left and right rim, [N, 3] float64 each, at the points of the centre line [m]."""
+        """Left and right border, [N, 3] float64 each, at the points of the centre line [m]."""
         aside = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)
         half = np.zeros_like(self.centre)
         half[:, :2] = aside * (self.widths / 2)[:, None]
@@ -344,7 +344,7 @@ class Lane:
         return float(np.interp(s, self.s, self.widths))
 
     def moved(self, yaw: float, shift: Float) -> Lane:
-        """The lane turned about the z axis of the world by ``yaw`` [rad], then moved [m]."""
+        """The lane rotated about the world's z axis by ``yaw`` [rad], then moved [m]."""
         return replace(self, centre=turned(self.centre, yaw) + shift)
 
 
@@ -373,7 +373,7 @@ class Area:
 
 @dataclass(frozen=True, eq=False)
 class StopLine:
-    """Where vehicles wait.
+    """A line at which vehicles stop.
 
     Attributes:
         stop_line_id: unique among the stop lines.
@@ -425,7 +425,7 @@ class Signal:
 
 
 def points_of(values: ArrayLike, what: str, *, least: int = 2) -> Float:
-    """Finite points [N, 3] that nobody writes to, N >= ``least``.
+    """Finite, read-only points [N, 3], N >= ``least``.
 
     Raises:
         SceneError: naming ``what``.

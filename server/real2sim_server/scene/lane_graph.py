@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -271,19 +271,19 @@ MAX_LENGTH_M = 2e7
 
 @dataclass(frozen=True, eq=False)
 class LaneGraph:
-    """Lanes and what rules them, in the world frame of a scene [m]. Immutable and shared.
+    """Lanes and their traffic rules, in the world frame of a scene [m]. Immutable and shared.
 
     Attributes:
         lanes: by id, in a stable order.
         areas, stop_lines, signals, roads: by id.
         source: where it comes from: a format and file, or the log.
-        accuracy: how far centre lines may be from those of the street: an estimate of the median
-            error [m]; None where nothing is known of it (maps as their makers give them).
-        geo_reference: projection of the map that it was read from (PROJ text), or empty.
-        notes: what the reader of a map left out, one sentence each; not stored with a scene.
+        accuracy: estimated median error of the centre lines [m]; None if unknown (maps of other
+            providers).
+        geo_reference: projection of the source map (PROJ text), or empty.
+        notes: parts that the reader of a map skipped, one sentence each; not stored with a scene.
 
     Raises:
-        SceneError: an id that is stored under another or that nothing has.
+        SceneError: an id stored under another one, or a reference to a missing one.
     """
 
     lanes: Mapping[str, Lane]
@@ -372,7 +372,7 @@ class LaneGraph:
 
     @cached_property
     def predecessors(self) -> Mapping[str, tuple[str, ...]]:
-        """Lanes that each lane follows on, by its id."""
+        """Predecessors of each lane, by its id."""
         found: dict[str, list[str]] = {name: [] for name in self.lanes}
         for lane in self.lanes.values():
             for name in lane.successors:
@@ -394,13 +394,13 @@ class LaneGraph:
         kinds: Iterable[str] = TRAVELLED,
         within: float = math.inf,
     ) -> LanePlace | None:
-        """The lane nearest to a pose, None where none of these kinds is ``within`` [m].
+        """The lane nearest to a pose, or None if no lane of these kinds lies ``within`` [m].
 
         Args:
-            x, y: the place in the world [m].
-            heading: lanes of about that direction [rad] come before others; None: any direction.
+            x, y: world position [m].
+            heading: preferred direction of the lane [rad]; None: any direction.
             kinds: of lanes that count.
-            within: farthest distance from a centre line [m].
+            within: maximum distance from a centre line [m].
         """
         place = np.array([[x, y, math.nan if heading is None else heading]])
         index, values = self.nearest_many(place, kinds=kinds)
@@ -414,8 +414,7 @@ class LaneGraph:
     def nearest_many(
         self, poses: ArrayLike, *, kinds: Iterable[str] = TRAVELLED
     ) -> tuple[NDArray[np.int64], Float]:
-        """The nearest lanes of poses [S, 3] (x, y [m], heading [rad] or NaN), some microseconds
-        each.
+        """The nearest lanes of poses [S, 3] (x, y [m], heading [rad] or NaN), in microseconds each.
 
         Returns:
             Positions [S] in :attr:`lane_ids`, -1 without any lane of these kinds; and [S, 2]
@@ -432,7 +431,7 @@ class LaneGraph:
         return found, values
 
     def is_drivable(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Which places [S, 2] [m] lie on the surface of the road, [S] bool: on a lane of a
+        """Whether positions [S, 2] [m] lie on the road surface, [S] bool: on a lane of a
         :data:`DRIVABLE` kind, in a drivable area, a junction or a crosswalk."""
         places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
         found = np.zeros(len(places), dtype=np.bool_)
@@ -449,13 +448,13 @@ class LaneGraph:
     def routes(
         self, lane_id: str, length: float, *, s: float = 0.0, limit: int = 64
     ) -> list[tuple[str, ...]]:
-        """Ways on along successors from ``s`` on a lane, each as the lanes it takes.
+        """Routes along successors from ``s`` on a lane, each as a tuple of lane ids.
 
         Args:
-            lane_id: where it begins.
-            length: how far each goes, unless it ends before [m].
-            s: begin on that lane [m].
-            limit: how many at most; those that are found first.
+            lane_id: first lane.
+            length: of each route, unless its lanes end before [m].
+            s: start on the first lane [m].
+            limit: maximum number of routes; the first ones found.
 
         Raises:
             SceneError: there is no such lane.
@@ -475,7 +474,7 @@ class LaneGraph:
         return found
 
     def route(self, start: str, goal: str, *, change_cost: float = 20.0) -> tuple[str, ...] | None:
-        """The shortest way from one lane to another, or None.
+        """The shortest route from one lane to another, or None.
 
         Args:
             start, goal: lanes.
@@ -509,16 +508,9 @@ class LaneGraph:
                     heapq.heappush(queue, (cost + step, onward))
         return None
 
-    def centre_line(self, way: Sequence[str]) -> Float:
-        """Points [N, 3] float64 along lanes that follow each other, none twice [m]."""
-        points: Float = np.concatenate([self.lane(name).centre for name in way])
-        steps = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
-        kept: Float = points[np.concatenate([[True], steps > 1e-3])]
-        return kept
-
     @cached_property
     def gaps(self) -> Mapping[tuple[str, str], float]:
-        """Distance between the end of a lane and the start of each that goes on from it [m]."""
+        """Distance between the end of a lane and the start of each successor [m]."""
         return {
             (lane.lane_id, name): float(
                 np.linalg.norm(lane.centre[-1] - self.lanes[name].centre[0])

@@ -31,7 +31,7 @@ from ..geometry.transform import Float, is_rigid
 from .errors import LidarError, RadarError
 
 MAX_SLOTS = 2048
-"""Instants of a sweep at which poses are taken: 0.05 ms apart at 10 Hz, 0.4 mm at 15 m/s."""
+"""Instants of a sweep at which poses are sampled: 0.05 ms apart at 10 Hz, 0.4 mm at 15 m/s."""
 MAX_RANGE_M = 2000.0
 MAX_DIVERGENCE = 0.1
 
@@ -92,7 +92,7 @@ class Beams:
         start: float = np.pi,
         field_of_view: float = 2 * np.pi,
     ) -> Beams:
-        """Rows that turn about the sensor's z axis.
+        """Rows that rotate about the sensor's z axis.
 
         Args:
             elevation: [B] of each row [rad].
@@ -162,7 +162,7 @@ class Beams:
 
 @dataclass(frozen=True)
 class Detection:
-    """What the detector needs for a return.
+    """Thresholds of the detector for a return.
 
     Attributes:
         range_m, reflectivity: a diffuse surface of this reflectivity, in (0, 1], at this distance
@@ -246,7 +246,7 @@ class Lidar:
         return self.beams.shape
 
     def placed(self, T_vehicle_lidar: ArrayLike) -> Lidar:
-        """The same sensor elsewhere on the vehicle."""
+        """The same sensor at another pose on the vehicle."""
         return replace(self, T_vehicle_lidar=np.asarray(T_vehicle_lidar, dtype=np.float64))
 
 
@@ -266,7 +266,7 @@ def _check_range(what: str, value: float, low: float, high: float) -> None:
 FOLDER = Path(__file__).parent / "lidar_models"
 MAX_FILE_BYTES = 64 << 20
 LIDAR_MOUNT = (0.9, 0.0, 1.73)
-"""Of LiDARs whose model names no pose, from the vehicle's rear axle [m]."""
+"""Default position of LiDARs, from the vehicle's rear axle [m]."""
 
 
 @cache
@@ -461,7 +461,7 @@ RADARS: Mapping[str, RadarModel] = {
 """Radars of 77 GHz of four kinds, by orders of magnitude; no maker's figures."""
 
 RADAR_MOUNT = (3.6, 0.0, 0.5)
-"""Of radars whose session names no pose, from the vehicle's rear axle [m]."""
+"""Default position of radars, from the vehicle's rear axle [m]."""
 
 
 def at_mount() -> Float:
@@ -507,7 +507,7 @@ class Radar:
 
     @cached_property
     def rays(self) -> Lidar:
-        """The fan of rays that finds what there is to see, all at one instant, [B, C]."""
+        """The fan of rays that finds targets, all at one instant, [B, C]."""
         model = self.model
         wide, high = (
             max(round(angle / model.ray_spacing_deg), 1) for angle in model.field_of_view_deg

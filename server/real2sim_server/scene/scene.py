@@ -73,12 +73,12 @@ class Sky:
         return sum(t.numel() * t.element_size() for t in self.tensors().values())
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by name, without what is not known."""
+        """Its tensors by name, without absent ones."""
         known = {} if self.uncertainties is None else {"uncertainties": self.uncertainties}
         return {"faces": self.faces, **known}
 
     def check_values(self) -> None:
-        """Look at every value. Raises SceneError for those not finite or out of range."""
+        """Check every value. Raises SceneError for non-finite ones and those out of range."""
         if not bool(torch.isfinite(self.faces).all()):
             raise SceneError("sky: faces hold values that are not finite")
         given = self.uncertainties
@@ -176,7 +176,7 @@ def box_size(size: Iterable[float], what: str) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """One movable thing: a cluster of Gaussians in its own frame, with a box and a trajectory.
+    """A movable object: a cluster of Gaussians in its own frame, with a box and a trajectory.
 
     Attributes:
         object_id: unique in the scene, for example ``car_3``.
@@ -249,7 +249,7 @@ class Scene:
     World frame: right-handed, x forward, y left, z up [m], recentred near the drive.
 
     Attributes:
-        name: human name, also the last part of its folder.
+        name: display name, also the last part of its folder.
         background: static Gaussians in the world frame.
         objects: by id, in a stable order; ``instance_id`` is 1 + position in that order.
         sky: cube map, or None for black.
@@ -259,10 +259,9 @@ class Scene:
         ego_size: (length, width, height) of the recording vehicle's box [m].
         provenance: where it comes from: source, reader, settings, versions (JSON values only).
         content_hash: SHA-256 of the bundle it was read from or written to; empty before that.
-        stored_ground: as the reconstruction fitted it; None where nobody has so far. Ask
-            :attr:`ground`.
-        lidar: what LiDARs see in its place, or None: they see the same Gaussians as cameras.
-        lanes: of its roads, from a map or the log; None where nobody has given it any.
+        stored_ground: as the reconstruction fitted it, or None. Use :attr:`ground` instead.
+        lidar: Gaussians for LiDARs, or None: LiDARs see the same Gaussians as cameras.
+        lanes: of its roads, from a map or the log, or None.
     """
 
     name: str
@@ -332,7 +331,7 @@ class Scene:
 
     @property
     def has_uncertainties(self) -> bool:
-        """Whether it is known how well training rays tell what it shows."""
+        """Whether uncertainties are known."""
         return self.background.uncertainties is not None
 
     @property

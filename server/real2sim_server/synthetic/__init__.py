@@ -1,4 +1,4 @@
-"""Synthetic drives: a procedural street, ray-cast on the CPU, with the truth at hand.
+"""Synthetic drives: a procedural street, ray-cast on the CPU, with ground truth.
 
 It shares no code with the renderer of Gaussians, so that it can be its judge.
 """

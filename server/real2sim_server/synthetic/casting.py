@@ -69,7 +69,7 @@ def build_geometry(meshes: list[Mesh]) -> tuple[Geometry, NDArray[np.int64]]:
 def append_geometry(
     geometry: Geometry, meshes: list[Mesh]
 ) -> tuple[Geometry, list[tuple[NDArray[np.int64], int, tuple[int, int]]]]:
-    """More meshes behind those of a geometry, for :func:`refit`.
+    """Append meshes to a geometry, for :func:`refit`.
 
     Returns:
         The geometry; of each mesh the order of its triangles, the row of the first, and its first
@@ -410,7 +410,7 @@ def cast(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
 
 @func(forceinline=True)
 def is_blocked(g, instances, ox, oy, oz, dx, dy, dz, limit, stack):
-    """Whether anything lies on a ray within ``limit``."""
+    """Whether a ray hits anything within ``limit``."""
     for i in range(len(instances.radius)):
         if not _near_instance(instances, i, ox, oy, oz, dx, dy, dz, limit):
             continue

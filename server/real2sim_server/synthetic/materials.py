@@ -1,4 +1,4 @@
-"""What surfaces are made of: albedo and gloss as functions of texture coordinates.
+"""Materials of surfaces: albedo and gloss as functions of texture coordinates.
 
 Every material takes the size of a pixel on the surface and fades what is finer, so that textures
 do not alias at a distance. Colours are linear RGB; the last value is the fraction of mirror

@@ -27,7 +27,7 @@ BICYCLE_COLOURS = {
 
 @dataclass(frozen=True, eq=False)
 class PersonMesh:
-    """Somebody's triangles and where they lie in the world's arrays.
+    """A person's triangles, and their position in the world's arrays.
 
     Attributes:
         person: whose they are.
@@ -48,7 +48,7 @@ class PersonMesh:
 
 @dataclass(frozen=True, eq=False)
 class PeopleCast:
-    """The people of a street in the arrays that rays are cast at.
+    """The people of a street in the arrays for ray casting.
 
     The arrays change with time, so whoever casts holds them by :meth:`at`.
     """
@@ -60,7 +60,7 @@ class PeopleCast:
 
     @contextmanager
     def at(self, t_us: float) -> Iterator[RaycastWorld]:
-        """The world with everybody in the pose of an instant [us]."""
+        """The world with all people posed at an instant [us]."""
         with self._lock:
             if self._now != [t_us]:
                 for mesh in self.meshes:
@@ -69,7 +69,7 @@ class PeopleCast:
             yield self.world
 
     def over(self, times_us: Float) -> Iterator[RaycastWorld]:
-        """The world at instants [T] [us], one after the other; to be used up."""
+        """Yield the world at instants [T] [us], one after the other."""
         with self._lock:
             self._now.clear()
             shapes = [mesh.person.vertices(times_us * 1e-6) for mesh in self.meshes]
@@ -79,7 +79,7 @@ class PeopleCast:
                 yield self.world
 
     def roots(self) -> NDArray[np.int64]:
-        """Root node [P] of everybody's hierarchy."""
+        """Root node [P] of each person's hierarchy."""
         return np.array([mesh.nodes[0] for mesh in self.meshes], dtype=np.int64)
 
     def _move(self, mesh: PersonMesh, vertices: Float) -> None:
@@ -99,7 +99,7 @@ def part_names(person: PlannedPerson) -> tuple[str, ...]:
 def add_people(
     geometry: Geometry, people: tuple[PlannedPerson, ...], paints: list[tuple[float, ...]]
 ) -> tuple[Geometry, tuple[PersonMesh, ...]]:
-    """Put people behind the world's other meshes; ``paints`` gets their colours."""
+    """Append people to the world's meshes, and their colours to ``paints``."""
     meshes, out = [], []
     for person in people:
         triangles, parts = person_triangles(person)
@@ -122,7 +122,7 @@ def add_people(
 
 
 def person_triangles(person: PlannedPerson) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangles [T, 3] and what each belongs to [T], see :func:`part_names`."""
+    """Triangles [T, 3] and the part of each [T], see :func:`part_names`."""
     model = person.motion.body.model
     triangles = model.triangles[model.triangles_of(person.looks.groups)]
     parts = np.median(model.parts[triangles], axis=1).astype(np.int64)
@@ -150,7 +150,7 @@ def _paint(
 
 @dataclass(frozen=True, eq=False)
 class PeopleTruth:
-    """Everybody at one instant.
+    """All people at one instant.
 
     Attributes:
         tracks: [P] index into the log's tracks.

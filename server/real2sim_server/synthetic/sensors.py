@@ -65,7 +65,7 @@ def ambient(nz, openness):
 
 @func(fastmath=True)
 def mirrored(x, y, z, seed):
-    """What a glossy surface sees in a direction: sky above, house fronts, road below."""
+    """Reflected light from a direction: sky above, house fronts, road below."""
     r, g, b = sky_colour(x, y, z, seed)
     houses = 1.0 - ramp(z, 0.12, 0.45)
     road = 1.0 - ramp(z, -0.12, 0.0)
@@ -92,7 +92,7 @@ CAR_SHADE_REACH = 1.1
 
 
 class RaycastWorld(NamedTuple):
-    """All that a ray can meet, apart from where the vehicles are.
+    """Everything that a ray can hit, without the poses of vehicles.
 
     One flat tuple, because parallel kernels take no nested ones.
 
@@ -316,7 +316,7 @@ CHUNK = 256
 
 
 class Samples(NamedTuple):
-    """What camera rays see.
+    """Results of camera rays.
 
     Attributes:
         colours: [N, 3] float32, display values in [0, 1].
@@ -440,7 +440,7 @@ def shoot_rays(world, instances, origins, directions, sizes):
 
 @kernel(parallel=True)
 def trace(world, instances, m, k, width, height):
-    """What pixel centres see: triangle [N], u, v [N], instance [N] and distance [N] of the hit.
+    """Hits of pixel centres: triangle [N], u, v [N], instance [N] and distance [N] of the hit.
 
     Triangles are rows of the world's arrays, -1 in the sky; instances are -1 for the static world.
     """
@@ -465,7 +465,7 @@ def trace(world, instances, m, k, width, height):
 
 @kernel
 def _find_edges(keys, planes):
-    """Which pixels [H, W] show another surface than one of their eight neighbours."""
+    """Mask [H, W] of pixels whose surface differs from one of their eight neighbours'."""
     edges = np.zeros(keys.shape, np.bool_)
     for row in range(keys.shape[0]):
         for column in range(keys.shape[1]):

@@ -161,7 +161,7 @@ FACADE = 9.2
 """Distance of the building line from the centre line [m]."""
 
 EGO_OFFSET = -LANE / 2
-"""Where the ego vehicle drives, d [m]."""
+"""Lateral position of the ego vehicle, d [m]."""
 
 _STEP = 0.5
 _BEHIND, _AHEAD = 55.0, 105.0
@@ -229,12 +229,12 @@ def lay_street(rng: np.random.Generator, *, drive_length: float) -> Street:
 
 WALK_WIDTH = FACADE - KERB
 STOP_LINE_M, CROSSING_M = 3.15, 1.8
-"""How far before and how far around the middle of the pedestrian crossing paint lies [m]."""
+"""Extent of the paint before and around the middle of the pedestrian crossing [m]."""
 SPEED_LIMIT = 13.9
 
 
 def street_lanes(street: Street) -> LaneGraph:
-    """Driving lanes with parking strips and sidewalks beside, the crossing and its stop lines."""
+    """Driving lanes, parking strips, sidewalks, the crossing and its stop lines."""
     s = np.arange(street.start, street.end + 1e-9, 1.0)
     parking = KERB - LANE
     strips: list[tuple[str, LaneKind, float, float]] = [

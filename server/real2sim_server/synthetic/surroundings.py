@@ -54,7 +54,7 @@ SHOP_COLOURS = (
 
 @dataclass(frozen=True)
 class House:
-    """How a house looks.
+    """The appearance of a house.
 
     Attributes:
         floors: storeys, the ground floor included.
@@ -302,7 +302,7 @@ LAMP_ROW = KERB + 0.5
 def build_surroundings(
     street: Street, paints: list[tuple[float, ...]], rng: np.random.Generator
 ) -> Mesh:
-    """Everything that stands still, apart from parked vehicles."""
+    """All static geometry, without parked vehicles."""
     builder = MeshBuilder(paints)
     _add_ground(builder, street)
     for side in (-1.0, 1.0):
@@ -476,7 +476,7 @@ def _add_sign(
 
 
 def _close_street(builder: MeshBuilder, street: Street, rng: np.random.Generator) -> None:
-    """Houses across both ends, so that no view ends in nothing."""
+    """Houses across both ends of the street, to close the view."""
     for s, facing in ((street.start, 1.0), (street.end, -1.0)):
         heading = float(street.heading(s))
         across = np.array([-np.sin(heading), np.cos(heading)]) * facing

@@ -47,14 +47,14 @@ ADULTS = (
 CHILDREN = ("girl", "boy", "small_girl", "small_boy")
 WOMEN = ("woman", "girl")
 HEIGHTS = {"tall_man": 1.92, "tall_woman": 1.8}
-"""Of builds that are taller as they come than most who are called so [m]."""
+"""Of builds whose default height is larger than the name suggests [m]."""
 
 LOW, HIGH = 7.1, 8.5
-"""Distances from the centre line between which people walk on a pavement [m]."""
+"""Range of distances from the centre line for walking on a pavement [m]."""
 WAITING = KERB + 0.35
 CYCLE_OFFSET = 3.2
 PASS = 0.65
-"""How close two people come [m]."""
+"""Minimum distance between two people [m]."""
 _TRIES = 40
 
 Path = tuple[Float, Float, Float, Float]
@@ -63,7 +63,7 @@ Path = tuple[Float, Float, Float, Float]
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What somebody wears: triangles beyond the body's, and a colour (linear RGB) for each part."""
+    """Clothing of a person: extra triangles, and a colour (linear RGB) for each part."""
 
     groups: tuple[str, ...]
     colours: dict[str, Colour]
@@ -72,7 +72,7 @@ class Looks:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPerson:
-    """Somebody on foot or on a bicycle.
+    """A pedestrian or cyclist.
 
     Attributes:
         category: "pedestrian" or "cyclist".
@@ -141,7 +141,7 @@ def _first(count: int, names: Iterator[str]) -> list[str]:
 
 
 class _Planner:
-    """Finds everybody a way that nobody else is in."""
+    """Plans paths without conflicts."""
 
     def __init__(
         self,
@@ -168,7 +168,7 @@ class _Planner:
         )  # fmt: skip
 
     def walker(self, doing: str) -> PlannedPerson:
-        """One on foot; who finds no way stands at the kerb."""
+        """A pedestrian; without a free path, one standing at the kerb."""
         body = self._somebody()
         style = GaitStyle(
             stride=float(self.rng.uniform(0.94, 1.06)),
@@ -198,7 +198,7 @@ class _Planner:
         return self._person("pedestrian", doing, gait, places, yaw)
 
     def rider(self, number: int) -> PlannedPerson:
-        """One on a bicycle, with the ego vehicle and towards it by turns."""
+        """A cyclist, alternately with and against the ego vehicle's direction."""
         names = ADULTS if number % 3 < 2 else ("girl", "boy")
         build = str(self.rng.choice(names))
         body = body_model().shaped(build, height=HEIGHTS.get(build))
@@ -341,13 +341,13 @@ class _Planner:
 
 
 def _started(t: Float, speed: float, *, rise: float) -> Float:
-    """Way gone at times after a start, with a constant pull to ``speed`` over ``rise`` [s]."""
+    """Distance at times after a start; acceleration to ``speed`` is constant over ``rise`` [s]."""
     t = np.maximum(t, 0.0)
     return speed * np.where(t < rise, t * t / (2 * rise), t - rise / 2)
 
 
 def _pavement(d: Float) -> Float:
-    """Height of the ground, its kerbs taken in a stride [m]."""
+    """Height of the ground, smoothed over a stride at kerbs [m]."""
     over = np.clip((np.abs(d) - (KERB - 0.3)) / 0.6, 0.0, 1.0)
     return KERB_HEIGHT * over
 
@@ -376,7 +376,7 @@ def _extent(person: PlannedPerson, t: Float) -> tuple[Float, Float]:
 
 PARKED_OFFSET = (LANE + KERB) / 2 + 0.05
 EGO_SPACE = (7.6, 1.9)
-"""Length and width that people leave to the ego vehicle, whose origin is its rear axle [m]."""
+"""Clearance for the ego vehicle, length and width about its rear axle [m]."""
 COLOURS = (
     (0.62, 0.62, 0.61), (0.62, 0.62, 0.61), (0.3, 0.31, 0.32), (0.1, 0.105, 0.11),
     (0.022, 0.022, 0.025), (0.32, 0.02, 0.018), (0.025, 0.07, 0.24), (0.06, 0.16, 0.3),
@@ -388,7 +388,7 @@ Distance = Callable[[Float], Float]
 
 @dataclass(frozen=True, eq=False)
 class DrivePlan:
-    """Everything about a drive but what it looks like.
+    """The plan of a drive, without its appearance.
 
     Attributes:
         street: its course.
@@ -421,7 +421,7 @@ class PlannedVehicle:
 
 
 def plan_drive(config: SyntheticConfig) -> DrivePlan:
-    """Lay the street and plan who drives and parks where."""
+    """Lay the street and plan all traffic."""
     street_rng, traffic_rng = (np.random.default_rng([config.seed, i]) for i in range(2))
     times_us = np.arange(config.frames, dtype=np.int64) * config.frame_period_us
     distance = _drive_distance(config, traffic_rng)
@@ -434,7 +434,7 @@ def plan_drive(config: SyntheticConfig) -> DrivePlan:
 
 
 def _drive_distance(config: SyntheticConfig, rng: np.random.Generator) -> Distance:
-    """Distance [m] the ego vehicle has driven at times [s]; it slows down and speeds up."""
+    """Distance [m] driven by the ego vehicle at times [s], at varying speed."""
     period, phase = rng.uniform(6, 10), rng.uniform(0, 2 * np.pi)
     rate = 2 * np.pi / period
 

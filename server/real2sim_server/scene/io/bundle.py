@@ -73,11 +73,10 @@ _UNWRITTEN = {"format": "", "version": 0, "content_hash": "0" * 64, "files": {}}
 
 
 def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = False) -> Scene:
-    """Write ``scene`` as a bundle; the same scene with its content hash and its ground.
+    """Write ``scene`` as a bundle; return the scene with its content hash and its ground.
 
-    A scene without a stored ground gets one: the fitted one that it would tell of anyway. The
-    folder appears whole or not at all. An existing bundle is replaced only with
-    ``overwrite``; any other folder with something in it is never touched.
+    A scene without a stored ground gets its fitted one. Writing is atomic. An existing bundle is
+    replaced only with ``overwrite``; other non-empty folders are never touched.
 
     Args:
         scene: on any device.
@@ -138,9 +137,9 @@ def load_scene(
 
     Args:
         path: folder of the bundle.
-        device: where the tensors shall live.
-        verify: compare every hash and look at every value; without it only shapes, types and
-            file sizes are checked.
+        device: of the tensors.
+        verify: check every hash and every value; without it only shapes, types and file
+            sizes are checked.
 
     Raises:
         BundleError: with the file and the reason: missing, cut short, changed, of a newer version.
@@ -170,8 +169,8 @@ def load_scene(
 
 
 def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
-    """The ground of a scene bundle, without its scene: the stored one, or of older bundles the one
-    that :attr:`~..Scene.ground` would fit. The same object as that of the scene, while it lives.
+    """The ground of a scene bundle, without its scene: the stored one or, for older bundles, the
+    one that :attr:`~..Scene.ground` fits. Shared with the loaded scene.
 
     Args:
         path: folder of the bundle.
@@ -212,7 +211,7 @@ def _document_of(folder: Path, content_hash: str) -> SceneDocument:
 
 
 def save_asset(asset: Asset, path: str | PathLike[str], *, overwrite: bool = False) -> Asset:
-    """Write ``asset`` as a bundle; the same asset with its content hash.
+    """Write ``asset`` as a bundle; return the asset with its content hash.
 
     Arguments and errors are those of :func:`save_scene`.
     """
@@ -309,7 +308,7 @@ def _ground_part(ground: Ground, tensors: Mapping[str, Tensor]) -> GroundPart:
 
 
 def _reflectors(lidar: LidarSurfaces) -> list[tuple[str, Reflector]]:
-    """Prefix of the tensors' keys, and what they are of."""
+    """Prefixes of the tensors' keys, with their reflectors."""
     objects = enumerate(lidar.objects.values())
     return [("background.", lidar.background), *((f"{i}.", part) for i, part in objects)]
 
@@ -541,7 +540,7 @@ def _fit_ground(folder: Path, document: SceneDocument) -> Ground:
 
 @contextmanager
 def _as_bundle_error(folder: Path) -> Iterator[None]:
-    """Say which bundle it is when its parts are well-formed but make no scene."""
+    """Name the bundle in errors about its content."""
     try:
         yield
     except BundleError:

@@ -58,8 +58,8 @@ def figure_shapes(gaussians: int) -> dict[str, tuple[int, ...]]:
 
 
 def reflector_tensors(reflector: Reflector) -> dict[str, Tensor]:
-    """Tensors of what LiDARs see by name, on the CPU and contiguous;
-    colours and what is known of them are not kept."""
+    """Tensors of a reflector by name, on the CPU and contiguous, without colours and
+    uncertainties."""
     tensors = cloud_tensors(reflector.cloud)
     for name in ("sh", UNCERTAINTIES):
         tensors.pop(name, None)
@@ -169,7 +169,7 @@ def check_file(path: Path, nbytes: int) -> None:
 
 FORMAT = "real2sim-scene"
 VERSION = 7
-"""Newest version read here; what needs no more is written in version 1."""
+"""Newest readable version; a bundle is written in the lowest one that holds its content."""
 DOCUMENT_NAME = "scene.json"
 
 
@@ -183,7 +183,7 @@ def write_container(
     tensors: Mapping[str, Mapping[str, Tensor]],
     overwrite: bool,
 ) -> DocumentT:
-    """Write a bundle to ``path``, whole or not at all; the document as written.
+    """Write a bundle to ``path`` atomically; return the document as written.
 
     Args:
         document: its ``format``, ``version``, ``content_hash`` and ``files`` are filled in here.
@@ -279,7 +279,7 @@ def _refuse_constant(constant: str) -> float:
 
 
 def _check_head(given: Any, file: Path, kind: str) -> None:
-    """Format, version and kind come first: nothing else is known of another version."""
+    """Check format, version and kind first: other versions may differ in everything else."""
     if not isinstance(given, dict) or given.get("format") != FORMAT:
         raise BundleError(f"{file}: not of format {FORMAT!r}")
     version = given.get("version")

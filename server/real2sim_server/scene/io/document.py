@@ -70,14 +70,14 @@ class TrajectoryPart(_Part):
 
 
 class ShutterPart(_Part):
-    """How a camera reads out; see :class:`~real2sim_server.scene.Shutter`."""
+    """Readout of a camera; see :class:`~real2sim_server.scene.Shutter`."""
 
     direction: str
     readout_us: Count
 
 
 class OpticsPart(_Part):
-    """What a camera really is; see :class:`~real2sim_server.scene.camera.Optics`."""
+    """Optics of the physical camera; see :class:`~real2sim_server.scene.camera.Optics`."""
 
     K: Matrix3
     lens: dict[str, Any] | None = None
@@ -192,7 +192,7 @@ class EgoPart(_Part):
 
 
 class ColourPart(_Part):
-    """How the colours of a cloud change; see :class:`~real2sim_server.scene.TimeColour`."""
+    """Time-dependent colours of a cloud; see :class:`~real2sim_server.scene.TimeColour`."""
 
     harmonics: Count
     basis: Literal["cosine", "real_dft"]
@@ -202,7 +202,7 @@ class ColourPart(_Part):
 
 
 class GaitPart(_Part):
-    """How a person walks; see :class:`~real2sim_server.body.gait.GaitStyle`."""
+    """Walking style of a person; see :class:`~real2sim_server.body.gait.GaitStyle`."""
 
     stride: float
     arms: float
@@ -212,7 +212,7 @@ class GaitPart(_Part):
 
 
 class FigurePart(_Part):
-    """How a cloud follows a body; see :class:`~real2sim_server.scene.Figure`."""
+    """Binding of a cloud to a body; see :class:`~real2sim_server.scene.Figure`."""
 
     shape: list[float]
     height: float
@@ -255,7 +255,7 @@ class ReflectorPart(_Part):
 
 
 class ResponsePart(_Part):
-    """What a LiDAR makes of reflectivity, by ring and range."""
+    """Intensity response of a LiDAR, by ring and range."""
 
     elevation: Annotated[list[float], Field(max_length=MAX_RINGS)]
     gain: Annotated[list[list[float]], Field(max_length=MAX_RINGS)]
@@ -283,7 +283,7 @@ class LanesPart(_Part):
 
 
 class SceneContent(_Part):
-    """Everything that makes a scene what it is; the content hash is taken over this.
+    """The content of a scene, input of the content hash.
 
     Attributes:
         ground: left out of the JSON where there is none, as versions 1 and 2 of the format ask.
@@ -332,7 +332,7 @@ class SceneContent(_Part):
 
 
 class AssetContent(_Part):
-    """Everything that makes an asset what it is; the content hash is taken over this.
+    """The content of an asset, input of the content hash.
 
     Attributes:
         figure: left out of the JSON where there is none, as versions 1 to 6 of the format ask.

@@ -460,7 +460,7 @@ def _write_folder(
 
 
 def _is_replaceable(out: Path) -> bool:
-    """Whether a folder is empty or an export of this kind, so that nothing else gets lost."""
+    """Whether a folder is empty or an export of this kind, so that nothing else is lost."""
     if not out.is_dir():
         return False
     if not any(out.iterdir()):
@@ -474,7 +474,7 @@ def _is_replaceable(out: Path) -> bool:
 
 
 def _file_name(index: int, object_id: str) -> str:
-    """A name that is safe in any folder; the number keeps ids apart that look alike in it."""
+    """A safe file name; the number distinguishes ids that look alike in it."""
     return f"{index:03d}_{re.sub(r'[^A-Za-z0-9_-]', '_', object_id)[:60]}"
 
 
@@ -486,7 +486,7 @@ def _index(
     background: str,
     turn: Float,
 ) -> dict[str, Any]:
-    """What ``objects.json`` says: what each file is and where its object was when."""
+    """Content of ``objects.json``: the files, and the trajectories of their objects."""
     return {
         "format": INDEX_FORMAT,
         "version": 1,

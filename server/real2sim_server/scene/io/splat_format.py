@@ -30,19 +30,19 @@ class SplatFormat(Protocol):
 
     @property
     def name(self) -> str:
-        """What the format is called in messages."""
+        """Name of the format in messages."""
 
     @property
     def suffix(self) -> str:
-        """End of its file names, lower case, with the dot; chooses the format to write."""
+        """Suffix of its file names, lower case, with the dot; selects the format to write."""
 
     @property
     def has_signature(self) -> bool:
-        """Whether the content tells the format; the others are told by ``suffix``."""
+        """Whether the content identifies the format, else ``suffix`` does."""
 
     @property
     def up_axis(self) -> UpAxis:
-        """Axis that users of the format agree on to point up; else the scene's own, ``z``."""
+        """Up axis by convention of the format; else the scene's own, ``z``."""
 
     def recognises(self, head: bytes) -> bool:
         """Whether a file that starts with ``head`` (up to 64 KiB) is of this format.
@@ -73,7 +73,7 @@ class SplatFormat(Protocol):
 
 
 def check_memory(path: Path, count: int, harmonics: int, max_bytes: int | None) -> None:
-    """Refuse a file by what comes out of it, which says nothing of how small it is packed.
+    """Refuse a file by its unpacked size, whatever its compressed size.
 
     Args:
         path: for the message.

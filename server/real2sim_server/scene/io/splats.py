@@ -1,4 +1,4 @@
-"""Splat files of other programs: read them, write them, make scenes and assets of them."""
+"""Splat files of other programs: formats, reading, writing, and import as scenes and assets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .spz import Spz
 HEAD_BYTES = 1 << 16
 
 FORMATS: list[SplatFormat] = [PlayCanvasPly(), InriaPly(), Spz(), AntimatterSplat()]
-"""In the order in which they are asked whether a file or a name is theirs."""
+"""In order of precedence, for files and for names."""
 
 _ROTATIONS: dict[str, list[list[float]]] = {
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -35,7 +35,7 @@ _ROTATIONS: dict[str, list[list[float]]] = {
 ``-y`` that of OpenCV and COLMAP (z forward, x right)."""
 
 VIEW_DURATION_US = 10_000_000
-"""How long the ego of an imported scene stands: long enough to drive through it."""
+"""Duration of the ego's stand in an imported scene: long enough to drive through it."""
 
 
 def register_format(splat_format: SplatFormat) -> None:
