@@ -266,7 +266,7 @@ class Figure:
         return Stride(steps, float(np.interp(seconds, walk.gait.times, walk.gait.speeds)))
 
     def strode(self, stride: Stride, *, speed: float, seconds: float) -> Stride:
-        """Walking state after ``seconds`` at ``speed`` [m/s]; constant speed keeps feet in place."""
+        """Walking state after ``seconds`` at ``speed`` [m/s]; feet stay in place."""
         settled = math.exp(-seconds / SETTLING)
         pace = speed + (stride.pace - speed) * settled
         return Stride(stride.steps + seconds * speed / self._step_length(pace), pace)
