@@ -122,7 +122,7 @@ PARALLEL = 1e-6
 
 
 @kernel
-def boxes_overlap(T_world_a: Any, size_a: Any, T_world_b: Any, size_b: Any) -> bool:
+def boxes_overlap(T_world_a: Any, size_a: Any, T_world_b: Any, size_b: Any) -> Any:
     """Whether two boxes share volume; boxes that only touch do not.
 
     Separating-axis test over the same axes as :func:`~.box.box_penetration`.

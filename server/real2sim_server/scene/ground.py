@@ -31,7 +31,7 @@ neither the noise of single cells nor the edge of one decides how a vehicle lean
 
 
 @func
-def height_under(heights: Any, frame: Any, x: float, y: float) -> float:
+def height_under(heights: Any, frame: Any, x: float, y: float) -> Any:
     """Bilinear height between cell centres; outside the nearest place of the rim counts.
 
     Args:
@@ -51,7 +51,7 @@ def height_under(heights: Any, frame: Any, x: float, y: float) -> float:
 
 
 @kernel
-def height_at(heights: Any, frame: Any, x: float, y: float) -> float:
+def height_at(heights: Any, frame: Any, x: float, y: float) -> Any:
     """Ground height [m] below one place."""
     return height_under(heights, frame, x, y)
 
@@ -228,19 +228,19 @@ def of_bundle(content_hash: str, make: Callable[[], Ground]) -> Ground:
 
 # Obstacles.
 
-CELL = 0.25
+OBSTACLE_CELL = 0.25
 """Edge of a cell [m]."""
 
-LOWEST, HIGHEST = 0.4, 1.6
-"""Heights above the ground between which a Gaussian is in the way of a car [m]."""
+MIN_OBSTACLE_HEIGHT, MAX_OBSTACLE_HEIGHT = 0.4, 1.6
+"""Heights above the ground of Gaussians that block a car [m]."""
 
-OPAQUE = 0.5
+OBSTACLE_OPACITY = 0.5
 """Minimum opacity of Gaussians that count."""
 
-FEWEST = 3
+MIN_GAUSSIANS = 3
 """Minimum Gaussians in an occupied cell; fewer are floaters."""
 
-REACH = 40.0
+MAX_DISTANCE = 40.0
 """Maximum distance of cells from the recorded path [m]."""
 
 DRIVEN_HALF_WIDTH = 1.1
@@ -249,11 +249,11 @@ DRIVEN_HALF_WIDTH = 1.1
 POSE_SPACING = 0.05
 """Minimum spacing of recorded poses; closer ones only add noise [m]."""
 
-STUB = 1.0
+PARKED_LENGTH = 1.0
 """Path length of a parked vehicle [m]."""
 
 
-class Way(Protocol):
+class EgoPath(Protocol):
     """The recorded path of the ego, as :func:`occupied_cells` needs it."""
 
     @property
@@ -273,11 +273,11 @@ class Way(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedWay:
+class RecordedPath:
     """The recorded path of the ego, without coincident poses.
 
     Attributes:
-        s, positions, yaws: see :class:`Way`.
+        s, positions, yaws: see :class:`EgoPath`.
     """
 
     s: Float
@@ -285,7 +285,7 @@ class RecordedWay:
     yaws: Float
 
     @classmethod
-    def of(cls, ego: Trajectory) -> RecordedWay:
+    def of(cls, ego: Trajectory) -> RecordedPath:
         """The path of a trajectory; for a parked vehicle, a metre along its heading."""
         kept = [0]
         for i, place in enumerate(ego.positions[:, :2]):
@@ -294,7 +294,7 @@ class RecordedWay:
         positions = ego.positions[kept]
         yaws = np.unwrap(quaternion_yaw(ego.quaternions[kept]))
         if len(kept) == 1:
-            ahead = STUB * np.array([np.cos(yaws[0]), np.sin(yaws[0]), 0.0])
+            ahead = PARKED_LENGTH * np.array([np.cos(yaws[0]), np.sin(yaws[0]), 0.0])
             positions = np.stack([positions[0], positions[0] + ahead])
             yaws = np.repeat(yaws, 2)
         steps = np.abs(np.diff(positions[:, 0] + 1j * positions[:, 1]))
@@ -308,7 +308,7 @@ class OccupiedCells:
     Attributes:
         origin: [2] lowest corner [m].
         occupied: [nx, ny] bool.
-        points: [K, 3] float64 centres of the Gaussians in the way, of occupied cells only [m].
+        points: [K, 3] float64 centres of the blocking Gaussians, in occupied cells only [m].
     """
 
     origin: Float
@@ -316,8 +316,8 @@ class OccupiedCells:
     points: Float
 
 
-def occupied_cells(background: GaussianCloud, ground: Ground, way: Way) -> OccupiedCells:
-    """Where something of a background is in the way.
+def occupied_cells(background: GaussianCloud, ground: Ground, path: EgoPath) -> OccupiedCells:
+    """Cells in which the background blocks a car.
 
     A cell is occupied when at least three Gaussians of more than half opacity have their centres in
     it between 0.4 and 1.6 m above the ground. Where the recorded vehicle drove it is free.
@@ -325,37 +325,39 @@ def occupied_cells(background: GaussianCloud, ground: Ground, way: Way) -> Occup
     Args:
         background: of a scene.
         ground: of the same scene.
-        way: of the vehicle that recorded it.
+        path: of the vehicle that recorded it.
     """
-    opaque = (background.opacities > OPAQUE).cpu().numpy()
+    opaque = (background.opacities > OBSTACLE_OPACITY).cpu().numpy()
     points = background.means.cpu().numpy().astype(np.float64)[opaque]
-    lower = way.positions[:, :2].min(axis=0) - REACH
-    upper = way.positions[:, :2].max(axis=0) + REACH
-    shape = np.ceil((upper - lower) / CELL).astype(np.int64)
+    lower = path.positions[:, :2].min(axis=0) - MAX_DISTANCE
+    upper = path.positions[:, :2].max(axis=0) + MAX_DISTANCE
+    shape = np.ceil((upper - lower) / OBSTACLE_CELL).astype(np.int64)
     points = points[((points[:, :2] >= lower) & (points[:, :2] < upper)).all(axis=1)]
     counts = np.zeros(shape, dtype=np.int32)
     if len(points):
         height = points[:, 2] - ground.height_at(points[:, :2])
-        points = points[(height > LOWEST) & (height < HIGHEST)]
-        cells = np.floor((points[:, :2] - lower) / CELL).astype(np.int64)
+        points = points[(height > MIN_OBSTACLE_HEIGHT) & (height < MAX_OBSTACLE_HEIGHT)]
+        cells = np.floor((points[:, :2] - lower) / OBSTACLE_CELL).astype(np.int64)
         np.add.at(counts, (cells[:, 0], cells[:, 1]), 1)
-    occupied = counts >= FEWEST
-    _clear_driven(occupied, lower, way)
-    cells = np.floor((points[:, :2] - lower) / CELL).astype(np.int64)
+    occupied = counts >= MIN_GAUSSIANS
+    _clear_driven(occupied, lower, path)
+    cells = np.floor((points[:, :2] - lower) / OBSTACLE_CELL).astype(np.int64)
     return OccupiedCells(lower, occupied, points[occupied[cells[:, 0], cells[:, 1]]])
 
 
-def _clear_driven(occupied: NDArray[np.bool_], lower: Float, way: Way) -> None:
+def _clear_driven(occupied: NDArray[np.bool_], lower: Float, path: EgoPath) -> None:
     # From behind the rear axle at the start to the front bumper at the end.
-    length = float(way.s[-1])
-    at = np.arange(-1.0, length + 4.0, CELL)
-    x = np.interp(at, way.s, way.positions[:, 0])
-    y = np.interp(at, way.s, way.positions[:, 1])
-    yaw = np.interp(at, way.s, way.yaws)
+    length = float(path.s[-1])
+    at = np.arange(-1.0, length + 4.0, OBSTACLE_CELL)
+    x = np.interp(at, path.s, path.positions[:, 0])
+    y = np.interp(at, path.s, path.positions[:, 1])
+    yaw = np.interp(at, path.s, path.yaws)
     beyond = at - np.clip(at, 0.0, length)
     x, y = x + beyond * np.cos(yaw), y + beyond * np.sin(yaw)
-    for side in np.arange(-DRIVEN_HALF_WIDTH, DRIVEN_HALF_WIDTH + CELL / 2, CELL / 2):
+    for side in np.arange(
+        -DRIVEN_HALF_WIDTH, DRIVEN_HALF_WIDTH + OBSTACLE_CELL / 2, OBSTACLE_CELL / 2
+    ):
         points = np.stack([x - side * np.sin(yaw), y + side * np.cos(yaw)], axis=1)
-        cells = np.floor((points - lower) / CELL).astype(np.int64)
+        cells = np.floor((points - lower) / OBSTACLE_CELL).astype(np.int64)
         inside = ((cells >= 0) & (cells < occupied.shape)).all(axis=1)
         occupied[cells[inside, 0], cells[inside, 1]] = False

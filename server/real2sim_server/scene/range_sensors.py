@@ -263,8 +263,8 @@ def _check_range(what: str, value: float, low: float, high: float) -> None:
 
 # Catalogue of LiDARs.
 
-FOLDER = Path(__file__).parent / "lidar_models"
-MAX_FILE_BYTES = 64 << 20
+LIDAR_FOLDER = Path(__file__).parent / "lidar_models"
+MAX_LIDAR_FILE_BYTES = 64 << 20
 LIDAR_MOUNT = (0.9, 0.0, 1.73)
 """Default position of LiDARs, from the vehicle's rear axle [m]."""
 
@@ -272,7 +272,7 @@ LIDAR_MOUNT = (0.9, 0.0, 1.73)
 @cache
 def lidar_names() -> tuple[str, ...]:
     """Names of the catalogue."""
-    return tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
+    return tuple(sorted(path.stem for path in LIDAR_FOLDER.glob("*.json")))
 
 
 @cache
@@ -285,7 +285,7 @@ def catalogue_lidar(name: str) -> Lidar:
     if name not in lidar_names():
         known = ", ".join(lidar_names())
         raise LidarError(f"no LiDAR {name!r} in the catalogue; it has {known}")
-    return read_lidar(FOLDER / f"{name}.json")
+    return read_lidar(LIDAR_FOLDER / f"{name}.json")
 
 
 def find_lidar(name: str) -> Lidar:
@@ -305,8 +305,10 @@ def read_lidar(path: str | PathLike[str]) -> Lidar:
     """
     file = Path(path)
     try:
-        if file.stat().st_size > MAX_FILE_BYTES:
-            raise LidarError(f"{file}: {file.stat().st_size:,} bytes; at most {MAX_FILE_BYTES:,}")
+        if file.stat().st_size > MAX_LIDAR_FILE_BYTES:
+            raise LidarError(
+                f"{file}: {file.stat().st_size:,} bytes; at most {MAX_LIDAR_FILE_BYTES:,}"
+            )
         values = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise LidarError(f"{file}: no readable JSON file: {error}") from error
@@ -464,7 +466,7 @@ RADAR_MOUNT = (3.6, 0.0, 0.5)
 """Default position of radars, from the vehicle's rear axle [m]."""
 
 
-def at_mount() -> Float:
+def radar_mount() -> Float:
     """``T_vehicle_radar`` [4, 4] at RADAR_MOUNT, looking ahead."""
     pose = np.eye(4)
     pose[:3, 3] = RADAR_MOUNT
@@ -497,7 +499,7 @@ class Radar:
 
     name: str
     model: RadarModel
-    T_vehicle_radar: Float = field(default_factory=at_mount)
+    T_vehicle_radar: Float = field(default_factory=radar_mount)
 
     def __post_init__(self) -> None:
         pose = np.array(self.T_vehicle_radar, dtype=np.float64)

@@ -57,8 +57,8 @@ from .document import (
     SceneDocument,
     SkyPart,
     TrajectoryPart,
-    pack,
-    unpack,
+    pack_lanes,
+    unpack_lanes,
 )
 
 BACKGROUND_FILE = "background.safetensors"
@@ -293,7 +293,7 @@ def _outgoing_ground(ground: Ground) -> dict[str, Tensor]:
 def _outgoing_lanes(lanes: LaneGraph | None) -> tuple[LanesPart | None, dict[str, Tensor]]:
     if lanes is None:
         return None, {}
-    document, arrays = pack(lanes)
+    document, arrays = pack_lanes(lanes)
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     counts = {name: len(array) for name, array in arrays.items()}
     return LanesPart(**counts, tensors=tensor_hashes(tensors), document=document), tensors
@@ -489,7 +489,7 @@ def _lanes(folder: Path, document: SceneDocument, verify: bool) -> LaneGraph:
     shapes: dict[str, tuple[int, ...]] = {"points": (part.points, 3), "values": (part.values,)}
     dtypes = dict.fromkeys(shapes, torch.float64)
     taken = file.take("", shapes=shapes, hashes=part.tensors, dtypes=dtypes)
-    return unpack(part.document, {name: tensor.numpy() for name, tensor in taken.items()})
+    return unpack_lanes(part.document, {name: tensor.numpy() for name, tensor in taken.items()})
 
 
 def _response(part: ResponsePart | None) -> RingResponse | None:

@@ -402,7 +402,7 @@ _ARRAYS = {
     **dict.fromkeys(("centre", "outline", "points"), "points"),
     **dict.fromkeys(("widths", "s", "headings", "rolls", "inner", "outer"), "values"),
 }
-MAX_BYTES = 512 << 20
+MAX_LANES_BYTES = 512 << 20
 
 
 def lane_document(graph: LaneGraph, *, with_roads: bool = True) -> SceneLanes:
@@ -456,8 +456,8 @@ def read_lanes(path: Path) -> LaneGraph:
         BundleError: naming the file: missing, too large, no such document, or no graph.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise BundleError(f"{path}: is larger than {MAX_BYTES >> 20} MiB")
+        if path.stat().st_size > MAX_LANES_BYTES:
+            raise BundleError(f"{path}: is larger than {MAX_LANES_BYTES >> 20} MiB")
         return graph_of(SceneLanes.model_validate_json(path.read_bytes()))
     except OSError as error:
         raise BundleError(f"{path}: cannot be read: {error.strerror}") from error
@@ -469,7 +469,7 @@ def read_lanes(path: Path) -> LaneGraph:
         raise BundleError(f"{path}: {error}") from error
 
 
-def pack(graph: LaneGraph) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+def pack_lanes(graph: LaneGraph) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     """A graph as its document with lengths in the place of arrays, and the arrays: ``points``
     [P, 3] and ``values`` [V], in the order of the document."""
     arrays: dict[str, list[Any]] = {"points": [], "values": []}
@@ -487,8 +487,10 @@ def pack(graph: LaneGraph) -> tuple[dict[str, Any], dict[str, NDArray[np.float64
     return document, {"points": points, "values": np.array(arrays["values"], np.float64)}
 
 
-def unpack(document: Mapping[str, Any], arrays: Mapping[str, NDArray[np.float64]]) -> LaneGraph:
-    """What :func:`pack` has packed.
+def unpack_lanes(
+    document: Mapping[str, Any], arrays: Mapping[str, NDArray[np.float64]]
+) -> LaneGraph:
+    """Inverse of :func:`pack_lanes`.
 
     Raises:
         SceneError: lengths do not fit the arrays, or it is no graph.

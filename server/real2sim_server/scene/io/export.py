@@ -32,7 +32,7 @@ from .splats import FORMATS, format_to_write, upright, write_splats
 
 FLOAT, UNSIGNED_BYTE = 5126, 5121
 ARRAY_BUFFER = 34962
-MAX_BYTES = 0xFFFFFFFF
+MAX_GLB_BYTES = 0xFFFFFFFF
 """Lengths in a glb file are 32 bits."""
 
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
@@ -101,9 +101,9 @@ class GlbWriter:
         text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + (8 + self._nbytes if self._parts else 0)
-        if total > MAX_BYTES:
+        if total > MAX_GLB_BYTES:
             raise SceneError(
-                f"{path}: {total} bytes; a glb file holds at most {MAX_BYTES}; export objects "
+                f"{path}: {total} bytes; a glb file holds at most {MAX_GLB_BYTES}; export objects "
                 "one by one or as spz"
             )
         with atomic_file(path) as file:

@@ -237,7 +237,7 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
-LARGEST_LOGIT = 40.0
+MAX_LOGIT = 40.0
 """Opacities of 0 and 1 have no finite logit; in float32 this one stands for them."""
 
 
@@ -302,7 +302,7 @@ def write_inria_ply(cloud: GaussianCloud, path: Path, *, comment: str = "") -> N
         np.zeros((len(cloud), 3)),
         sh[:, 0],
         sh[:, 1:].transpose(0, 2, 1).reshape(len(cloud), rest),
-        np.clip(logits, -LARGEST_LOGIT, LARGEST_LOGIT)[:, None],
+        np.clip(logits, -MAX_LOGIT, MAX_LOGIT)[:, None],
         np.log(cloud.scales.detach().cpu().numpy().astype(np.float64)),
         cloud.quats.detach().cpu().numpy(),
     ]
@@ -394,7 +394,7 @@ Words = NDArray[np.uint32]
 
 CHUNK_FIELDS = LOW_POSITION + HIGH_POSITION + LOW_SCALE + HIGH_SCALE + LOW_COLOUR + HIGH_COLOUR
 
-LARGEST_LOG_SCALE = 20.0
+MAX_LOG_SCALE = 20.0
 """Log scales are clamped to plus or minus this, as in the format's own writer."""
 
 
@@ -546,9 +546,7 @@ def _packed(cloud: GaussianCloud) -> tuple[Float, Words]:
     """Bounds [C, 18] of all chunks in the order of ``CHUNK_FIELDS``, and words [N, 4]."""
     log_scales = np.log(host_array(cloud.scales))
     position, low_position, high_position = _fractions(host_array(cloud.means))
-    scale, low_scale, high_scale = _fractions(
-        np.clip(log_scales, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
-    )
+    scale, low_scale, high_scale = _fractions(np.clip(log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE))
     colour, low_colour, high_colour = _fractions(0.5 + SH_C0 * host_array(cloud.sh[:, 0]))
     rgba = np.concatenate([colour, host_array(cloud.opacities)[:, None]], axis=1)
     words = [

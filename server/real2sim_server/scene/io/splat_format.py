@@ -21,7 +21,7 @@ from ..errors import BundleError, BundleTooLargeError
 UpAxis = Literal["z", "y", "-y"]
 """Axis of a file that points up: ``y`` as in glTF (z forward), ``-y`` as in OpenCV and COLMAP."""
 
-SMALLEST_SCALE = 1e-20
+MIN_SCALE = 1e-20
 """Scales whose exponential underflows are lifted to this [m], since a scale is positive."""
 
 
@@ -167,7 +167,7 @@ def build_cloud(
             f"the first at {int(np.argmax(zero))}"
         )
     with np.errstate(over="ignore", under="ignore"):
-        scales = np.maximum(np.exp(log_scales), SMALLEST_SCALE)
+        scales = np.maximum(np.exp(log_scales), MIN_SCALE)
         parts = {
             "means": means,
             "quats": quats / norms,
@@ -185,7 +185,7 @@ def build_cloud(
 
 # The headerless ``.splat``.
 
-RECORD = np.dtype(
+SPLAT_RECORD = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
 )
 
@@ -213,13 +213,13 @@ class AntimatterSplat:
     def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
         """The Gaussians of a file. Raises BundleError naming the file and the reason."""
         nbytes = path.stat().st_size
-        if nbytes % RECORD.itemsize:
+        if nbytes % SPLAT_RECORD.itemsize:
             raise BundleError(
                 f"{path}: truncated or no .splat file: {nbytes} bytes are no multiple of "
-                f"{RECORD.itemsize}"
+                f"{SPLAT_RECORD.itemsize}"
             )
-        check_memory(path, nbytes // RECORD.itemsize, 1, max_bytes)
-        records = np.fromfile(path, dtype=RECORD)
+        check_memory(path, nbytes // SPLAT_RECORD.itemsize, 1, max_bytes)
+        records = np.fromfile(path, dtype=SPLAT_RECORD)
         for name, bad in {
             "position": ~np.isfinite(records["position"]),
             "scale": ~(np.isfinite(records["scale"]) & (records["scale"] >= 0)),
@@ -248,7 +248,7 @@ class AntimatterSplat:
         Raises:
             OSError: the file cannot be written.
         """
-        records = np.empty(len(cloud), dtype=RECORD)
+        records = np.empty(len(cloud), dtype=SPLAT_RECORD)
         opacities, scales = host_array(cloud.opacities), host_array(cloud.scales)
         rgb = 0.5 + SH_C0 * host_array(cloud.sh[:, 0])
         rgba = np.concatenate([rgb, opacities[:, None]], axis=1)
