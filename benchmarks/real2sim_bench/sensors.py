@@ -18,7 +18,7 @@ from real2sim_server.render import render_cameras
 from real2sim_server.render.cast import cast, detect
 from real2sim_server.scene import BrownConrady, Camera, Fisheye, Shutter
 from real2sim_server.scene.io import read_packed
-from real2sim_server.scene.lidar_catalogue import catalogue_lidar
+from real2sim_server.scene.range_sensors import catalogue_lidar
 from real2sim_server.synthetic.gaussian_street import street_scene
 
 GAUSSIANS = 300_000

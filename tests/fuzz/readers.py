@@ -36,7 +36,7 @@ from real2sim_server.scene.io import (
     write_splats,
 )
 from real2sim_server.scene.io.container import content_hash
-from real2sim_server.scene.io.formats import Spz
+from real2sim_server.scene.io.spz import Spz
 
 Parts = dict[str, bytes]
 TESTS = Path(__file__).resolve().parents[1]

@@ -39,6 +39,7 @@ from real2sim_server.logs import open_log
 from real2sim_server.maps import read_map
 from real2sim_server.render.modalities import unregister
 from real2sim_server.scene import GaussianCloud, Trajectory
+from real2sim_server.scene.asset import person_asset
 from real2sim_server.scene.io import save_asset
 from real2sim_server.scene.io.document import (
     CameraPart,
@@ -47,7 +48,6 @@ from real2sim_server.scene.io.document import (
     SceneContent,
     SceneDocument,
 )
-from real2sim_server.scene.person import person_asset
 from real2sim_server.service.http.metrics import Metrics
 from real2sim_server.service.objects.object_store import FolderObjects, S3Objects, open_objects
 from real2sim_server.service.serve import running_worker

@@ -17,12 +17,11 @@ from typing import Any
 
 import structlog
 
-from .limits import MIB, Limits
-from .starter import OUT_OF_MEMORY, REQUEST_BYTES
+from .starter import MIB, OUT_OF_MEMORY, REQUEST_BYTES, Limits
 
 MAX_ANSWER_BYTES = 64 * MIB
 STARTING_S = 60.0
-"""Time for the modules of a call to load, beside the time of the call itself."""
+"""Time to load the modules of a call, on top of the time of the call itself."""
 _PROGRAM = "from real2sim_server._confined.starter import main; main()"
 _KEPT_VARIABLES = ("TMPDIR", "HOME", "NUMBA_CACHE_DIR")
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -31,7 +30,7 @@ log = structlog.get_logger(__name__)
 
 
 class ConfinedError(Exception):
-    """A confined call that came to no end of its own; the message says why.
+    """A confined call did not finish; the message gives the reason.
 
     Attributes:
         out_of_memory: whether it needed more memory than it might take.
@@ -49,7 +48,7 @@ def run_confined(
     limits: Limits | None = None,
     errors: tuple[type[Exception], ...] = (),
 ) -> Any:
-    """Call a function in a process of its own; its value. Safe on any thread, waits for the end.
+    """Call a function in a separate process and return its value. Blocks; thread-safe.
 
     Args:
         target: ``module:function`` of this program.
@@ -99,7 +98,7 @@ def _ending(status: int) -> str:
 
 
 class _Starter:
-    """The starter's process, begun with the first call and again should it have ended."""
+    """The starter's process, started on the first call and restarted if it ended."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -108,7 +107,7 @@ class _Starter:
         self._owner = 0
 
     def answer(self, request: bytes, seconds: float) -> list[bytes]:
-        """Lines that child and starter told: the outcome, if any, and how the child ended.
+        """Lines from child and starter: the outcome, if any, and the exit of the child.
 
         Raises:
             ConfinedError: too long a request or answer, or no answer at all.
@@ -156,7 +155,7 @@ class _Starter:
         return self._control
 
     def close(self) -> None:
-        """End the starter and what it started."""
+        """End the starter and its children."""
         with self._lock:
             self._stop()
 

@@ -1,4 +1,4 @@
-"""The process that starts confined ones: it forks a child for each request and reads no file.
+"""The starter process: forks a confined child for each request and reads no file.
 
 A program that has its modules loaded forks in milliseconds, where a new interpreter takes seconds.
 The starter has one thread and one socket to the process that began it, and ends with that one.
@@ -7,24 +7,111 @@ The starter has one thread and one socket to the process that began it, and ends
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import importlib
 import json
+import math
 import os
+import resource
 import select
 import signal
 import socket
+import sys
 import time
 import traceback
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from .limits import Limits, apply_limits
+# Limits of a confined process, and how it gives up its privileges.
+
+MIB = 1024**2
+NICENESS = 10
+_PR_SET_NO_NEW_PRIVS = 38
+_PR_CAPBSET_DROP = 24
+_CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
+_CAPABILITY_VERSION_3 = 0x20080522
+_CAPABILITIES = 64
+_READ_AND_WRITE_OTHERS = 0b110
+"""CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH: root goes on to reach the files it was given."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of one confined call.
+
+    Attributes:
+        memory_bytes: address space beyond that of the program itself; files that are mapped count.
+        seconds: until it is ended; also of processor time.
+        written_bytes: largest file it may write; with 0 it writes none.
+        open_files: descriptors.
+    """
+
+    memory_bytes: int = 2048 * MIB
+    seconds: float = 60.0
+    written_bytes: int = 0
+    open_files: int = 64
+
+
+def apply_limits(limits: Limits) -> None:
+    """Give up everything beyond ``limits``, for good.
+
+    What the system does not offer is passed over: limits of address space outside of Linux,
+    a network of its own where namespaces are refused.
+    """
+    with contextlib.suppress(OSError):
+        os.nice(NICENESS)
+    if sys.platform == "linux":
+        _give_up_privileges()
+        _limit(resource.RLIMIT_AS, _address_space() + limits.memory_bytes)
+    _limit(resource.RLIMIT_CORE, 0)
+    _limit(resource.RLIMIT_NOFILE, limits.open_files)
+    _limit(resource.RLIMIT_FSIZE, limits.written_bytes)
+    _limit(resource.RLIMIT_CPU, max(1, math.ceil(limits.seconds)))
+
+
+def _limit(which: int, value: int) -> None:
+    _, highest = resource.getrlimit(which)
+    if highest != resource.RLIM_INFINITY:
+        value = min(value, highest)
+    resource.setrlimit(which, (value, value))
+
+
+def _address_space() -> int:
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    return pages * resource.getpagesize()
+
+
+def _give_up_privileges() -> None:
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "privileges cannot be given up")
+    if os.geteuid() == 0:
+        libc.unshare(_CLONE_NEWNET)
+        for capability in range(_CAPABILITIES):
+            libc.prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0)
+        _keep_capabilities(libc, _READ_AND_WRITE_OTHERS)
+    else:
+        libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET)
+        _keep_capabilities(libc, 0)
+
+
+def _keep_capabilities(libc: ctypes.CDLL, kept: int) -> None:
+    """Leave the capabilities of the mask ``kept`` (all below 32) and no others."""
+    header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
+    held = (ctypes.c_uint32 * 6)()
+    if libc.capget(header, held) != 0:
+        return
+    remaining = [held[k] & kept for k in range(2)]
+    sets = (ctypes.c_uint32 * 6)(remaining[0], remaining[1], 0, 0, 0, 0)
+    libc.capset(header, sets)
+
 
 REQUEST_BYTES = 1 << 16
 OUT_OF_MEMORY = "out of memory"
 _MEMORY = ("allocate memory", "failed to map segment", "bad_alloc")
-"""Parts of messages of libraries that have no type of error for a lack of memory."""
+"""Message fragments of libraries without an error type for a lack of memory."""
 
 
 @dataclass
@@ -79,7 +166,7 @@ def _end_late(children: dict[int, _Child]) -> None:
 
 
 def _reap(children: dict[int, _Child]) -> None:
-    """Tell callers whose children are over how these ended."""
+    """Report the exit of finished children to their callers."""
     while children:
         pid, status = os.waitpid(-1, os.WNOHANG)
         if pid == 0:
@@ -92,7 +179,7 @@ def _reap(children: dict[int, _Child]) -> None:
 
 
 def _serve(control: socket.socket, children: dict[int, _Child]) -> bool:
-    """Start one child; False once the caller has gone."""
+    """Start one child; False if the caller has closed its socket."""
     message, descriptors, _, _ = socket.recv_fds(control, REQUEST_BYTES, 1)
     if not message:
         return False
@@ -159,7 +246,7 @@ def _outcome(target: str, arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _lacks_memory(error: BaseException | None) -> bool:
-    """Whether an error, or what it came from, is a lack of memory. torch has no type for it."""
+    """Whether an error, or its cause, is a lack of memory. torch has no type for it."""
     while error is not None:
         if isinstance(error, MemoryError) or any(sign in str(error) for sign in _MEMORY):
             return True

@@ -36,7 +36,7 @@ def export(
     """Write a scene for other programs: per object, baked at a time, animated as glTF, or as
     plain points: all in one .ply, or in a folder the background and each object apart."""
     from ..scene.io import export_scene, load_scene
-    from ..scene.io.formats import FORMATS
+    from ..scene.io.splats import FORMATS
 
     refuse_existing(out, overwrite=overwrite)
     loaded = load_scene(scene)

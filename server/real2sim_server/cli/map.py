@@ -49,7 +49,7 @@ def map_(
     from dataclasses import replace
 
     from ..scene.io import load_scene, save_scene
-    from ..scene.io.lane_document import lane_document
+    from ..scene.io.document import lane_document
 
     loaded = load_scene(scene)
     figures: dict[str, Any] = {"scene": str(scene)}

@@ -113,7 +113,7 @@ def _render_sweep(
     from ..render.cast.call import select_caster
     from ..render.cast.files import SUFFIXES, write_sweep
     from ..scene.io import load_scene
-    from ..scene.lidar_catalogue import find_lidar
+    from ..scene.range_sensors import find_lidar
 
     if out.suffix.lower() not in SUFFIXES:
         raise CommandError(f"--out {out}: the name must end in {', '.join(SUFFIXES)}")

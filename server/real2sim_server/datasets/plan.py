@@ -21,7 +21,7 @@ from ..edit import EditError, ScenarioState, apply_operations
 from ..geometry.transform import transform_from
 from ..scene import Camera, CameraRig, Lidar, LidarError, Scene, SceneError
 from ..scene.camera import T_VEHICLE_OPTICAL
-from ..scene.lidar_catalogue import catalogue_lidar, lidar_from_values
+from ..scene.range_sensors import catalogue_lidar, lidar_from_values
 from .drive import DatasetError, Drive, ScenarioDrive
 from .labels.boxes import BoxNoise
 from .labels.points import ROOF

@@ -15,7 +15,7 @@ from ..geometry.box import bottom_centres
 from ..geometry.transform import Float, invert_transform, transform_from, yaw_quaternion
 from ..render.types import Instance
 from ..scene import UNSEEN, GaussianCloud, Ground, Scene
-from ..scene.spherical_harmonics import SH_C0
+from ..scene.cloud import SH_C0
 from .state import ObjectState, ScenarioState
 
 PARKED = 0.5

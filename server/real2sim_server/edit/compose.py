@@ -23,7 +23,7 @@ from ..render.cast.call import Attributes, SweepScene, incidence_of, met_by_lida
 from ..render.lens import TOLERANCE
 from ..render.types import Instance
 from ..scene import Figure, GaussianCloud, Lidar, Scene, Stride, Trajectory
-from ..scene.spherical_harmonics import SH_C0
+from ..scene.cloud import SH_C0
 from .appearance import contact_shadow, inpaint_ground, vacated_parking
 from .motion import require_object
 from .state import ObjectState, ScenarioState

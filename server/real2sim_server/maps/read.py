@@ -6,7 +6,7 @@ from os import PathLike
 from pathlib import Path
 
 from ..scene.errors import SceneError
-from ..scene.io.lane_document import read_lanes
+from ..scene.io.document import read_lanes
 from ..scene.lane_graph import LaneGraph
 from .argoverse2 import Argoverse2MapReader
 from .lanelet2 import Lanelet2Reader

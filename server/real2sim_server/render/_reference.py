@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..geometry.transform import Float
-from ..scene.camera_motion import turned
-from ..scene.spherical_harmonics import evaluate_sh
+from ..scene.camera import turned
+from ..scene.cloud import evaluate_sh
 from .backend import (
     ALPHA_MAX,
     ALPHA_MIN,

@@ -18,7 +18,7 @@ from real2sim_proto.semantics import UNLABELED
 
 from .._numba import is_on_disk, made
 from ..scene import UNSEEN, BrownConrady, Camera, CameraMotion, GaussianCloud, Shutter
-from ..scene.spherical_harmonics import SH_C0
+from ..scene.cloud import SH_C0
 from .backend import (
     Backend,
     BatchBackend,

@@ -18,7 +18,7 @@ from real2sim_proto.semantics import GROUND, STATIC
 
 from ..geometry.transform import Float, invert_transform, quaternion_to_matrix
 from ..scene import Camera, Ground
-from ..scene.camera_motion import CameraMotion
+from ..scene.camera import CameraMotion
 from .types import weak_cache
 
 CELLS = 96

@@ -24,8 +24,8 @@ from ..scene import (
     Sky,
     Trajectory,
 )
+from ..scene.asset import person_asset
 from ..scene.lane_graph import LaneGraph
-from ..scene.person import person_asset
 from ..world.path import LoggedPath
 from ..world.storyboard.roads import GraphNetwork, Place, Way, straight
 from ..world.storyboard.run import BOXES, StoryboardRun

@@ -1,13 +1,11 @@
 """The world as data: Gaussians, objects with trajectories, sky, cameras.
 
-Knows neither the passing of time nor HTTP.
+Independent of simulation time and of HTTP.
 """
 
 from .asset import Asset
-from .camera import Camera, CameraRig
-from .camera_motion import CameraMotion
-from .cloud import UNSEEN, GaussianCloud
-from .colour import TimeColour
+from .camera import Camera, CameraMotion, CameraRig, Shutter
+from .cloud import UNSEEN, GaussianCloud, TimeColour
 from .errors import (
     BundleError,
     BundleTooLargeError,
@@ -19,16 +17,12 @@ from .errors import (
 )
 from .figure import Figure, Stride
 from .ground import Ground
-from .lane import Area, Lane, LanePlace, Signal, StopLine
+from .lane import Area, Lane, LanePlace, Road, RoadLane, Signal, StopLine
 from .lane_graph import LaneGraph
 from .lens import BrownConrady, Fisheye, FTheta, Lens, Omnidirectional
-from .lidar import Beams, Detection, Lidar
 from .lidar_surfaces import LidarSurfaces, Reflector, RingResponse
-from .radar import Radar
-from .road import Road, RoadLane
-from .scene import Scene, SceneObject
-from .shutter import Shutter
-from .sky import Sky
+from .range_sensors import Beams, Detection, Lidar, Radar
+from .scene import Scene, SceneObject, Sky
 from .trajectory import Trajectory
 
 __all__ = [

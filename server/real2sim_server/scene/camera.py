@@ -1,17 +1,88 @@
-"""Cameras and the rig that carries them."""
+"""Cameras: optics, shutter, the rig that carries them, and their motion during an exposure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float, invert_transform, is_rigid
+from real2sim_proto.cameras import ShutterDirection
+
+from ..geometry.transform import (
+    Float,
+    invert_transform,
+    is_rigid,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+    slerp,
+)
 from .errors import SceneError
 from .lens import Lens
-from .shutter import GLOBAL, Shutter
+
+# Shutter.
+
+DIRECTIONS = get_args(ShutterDirection)
+MAX_READOUT_US = 200_000
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """The readout of an image.
+
+    Attributes:
+        direction: ``global``: all pixels at once; or which rows or columns come first.
+        readout_us: time from the first to the last row or column [us]; 0 where ``global``. The
+            instant of an image is the middle of it.
+
+    Raises:
+        SceneError: for an unknown direction, or a read-out that is not 1 to 200,000 us.
+    """
+
+    direction: ShutterDirection = "global"
+    readout_us: int = 0
+
+    def __post_init__(self) -> None:
+        if self.direction not in DIRECTIONS:
+            raise SceneError(
+                f"shutter: direction must be one of {list(DIRECTIONS)}, not {self.direction!r}"
+            )
+        rolls = self.direction != "global"
+        if not (rolls <= self.readout_us <= MAX_READOUT_US * rolls):
+            raise SceneError(
+                f"shutter: readout_us must be 1 to {MAX_READOUT_US}, and 0 where global, "
+                f"not {self.readout_us!r} with {self.direction!r}"
+            )
+
+    @property
+    def rolls(self) -> bool:
+        """Whether rows or columns are exposed one after the other."""
+        return self.direction != "global"
+
+    @property
+    def by_row(self) -> bool:
+        """Whether the pixels of a row are exposed together, else those of a column."""
+        return self.direction in {"top_to_bottom", "bottom_to_top"}
+
+    def line_times(self, width: int, height: int) -> NDArray[np.float64]:
+        """Exposure time of each row (or column), 0 to 1 over the readout; NCore's convention: the
+        first at 0, the last at 1."""
+        count = height if self.by_row else width
+        times = np.arange(count) / max(count - 1, 1)
+        return times if self.direction in {"top_to_bottom", "left_to_right"} else 1 - times
+
+    def times_at(self, pixels: Float, width: int, height: int) -> Float:
+        """Exposure times of positions [..., 2] [px]; outside the image, those of its edge."""
+        axis, count = (1, height) if self.by_row else (0, width)
+        line = np.clip(np.floor(np.nan_to_num(pixels[..., axis])), 0, count - 1).astype(np.int64)
+        return self.line_times(width, height)[line]
+
+
+GLOBAL = Shutter()
+"""All pixels at once."""
+
 
 T_VEHICLE_OPTICAL = np.array(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64
@@ -21,7 +92,7 @@ T_VEHICLE_OPTICAL = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What a camera's images were before they were freed of distortion; sizes are the camera's.
+    """The optics before the images were undistorted; sizes are the camera's.
 
     Attributes:
         K: [3, 3] float64 [px].
@@ -82,7 +153,7 @@ class Camera:
             self.as_recorded()
 
     def _check_lens(self, lens: Lens) -> None:
-        """Perspective images show something everywhere, others at least in their middle."""
+        """Perspective images cover all pixels, others at least the middle ones."""
         try:
             reach = lens.reach
         except SceneError as error:
@@ -188,3 +259,68 @@ class CameraRig:
             if camera.name == name:
                 return camera
         raise SceneError(f"unknown camera {name!r}; this rig has {list(self.names)}")
+
+
+# Motion of a camera during readout.
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMotion:
+    """Pose of a camera during the readout of an image.
+
+    The position moves uniformly along a straight line, the rotation uniformly about one axis.
+
+    Attributes:
+        start, end: [4, 4] ``T_world_camera`` at the first and the last line.
+    """
+
+    start: Float
+    end: Float
+
+    @classmethod
+    def still(cls, pose: Float) -> CameraMotion:
+        """A camera at rest at ``pose`` [4, 4]."""
+        return cls(pose, pose)
+
+    @classmethod
+    def about(cls, pose: Float, linear: Float, angular: Float, seconds: float) -> CameraMotion:
+        """A camera at ``pose`` in the middle of ``seconds``, with velocity ``linear`` [3] [m/s] and
+        angular velocity ``angular`` [3] [rad/s], both in the world frame."""
+        return cls(*(moved(pose, linear, angular, seconds * side) for side in (-0.5, 0.5)))
+
+    @property
+    def moves(self) -> bool:
+        """Whether start and end differ."""
+        return not np.array_equal(self.start, self.end)
+
+    def at(self, times: Float) -> tuple[Float, Float]:
+        """Rotations [..., 3, 3] and positions [..., 3] at ``times`` [...] from 0 to 1."""
+        times = np.asarray(times, dtype=np.float64)
+        ends = matrix_to_quaternion(np.stack([self.start[:3, :3], self.end[:3, :3]]))
+        turns = quaternion_to_matrix(slerp(ends[0], ends[1], times))
+        share = times[..., None]
+        return turns, (1 - share) * self.start[:3, 3] + share * self.end[:3, 3]
+
+    def middle(self) -> Float:
+        """``T_world_camera`` [4, 4] in the middle."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.at(np.array(0.5))
+        return pose
+
+
+def moved(pose: Float, linear: Any, angular: Any, seconds: float) -> Float:
+    """A pose [4, 4] after ``seconds`` of uniform motion: ``linear`` [3] of its own origin [m/s],
+    ``angular`` [3] about it [rad/s], both in the world."""
+    found = np.array(pose, dtype=np.float64)
+    found[:3, :3] = turned(np.asarray(angular, dtype=np.float64) * seconds) @ found[:3, :3]
+    found[:3, 3] += np.asarray(linear, dtype=np.float64) * seconds
+    return found
+
+
+def turned(vector: Float) -> Float:
+    """The rotation [3, 3] about ``vector`` [3] by its length [rad]."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0:
+        return np.eye(3)
+    axis = vector / angle
+    return quaternion_to_matrix(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]))

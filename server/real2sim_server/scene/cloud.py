@@ -1,21 +1,128 @@
-"""A cluster of 3D Gaussians."""
+"""Clusters of 3D Gaussians: spherical harmonics, transforms, and colour that changes over time."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ..geometry.transform import is_rigid, matrix_to_quaternion, quaternion_to_matrix
+from ..geometry.transform import Float, is_rigid, matrix_to_quaternion, quaternion_to_matrix
 from .errors import SceneError
-from .spherical_harmonics import rotate_sh
+
+# Real spherical harmonics, degree 0 to 3. Basis order and signs are those of 3D Gaussian Splatting
+# (Kerbl et al. 2023), which every splat file uses; the formulas are in Sloan, Stupid Spherical
+# Harmonics Tricks (2008).
+
+SH_C0 = 0.28209479177387814
+"""The constant basis function: colour = SH_C0 * sh[0] + 0.5."""
+
+
+def sh_basis(directions: Float, degree: int) -> Float:
+    """Basis functions [..., (degree + 1)^2] float64 at unit ``directions`` [..., 3]."""
+    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
+    xx, yy, zz = x * x, y * y, z * z
+    functions = [
+        np.full_like(x, SH_C0),
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    return np.stack(functions[: (degree + 1) ** 2], axis=-1)
+
+
+def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
+    """Sum of ``sh`` [N, K, 3] along ``directions`` [N, 3] (any length), K = (degree + 1)^2.
+
+    Returns:
+        [N, 3], without the offset of 0.5 and without clamping.
+    """
+    basis = _tensor_basis(torch.nn.functional.normalize(directions, dim=-1), int(sh.shape[1]))
+    return (basis[:, :, None] * sh).sum(1)
+
+
+def _tensor_basis(directions: Tensor, count: int) -> Tensor:
+    """The first ``count`` (1, 4, 9 or 16) functions [N, count], in the precision of the tensor."""
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, 0.2820947917738781)]
+    if count > 1:
+        basis += [-0.48860251190292 * y, 0.48860251190292 * z, -0.48860251190292 * x]
+    if count > 4:
+        basis += [
+            1.092548430592079 * x * y,
+            -1.092548430592079 * y * z,
+            0.9461746957575601 * z * z - 0.3153915652525201,
+            -1.092548430592079 * x * z,
+            0.5462742152960395 * (x * x - y * y),
+        ]
+    if count > 9:
+        basis += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5 * z * z - 1),
+            0.3731763325901154 * z * (5 * z * z - 3),
+            -0.4570457994644658 * x * (5 * z * z - 1),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def sh_rotation(rotation: Float, degree: int) -> Float:
+    """Matrix [K, K] float64 that turns SH coefficients along with ``rotation`` [3, 3].
+
+    The turned function at R d equals the original at d. Each band is closed under rotation, so the
+    matrix is block-diagonal; a block is the exact solution of an overdetermined linear system over
+    fixed directions.
+    """
+    directions = _spread_directions()
+    before = sh_basis(directions, degree)
+    after = sh_basis(directions @ np.asarray(rotation, dtype=np.float64).T, degree)
+    matrix = np.zeros((before.shape[1], before.shape[1]))
+    for band in range(degree + 1):
+        part = slice(band * band, (band + 1) ** 2)
+        matrix[part, part] = np.linalg.lstsq(after[:, part], before[:, part], rcond=None)[0]
+    # Rounding noise, which would make turning by nothing change bits.
+    matrix[np.abs(matrix) < 1e-12] = 0
+    return matrix
+
+
+def rotate_sh(sh: Tensor, rotation: Float) -> Tensor:
+    """Coefficients [N, K, 3] of the same Gaussians after turning them by ``rotation`` [3, 3]."""
+    if sh.shape[1] == 1:
+        return sh
+    degree = round(sh.shape[1] ** 0.5) - 1
+    matrix = torch.from_numpy(sh_rotation(rotation, degree)).to(sh)
+    return torch.einsum("jk,nkc->njc", matrix, sh).contiguous()
+
+
+def _spread_directions(count: int = 64) -> Float:
+    """Unit directions [count, 3] spread evenly (Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    radius = np.sqrt(1 - z * z)
+    angle = np.pi * (1 + 5**0.5) * k
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+
 
 SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 UNSEEN = 0.25
-"""Uncertainty of what no training ray has met: about the absolute error of a guessed colour."""
+"""Uncertainty where no training ray passed: about the absolute error of a guessed colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +184,7 @@ class GaussianCloud:
         return int(self.means.shape[0])
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by name, without what is not known."""
+        """Its tensors by name, without absent ones."""
         named = ((field.name, getattr(self, field.name)) for field in fields(self))
         return {name: tensor for name, tensor in named if tensor is not None}
 
@@ -88,7 +195,7 @@ class GaussianCloud:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors live."""
+        """Device of the tensors."""
         return self.means.device
 
     @property
@@ -109,7 +216,7 @@ class GaussianCloud:
         )
 
     def to(self, device: torch.device | str) -> GaussianCloud:
-        """The cloud on another device; itself when it is there already."""
+        """The cloud on another device; itself if it is already there."""
         if torch.device(device) == self.device:
             return self
         return GaussianCloud(**{name: t.to(device) for name, t in self.tensors().items()})
@@ -119,7 +226,7 @@ class GaussianCloud:
         return GaussianCloud(**{name: t[index].contiguous() for name, t in self.tensors().items()})
 
     def by_importance(self) -> Tensor:
-        """Indices [N] int64, what covers most first: by opacity times the area [m^2] of the
+        """Indices [N] int64, largest coverage first: by opacity times the area [m^2] of the
         largest ellipse; equals keep their order."""
         largest = self.scales.sort(dim=1, descending=True).values[:, :2]
         return torch.argsort(self.opacities * largest.prod(dim=1), descending=True, stable=True)
@@ -196,7 +303,7 @@ class GaussianCloud:
         )
 
     def check_values(self, what: str) -> None:
-        """Look at every value, as is due where a cloud comes from outside.
+        """Check every value of a cloud from an untrusted source.
 
         Args:
             what: name of the cloud for the message.
@@ -241,3 +348,92 @@ def _refuse(bad: Tensor, what: str, reason: str) -> None:
     count = int(bad.sum())
     if count:
         raise SceneError(f"{what}: {count} of {bad.numel()} values: {reason}")
+
+
+# Colour that changes over time.
+
+BASES = ("cosine", "real_dft")
+
+
+@dataclass(frozen=True, eq=False)
+class TimeColour:
+    """Time-dependent offset of the constant part of a cloud's colour.
+
+    At phase s, which goes from 0 at ``start_us`` to 1 at ``end_us`` and stays there, the SH
+    coefficient ``sh[:, 0]`` becomes ``sh[:, 0] + sum_k coefficients[:, k] b_k(s)``, k from 0.
+
+    Attributes:
+        coefficients: [N, F, 3] float32.
+        basis: ``cosine``: b_k = cos(pi (k + 1) s), half periods, so that beginning and end may
+            differ (Yan et al. 2024, eq. 4); ``real_dft``: sin(2 pi s), cos(2 pi s), sin(4 pi s)
+            ..., as their released code has it.
+        start_us, end_us: [us], start before end.
+
+    Raises:
+        SceneError: for other shapes, an unknown basis or an empty span of time.
+    """
+
+    coefficients: Tensor
+    basis: str
+    start_us: int
+    end_us: int
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.coefficients.shape)
+        if len(shape) != 3 or shape[2] != 3 or self.coefficients.dtype != torch.float32:
+            raise SceneError(f"colour coefficients must be [N, F, 3] float32, not {shape}")
+        if self.basis not in BASES:
+            raise SceneError(f"basis of a colour must be one of {list(BASES)}, not {self.basis!r}")
+        if not self.start_us < self.end_us:
+            raise SceneError(
+                f"a colour must start before it ends, not {self.start_us} and {self.end_us}"
+            )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return self.coefficients.numel() * self.coefficients.element_size()
+
+    def tones(self, t_us: int) -> Tensor:
+        """Values [F] float32 of the basis functions at ``t_us``."""
+        phase = (t_us - self.start_us) / (self.end_us - self.start_us)
+        return colour_basis(phase, int(self.coefficients.shape[1]), self.basis)
+
+    def tones_of(self, times_us: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Values [M, F] at several instants [us]; each row equals :meth:`tones`."""
+        phases = (times_us - self.start_us) / (self.end_us - self.start_us)
+        return _basis_values(phases, int(self.coefficients.shape[1]), self.basis)
+
+    def at(self, cloud: GaussianCloud, t_us: int) -> GaussianCloud:
+        """``cloud`` with the colours of ``t_us``."""
+        tones = self.tones(t_us).to(cloud.device)
+        sh = cloud.sh.clone()
+        sh[:, 0] += torch.einsum("nfc,f->nc", self.coefficients, tones)
+        return replace(cloud, sh=sh)
+
+    def to(self, device: torch.device | str) -> TimeColour:
+        """The colour on another device."""
+        return replace(self, coefficients=self.coefficients.to(device))
+
+
+def colour_basis(phase: float, count: int, basis: str) -> Tensor:
+    """Values [count] float32 of the basis functions at ``phase``, clamped to [0, 1]."""
+    return torch.from_numpy(_values_at(phase, count, basis).copy())
+
+
+@lru_cache(maxsize=1024)
+def _values_at(phase: float, count: int, basis: str) -> NDArray[np.float32]:
+    """Of one instant: the objects of a scene mostly have colours over the same span of time."""
+    values: NDArray[np.float32] = _basis_values(np.array([phase]), count, basis)[0]
+    return values
+
+
+def _basis_values(phases: NDArray[np.float64], count: int, basis: str) -> NDArray[np.float32]:
+    s = np.clip(phases, 0.0, 1.0)[:, None]
+    k = np.arange(count)
+    if basis == "cosine":
+        values = np.cos(np.pi * (k + 1) * s)
+    else:
+        angle = 2 * np.pi * (k // 2 + 1) * s
+        values = np.where(k % 2 == 0, np.sin(angle), np.cos(angle))
+    return values.astype(np.float32)

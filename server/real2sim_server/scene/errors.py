@@ -1,23 +1,23 @@
-"""Errors of the scene room.
+"""Errors of scenes.
 
 SceneError
-├── TimeOutOfRangeError   a pose was asked for outside a trajectory
-├── UnknownObjectError    an object id the scene does not have
-├── LidarError            a LiDAR that cannot be, or a name that the catalogue does not have
-├── RadarError            a name that the catalogue of radars does not have
+├── TimeOutOfRangeError   a pose was requested outside a trajectory
+├── UnknownObjectError    an object id that the scene does not have
+├── LidarError            a LiDAR out of range, or a name missing from the catalogue
+├── RadarError            a name missing from the catalogue of radars
 └── BundleError           a file that is not a readable scene or splat file
-    └── BundleTooLargeError   one that would take more memory than it may
+    └── BundleTooLargeError   one that would exceed the memory limit
 """
 
 from __future__ import annotations
 
 
 class SceneError(Exception):
-    """Something about a scene is not as it must be. The message says what, and what to do."""
+    """A scene is invalid. The message gives the reason and the remedy."""
 
 
 class TimeOutOfRangeError(SceneError, ValueError):
-    """A pose was asked for outside a trajectory's time range; trajectories never extrapolate."""
+    """A pose was requested outside a trajectory's time range; trajectories never extrapolate."""
 
 
 class UnknownObjectError(SceneError, KeyError):
@@ -28,16 +28,16 @@ class UnknownObjectError(SceneError, KeyError):
 
 
 class LidarError(SceneError, ValueError):
-    """A LiDAR out of range or unknown; the message says what was given and what is allowed."""
+    """A LiDAR is out of range or unknown; the message gives the value and the allowed ones."""
 
 
 class RadarError(SceneError, ValueError):
-    """A radar that the catalogue does not have; the message names those it has."""
+    """The catalogue has no such radar; the message lists the known ones."""
 
 
 class BundleError(SceneError, ValueError):
-    """A file or folder that cannot be read as a scene, with the place and the reason."""
+    """A file or folder cannot be read as a scene; the message gives the place and the reason."""
 
 
 class BundleTooLargeError(BundleError):
-    """A file that would take more memory than it may, however small it is itself."""
+    """A file would exceed the memory limit when read, however small it is itself."""

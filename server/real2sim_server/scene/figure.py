@@ -1,14 +1,13 @@
 """People among the objects of a scene: Gaussians that follow the joints of a body.
 
-The cluster of a person is stored in the rest pose of the body model. Its pose at an instant follows
-from the trajectory it goes along: footsteps are laid along the path by the distance covered
-(:mod:`real2sim_server.body.gait`), so that a person on another path, or at another speed, makes
-other steps. Poses are tabulated on the way, a piece at a time, and interpolated.
+A person's cluster is stored in the rest pose of the body model. The pose at an instant follows from
+the trajectory: footsteps are placed along the path by the distance covered
+(:mod:`real2sim_server.body.gait`), so a person on another path, or at another speed, takes other
+steps. Poses are tabulated on demand, one segment at a time, and interpolated. A person moved by
+something else walks straight on with every step of a :class:`Stride`.
 
-Whoever is moved by something else walks straight on with every step of a :class:`Stride`.
-
-Means go by linear blend skinning. A Gaussian is turned by the blended quaternion of its joints, the
-rotation nearest to the blended transforms, and keeps its scales.
+Linear blend skinning moves the means. The blended quaternion of the joints, the rotation nearest to
+the blended transforms, rotates a Gaussian; its scales stay.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -26,22 +25,83 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from .._numba import kernel
 from ..body import JOINTS, Body, body_model, joint_transforms, keypoints, skin
 from ..body.gait import LEAD, STANDING, Gait, GaitStyle, plan_gait, stride_length
 from ..body.skinning import joint_positions
 from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix, quaternion_yaw
 from .cloud import GaussianCloud
 from .errors import SceneError
-from .figure_kernels import pose_gaussians
 from .trajectory import Trajectory
+
+# Kernel: skinning of Gaussians.
+
+
+@kernel(nogil=True)
+def pose_gaussians(  # noqa: PLR0917
+    means: Any, quats: Any, joints: Any, weights: Any, turns: Any, shifts: Any
+) -> Any:
+    """Means [N, 3] and quaternions [N, 4] float32 of Gaussians on a posed body.
+
+    Args:
+        means, quats: [N, 3] and [N, 4] float32, of the rest pose.
+        joints, weights: [N, 4], which joints move a Gaussian, and by how much.
+        turns, shifts: [J, 4] ``wxyz`` and [J, 3]; a joint takes x to turn x + shift.
+    """
+    rows = np.empty((len(turns), 16))
+    for j in range(len(turns)):
+        w, x, y, z = turns[j, 0], turns[j, 1], turns[j, 2], turns[j, 3]
+        rows[j, 0] = 1 - 2 * (y * y + z * z)
+        rows[j, 1], rows[j, 2] = 2 * (x * y - w * z), 2 * (x * z + w * y)
+        rows[j, 3], rows[j, 4] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z)
+        rows[j, 5], rows[j, 6] = 2 * (y * z - w * x), 2 * (x * z - w * y)
+        rows[j, 7], rows[j, 8] = 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        for axis in range(3):
+            rows[j, 9 + axis] = shifts[j, axis]
+        rows[j, 12], rows[j, 13], rows[j, 14], rows[j, 15] = w, x, y, z
+    posed = np.empty((len(means), 3), np.float32)
+    turned = np.empty((len(means), 4), np.float32)
+    blend = np.empty(16)
+    for i in range(len(means)):
+        first, share = joints[i, 0], weights[i, 0]
+        for c in range(16):
+            blend[c] = share * rows[first, c]
+        for k in range(1, 4):
+            j, share = joints[i, k], weights[i, k]
+            if share == 0:
+                continue
+            for c in range(12):
+                blend[c] += share * rows[j, c]
+            # Both signs of a quaternion are one rotation: those of the first joint's side add up.
+            same = 0.0
+            for c in range(12, 16):
+                same += rows[j, c] * rows[first, c]
+            if same < 0:
+                share = -share
+            for c in range(12, 16):
+                blend[c] += share * rows[j, c]
+        x, y, z = means[i, 0], means[i, 1], means[i, 2]
+        for axis in range(3):
+            at = 3 * axis
+            posed[i, axis] = blend[at] * x + blend[at + 1] * y + blend[at + 2] * z + blend[9 + axis]
+        a, b, c_, d = blend[12], blend[13], blend[14], blend[15]
+        length = np.sqrt(a * a + b * b + c_ * c_ + d * d)
+        a, b, c_, d = a / length, b / length, c_ / length, d / length
+        w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        turned[i, 0] = a * w - b * x - c_ * y - d * z
+        turned[i, 1] = a * x + b * w + c_ * z - d * y
+        turned[i, 2] = a * y - b * z + c_ * w + d * x
+        turned[i, 3] = a * z + b * y - c_ * x + d * w
+    return posed, turned
+
 
 ROW_US = 20_000
 """Spacing of tabulated poses [us]; between them joints move straight on."""
 PIECE = 100
 """Poses that are tabulated at once."""
 KEPT_PIECES, KEPT_CLOUDS = 16, 4
-LONGEST_US = 3_600_000_000
-"""Who takes longer than this for a path stands [us]."""
+MAX_DURATION_US = 3_600_000_000
+"""People on longer trajectories stand still [us]."""
 PACE, FASTEST = 0.05, 8.0
 """Spacing of the paces that striding is tabulated for, and the last of them [m/s]."""
 STRIDE_ROWS = 48
@@ -52,7 +112,7 @@ SETTLING = 0.3
 
 
 class Stride(NamedTuple):
-    """How far somebody is in walking whom no trajectory leads.
+    """Walking state of a person without a trajectory.
 
     Attributes:
         steps: made so far; a foot swings over each whole one.
@@ -65,14 +125,14 @@ class Stride(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """How the Gaussians of an object follow a body that walks.
+    """Binding of an object's Gaussians to a walking body.
 
     Attributes:
         shape: [<= 12] coefficients of the body model's shapes.
         height: of the body [m].
         middle: height of the object's origin above the body's, which is on the ground [m].
         joints: [N, 4] uint8, joints that move a Gaussian.
-        weights: [N, 4] float32, and by how much; each row sums to one.
+        weights: [N, 4] float32 of these joints; each row sums to one.
         style: how it walks.
 
     Raises:
@@ -129,7 +189,7 @@ class Figure:
         return body
 
     def styled(self, **style: float) -> Figure:
-        """The same person walking otherwise; the same one again for the same style.
+        """The same person in another walking style; the same object for the same style.
 
         Args:
             style: fields of :class:`..body.gait.GaitStyle`; others stay.
@@ -149,7 +209,7 @@ class Figure:
         return self.joints.nbytes + self.weights.nbytes
 
     def check_values(self, what: str) -> None:
-        """Look at every value, as is due where a figure comes from outside.
+        """Check every value of a figure from an untrusted source.
 
         Args:
             what: name of the object for the message.
@@ -175,30 +235,30 @@ class Figure:
             )
 
     def posed(self, cloud: GaussianCloud, trajectory: Trajectory, t_us: int) -> GaussianCloud:
-        """``cloud`` in the pose that it has at ``t_us`` on its way along ``trajectory``.
+        """``cloud`` in its pose at ``t_us`` along ``trajectory``.
 
         Args:
             cloud: in the rest pose, frame of the object.
             trajectory: of the object; its origin is ``middle`` above the ground.
-            t_us: instant [us]; before and after the trajectory it stands as at its ends.
+            t_us: instant [us]; outside the trajectory the pose is that of the nearer end.
 
         Returns:
-            The same object again while nothing else of that person was asked for.
+            The same object as before, if the query repeats the last one of this person.
         """
         with self._lock:
             return self._walk(trajectory).cloud(cloud, t_us)
 
     def striding(self, cloud: GaussianCloud, stride: Stride) -> GaussianCloud:
-        """``cloud`` walking straight on, wherever it is moved.
+        """``cloud`` walking straight on, for callers that move it themselves.
 
         Args:
             cloud: in the rest pose, frame of the object.
-            stride: how far it is.
+            stride: walking state.
         """
         return self._binding.posed(cloud, *self._stride_joints(stride))
 
     def stride_at(self, trajectory: Trajectory, t_us: int) -> Stride:
-        """How far it is at ``t_us`` on its way along ``trajectory``, to go on from there."""
+        """Walking state at ``t_us`` along ``trajectory``, to continue from."""
         with self._lock:
             walk = self._walk(trajectory)
         seconds = float(np.clip(t_us - walk.start_us, 0, walk.span_us)) * 1e-6
@@ -206,7 +266,7 @@ class Figure:
         return Stride(steps, float(np.interp(seconds, walk.gait.times, walk.gait.speeds)))
 
     def strode(self, stride: Stride, *, speed: float, seconds: float) -> Stride:
-        """How far it is after ``seconds`` more at ``speed`` [m/s]; at an even one feet stand."""
+        """Walking state after ``seconds`` at ``speed`` [m/s]; feet stay in place."""
         settled = math.exp(-seconds / SETTLING)
         pace = speed + (stride.pace - speed) * settled
         return Stride(stride.steps + seconds * speed / self._step_length(pace), pace)
@@ -217,9 +277,9 @@ class Figure:
         """COCO's 17 keypoints [17, 3], frame of the object [m].
 
         Args:
-            trajectory: that leads it.
-            t_us: instant on the way [us].
-            stride: how it walks where no trajectory leads it.
+            trajectory: of the object.
+            t_us: instant on the trajectory [us].
+            stride: walking state, in place of the trajectory.
         """
         if stride is not None:
             turns, places = self._stride_joints(stride)
@@ -234,7 +294,7 @@ class Figure:
         return points
 
     def _walk(self, trajectory: Trajectory) -> _Walk:
-        """The way along a trajectory, kept as long as that lives; under the lock."""
+        """The walk along a trajectory, cached for its lifetime; needs the lock."""
         walk = self._walks.get(trajectory)
         if walk is None:
             walk = self._walks[trajectory] = _Walk(self, trajectory)
@@ -328,7 +388,7 @@ class _Binding:
 
 
 class _Walk:
-    """A figure on its way along one trajectory: tabulated poses, and what was shown last."""
+    """A figure's walk along one trajectory: tabulated poses, and the last result."""
 
     def __init__(self, figure: Figure, trajectory: Trajectory) -> None:
         # No reference to the trajectory: the walk is kept as long as that lives.
@@ -342,7 +402,7 @@ class _Walk:
         )
 
     def cloud(self, cloud: GaussianCloud, t_us: int) -> GaussianCloud:
-        """``cloud`` at ``t_us``, from memory where it was asked for before."""
+        """``cloud`` at ``t_us``; repeated queries return the cached one."""
         key = (id(cloud), t_us)
         found = self.shown.get(key)
         if found is None or found[0] is not cloud:
@@ -370,7 +430,7 @@ class _Walk:
 
 def _gait(figure: Figure, trajectory: Trajectory) -> Gait:
     times, count = (trajectory.times_us - trajectory.start_us) * 1e-6, len(trajectory.times_us)
-    if trajectory.end_us - trajectory.start_us > LONGEST_US:
+    if trajectory.end_us - trajectory.start_us > MAX_DURATION_US:
         count = 1
     return plan_gait(
         figure.body,

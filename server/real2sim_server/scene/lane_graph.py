@@ -1,10 +1,10 @@
-"""The lanes of a scene as one graph: what traffic follows, planners are sent and scores ask."""
+"""The lanes of a scene as one graph with a spatial index, for traffic, planners and scores."""
 
 from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -13,31 +13,277 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._numba import func, kernel
 from ..geometry.transform import Float
 from .errors import SceneError
-from .lane import DRIVABLE, TRAVELLED, Area, Lane, LanePlace, Signal, StopLine
-from .lane_index import LaneIndex
-from .lane_kernels import inside_any, nearest_lanes
-from .road import Road, turned
+from .lane import DRIVABLE, TRAVELLED, Area, Lane, LanePlace, Road, Signal, StopLine, turned
+
+# Kernels: lanes near a position.
+
+HEADING_COST = 2.5
+"""What a heading across a lane counts as, beside the distance [m]; against it, twice that: lanes
+of both directions that share a place are told apart, and the next lane beside is none the nearer.
+"""
+
+
+@func
+def cell_of(frame: Any, columns: int, rows: int, x: float, y: float) -> Any:
+    """Cell of a place, clamped into the grid of ``frame`` (x0, y0, edge)."""
+    i = min(max(math.floor((x - frame[0]) / frame[2]), 0), columns - 1)
+    j = min(max(math.floor((y - frame[1]) / frame[2]), 0), rows - 1)
+    return i, j
+
+
+@func
+def on_segment(segments: Any, k: int, x: float, y: float) -> Any:
+    """Share along segment ``k`` of its place nearest to (x, y), and the signed distance: positive
+    to its left [m]."""
+    ax, ay, bx, by = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
+    dx, dy = bx - ax, by - ay
+    along = ((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy)
+    along = min(max(along, 0.0), 1.0)
+    ex, ey = x - (ax + along * dx), y - (ay + along * dy)
+    distance = math.hypot(ex, ey)
+    return along, math.copysign(distance, dx * ey - dy * ex)
+
+
+@func
+def nearest_segment(grid: Any, segments: Any, lane_of: Any, allowed: Any, place: Any) -> Any:
+    """Segment of an allowed lane that costs least, or -1; share along it, signed distance.
+
+    The heading of ``place`` (x, y, heading) may be NaN: then the distance alone decides.
+    Cells are visited in rings, until no farther one can hold anything nearer.
+    """
+    x, y, heading = place
+    first, entries, frame, columns, rows = grid
+    u, v = cell_of(frame, columns, rows, x, y)
+    best, best_cost, best_along, best_offset = -1, np.inf, 0.0, 0.0
+    for ring in range(max(columns, rows)):
+        if (ring - 1) * frame[2] > best_cost:
+            break
+        for i in range(max(u - ring, 0), min(u + ring, columns - 1) + 1):
+            edge = abs(i - u) == ring
+            step = 1 if edge or ring == 0 else 2 * ring
+            for j in range(v - ring, v + ring + 1, step):
+                if j < 0 or j >= rows:
+                    continue
+                cell = i * rows + j
+                for e in range(first[cell], first[cell + 1]):
+                    k = entries[e]
+                    if not allowed[lane_of[k]]:
+                        continue
+                    along, offset = on_segment(segments, k, x, y)
+                    cost = abs(offset)
+                    if not math.isnan(heading):
+                        cost += HEADING_COST * (1.0 - math.cos(heading - segments[k, 4]))
+                    if cost < best_cost or (cost == best_cost and k < best):
+                        best, best_cost, best_along, best_offset = k, cost, along, offset
+    return best, best_along, best_offset
+
+
+@kernel
+def nearest_lanes(table: Any, allowed: Any, places: Any, found: Any, values: Any) -> None:
+    """For each place [S, 3] (x, y, heading or NaN) the lane, its arc length and the offset.
+
+    Args:
+        table: (grid, segments, lane_of): the grid is (first, entries, frame, columns, rows),
+            segments by cell; segments [K, 7] float64 are x and y of both ends, heading, arc length
+            at both ends; lane_of is [K] int32.
+        allowed: [L] bool, lanes that count.
+        found: [S] int64, filled: the lane, or -1 where none is allowed.
+        values: [S, 2] float64, filled: arc length and offset to the left [m].
+    """
+    grid, segments, lane_of = table
+    for n in range(len(places)):
+        k, along, offset = nearest_segment(
+            grid, segments, lane_of, allowed, (places[n, 0], places[n, 1], places[n, 2])
+        )
+        found[n] = lane_of[k] if k >= 0 else -1
+        if k >= 0:
+            values[n, 0] = segments[k, 5] + along * (segments[k, 6] - segments[k, 5])
+            values[n, 1] = offset
+
+
+@func
+def in_quad(quads: Any, k: int, x: float, y: float) -> bool:
+    """Whether a place lies in the quadrilateral ``k`` (rims included), however it is turned."""
+    positive, negative = False, False
+    for a in range(4):
+        b = (a + 1) % 4
+        ax, ay, bx, by = quads[k, a, 0], quads[k, a, 1], quads[k, b, 0], quads[k, b, 1]
+        side = (bx - ax) * (y - ay) - (by - ay) * (x - ax)
+        positive, negative = positive or side > 1e-9, negative or side < -1e-9
+    return not (positive and negative)
+
+
+@func
+def in_polygon(points: Any, start: int, stop: int, x: float, y: float) -> bool:
+    """Whether a place lies inside the closed outline ``points[start:stop]`` (even-odd rule)."""
+    inside = False
+    b = stop - 1
+    for a in range(start, stop):
+        ax, ay, bx, by = points[a, 0], points[a, 1], points[b, 0], points[b, 1]
+        if (ay > y) != (by > y) and x < (bx - ax) * (y - ay) / (by - ay) + ax:
+            inside = not inside
+        b = a
+    return inside
+
+
+@kernel
+def inside_any(table: Any, allowed: Any, outlines: Any, places: Any, found: Any) -> None:
+    """Which places [S, 2] lie on an allowed lane or inside one of the outlines.
+
+    Args:
+        table: (grid, quads, lane_of) with rims of each segment [K, 4, 2] float64 [m].
+        allowed: [L] bool, lanes that count.
+        outlines: (points [P, 2], first [A + 1], bounds [A, 4]) of areas.
+        found: [S] bool, filled.
+    """
+    grid, quads, lane_of = table
+    first, entries, frame, columns, rows = grid
+    points, starts, bounds = outlines
+    for n in range(len(places)):
+        x, y = places[n, 0], places[n, 1]
+        u, v = cell_of(frame, columns, rows, x, y)
+        hit = False
+        cell = u * rows + v
+        for e in range(first[cell], first[cell + 1]):
+            k = entries[e]
+            if allowed[lane_of[k]] and in_quad(quads, k, x, y):
+                hit = True
+                break
+        for a in range(len(bounds)):
+            if hit:
+                break
+            if bounds[a, 0] <= x <= bounds[a, 2] and bounds[a, 1] <= y <= bounds[a, 3]:
+                hit = in_polygon(points, starts[a], starts[a + 1], x, y)
+        found[n] = hit
+
+
+@kernel
+def count_cells(boxes: Any, frame: Any, columns: int, rows: int) -> Any:
+    """How many of the boxes [K, 4] (low x, y, high x, y) touch each cell, as first places of a
+    list by cell [columns * rows + 1]."""
+    first = np.zeros(columns * rows + 1, np.int64)
+    for k in range(len(boxes)):
+        i0, j0 = cell_of(frame, columns, rows, boxes[k, 0], boxes[k, 1])
+        i1, j1 = cell_of(frame, columns, rows, boxes[k, 2], boxes[k, 3])
+        for i in range(i0, i1 + 1):
+            for j in range(j0, j1 + 1):
+                first[i * rows + j + 1] += 1
+    for cell in range(columns * rows):
+        first[cell + 1] += first[cell]
+    return first
+
+
+@kernel
+def fill_cells(boxes: Any, frame: Any, columns: int, rows: int, first: Any) -> Any:
+    """The list that :func:`count_cells` has counted: boxes by cell, each cell's in order."""
+    entries = np.empty(first[-1], np.int32)
+    fill = first[:-1].copy()
+    for k in range(len(boxes)):
+        i0, j0 = cell_of(frame, columns, rows, boxes[k, 0], boxes[k, 1])
+        i1, j1 = cell_of(frame, columns, rows, boxes[k, 2], boxes[k, 3])
+        for i in range(i0, i1 + 1):
+            for j in range(j0, j1 + 1):
+                cell = i * rows + j
+                entries[fill[cell]] = k
+                fill[cell] += 1
+    return entries
+
+
+# Spatial index of the lanes, as arrays and a grid for the kernels.
+
+CELL_M, MAX_CELLS = 5.0, 4_000_000
+MAX_SEGMENT_M = 20.0
+
+
+class LaneIndex:
+    """Segments of all lanes in arrays, and a grid over them, as kernels take them."""
+
+    def __init__(self, lanes: tuple[Lane, ...]) -> None:
+        self.lanes = lanes
+        parts = [_segments(lane) for lane in lanes]
+        counts = [len(quads) for _, quads in parts]
+        self.segments = np.concatenate([p for p, _ in parts]) if parts else np.zeros((0, 7))
+        self.quads = np.concatenate([q for _, q in parts]) if parts else np.zeros((0, 4, 2))
+        self.lane_of = np.repeat(np.arange(len(lanes), dtype=np.int32), counts)
+        self.kinds = np.array([lane.kind for lane in lanes], dtype=object)
+        self.grid = self._grid()
+
+    def of_kinds(self, kinds: Iterable[str]) -> NDArray[np.bool_]:
+        """Which lanes are of these kinds, [L] bool."""
+        wanted = frozenset(kinds)
+        known = self._of_kinds.get(wanted)
+        if known is None:
+            known = np.array([kind in wanted for kind in self.kinds], dtype=np.bool_)
+            self._of_kinds[wanted] = known
+        return known
+
+    @cached_property
+    def _of_kinds(self) -> dict[frozenset[str], NDArray[np.bool_]]:
+        return {}
+
+    def _grid(self) -> tuple[NDArray[np.int64], NDArray[np.int32], Float, int, int]:
+        """Segments by cell: of every cell that the rectangle around their rims touches."""
+        ends = self.segments[:, :4].reshape(-1, 2, 2)
+        corners = np.concatenate([self.quads, ends], axis=1)
+        boxes = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
+        if not len(boxes):
+            boxes = np.zeros((0, 4))
+        low = boxes[:, :2].min(axis=0) if len(boxes) else np.zeros(2)
+        high = boxes[:, 2:].max(axis=0) if len(boxes) else np.ones(2)
+        size = np.maximum(high - low, 1.0)
+        cell = max(CELL_M, float(np.sqrt(size.prod() / MAX_CELLS)), float(size.max()) / MAX_CELLS)
+        columns, rows = (int(n) for n in np.floor(size / cell) + 1)
+        frame = np.array([*low, cell])
+        boxes = np.ascontiguousarray(boxes)
+        first = count_cells(boxes, frame, columns, rows)
+        return first, fill_cells(boxes, frame, columns, rows, first), frame, columns, rows
+
+
+def _segments(lane: Lane) -> tuple[Float, Float]:
+    """Segments [K, 7] (both ends, heading, arc length at both) and rims [K, 4, 2] of a lane, none
+    longer than a few cells."""
+    left, right = lane.rims
+    s = lane.s
+    longest = np.diff(s).max()
+    if longest > MAX_SEGMENT_M:
+        counts = np.ceil(np.diff(s) / MAX_SEGMENT_M).astype(int)
+        inner = [
+            np.linspace(a, b, n, endpoint=False)
+            for a, b, n in zip(s[:-1], s[1:], counts, strict=True)
+        ]
+        s = np.concatenate([*inner, s[-1:]])
+    lines = [
+        np.stack([np.interp(s, lane.s, line[:, i]) for i in (0, 1)], axis=1)
+        for line in (lane.centre, left, right)
+    ]
+    centre, left, right = lines
+    a, b = centre[:-1], centre[1:]
+    heading = np.arctan2(*(b - a).T[::-1])
+    segments = np.column_stack([a, b, heading, s[:-1], s[1:]])
+    return segments, np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
+
 
 MAX_LENGTH_M = 2e7
 
 
 @dataclass(frozen=True, eq=False)
 class LaneGraph:
-    """Lanes and what rules them, in the world frame of a scene [m]. Immutable and shared.
+    """Lanes and their traffic rules, in the world frame of a scene [m]. Immutable and shared.
 
     Attributes:
         lanes: by id, in a stable order.
         areas, stop_lines, signals, roads: by id.
         source: where it comes from: a format and file, or the log.
-        accuracy: how far centre lines may be from those of the street: an estimate of the median
-            error [m]; None where nothing is known of it (maps as their makers give them).
-        geo_reference: projection of the map that it was read from (PROJ text), or empty.
-        notes: what the reader of a map left out, one sentence each; not stored with a scene.
+        accuracy: estimated median error of the centre lines [m]; None if unknown (maps of other
+            providers).
+        geo_reference: projection of the source map (PROJ text), or empty.
+        notes: parts that the reader of a map skipped, one sentence each; not stored with a scene.
 
     Raises:
-        SceneError: an id that is stored under another or that nothing has.
+        SceneError: an id stored under another one, or a reference to a missing one.
     """
 
     lanes: Mapping[str, Lane]
@@ -126,7 +372,7 @@ class LaneGraph:
 
     @cached_property
     def predecessors(self) -> Mapping[str, tuple[str, ...]]:
-        """Lanes that each lane follows on, by its id."""
+        """Predecessors of each lane, by its id."""
         found: dict[str, list[str]] = {name: [] for name in self.lanes}
         for lane in self.lanes.values():
             for name in lane.successors:
@@ -148,13 +394,13 @@ class LaneGraph:
         kinds: Iterable[str] = TRAVELLED,
         within: float = math.inf,
     ) -> LanePlace | None:
-        """The lane nearest to a pose, None where none of these kinds is ``within`` [m].
+        """The lane nearest to a pose, or None if no lane of these kinds lies ``within`` [m].
 
         Args:
-            x, y: the place in the world [m].
-            heading: lanes of about that direction [rad] come before others; None: any direction.
+            x, y: world position [m].
+            heading: preferred direction of the lane [rad]; None: any direction.
             kinds: of lanes that count.
-            within: farthest distance from a centre line [m].
+            within: maximum distance from a centre line [m].
         """
         place = np.array([[x, y, math.nan if heading is None else heading]])
         index, values = self.nearest_many(place, kinds=kinds)
@@ -168,8 +414,7 @@ class LaneGraph:
     def nearest_many(
         self, poses: ArrayLike, *, kinds: Iterable[str] = TRAVELLED
     ) -> tuple[NDArray[np.int64], Float]:
-        """The nearest lanes of poses [S, 3] (x, y [m], heading [rad] or NaN), some microseconds
-        each.
+        """The nearest lanes of poses [S, 3] (x, y [m], heading [rad] or NaN), in microseconds each.
 
         Returns:
             Positions [S] in :attr:`lane_ids`, -1 without any lane of these kinds; and [S, 2]
@@ -186,7 +431,7 @@ class LaneGraph:
         return found, values
 
     def is_drivable(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Which places [S, 2] [m] lie on the surface of the road, [S] bool: on a lane of a
+        """Whether positions [S, 2] [m] lie on the road surface, [S] bool: on a lane of a
         :data:`DRIVABLE` kind, in a drivable area, a junction or a crosswalk."""
         places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
         found = np.zeros(len(places), dtype=np.bool_)
@@ -203,13 +448,13 @@ class LaneGraph:
     def routes(
         self, lane_id: str, length: float, *, s: float = 0.0, limit: int = 64
     ) -> list[tuple[str, ...]]:
-        """Ways on along successors from ``s`` on a lane, each as the lanes it takes.
+        """Routes along successors from ``s`` on a lane, each as a tuple of lane ids.
 
         Args:
-            lane_id: where it begins.
-            length: how far each goes, unless it ends before [m].
-            s: begin on that lane [m].
-            limit: how many at most; those that are found first.
+            lane_id: first lane.
+            length: of each route, unless its lanes end before [m].
+            s: start on the first lane [m].
+            limit: maximum number of routes; the first ones found.
 
         Raises:
             SceneError: there is no such lane.
@@ -229,7 +474,7 @@ class LaneGraph:
         return found
 
     def route(self, start: str, goal: str, *, change_cost: float = 20.0) -> tuple[str, ...] | None:
-        """The shortest way from one lane to another, or None.
+        """The shortest route from one lane to another, or None.
 
         Args:
             start, goal: lanes.
@@ -263,16 +508,9 @@ class LaneGraph:
                     heapq.heappush(queue, (cost + step, onward))
         return None
 
-    def centre_line(self, way: Sequence[str]) -> Float:
-        """Points [N, 3] float64 along lanes that follow each other, none twice [m]."""
-        points: Float = np.concatenate([self.lane(name).centre for name in way])
-        steps = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
-        kept: Float = points[np.concatenate([[True], steps > 1e-3])]
-        return kept
-
     @cached_property
     def gaps(self) -> Mapping[tuple[str, str], float]:
-        """Distance between the end of a lane and the start of each that goes on from it [m]."""
+        """Distance between the end of a lane and the start of each successor [m]."""
         return {
             (lane.lane_id, name): float(
                 np.linalg.norm(lane.centre[-1] - self.lanes[name].centre[0])

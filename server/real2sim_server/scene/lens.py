@@ -1,4 +1,4 @@
-"""Lenses other than the pinhole: which direction each point of the image plane looks along.
+"""Lenses other than the pinhole: maps between directions and points of the image plane.
 
 A lens maps directions of the camera frame (x right, y down, z forward) to a plane of focal length
 one, which the camera's ``K`` maps to pixels. So a lens knows no image size and stays what it is
@@ -22,10 +22,10 @@ from .errors import SceneError
 
 Valid = NDArray[np.bool_]
 ROUNDS = 40
-"""Most rounds of Newton's method; it ends when nothing moves any more."""
+"""Maximum iterations of Newton's method; it stops at convergence."""
 CONVERGED = 1e-12
 SAMPLES = 2048
-"""Places at which a radius is looked at to find where it stops growing."""
+"""Samples in the search for the end of a radius's growth."""
 FLATTEST = math.tan(math.radians(89.0))
 """No perspective lens looks farther from its axis than this distance on the plane."""
 OPENING = math.pi
@@ -33,7 +33,7 @@ OPENING = math.pi
 
 
 class Lens(Protocol):
-    """What all lenses have.
+    """Interface of all lenses.
 
     Attributes:
         model: its name in files and on the wire.
@@ -131,7 +131,7 @@ class BrownConrady:
         return _unit(np.concatenate([found, np.ones((*found.shape[:-1], 1))], -1)), valid
 
     def _start(self, plane: Float) -> Float:
-        """Where Newton's method starts: as if all distortion were radial."""
+        """Start of Newton's method: the inverse for purely radial distortion."""
         x = np.geomspace(1e-3, self.valid_radius, SAMPLES)
         radius = x * self._factor(x * x)[0]
         given = np.linalg.norm(plane, axis=-1)
@@ -401,7 +401,7 @@ class FTheta:
 MODELS: dict[str, type[Any]] = {
     kind.model: kind for kind in (BrownConrady, Fisheye, Omnidirectional, FTheta)
 }
-"""Lenses by their names; ``pinhole`` is no lens at all."""
+"""Lenses by name; ``pinhole`` means none."""
 
 
 def lens_values(lens: Lens | None) -> dict[str, Any] | None:

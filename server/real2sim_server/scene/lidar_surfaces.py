@@ -1,4 +1,4 @@
-"""What the LiDAR of a scene sees: Gaussians of its own, with a reflectivity each.
+"""Gaussians that only LiDARs see, with a reflectivity each.
 
 Images and LiDAR ask different things of Gaussians: those trained on images alone are haze to a
 beam. So a scene may hold a second set, made of the recorded sweeps, that only LiDARs look at.
@@ -56,7 +56,7 @@ class Reflector:
         return Reflector(self.cloud.to(device), self.attributes.to(device))
 
     def check_values(self, what: str) -> None:
-        """Look at every value. Raises SceneError with the count of bad ones."""
+        """Check every value. Raises SceneError with the count of bad ones."""
         self.cloud.check_values(what)
         most = torch.tensor([MAX_REFLECTIVITY, 1.0], device=self.attributes.device)
         bad = ~((self.attributes >= 0) & (self.attributes <= most))

@@ -1,4 +1,4 @@
-"""The immutable scene that all sessions share."""
+"""The immutable scene that all sessions share: objects with trajectories, and the sky."""
 
 from __future__ import annotations
 
@@ -11,20 +11,152 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..geometry.box import box_corners
 from ..geometry.transform import Float
 from .camera import CameraRig
-from .cloud import GaussianCloud
-from .colour import TimeColour
+from .cloud import GaussianCloud, TimeColour
 from .errors import SceneError, UnknownObjectError
 from .figure import Figure
 from .ground import Ground, of_bundle
 from .ground_fit import fit_scene_ground
 from .lane_graph import LaneGraph
 from .lidar_surfaces import LidarSurfaces
-from .sky import Sky
 from .trajectory import Trajectory
+
+# Sky.
+
+
+@dataclass(frozen=True, eq=False)
+class Sky:
+    """A cube map of the sky in world directions.
+
+    Attributes:
+        faces: [6, R, R, 3] float32 RGB in [0, 1], order +x -x +y -y +z -z. On each face the pixel
+            (row, column) centre at u, v = (column + 0.5, row + 0.5) / R * 2 - 1 looks along the
+            direction of :func:`face_directions`.
+        uncertainties: [6, R, R] float32 in [0, 1] of the texels, as those of a cloud's Gaussians;
+            None where they are not known.
+    """
+
+    faces: Tensor
+    uncertainties: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.faces.shape)
+        if (
+            len(shape) != 4
+            or shape[0] != 6
+            or shape[1] != shape[2]
+            or shape[3] != 3
+            or shape[1] < 1
+        ):
+            raise SceneError(f"sky faces must be [6, R, R, 3], not {list(shape)}")
+        if self.faces.dtype != torch.float32:
+            raise SceneError(f"sky faces must be float32, not {self.faces.dtype}")
+        given = self.uncertainties
+        if given is not None and (given.shape != shape[:3] or given.dtype != torch.float32):
+            raise SceneError(
+                f"uncertainties of a sky must be {list(shape[:3])} float32, "
+                f"not {list(given.shape)} {given.dtype}"
+            )
+
+    @property
+    def resolution(self) -> int:
+        """Edge length R of a face [px]."""
+        return int(self.faces.shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return sum(t.numel() * t.element_size() for t in self.tensors().values())
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Its tensors by name, without absent ones."""
+        known = {} if self.uncertainties is None else {"uncertainties": self.uncertainties}
+        return {"faces": self.faces, **known}
+
+    def check_values(self) -> None:
+        """Check every value. Raises SceneError for non-finite ones and those out of range."""
+        if not bool(torch.isfinite(self.faces).all()):
+            raise SceneError("sky: faces hold values that are not finite")
+        given = self.uncertainties
+        if given is not None and not bool(((given >= 0) & (given <= 1)).all()):
+            raise SceneError("sky: uncertainties hold values outside [0, 1]")
+
+    @classmethod
+    def uniform(cls, rgb: tuple[float, float, float], *, resolution: int = 1) -> Sky:
+        """One colour everywhere."""
+        return cls(
+            torch.tensor(rgb, dtype=torch.float32).expand(6, resolution, resolution, 3).contiguous()
+        )
+
+    def to(self, device: torch.device | str) -> Sky:
+        """The sky on another device."""
+        if torch.device(device) == self.faces.device:
+            return self
+        return Sky(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
+
+    def sample(self, directions: Tensor) -> Tensor:
+        """Bilinear colour [..., 3] along world ``directions`` [..., 3] (any length, not zero)."""
+        face, u, v = face_coordinates(directions)
+        r = self.resolution
+        column = ((u + 1) / 2 * r - 0.5).clamp(0, r - 1)
+        row = ((v + 1) / 2 * r - 0.5).clamp(0, r - 1)
+        c0, r0 = column.floor().long(), row.floor().long()
+        c1, r1 = (c0 + 1).clamp(max=r - 1), (r0 + 1).clamp(max=r - 1)
+        fc, fr = (column - c0)[..., None], (row - r0)[..., None]
+        top = self.faces[face, r0, c0] * (1 - fc) + self.faces[face, r0, c1] * fc
+        bottom = self.faces[face, r1, c0] * (1 - fc) + self.faces[face, r1, c1] * fc
+        return top * (1 - fr) + bottom * fr
+
+
+def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Face index [...] and coordinates u (column), v (row) [...] in [-1, 1] of ``directions``.
+
+    ±x faces: u = ∓y, v = -z; ±y faces: u = ±x, v = -z; +z face: u = -y, v = +x;
+    -z face: u = -y, v = -x, each over the largest absolute component. Side faces stand upright
+    seen from inside.
+    """
+    x, y, z = directions.unbind(-1)
+    ax, ay, az = x.abs(), y.abs(), z.abs()
+    on_x = (ax >= ay) & (ax >= az)
+    on_y = ~on_x & (ay >= az)
+    face = torch.where(
+        on_x,
+        torch.where(x > 0, 0, 1),
+        torch.where(on_y, torch.where(y > 0, 2, 3), torch.where(z > 0, 4, 5)),
+    )
+    major = torch.where(on_x, ax, torch.where(on_y, ay, az))
+    u = torch.where(
+        on_x, torch.where(x > 0, -y, y), torch.where(on_y, torch.where(y > 0, x, -x), -y)
+    )
+    v = torch.where(on_x | on_y, -z, torch.where(z > 0, x, -x))
+    return face, u / major, v / major
+
+
+def face_directions(resolution: int) -> NDArray[np.float32]:
+    """Unit world directions [6, R, R, 3] float32 of all pixel centres.
+
+    Inverse of :func:`face_coordinates`.
+    """
+    centre = (np.arange(resolution) + 0.5) / resolution * 2 - 1
+    v, u = np.meshgrid(centre, centre, indexing="ij")
+    one = np.ones_like(u)
+    faces = np.stack(
+        [
+            np.stack([one, -u, -v], -1),
+            np.stack([-one, u, -v], -1),
+            np.stack([u, one, -v], -1),
+            np.stack([-u, -one, -v], -1),
+            np.stack([v, -u, one], -1),
+            np.stack([-v, -u, -one], -1),
+        ]
+    )
+    directions = faces / np.linalg.norm(faces, axis=-1, keepdims=True)
+    return np.asarray(directions, dtype=np.float32)
+
 
 MAX_OBJECTS = 65_534
 """Instance images are uint16: 0 is the background, 65535 is kept free."""
@@ -44,7 +176,7 @@ def box_size(size: Iterable[float], what: str) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """One movable thing: a cluster of Gaussians in its own frame, with a box and a trajectory.
+    """A movable object: a cluster of Gaussians in its own frame, with a box and a trajectory.
 
     Attributes:
         object_id: unique in the scene, for example ``car_3``.
@@ -117,7 +249,7 @@ class Scene:
     World frame: right-handed, x forward, y left, z up [m], recentred near the drive.
 
     Attributes:
-        name: human name, also the last part of its folder.
+        name: display name, also the last part of its folder.
         background: static Gaussians in the world frame.
         objects: by id, in a stable order; ``instance_id`` is 1 + position in that order.
         sky: cube map, or None for black.
@@ -127,10 +259,9 @@ class Scene:
         ego_size: (length, width, height) of the recording vehicle's box [m].
         provenance: where it comes from: source, reader, settings, versions (JSON values only).
         content_hash: SHA-256 of the bundle it was read from or written to; empty before that.
-        stored_ground: as the reconstruction fitted it; None where nobody has so far. Ask
-            :attr:`ground`.
-        lidar: what LiDARs see in its place, or None: they see the same Gaussians as cameras.
-        lanes: of its roads, from a map or the log; None where nobody has given it any.
+        stored_ground: as the reconstruction fitted it, or None. Use :attr:`ground` instead.
+        lidar: Gaussians for LiDARs, or None: LiDARs see the same Gaussians as cameras.
+        lanes: of its roads, from a map or the log, or None.
     """
 
     name: str
@@ -200,7 +331,7 @@ class Scene:
 
     @property
     def has_uncertainties(self) -> bool:
-        """Whether it is known how well training rays tell what it shows."""
+        """Whether uncertainties are known."""
         return self.background.uncertainties is not None
 
     @property

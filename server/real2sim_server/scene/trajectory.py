@@ -32,7 +32,7 @@ def leads_anywhere(positions: Float) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Rigid poses at increasing time stamps; in between positions are linear, rotations slerped.
+    """Rigid poses at increasing time stamps; positions interpolate linearly, rotations by slerp.
 
     Attributes:
         times_us: [T] int64, strictly increasing [us], T >= 1.
@@ -76,7 +76,7 @@ class Trajectory:
 
     @cached_property
     def extent(self) -> float:
-        """Longer side of the rectangle around its places, seen from above [m]."""
+        """Longer side of the bounding rectangle of its positions, seen from above [m]."""
         return float(np.ptp(self.positions[:, :2], axis=0).max())
 
     @classmethod
@@ -109,7 +109,7 @@ class Trajectory:
 
     @property
     def moves(self) -> bool:
-        """Whether it leads anywhere, see :func:`leads_anywhere`."""
+        """Whether it moves, see :func:`leads_anywhere`."""
         return leads_anywhere(self.positions)
 
     def covers(self, t_us: int) -> bool:
@@ -156,7 +156,7 @@ class Trajectory:
         return velocity
 
     def between(self, start_us: int, end_us: int) -> Trajectory:
-        """The part within [start_us, end_us]; where it is cut a pose is added.
+        """The part within [start_us, end_us], with interpolated poses at the cuts.
 
         Raises:
             TimeOutOfRangeError: nothing of it lies there.

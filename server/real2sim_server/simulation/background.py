@@ -1,6 +1,6 @@
 """Colliders of a scene: its ground, and upright boxes around the obstacles of its background.
 
-Solid cells are the closed loop's (``scene.obstacles``). Adjacent cells form one obstacle. Its
+Solid cells are the closed loop's (``scene.ground``). Adjacent cells form one obstacle. Its
 Gaussians are split along their length until a box seen from above fits each part: one for a pole,
 one for each side of a house, several for a curved hedge. The recording saw only one side of a wall,
 so boxes grow away from the recorded path.
@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from ..geometry.transform import Float, invert_transform
 from ..physics.colliders import Box, HeightField
 from ..scene import GaussianCloud, Ground, Scene
-from ..scene.obstacles import CELL, HIGHEST, OPAQUE, OccupiedCells, RecordedWay, occupied_cells
+from ..scene.ground import (
+    MAX_OBSTACLE_HEIGHT,
+    OBSTACLE_CELL,
+    OBSTACLE_OPACITY,
+    OccupiedCells,
+    RecordedPath,
+    occupied_cells,
+)
 
 BACKGROUND = "background"
 """Names of these colliders begin with it."""
@@ -99,7 +106,7 @@ def background_colliders(scene: Scene, cleared: Sequence[Cleared], *, within: fl
         cleared: places of the objects that take part, as they start; at least one.
         within: distance from these at which something still counts [m].
     """
-    way = RecordedWay.of(scene.ego)
+    way = RecordedPath.of(scene.ego)
     cells = occupied_cells(scene.background, scene.ground, way)
     starts = np.array([c.T_world_box[:2, 3] for c in cleared])
     points = cells.points
@@ -138,7 +145,7 @@ def _connected(points: Float, cells: OccupiedCells) -> Iterator[Float]:
 
     if not len(points):
         return
-    index = np.floor((points[:, :2] - cells.origin) / CELL).astype(np.int64)
+    index = np.floor((points[:, :2] - cells.origin) / OBSTACLE_CELL).astype(np.int64)
     there = np.zeros(cells.occupied.shape, dtype=np.bool_)
     there[index[:, 0], index[:, 1]] = True
     labels, count = ndimage.label(there, structure=np.ones((3, 3)))
@@ -154,16 +161,16 @@ def _fitted(
 ) -> Iterator[_Rectangle]:
     """Rectangles that cover points [K, 2] of one obstacle, split where one does not fit."""
     rectangle = _around(points)
-    grid = rectangle.grid(CELL / 2)
+    grid = rectangle.grid(OBSTACLE_CELL / 2)
     blocked = any(c.holds(grid).any() for c in cleared)
-    index = np.floor((grid - cells.origin) / CELL).astype(np.int64)
+    index = np.floor((grid - cells.origin) / OBSTACLE_CELL).astype(np.int64)
     index = np.clip(index, 0, np.array(cells.occupied.shape) - 1)
     filled = float(cells.occupied[index[:, 0], index[:, 1]].mean())
     fits = rectangle.width <= THIN or filled >= FILLED
     if fits and not blocked:
         yield rectangle
         return
-    if rectangle.length <= CELL:
+    if rectangle.length <= OBSTACLE_CELL:
         # Nothing smaller is resolved.
         if not blocked:
             yield rectangle
@@ -189,7 +196,7 @@ def _around(points: Float) -> _Rectangle:
     return _Rectangle(middle + (low + high) / 2 @ frame, along, length, width)
 
 
-def _seen_side(rectangle: _Rectangle, way: RecordedWay, cleared: Sequence[Cleared]) -> _Rectangle:
+def _seen_side(rectangle: _Rectangle, way: RecordedPath, cleared: Sequence[Cleared]) -> _Rectangle:
     """What is long and thin is made thicker, away from the recorded way and where nothing starts; a
     pole stays as it is."""
     missing = DEPTH - rectangle.width
@@ -200,7 +207,7 @@ def _seen_side(rectangle: _Rectangle, way: RecordedWay, cleared: Sequence[Cleare
     sign = -math.copysign(1.0, float(rectangle.across @ towards))
     centre = rectangle.centre + sign * missing / 2 * rectangle.across
     deep = _Rectangle(centre, rectangle.along, rectangle.length, DEPTH)
-    return rectangle if any(c.holds(deep.grid(CELL / 2)).any() for c in cleared) else deep
+    return rectangle if any(c.holds(deep.grid(OBSTACLE_CELL / 2)).any() for c in cleared) else deep
 
 
 def _high_points(background: GaussianCloud, ground: Ground, near: Sequence[_Rectangle]) -> Float:
@@ -212,7 +219,7 @@ def _high_points(background: GaussianCloud, ground: Ground, near: Sequence[_Rect
     margin = max(r.length for r in near)
     low, high = centres.min(axis=0) - margin, centres.max(axis=0) + margin
     inside = ((means[:, :2] > low) & (means[:, :2] < high)).all(axis=1)
-    inside &= (background.opacities > OPAQUE).cpu().numpy()
+    inside &= (background.opacities > OBSTACLE_OPACITY).cpu().numpy()
     points = means[inside]
     points[:, 2] -= ground.height_at(points[:, :2])
     low_enough: Float = points[(points[:, 2] > 0) & (points[:, 2] < TOP)]
@@ -222,10 +229,10 @@ def _high_points(background: GaussianCloud, ground: Ground, near: Sequence[_Rect
 def _upright(name: str, rectangle: _Rectangle, ground: Ground, high: Float) -> Box:
     """The box over a rectangle, as tall as the points above it."""
     local = (high[:, :2] - rectangle.centre) @ np.stack([rectangle.along, rectangle.across]).T
-    reach = np.array([rectangle.length, rectangle.width]) / 2 + CELL / 2
+    reach = np.array([rectangle.length, rectangle.width]) / 2 + OBSTACLE_CELL / 2
     above = high[np.all(np.abs(local) < reach, axis=1), 2]
-    tall = float(np.quantile(above, 1 - TRIM)) if len(above) else HIGHEST
-    heights = ground.height_at(rectangle.grid(CELL))
+    tall = float(np.quantile(above, 1 - TRIM)) if len(above) else MAX_OBSTACLE_HEIGHT
+    heights = ground.height_at(rectangle.grid(OBSTACLE_CELL))
     low, top = float(heights.min()) - FOOT, float(heights.max()) + tall
     pose = np.eye(4)
     pose[:2, 0], pose[:2, 1] = rectangle.along, rectangle.across

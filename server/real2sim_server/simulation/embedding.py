@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix
 from ..scene import GaussianCloud
-from ..scene.spherical_harmonics import sh_basis
+from ..scene.cloud import sh_basis
 
 NEIGHBOURS = 20
 FLAT = 0.05

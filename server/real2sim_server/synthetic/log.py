@@ -1,4 +1,4 @@
-"""The synthetic drive as a DrivingLog, with access to the truth from any pose."""
+"""The synthetic drive as a DrivingLog, with ground truth from any pose."""
 
 from __future__ import annotations
 
@@ -17,35 +17,37 @@ from ..geometry.transform import Float, apply_transform, invert_transform
 from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
 from ..logs.readers.native import write_native_log
 from ..scene import Camera, CameraMotion, CameraRig, Lidar
-from .bvh import build_geometry
-from .casting import Instances
-from .config import SyntheticConfig
-from .lanes import street_lanes
-from .people import PlannedPerson
-from .people_casting import PeopleCast, add_people
-from .people_truth import PeopleTruth, people_truth, trace_flow, trace_parts
-from .sensors import shoot_image, shoot_lidar, shoot_rays
-from .shading import RaycastWorld
+from .casting import Instances, build_geometry
+from .people_casting import (
+    PeopleCast,
+    PeopleTruth,
+    add_people,
+    people_truth,
+    trace_flow,
+    trace_parts,
+)
+from .sensors import RaycastWorld, shoot_image, shoot_lidar, shoot_rays
+from .street import SyntheticConfig, street_lanes
 from .surroundings import build_surroundings
-from .traffic import DrivePlan, PlannedVehicle, plan_drive, poses_at
+from .traffic import DrivePlan, PlannedPerson, PlannedVehicle, plan_drive, poses_at
 from .vehicles import SHAPES, build_vehicle, roof_heights, shape_row
 
 SWEEP_STEP_US = 4000.0
-"""How long a sweep takes people to stand still in their walk, not in their way [us]."""
+"""Time step of people's body poses within a sweep; their positions move on [us]."""
 SHUTTER_STEP_US = 2000
-"""Likewise of a rolling shutter [us]."""
+"""The same within a rolling shutter [us]."""
 LIDAR_POSITION = (0.9, 0.0, 1.73)
 LIDAR_ELEVATION = (np.radians(-25.0), np.radians(3.0))
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticLog(DrivingLog):
-    """A synthetic drive; images and sweeps are ray-cast whenever they are asked for."""
+    """A synthetic drive; images and sweeps are ray-cast on demand."""
 
     def render(
         self, T_world_camera: ArrayLike, k: ArrayLike, width: int, height: int, t_us: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
-        """The truth from any pose at any time of the drive.
+        """Ground truth from any pose at any time of the drive.
 
         Args:
             T_world_camera: [4, 4], OpenCV camera frame.
@@ -69,7 +71,7 @@ class SyntheticLog(DrivingLog):
         vehicles: Sequence[int],
         T_world_objects: ArrayLike,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
-        """The truth of an edited street: with these vehicles at these places, and no others.
+        """Ground truth of an edited street: with only these vehicles, at these poses.
 
         Args:
             T_world_camera, k: as of :meth:`render`.
@@ -102,7 +104,7 @@ class SyntheticLog(DrivingLog):
     def render_through(
         self, camera: Camera, motion: CameraMotion, t_us: int, *, samples: int = 3
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """The truth through any lens and shutter, with vehicles where they are at each row's time.
+        """Ground truth through any lens and shutter, with vehicles posed at each row's time.
 
         Args:
             camera: lens, shutter, K and size.
@@ -119,7 +121,7 @@ class SyntheticLog(DrivingLog):
         return source.render_through(camera, motion, t_us, samples)
 
     def people(self, t_us: int) -> PeopleTruth:
-        """Joints, keypoints and tracks of everybody on foot or on a bicycle at ``t_us`` [us]."""
+        """Joints, keypoints and tracks of all pedestrians and cyclists at ``t_us`` [us]."""
         source = self.source
         assert isinstance(source, SyntheticSource)
         return people_truth(source.drive.people, len(source.drive.vehicles), t_us)
@@ -221,7 +223,7 @@ class SyntheticSource:
 
     @contextmanager
     def world_at(self, t_us: float) -> Iterator[RaycastWorld]:
-        """All that rays meet, people in their poses of an instant [us]."""
+        """The world for rays, with people posed at an instant [us]."""
         if self.people is None:
             yield self.world
             return
@@ -275,7 +277,7 @@ class SyntheticSource:
         part: tuple[Any, ...],
         samples: int,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """A part of an image that is taken at one time."""
+        """A part of an image with one exposure time."""
         x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         corners = np.stack([x, y], -1)[part].reshape(-1, 2)
         step = (np.arange(samples) + 0.5) / samples
@@ -302,7 +304,7 @@ class SyntheticSource:
         return rgb, (ranges.mean(1) * solid).astype(np.float32).reshape(shape)
 
     def instances(self, t_us: int) -> Instances:
-        """Where all vehicles and people are at ``t_us``."""
+        """Poses of all vehicles and people at ``t_us``."""
         sweeps = self._instances_over(np.array([float(t_us)]))
         return sweeps._replace(to_object=sweeps.to_object[0], to_world=sweeps.to_world[0])
 
@@ -432,7 +434,7 @@ def _lost(
     limit: float,
     rng: np.random.Generator,
 ) -> NDArray[np.bool_]:
-    """Which returns get lost: one in a hundred, and dark surfaces far away."""
+    """Mask of lost returns: one in a hundred, and dark surfaces far away."""
     dim = 1 - np.minimum(reflected / 0.08, 1.0)
     lost: NDArray[np.bool_] = rng.random(ranges.shape) < 0.01 + 0.8 * dim * (ranges / limit)
     return lost
@@ -448,7 +450,7 @@ def _sweep(points: Float, intensity: ArrayLike, offsets_us: ArrayLike) -> LidarS
 
 
 def generate_log(config: SyntheticConfig) -> SyntheticLog:
-    """The drive that ``config`` describes; the world is built now, pictures are cast on demand."""
+    """The drive of ``config``; builds the world now, casts images on demand."""
     drive = plan_drive(config)
     paints: list[tuple[float, ...]] = []
     house_rng = np.random.default_rng([config.seed, 2])

@@ -108,7 +108,7 @@ SHAPES = (
 
 
 def shape_row(shape: VehicleShape) -> list[float]:
-    """Measures in metres that the body's material needs, see ``bodywork.body_surface``."""
+    """Measures in metres that the body's material needs, see ``materials.body_surface``."""
     length, width, height = shape.size
     return [
         length,

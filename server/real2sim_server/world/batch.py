@@ -132,7 +132,7 @@ class Road(NamedTuple):
     """Ground and roads.
 
     Attributes:
-        heights, frame: of the ground, see ``scene.ground_kernels``.
+        heights, frame: of the ground, see ``scene.ground``.
         route: knots of the recorded way, see :mod:`.path`.
         line_points, line_ends, lane_points, lane_ends: of the route and of other lanes, see
             ``scoring.road_kernels``.

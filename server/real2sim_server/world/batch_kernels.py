@@ -12,7 +12,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from .._numba import PARALLEL_LOOPS, func, kernel
 from ..edit.tracks import poses_at
-from ..scene.ground_kernels import pose_at
+from ..scene.ground import pose_at
 from .boxes import REAR_OVERHANG, first_contacts, heading
 from .collision.sweep import COARSE
 from .driving import HOLD, PlanarState

@@ -24,8 +24,7 @@ from ..geometry.transform import (
     yaw_quaternion,
 )
 from ..scene import Beams, Lidar, LidarError, Radar, RadarError
-from ..scene.lidar_catalogue import catalogue_lidar, lidar_of
-from ..scene.radar import catalogue_radar
+from ..scene.range_sensors import catalogue_lidar, catalogue_radar, lidar_of
 from .agents import Agents, rows_of
 from .common import WorldError
 

@@ -16,7 +16,7 @@ from real2sim_server.datasets.export import export_dataset
 from real2sim_server.datasets.labels.views import HIDDEN, VISIBLE, keypoints_at
 from real2sim_server.datasets.plan import ExportPlan
 from real2sim_server.edit import ScenarioState, apply_operations
-from real2sim_server.scene.person import person_asset
+from real2sim_server.scene.asset import person_asset
 from real2sim_server.service.library.assets import LibraryAsset
 
 ANNA = person_asset("anna", "woman", height=1.7)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from real2sim_server.render._reference import _blend_image, _jacobian, _Splats
 from real2sim_server.render.backend import ALPHA_MIN, ScreenWatch
-from real2sim_server.scene.spherical_harmonics import evaluate_sh
+from real2sim_server.scene.cloud import evaluate_sh
 
 from .pretended import Pretended, held
 

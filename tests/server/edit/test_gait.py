@@ -9,7 +9,7 @@ from real2sim_proto.operations import Insert, SetGait
 from real2sim_server.edit import EditError, ScenarioState, apply_operations, instances_at
 from real2sim_server.edit.compose import figure_of
 from real2sim_server.edit.state import pack_state, unpack_state
-from real2sim_server.scene.person import person_asset
+from real2sim_server.scene.asset import person_asset
 from real2sim_server.service.library.assets import LibraryAsset
 
 ANNA = LibraryAsset(person_asset("anna", "woman"))

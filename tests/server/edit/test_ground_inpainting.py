@@ -12,7 +12,7 @@ from real2sim_proto.operations import Delete, Translate
 from real2sim_server.edit import ScenarioState, apply_operations, vacated_parking
 from real2sim_server.edit.appearance import inpaint_ground
 from real2sim_server.scene import UNSEEN, GaussianCloud
-from real2sim_server.scene.spherical_harmonics import SH_C0
+from real2sim_server.scene.cloud import SH_C0
 
 PARKED = "post"
 

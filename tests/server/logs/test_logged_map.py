@@ -14,7 +14,7 @@ from real2sim_server.geometry.transform import invert_transform
 from real2sim_server.logs import LoggedMap, open_log
 from real2sim_server.maps import MapError, lanes_of_log
 from real2sim_server.scene import Lane, LaneGraph
-from real2sim_server.scene.io.lane_document import lane_document
+from real2sim_server.scene.io.document import lane_document
 
 
 def straight(name: str, start: tuple[float, float], heading: float = 0.0, **more) -> Lane:

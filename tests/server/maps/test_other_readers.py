@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from real2sim.cli import build_app
 from real2sim_server.maps import MAP_READERS, MapError, read_map
 from real2sim_server.scene.io import save_scene
-from real2sim_server.scene.io.lane_document import lane_document
+from real2sim_server.scene.io.document import lane_document
 
 NODES = {
     1: (0, 3),

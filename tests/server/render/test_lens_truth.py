@@ -13,7 +13,7 @@ from real2sim_server.edit import posed_instances
 from real2sim_server.render import rasterize
 from real2sim_server.render.lens import LensView
 from real2sim_server.scene import BrownConrady, Camera, CameraMotion, Fisheye, FTheta, Shutter
-from real2sim_server.scene.camera_motion import turned
+from real2sim_server.scene.camera import turned
 from real2sim_server.scene.io.packed import read_packed
 from real2sim_server.synthetic import SyntheticConfig, generate_log
 

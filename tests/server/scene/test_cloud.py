@@ -6,7 +6,7 @@ import torch
 
 from real2sim_server.geometry.transform import apply_transform, quaternion_to_matrix, transform_from
 from real2sim_server.scene import UNSEEN, GaussianCloud, SceneError
-from real2sim_server.scene.spherical_harmonics import sh_basis
+from real2sim_server.scene.cloud import sh_basis
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

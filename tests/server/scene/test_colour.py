@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from real2sim_server.scene import SceneError, TimeColour
-from real2sim_server.scene.colour import colour_basis
+from real2sim_server.scene.cloud import colour_basis
 from real2sim_server.scene.io import load_scene, save_scene
 
 

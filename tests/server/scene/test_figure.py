@@ -13,6 +13,7 @@ from real2sim_server.body import JOINTS, joint_transforms
 from real2sim_server.body.gait import GaitStyle, plan_gait
 from real2sim_server.geometry.transform import quaternion_to_matrix, yaw_quaternion
 from real2sim_server.scene import BundleError, SceneError, SceneObject, Stride, Trajectory
+from real2sim_server.scene.asset import person_asset
 from real2sim_server.scene.io import (
     load_asset,
     load_scene,
@@ -22,7 +23,6 @@ from real2sim_server.scene.io import (
     write_packed,
 )
 from real2sim_server.scene.io.summary import read_asset_summary
-from real2sim_server.scene.person import person_asset
 
 
 @pytest.fixture(scope="module")

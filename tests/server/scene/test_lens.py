@@ -17,7 +17,6 @@ from real2sim_server.scene import (
     Shutter,
 )
 from real2sim_server.scene.camera import Optics
-from real2sim_server.scene.camera_motion import project_moving
 from real2sim_server.scene.lens import lens_from, lens_values
 
 K = np.array([[900.0, 0, 641.5], [0, 880, 359.25], [0, 0, 1]])
@@ -36,6 +35,21 @@ GLOBAL = Shutter()
 
 def camera(lens=None, shutter=GLOBAL):
     return Camera("front", 1280, 720, K, np.eye(4), lens, shutter)
+
+
+def project_moving(seen_by, motion, points, velocities=0.0):
+    """Image positions, validity and times of points under a rolling shutter, by fixed-point
+    iteration: the row of a point gives its time, and the time gives its position."""
+    shutter, size = seen_by.shutter, (seen_by.width, seen_by.height)
+    per_frame = np.broadcast_to(velocities, points.shape) * (shutter.readout_us * 1e-6)
+    times = np.zeros(len(points))
+    for _ in range(11 if shutter.rolls else 1):
+        turns, places = motion.at(times)
+        seen = points + per_frame * (times - 0.5)[:, None]
+        pixels, valid = seen_by.project(np.einsum("nji,nj->ni", turns, seen - places))
+        if shutter.rolls:
+            times = shutter.times_at(pixels, *size)
+    return pixels, valid, times
 
 
 def directions(count=10_000):

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from real2sim_server.scene import Beams, Detection, Lidar, LidarError
-from real2sim_server.scene.lidar import MAX_RAYS, MAX_SLOTS
-from real2sim_server.scene.lidar_catalogue import (
+from real2sim_server.scene.range_sensors import (
+    MAX_RAYS,
+    MAX_SLOTS,
     catalogue_lidar,
     find_lidar,
     lidar_from_values,

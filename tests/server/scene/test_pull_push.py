@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.scene.pull_push import pull_push
+from real2sim_server.scene.ground_fit import pull_push
 
 
 def test_pull_push_keeps_what_is_known_and_stays_within_its_range():

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from real2sim_server.scene import SceneError, Sky
-from real2sim_server.scene.sky import face_coordinates, face_directions
+from real2sim_server.scene.scene import face_coordinates, face_directions
 
 
 @pytest.fixture

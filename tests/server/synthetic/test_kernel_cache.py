@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from real2sim_server._numba import fingerprint
-from real2sim_server.synthetic import bvh, light, materials, noise, sensors
+from real2sim_server.synthetic import casting, materials, sensors
 
 DARK_EXPOSURE = 0.072
 
 
 @pytest.mark.parametrize(
     ("module", "name", "value"),
-    [(light, "EXPOSURE", DARK_EXPOSURE), (noise, "_VALUE", noise._VALUE[::-1].copy())],
+    [(sensors, "EXPOSURE", DARK_EXPOSURE), (materials, "_VALUE", materials._VALUE[::-1].copy())],
 )
 def test_the_key_of_the_image_kernel_covers_constants_of_other_files(
     monkeypatch: pytest.MonkeyPatch, module, name, value
@@ -29,7 +29,7 @@ def test_the_key_of_the_lidar_kernel_covers_the_materials(monkeypatch: pytest.Mo
 
 
 def test_kernels_that_python_calls_are_kept_and_all_others_are_part_of_them() -> None:
-    kept = (sensors._shoot, sensors._find_edges, sensors.shoot_lidar, bvh._build)
+    kept = (sensors._shoot, sensors._find_edges, sensors.shoot_lidar, casting._build)
     assert all(kernel._cache.__class__.__name__ == "_KernelCache" for kernel in kept)
-    parts = (light.sky_colour, noise.hash01, materials.static_surface, bvh._partition)
+    parts = (sensors.sky_colour, materials.hash01, materials.static_surface, casting._partition)
     assert all(part._cache.__class__.__name__ == "NullCache" for part in parts)

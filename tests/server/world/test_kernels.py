@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from real2sim_proto.operations import Translate
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 from real2sim_server.edit import tracks
-from real2sim_server.geometry import box_kernels
+from real2sim_server.geometry import box
 from real2sim_server.geometry.box import box_penetration
 from real2sim_server.geometry.transform import quaternion_yaw, transform_from, yaw_quaternion
 from real2sim_server.world import boxes as world_boxes
@@ -389,7 +389,7 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         warm_up_planning()
     modules = (
         entries,
-        box_kernels,
+        box,
         tracks,
         path,
         world_boxes,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from real2sim_server.scene import GaussianCloud, Ground, Trajectory
-from real2sim_server.scene.obstacles import RecordedWay, occupied_cells
+from real2sim_server.scene.ground import RecordedPath, occupied_cells
 from real2sim_server.world.path import LoggedPath
 
 
@@ -39,7 +39,7 @@ def test_the_recorded_way_clears_what_the_loop_clears(ego):
     around = np.random.default_rng(0).uniform((-5, -5, 0.5), (15, 8, 1.5), (20_000, 3))
     cells = [
         occupied_cells(cloud(around), Ground.level(0.0), way)
-        for way in (LoggedPath(ego), RecordedWay.of(ego))
+        for way in (LoggedPath(ego), RecordedPath.of(ego))
     ]
     np.testing.assert_array_equal(cells[0].occupied, cells[1].occupied)
     assert cells[0].occupied.any()
@@ -53,7 +53,7 @@ def test_haze_floaters_road_and_canopies_are_in_nobodys_way():
     floater = np.array([[16.0, 6.0, 1.0]])
     background = cloud(np.concatenate([solid, road, canopy, floater, haze]))
     background.opacities[-3:] = 0.3
-    way = RecordedWay.of(drive((0, 0, 0), (10, 0, 0)))
+    way = RecordedPath.of(drive((0, 0, 0), (10, 0, 0)))
     cells = occupied_cells(background, Ground.level(0.0), way)
     assert len(cells.points) == 3
     assert cells.points[:, 0] == pytest.approx(12.0, abs=0.1)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from ...geometry.transform import Float, invert_transform
 from ...scene import BrownConrady, Camera, SceneError, Shutter, Trajectory
-from ...scene.camera import Optics
-from ...scene.shutter import GLOBAL
+from ...scene.camera import GLOBAL, Optics
 from ..driving_log import DrivingLog, LogError, ObjectTrack
 
 

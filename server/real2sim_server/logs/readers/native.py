@@ -21,8 +21,7 @@ from pydantic import ValidationError
 from ..._npy import read_entries, read_headers, read_npy
 from ...scene import Camera, CameraRig, LaneGraph, SceneError, Trajectory
 from ...scene.camera import Optics
-from ...scene.io.document import OpticsPart
-from ...scene.io.lane_document import lane_document, read_lanes
+from ...scene.io.document import OpticsPart, lane_document, read_lanes
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import IMAGE_SUFFIXES, check_image_file, read_image, write_image
 from .files import check_ego_covers, check_frame_times

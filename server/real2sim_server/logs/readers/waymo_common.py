@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from ...geometry.transform import Float, apply_transform, invert_transform
 from ...scene import Camera, CameraRig, Shutter, Trajectory
-from ...scene.camera import T_VEHICLE_OPTICAL
-from ...scene.shutter import DIRECTIONS, GLOBAL, MAX_READOUT_US
+from ...scene.camera import DIRECTIONS, GLOBAL, MAX_READOUT_US, T_VEHICLE_OPTICAL
 from ..driving_log import DrivingLog, FrameSource, LidarSweep, LogError
 from .common import FrameBox, Lens, build_tracks, upright_pose
 from .files import check_frame_times, check_rigid

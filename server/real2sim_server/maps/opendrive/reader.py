@@ -14,9 +14,8 @@ import numpy as np
 from real2sim_proto.lanes import SignalKind
 
 from ...geometry.transform import Float
-from ...scene.lane import TRAVELLED, Area, Lane, Signal, StopLine
+from ...scene.lane import TRAVELLED, Area, Lane, Road, RoadLane, Signal, StopLine
 from ...scene.lane_graph import LaneGraph
-from ...scene.road import Road, RoadLane
 from ..reader import MapError, damage_named, head_of, integer, number, read_xml
 from .roads import SPEED_UNITS, OpenDriveRoad, SectionLane, read_road
 

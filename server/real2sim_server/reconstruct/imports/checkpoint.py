@@ -13,10 +13,9 @@ from torch import Tensor
 
 from ...geometry.transform import Float
 from ...scene import GaussianCloud, Scene
-from ...scene.cloud import SH_DEGREES
+from ...scene.cloud import SH_DEGREES, rotate_sh
 from ...scene.errors import SceneError
-from ...scene.io.formats.types import build_cloud
-from ...scene.spherical_harmonics import rotate_sh
+from ...scene.io.splat_format import build_cloud
 from ..options import ReconstructError
 from .torch_file import TorchFileError, read_torch_file
 

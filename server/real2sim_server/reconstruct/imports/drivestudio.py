@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ...geometry.transform import Float, invert_transform, transform_from
 from ...scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Sky, Trajectory
 from ...scene.camera import T_VEHICLE_OPTICAL
+from ...scene.cloud import SH_C0
 from ...scene.errors import SceneError
-from ...scene.spherical_harmonics import SH_C0
 from .checkpoint import (
     DIRECTIONS_WARNING,
     CheckpointError,

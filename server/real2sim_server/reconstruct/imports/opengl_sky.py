@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ...geometry.transform import Float
 from ...scene import Sky
-from ...scene.sky import face_directions
+from ...scene.scene import face_directions
 
 
 def sky_from_opengl_cube(faces: Float, R_cube_world: Float) -> Sky:

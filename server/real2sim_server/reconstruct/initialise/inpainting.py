@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene import Ground
-from ...scene.pull_push import pull_push
+from ...scene.ground_fit import pull_push
 
 MIRROR_REACH = 0.15
 """An unobserved point takes the colour of a point observed this near to its mirror image [m]."""

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...scene import Sky
-from ...scene.sky import face_directions
+from ...scene.scene import face_directions
 from .views import DEPTH_DOWNSCALE, ProjectedView
 
 Coordinates = NDArray[np.floating[Any]]

@@ -14,8 +14,8 @@ from ...geometry.transform import Float
 from ...logs import DrivingLog, ObjectTrack
 from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
+from ...scene.cloud import SH_C0
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
-from ...scene.spherical_harmonics import SH_C0
 from ..options import InitialiseOptions, ReconstructError
 from ..sky_mask import sky_mask
 from ..stages import OnProgress, Stages

@@ -17,7 +17,7 @@ from real2sim_proto.ranging import MAX_RAYS
 
 from ...geometry.transform import Float
 from ...scene import Beams, Lidar
-from ...scene.lidar import wrapped
+from ...scene.range_sensors import wrapped
 from .rays import RecordedRays
 
 FALLS_BACK = np.pi

@@ -20,7 +20,7 @@ from torch.nn.functional import normalize
 
 from ...geometry.transform import Float, matrix_to_quaternion
 from ...scene import GaussianCloud, SceneObject
-from ...scene.spherical_harmonics import SH_C0
+from ...scene.cloud import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
 from ..initialise.vehicle_light import light_on
 from ..initialise.vehicle_parts import palette_of

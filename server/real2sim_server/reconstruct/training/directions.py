@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ...scene import GaussianCloud
-from ...scene.spherical_harmonics import SH_C0
+from ...scene.cloud import SH_C0
 from ..initialise.vehicle_body import GRAZING, VehicleBody
 from .model import SceneModel
 from .visibility import Viewpoint, camera_from_object

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...scene import GaussianCloud, Scene
-from ...scene.colour import TimeColour
+from ...scene.cloud import TimeColour
 from .activation import activated, first_rows
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh", "fourier")

@@ -15,7 +15,7 @@ from torch import Tensor
 from ...logs import DrivingLog
 from ...render.backend import Backend
 from ...scene import Scene
-from ...scene.spherical_harmonics import SH_C0
+from ...scene.cloud import SH_C0
 from ..initialise.vehicle_body import scene_bodies
 from ..logged_view import image_time, objects_mask
 from ..options import ReconstructError

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Scene, Sky
-from ...scene.spherical_harmonics import SH_C0
+from ...scene.cloud import SH_C0
 from .densify import DensifyOptions, VisibilityLimits
 from .gaussians import Gaussians, concatenate
 from .model import SceneModel

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..._numba import PARALLEL_LOOPS
 from ...geometry.transform import Float
 from ...scene import Beams
-from ...scene.lidar import wrapped
+from ...scene.range_sensors import wrapped
 from .._cpu.lanes import LANES, inlined, kernel, prefetch
 from ..types import weak_cache
 

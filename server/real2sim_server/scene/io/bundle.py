@@ -16,17 +16,26 @@ from torch import Tensor
 
 from ...body.gait import GaitStyle
 from ..asset import Asset
-from ..cloud import GaussianCloud
-from ..colour import TimeColour
+from ..cloud import GaussianCloud, TimeColour
 from ..errors import BundleError, SceneError
 from ..figure import Figure
 from ..ground import Ground, of_bundle
 from ..ground_fit import BoxTrack, fit_scene_ground
 from ..lane_graph import LaneGraph
 from ..lidar_surfaces import RANGE_STEPS, LidarSurfaces, Reflector, RingResponse
-from ..scene import Scene, SceneObject
-from ..sky import Sky
-from .container import read_container, write_container
+from ..scene import Scene, SceneObject, Sky
+from .container import (
+    TensorFile,
+    cloud_shapes,
+    cloud_tensors,
+    figure_shapes,
+    figure_tensors,
+    read_container,
+    reflector_shapes,
+    reflector_tensors,
+    tensor_hashes,
+    write_container,
+)
 from .document import (
     UNCERTAINTIES,
     AssetContent,
@@ -48,17 +57,8 @@ from .document import (
     SceneDocument,
     SkyPart,
     TrajectoryPart,
-)
-from .lane_document import pack, unpack
-from .tensors import (
-    TensorFile,
-    cloud_shapes,
-    cloud_tensors,
-    figure_shapes,
-    figure_tensors,
-    reflector_shapes,
-    reflector_tensors,
-    tensor_hashes,
+    pack_lanes,
+    unpack_lanes,
 )
 
 BACKGROUND_FILE = "background.safetensors"
@@ -73,11 +73,10 @@ _UNWRITTEN = {"format": "", "version": 0, "content_hash": "0" * 64, "files": {}}
 
 
 def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = False) -> Scene:
-    """Write ``scene`` as a bundle; the same scene with its content hash and its ground.
+    """Write ``scene`` as a bundle; return the scene with its content hash and its ground.
 
-    A scene without a stored ground gets one: the fitted one that it would tell of anyway. The
-    folder appears whole or not at all. An existing bundle is replaced only with
-    ``overwrite``; any other folder with something in it is never touched.
+    A scene without a stored ground gets its fitted one. Writing is atomic. An existing bundle is
+    replaced only with ``overwrite``; other non-empty folders are never touched.
 
     Args:
         scene: on any device.
@@ -138,9 +137,9 @@ def load_scene(
 
     Args:
         path: folder of the bundle.
-        device: where the tensors shall live.
-        verify: compare every hash and look at every value; without it only shapes, types and
-            file sizes are checked.
+        device: of the tensors.
+        verify: check every hash and every value; without it only shapes, types and file
+            sizes are checked.
 
     Raises:
         BundleError: with the file and the reason: missing, cut short, changed, of a newer version.
@@ -170,8 +169,8 @@ def load_scene(
 
 
 def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
-    """The ground of a scene bundle, without its scene: the stored one, or of older bundles the one
-    that :attr:`~..Scene.ground` would fit. The same object as that of the scene, while it lives.
+    """The ground of a scene bundle, without its scene: the stored one or, for older bundles, the
+    one that :attr:`~..Scene.ground` fits. Shared with the loaded scene.
 
     Args:
         path: folder of the bundle.
@@ -212,7 +211,7 @@ def _document_of(folder: Path, content_hash: str) -> SceneDocument:
 
 
 def save_asset(asset: Asset, path: str | PathLike[str], *, overwrite: bool = False) -> Asset:
-    """Write ``asset`` as a bundle; the same asset with its content hash.
+    """Write ``asset`` as a bundle; return the asset with its content hash.
 
     Arguments and errors are those of :func:`save_scene`.
     """
@@ -294,7 +293,7 @@ def _outgoing_ground(ground: Ground) -> dict[str, Tensor]:
 def _outgoing_lanes(lanes: LaneGraph | None) -> tuple[LanesPart | None, dict[str, Tensor]]:
     if lanes is None:
         return None, {}
-    document, arrays = pack(lanes)
+    document, arrays = pack_lanes(lanes)
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     counts = {name: len(array) for name, array in arrays.items()}
     return LanesPart(**counts, tensors=tensor_hashes(tensors), document=document), tensors
@@ -309,7 +308,7 @@ def _ground_part(ground: Ground, tensors: Mapping[str, Tensor]) -> GroundPart:
 
 
 def _reflectors(lidar: LidarSurfaces) -> list[tuple[str, Reflector]]:
-    """Prefix of the tensors' keys, and what they are of."""
+    """Prefixes of the tensors' keys, with their reflectors."""
     objects = enumerate(lidar.objects.values())
     return [("background.", lidar.background), *((f"{i}.", part) for i, part in objects)]
 
@@ -490,7 +489,7 @@ def _lanes(folder: Path, document: SceneDocument, verify: bool) -> LaneGraph:
     shapes: dict[str, tuple[int, ...]] = {"points": (part.points, 3), "values": (part.values,)}
     dtypes = dict.fromkeys(shapes, torch.float64)
     taken = file.take("", shapes=shapes, hashes=part.tensors, dtypes=dtypes)
-    return unpack(part.document, {name: tensor.numpy() for name, tensor in taken.items()})
+    return unpack_lanes(part.document, {name: tensor.numpy() for name, tensor in taken.items()})
 
 
 def _response(part: ResponsePart | None) -> RingResponse | None:
@@ -541,7 +540,7 @@ def _fit_ground(folder: Path, document: SceneDocument) -> Ground:
 
 @contextmanager
 def _as_bundle_error(folder: Path) -> Iterator[None]:
-    """Say which bundle it is when its parts are well-formed but make no scene."""
+    """Name the bundle in errors about its content."""
     try:
         yield
     except BundleError:

@@ -1,15 +1,32 @@
-"""The JSON part of a bundle: its models, and the way from and to the scene types."""
+"""The JSON of scenes: models of a bundle's ``scene.json``, and lane graphs as documents.
+
+A lane document is the same JSON in ``lanes.json``, over REST and in clients.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from numpy.typing import NDArray
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 
-from ..camera import Camera, CameraRig, Optics
+from real2sim_proto.lanes import SceneLanes
+
+from ..camera import GLOBAL, Camera, CameraRig, Optics, Shutter
+from ..errors import BundleError, SceneError
+from ..lane import Area, Lane, Road, RoadLane, Signal, StopLine
+from ..lane_graph import LaneGraph
 from ..lens import lens_from, lens_values
-from ..shutter import GLOBAL, Shutter
 from ..trajectory import Trajectory
 
 Count = Annotated[int, Field(ge=0)]
@@ -53,14 +70,14 @@ class TrajectoryPart(_Part):
 
 
 class ShutterPart(_Part):
-    """How a camera reads out; see :class:`~real2sim_server.scene.Shutter`."""
+    """Readout of a camera; see :class:`~real2sim_server.scene.Shutter`."""
 
     direction: str
     readout_us: Count
 
 
 class OpticsPart(_Part):
-    """What a camera really is; see :class:`~real2sim_server.scene.camera.Optics`."""
+    """Optics of the physical camera; see :class:`~real2sim_server.scene.camera.Optics`."""
 
     K: Matrix3
     lens: dict[str, Any] | None = None
@@ -175,7 +192,7 @@ class EgoPart(_Part):
 
 
 class ColourPart(_Part):
-    """How the colours of a cloud change; see :class:`~real2sim_server.scene.TimeColour`."""
+    """Time-dependent colours of a cloud; see :class:`~real2sim_server.scene.TimeColour`."""
 
     harmonics: Count
     basis: Literal["cosine", "real_dft"]
@@ -185,7 +202,7 @@ class ColourPart(_Part):
 
 
 class GaitPart(_Part):
-    """How a person walks; see :class:`~real2sim_server.body.gait.GaitStyle`."""
+    """Walking style of a person; see :class:`~real2sim_server.body.gait.GaitStyle`."""
 
     stride: float
     arms: float
@@ -195,7 +212,7 @@ class GaitPart(_Part):
 
 
 class FigurePart(_Part):
-    """How a cloud follows a body; see :class:`~real2sim_server.scene.Figure`."""
+    """Binding of a cloud to a body; see :class:`~real2sim_server.scene.Figure`."""
 
     shape: list[float]
     height: float
@@ -238,7 +255,7 @@ class ReflectorPart(_Part):
 
 
 class ResponsePart(_Part):
-    """What a LiDAR makes of reflectivity, by ring and range."""
+    """Intensity response of a LiDAR, by ring and range."""
 
     elevation: Annotated[list[float], Field(max_length=MAX_RINGS)]
     gain: Annotated[list[list[float]], Field(max_length=MAX_RINGS)]
@@ -266,7 +283,7 @@ class LanesPart(_Part):
 
 
 class SceneContent(_Part):
-    """Everything that makes a scene what it is; the content hash is taken over this.
+    """The content of a scene, input of the content hash.
 
     Attributes:
         ground: left out of the JSON where there is none, as versions 1 and 2 of the format ask.
@@ -315,7 +332,7 @@ class SceneContent(_Part):
 
 
 class AssetContent(_Part):
-    """Everything that makes an asset what it is; the content hash is taken over this.
+    """The content of an asset, input of the content hash.
 
     Attributes:
         figure: left out of the JSON where there is none, as versions 1 to 6 of the format ask.
@@ -369,3 +386,134 @@ class AssetDocument(_Document):
 
     kind: Literal["asset"]
     content: AssetContent
+
+
+# Lane graphs as documents.
+
+_TABLES = {
+    "lanes": Lane,
+    "areas": Area,
+    "stop_lines": StopLine,
+    "signals": Signal,
+    "roads": Road,
+}
+_HEAD = ("source", "accuracy", "geo_reference")
+_ARRAYS = {
+    **dict.fromkeys(("centre", "outline", "points"), "points"),
+    **dict.fromkeys(("widths", "s", "headings", "rolls", "inner", "outer"), "values"),
+}
+MAX_LANES_BYTES = 512 << 20
+
+
+def lane_document(graph: LaneGraph, *, with_roads: bool = True) -> SceneLanes:
+    """The document of a graph.
+
+    Args:
+        graph: of a scene.
+        with_roads: also tell the reference lines of roads.
+    """
+    tables = [name for name in _TABLES if with_roads or name != "roads"]
+    parts = {name: [_values(p) for p in getattr(graph, name).values()] for name in tables}
+    # Values come out of a checked graph; what they are for is known to the models alone.
+    return SceneLanes.model_validate({key: getattr(graph, key) for key in _HEAD} | parts)
+
+
+def graph_of(document: SceneLanes) -> LaneGraph:
+    """The graph of a document.
+
+    Raises:
+        SceneError: it is well-formed but makes no graph; the message names the part.
+    """
+    tables = {
+        name: [_part(kind, entry.model_dump()) for entry in getattr(document, name)]
+        for name, kind in _TABLES.items()
+    }
+    return LaneGraph.of(**tables, **{key: getattr(document, key) for key in _HEAD})
+
+
+def _values(part: Any) -> dict[str, Any]:
+    found = {}
+    for name in part.__dataclass_fields__:
+        value = getattr(part, name)
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
+        elif isinstance(value, tuple):
+            value = [_values(v) if isinstance(v, RoadLane) else v for v in value]
+        found[name] = value
+    return found
+
+
+def _part(kind: type[Any], values: dict[str, Any]) -> Any:
+    if kind is Road:
+        values["lanes"] = tuple(RoadLane(**entry) for entry in values["lanes"])
+    return kind(**values)
+
+
+def read_lanes(path: Path) -> LaneGraph:
+    """The graph in a file ``lanes.json``.
+
+    Raises:
+        BundleError: naming the file: missing, too large, no such document, or no graph.
+    """
+    try:
+        if path.stat().st_size > MAX_LANES_BYTES:
+            raise BundleError(f"{path}: is larger than {MAX_LANES_BYTES >> 20} MiB")
+        return graph_of(SceneLanes.model_validate_json(path.read_bytes()))
+    except OSError as error:
+        raise BundleError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise BundleError(f"{path}: no document of lanes: {place}: {first['msg']}") from error
+    except SceneError as error:
+        raise BundleError(f"{path}: {error}") from error
+
+
+def pack_lanes(graph: LaneGraph) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+    """A graph as its document with lengths in the place of arrays, and the arrays: ``points``
+    [P, 3] and ``values`` [V], in the order of the document."""
+    arrays: dict[str, list[Any]] = {"points": [], "values": []}
+
+    def outline(value: Any, name: str = "") -> Any:
+        if name in _ARRAYS:
+            arrays[_ARRAYS[name]].extend(value)
+            return len(value)
+        if isinstance(value, dict):
+            return {key: outline(entry, key) for key, entry in value.items()}
+        return [outline(entry) for entry in value] if isinstance(value, list) else value
+
+    document: dict[str, Any] = outline(lane_document(graph).model_dump(mode="json"))
+    points = np.array(arrays["points"], dtype=np.float64).reshape(-1, 3)
+    return document, {"points": points, "values": np.array(arrays["values"], np.float64)}
+
+
+def unpack_lanes(
+    document: Mapping[str, Any], arrays: Mapping[str, NDArray[np.float64]]
+) -> LaneGraph:
+    """Inverse of :func:`pack_lanes`.
+
+    Raises:
+        SceneError: lengths do not fit the arrays, or it is no graph.
+    """
+    taken = dict.fromkeys(arrays, 0)
+
+    def filled(value: Any, name: str = "") -> Any:
+        if name in _ARRAYS:
+            source = _ARRAYS[name]
+            first = taken[source]
+            if type(value) is not int or not 0 <= value <= len(arrays[source]) - first:
+                raise SceneError(f"lanes: {name} of {value!r} entries goes beyond their file")
+            taken[source] += value
+            return arrays[source][first : first + value].tolist()
+        if isinstance(value, dict):
+            return {key: filled(entry, key) for key, entry in value.items()}
+        return [filled(entry) for entry in value] if isinstance(value, list) else value
+
+    whole = filled(dict(document))
+    if any(taken[name] != len(array) for name, array in arrays.items()):
+        raise SceneError("lanes: their file holds more than scene.json tells of")
+    try:
+        return graph_of(SceneLanes.model_validate(whole))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise SceneError(f"lanes: {first['loc']}: {first['msg']}") from error

@@ -1,8 +1,8 @@
-"""Packed scenes: one small file for sending and shipping, about a third of a bundle's bytes.
+"""Packed scenes: one small file for transfer, about a third of a bundle's bytes.
 
-A format of its own beside the bundle, because the two ask for opposite things: a bundle is mapped
-into memory as it lies and keeps every bit, a packed scene travels (the demo's street is one) and is
-read once. Splat files of other programs hold no tracks, cameras, sky or provenance.
+Packed scenes and bundles have opposite requirements: a bundle is memory-mapped and keeps every bit,
+a packed scene is transferred (the demo's street is one) and read once. Splat files of other
+programs hold no tracks, cameras, sky or provenance.
 
 A packed scene is quantised: centres to 1/65535 of their cloud's extent, axes to 1/3276 of a power
 of e, rotations to 1/127, opacities to 1/255, colours to half precision and the rest of the
@@ -30,13 +30,11 @@ from ..._files import atomic_file
 from ..._npy import read_entries, read_npy
 from ...body.gait import GaitStyle
 from ..camera import CameraRig
-from ..cloud import GaussianCloud
-from ..colour import TimeColour
+from ..cloud import GaussianCloud, TimeColour
 from ..errors import BundleError
 from ..figure import Figure
 from ..ground import Ground
-from ..scene import Scene, SceneObject
-from ..sky import Sky
+from ..scene import Scene, SceneObject, Sky
 from .document import UNCERTAINTIES, CameraPart, GaitPart, TrajectoryPart
 
 FORMAT, VERSION = "real2sim-packed", 3
@@ -377,3 +375,12 @@ def _tensor(array: NDArray[Any]) -> Tensor:
 def _vector(values: NDArray[np.float64]) -> Vector3:
     x, y, z = values.tolist()
     return x, y, z
+
+
+# The shipped street: the demo shows it, and a worker without scenes serves it.
+
+SHIPPED_STREET = Path(__file__).parents[2] / "demo" / "street.r2s.zip"
+"""A packed scene; ``python -m real2sim_server.demo.street`` makes it anew."""
+
+DEMO_SCENE = "demo_street"
+"""Its name where it is served."""

@@ -1,4 +1,4 @@
-"""Splat files of other programs: read them, write them, make scenes and assets of them."""
+"""Splat files of other programs: formats, reading, writing, and import as scenes and assets."""
 
 from __future__ import annotations
 
@@ -17,17 +17,14 @@ from ..cloud import GaussianCloud
 from ..errors import BundleError, SceneError
 from ..scene import Scene
 from ..trajectory import Trajectory
-from .formats import (
-    FORMATS,
-    InriaPly,
-    PlayCanvasPly,
-    SplatFormat,
-    UpAxis,
-    inria_ply,
-    suffixes,
-)
+from .ply import InriaPly, PlayCanvasPly, write_inria_ply
+from .splat_format import AntimatterSplat, SplatFormat, UpAxis
+from .spz import Spz
 
 HEAD_BYTES = 1 << 16
+
+FORMATS: list[SplatFormat] = [PlayCanvasPly(), InriaPly(), Spz(), AntimatterSplat()]
+"""In order of precedence, for files and for names."""
 
 _ROTATIONS: dict[str, list[list[float]]] = {
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -38,7 +35,24 @@ _ROTATIONS: dict[str, list[list[float]]] = {
 ``-y`` that of OpenCV and COLMAP (z forward, x right)."""
 
 VIEW_DURATION_US = 10_000_000
-"""How long the ego of an imported scene stands: long enough to drive through it."""
+"""Duration of the ego's stand in an imported scene: long enough to drive through it."""
+
+
+def register_format(splat_format: SplatFormat) -> None:
+    """Add a format from outside the package; it takes precedence over the existing ones.
+
+    Raises:
+        ValueError: another format has that name or that suffix.
+    """
+    for known in FORMATS:
+        if splat_format.name == known.name or splat_format.suffix == known.suffix:
+            raise ValueError(f"{known.name} ({known.suffix}) is registered already")
+    FORMATS.insert(0, splat_format)
+
+
+def suffixes() -> tuple[str, ...]:
+    """File name suffixes of all formats, in the order of comparison."""
+    return tuple(splat_format.suffix for splat_format in FORMATS)
 
 
 def read_splats(path: str | PathLike[str], *, max_bytes: int | None = None) -> GaussianCloud:
@@ -70,8 +84,8 @@ def write_splats(
 ) -> None:
     """Write ``cloud`` in the format that the name ends with, atomically, in its own frame.
 
-    ``.compressed.ply``, ``.ply``, ``.spz`` (version 3) or ``.splat``; what each format rounds is
-    said at its class in :mod:`.formats`.
+    ``.compressed.ply``, ``.ply``, ``.spz`` (version 3) or ``.splat``; each format's class
+    documents what it rounds.
 
     Args:
         cloud: the Gaussians.
@@ -120,14 +134,14 @@ def format_to_write(path: Path) -> SplatFormat:
 
 
 def write_ply(cloud: GaussianCloud, path: str | PathLike[str]) -> None:
-    """Write ``cloud`` as an INRIA-style PLY, atomically; see :func:`.formats.inria_ply.write_ply`.
+    """Write ``cloud`` as an INRIA-style PLY, atomically; see :func:`.ply.write_inria_ply`.
 
     Raises:
         SceneError: values that are not finite or out of range.
         OSError: the file cannot be written.
     """
     cloud.check_values(f"cloud for {path}")
-    inria_ply.write_ply(cloud, Path(path))
+    write_inria_ply(cloud, Path(path))
 
 
 @overload

@@ -1,7 +1,7 @@
-"""Imports done in a process of their own: an untrusted file becomes a checked bundle in a folder.
+"""Imports in a confined process: an untrusted file becomes a checked bundle in a folder.
 
-:func:`stage_scene` and :func:`stage_asset` are for the importer: they call the functions below in a
-confined process and leave a bundle that only has to be renamed to its place.
+The importer calls :func:`stage_scene` and :func:`stage_asset`. They run the functions below in a
+confined process and leave a bundle that only needs renaming to its final path.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import numpy as np
 from ..._confined import ConfinedError, Limits, run_confined
 from ..errors import BundleError, BundleTooLargeError, SceneError
 from .bundle import load_scene, save_asset, save_scene
-from .formats import UpAxis
+from .splat_format import UpAxis
 from .splats import import_splats, up_axis_of
 
 MIB = 1024**2
 LOADED_EARLY = ("cv2", "scipy.ndimage", "scipy.spatial")
-"""For the process that starts confined ones: the ground is fitted with them."""
+"""Modules that the starter of confined processes loads first: the ground fit needs them."""
 
 
 @dataclass(frozen=True)
 class StagingLimits:
-    """What one import may use.
+    """Limits of one import.
 
     Attributes:
-        max_bytes: of the Gaussians that come out, in memory.
+        max_bytes: memory of the resulting Gaussians.
         memory_bytes: of the process that reads, mapped files included.
         seconds: of one import.
     """
@@ -65,7 +65,7 @@ def stage_asset(
         asset_id: name of the asset.
         options: ``category``, ``up_axis`` and ``yaw`` as :func:`~.splats.import_splats` takes them,
             and ``length`` [m], None for that of the file.
-        limits: what it may use.
+        limits: of the import.
 
     Raises:
         BundleTooLargeError, BundleError, SceneError: as :func:`stage_scene`.
@@ -127,7 +127,7 @@ def read_and_save_asset(
         name=asset_id,
         as_asset=True,
         category=category,
-        # Most files that say nothing of their axes come from trainers that look along z.
+        # Most files without axes come from trainers that look along z.
         up_axis=up_axis or up_axis_of(source) or "-y",
         yaw=yaw,
         max_bytes=max_bytes,

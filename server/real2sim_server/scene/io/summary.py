@@ -1,4 +1,4 @@
-"""What a scene bundle holds, without reading its Gaussians."""
+"""Summaries of scene and asset bundles, read without their Gaussians."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ from ..ground import Ground
 from ..lane_graph import LaneGraph
 from ..trajectory import Trajectory
 from .bundle import load_ground, load_lanes
-from .container import read_container
+from .container import check_file, cloud_shapes, figure_shapes, read_container
 from .document import UNCERTAINTIES, AssetDocument, Bounds, SceneDocument, Vector3
-from .tensors import check_file, cloud_shapes, figure_shapes
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectSummary:
-    """What is known of an object without its Gaussians.
+    """An object without its Gaussians.
 
     Attributes:
         object_id, category, size, trajectory: as in SceneObject.
@@ -42,7 +41,7 @@ class ObjectSummary:
 
 @dataclass(frozen=True, eq=False)
 class SceneSummary:
-    """What is known of a scene bundle without its Gaussians.
+    """A scene bundle without its Gaussians.
 
     Attributes:
         path: folder of the bundle.
@@ -74,19 +73,19 @@ class SceneSummary:
 
     @cached_property
     def ground(self) -> Ground:
-        """The ground of the scene, read when first asked for; of older bundles it is fitted then.
+        """The ground of the scene, read on first access; fitted then for older bundles.
 
         Raises:
-            BundleError: the bundle is damaged, or another one stands there by now.
+            BundleError: the bundle is damaged, or another one has replaced it.
         """
         return load_ground(self.path, self.content_hash)
 
     @cached_property
     def lanes(self) -> LaneGraph | None:
-        """The lanes of the scene, read when first asked for; None where it has none.
+        """The lanes of the scene, read on first access; None where it has none.
 
         Raises:
-            BundleError: the bundle is damaged, or another one stands there by now.
+            BundleError: the bundle is damaged, or another one has replaced it.
         """
         return load_lanes(self.path, self.content_hash) if self.lane_count else None
 
@@ -122,12 +121,12 @@ def read_scene_summary(path: str | PathLike[str]) -> SceneSummary:
 
 @dataclass(frozen=True, eq=False)
 class AssetSummary:
-    """What is known of an asset bundle without its Gaussians.
+    """An asset bundle without its Gaussians.
 
     Attributes:
         asset_id, category, size, provenance, content_hash: as in Asset.
         gaussians: their number.
-        nbytes: what they take in memory.
+        nbytes: their memory [bytes].
     """
 
     asset_id: str

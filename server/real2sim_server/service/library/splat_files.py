@@ -10,7 +10,7 @@ from typing import TypeVar
 from torch import Tensor
 
 from ...scene import GaussianCloud
-from ...scene.io.formats import Spz
+from ...scene.io.spz import Spz
 
 GZIP_LEVEL = 1
 """Packs in a sixth of the time of level 9, into 3 % more bytes."""

@@ -25,7 +25,7 @@ from ...render import Instance, RigView
 from ...render.images import JpegEncoder, Light, to_display, to_light, turbo_jpeg
 from ...render.modalities import encode_image
 from ...scene import Camera, Lens, Shutter
-from ...scene.camera_motion import moved
+from ...scene.camera import moved
 from ...scene.lens import lens_from
 from ...world.ranging import Cloud
 

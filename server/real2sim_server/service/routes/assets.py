@@ -19,7 +19,7 @@ from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetPerson, A
 from real2sim_proto.base import Identifier
 
 from ...render import encode_image
-from ...scene.person import person_asset
+from ...scene.asset import person_asset
 from ..http.auth import TokenRoute
 from ..http.idempotency import IdempotencyKey, form_digest
 from ..http.problems import ServiceError

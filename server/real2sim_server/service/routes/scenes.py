@@ -24,8 +24,8 @@ from real2sim_proto.views import SceneView
 
 from ...edit import ScenarioState
 from ...scene.io import DEMO_SCENE, SHIPPED_STREET
-from ...scene.io.formats import suffixes
-from ...scene.io.lane_document import lane_document
+from ...scene.io.document import lane_document
+from ...scene.io.splats import suffixes
 from ..http.auth import TokenRoute
 from ..http.idempotency import IdempotencyKey, form_digest
 from ..http.problems import ServiceError, cancel_on_disconnect

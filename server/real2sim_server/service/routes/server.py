@@ -21,8 +21,7 @@ from real2sim_proto.scenes import Fleet, FleetMember, Limits, Readiness, ServerI
 from real2sim_proto.sessions import MAX_STEPS_PER_REQUEST
 from real2sim_proto.version import SUPPORTED_SUBPROTOCOLS
 
-from ...scene.lidar_catalogue import lidar_names
-from ...scene.radar import RADARS
+from ...scene.range_sensors import RADARS, lidar_names
 from ...settings import Settings
 from ..http.auth import TokenRoute, require_token
 from ..http.openapi import POLICY, published, reference_page

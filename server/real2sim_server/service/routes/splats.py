@@ -15,7 +15,7 @@ from real2sim_proto.base import Identifier, Microseconds
 from ...edit import cloud_of, figure_of
 from ...render.modalities import encode_image
 from ...scene import Scene
-from ...scene.io.formats import Spz
+from ...scene.io.spz import Spz
 from ..http.auth import TokenRoute
 from ..http.problems import ServiceError
 from ..http.responses import etag

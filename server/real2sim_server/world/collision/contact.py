@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene import Scene
-from ...scene.obstacles import CELL, occupied_cells
+from ...scene.ground import OBSTACLE_CELL, occupied_cells
 from ..path import Float, LoggedPath
 from .bodies import BodyProperties, BodyState
 
@@ -475,7 +475,7 @@ class ObstacleGrid:
     def manifold(self, body: BodyState, properties: BodyProperties) -> ContactManifold | None:
         """Where a body overlaps occupied cells; the normal points from their middle to its box."""
         points = footprint(body, properties)
-        cells = np.floor((points - self.origin) / CELL).astype(np.int64)
+        cells = np.floor((points - self.origin) / OBSTACLE_CELL).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.occupied.shape)).all(axis=1)
         hit = np.zeros(len(points), dtype=bool)
         hit[inside] = self.occupied[cells[inside, 0], cells[inside, 1]]
@@ -488,25 +488,25 @@ class ObstacleGrid:
         """How far occupied cells reach into a body, from its face against the unit normal ``n``,
         which points out of them; only where :meth:`manifold` finds any."""
         points = footprint(body, properties)
-        cells = np.floor((points - self.origin) / CELL).astype(np.int64)
+        cells = np.floor((points - self.origin) / OBSTACLE_CELL).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.occupied.shape)).all(axis=1)
         hit = np.zeros(len(points), dtype=bool)
         hit[inside] = self.occupied[cells[inside, 0], cells[inside, 1]]
         x, y = points[hit].mean(axis=0).tolist()
         along, across = points @ [nx, ny], points[hit] @ [-ny, nx]
-        width = float(np.ptp(across)) + CELL / 2
+        width = float(np.ptp(across)) + OBSTACLE_CELL / 2
         return Patch(x, y, float(along[hit].max() - along.min()), width)
 
     def breadth(self, x: float, y: float, nx: float, ny: float) -> tuple[float, float]:
         """How far what stands at x, y reaches to both sides of it across the normal ``n`` [m], at
         most BREADTH: a pole hardly, a wall as far as is looked."""
-        steps = np.arange(0.0, BREADTH + CELL / 4, CELL / 2)
-        deep = np.arange(-CELL, CELL * 1.01, CELL / 2)
+        steps = np.arange(0.0, BREADTH + OBSTACLE_CELL / 4, OBSTACLE_CELL / 2)
+        deep = np.arange(-OBSTACLE_CELL, OBSTACLE_CELL * 1.01, OBSTACLE_CELL / 2)
         found = []
         for sign in (-1.0, 1.0):
             across = sign * steps[:, None]
             places = np.stack([x - across * ny + deep * nx, y + across * nx + deep * ny], axis=-1)
-            cells = np.floor((places - self.origin) / CELL).astype(np.int64)
+            cells = np.floor((places - self.origin) / OBSTACLE_CELL).astype(np.int64)
             inside = ((cells >= 0) & (cells < self.occupied.shape)).all(axis=-1)
             there = np.zeros(inside.shape, dtype=bool)
             there[inside] = self.occupied[cells[inside, 0], cells[inside, 1]]
@@ -519,7 +519,7 @@ class ObstacleGrid:
     def count(self, body: BodyState, properties: BodyProperties) -> int:
         """Number of occupied cells under a body."""
         points = footprint(body, properties)
-        cells = np.floor((points - self.origin) / CELL).astype(np.int64)
+        cells = np.floor((points - self.origin) / OBSTACLE_CELL).astype(np.int64)
         inside = cells[((cells >= 0) & (cells < self.occupied.shape)).all(axis=1)]
         distinct = np.unique(inside[:, 0] * self.occupied.shape[1] + inside[:, 1])
         return int(self.occupied.reshape(-1)[distinct].sum())
@@ -543,8 +543,8 @@ def _nearest_side(
 
 def footprint(body: BodyState, properties: BodyProperties) -> Float:
     """Points [N, 2] [m] all over the body's box, no farther apart than half a cell."""
-    nx = max(math.ceil(properties.length / (CELL / 2)), 1) + 1
-    ny = max(math.ceil(properties.width / (CELL / 2)), 1) + 1
+    nx = max(math.ceil(properties.length / (OBSTACLE_CELL / 2)), 1) + 1
+    ny = max(math.ceil(properties.width / (OBSTACLE_CELL / 2)), 1) + 1
     u = np.linspace(-properties.length / 2, properties.length / 2, nx) + properties.box_ahead
     v = np.linspace(-properties.width / 2, properties.width / 2, ny)
     grid = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -559,7 +559,7 @@ _grids: WeakKeyDictionary[Scene, ObstacleGrid] = WeakKeyDictionary()
 def obstacle_grid(scene: Scene, path: LoggedPath) -> ObstacleGrid:
     """The grid of a scene's background; made once for each scene in memory.
 
-    Which cells are occupied is what :func:`~...scene.obstacles.occupied_cells` says, in simulations
+    Which cells are occupied is what :func:`~...scene.ground.occupied_cells` says, in simulations
     too.
 
     Args:

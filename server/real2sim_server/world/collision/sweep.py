@@ -18,9 +18,9 @@ from real2sim_proto.episode import EgoSpec, ResetSpec
 
 from ..._records import made_quickly
 from ...edit import ObjectState
-from ...geometry.box_kernels import boxes_overlap
+from ...geometry.box import boxes_overlap
 from ...geometry.transform import quaternion_yaw
-from ...scene.obstacles import CELL
+from ...scene.ground import OBSTACLE_CELL
 from ..agents import Agents, rows_in
 from ..boxes import REAR_OVERHANG, ego_box, first_contacts, first_occupied, holds_any, within_reach
 from ..ego.motion import Motion
@@ -289,16 +289,16 @@ class _Sweep:
 
     def background(self, obstacles: ObstacleGrid) -> tuple[_Contact | None, bool]:
         """The first contact with the background, and whether there is one at the end."""
-        grid = (obstacles.origin, CELL, obstacles.sums)
+        grid = (obstacles.origin, OBSTACLE_CELL, obstacles.sums)
         reach = math.hypot(*self._size[:2]) / 2 + self._slack
         if not holds_any(self._rough, reach, *grid):
             return None, False
         first, x, y, touching = first_occupied(
             self.way,
             self._size,
-            CELL / 2,
+            OBSTACLE_CELL / 2,
             obstacles.origin,
-            CELL,
+            OBSTACLE_CELL,
             obstacles.occupied,
             obstacles.sums,
         )

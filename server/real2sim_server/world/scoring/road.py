@@ -13,7 +13,7 @@ from real2sim_proto.lanes import SceneLanes
 
 from ..._numba import kernel
 from ...scene import LaneGraph
-from ...scene.io.lane_document import graph_of, lane_document
+from ...scene.io.document import graph_of, lane_document
 from ...scene.lane import DRIVABLE
 
 DENSITY = 0.25

@@ -23,9 +23,8 @@ from real2sim_proto.storyboard_actions import (
 )
 
 from ...scene.errors import SceneError
-from ...scene.lane import LANE_KINDS
+from ...scene.lane import LANE_KINDS, Road
 from ...scene.lane_graph import LaneGraph
-from ...scene.road import Road
 from ..common import WorldError
 from ..path import Float, LoggedPath
 from ..traffic.driver import STRAIGHT, lane_beside

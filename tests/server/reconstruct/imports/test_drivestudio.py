@@ -10,8 +10,8 @@ from real2sim_server.reconstruct.imports import (
     import_checkpoint,
     import_drivestudio,
 )
+from real2sim_server.scene.cloud import sh_basis
 from real2sim_server.scene.io import load_scene, save_scene
-from real2sim_server.scene.spherical_harmonics import sh_basis
 
 from .worlds import pose, studio_model, studio_state, write_matrix
 

@@ -11,8 +11,8 @@ from real2sim_server.reconstruct.imports import (
     import_checkpoint,
     import_street_gaussians,
 )
+from real2sim_server.scene.cloud import sh_basis
 from real2sim_server.scene.io import load_scene, save_scene
-from real2sim_server.scene.spherical_harmonics import sh_basis
 
 from .worlds import StreetWorld, street_model
 

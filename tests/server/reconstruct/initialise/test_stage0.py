@@ -15,7 +15,7 @@ from real2sim_server.reconstruct import (
     initialise_scene,
 )
 from real2sim_server.scene import CameraRig, Scene
-from real2sim_server.scene.spherical_harmonics import SH_C0
+from real2sim_server.scene.cloud import SH_C0
 
 from ..conftest import BOX_COLOUR, BOX_SIZE, SKY_COLOUR, WALL_COLOUR, WALL_X, painted_log
 

@@ -17,9 +17,9 @@ from real2sim_server.reconstruct.lidar import RecordedRays, fit_lidar_surfaces, 
 from real2sim_server.reconstruct.lidar.rings import fit_rings
 from real2sim_server.reconstruct.options import InitialiseOptions, ReconstructError
 from real2sim_server.scene import Beams, GaussianCloud, Lidar, Scene
-from real2sim_server.scene.lidar import wrapped
+from real2sim_server.scene.range_sensors import wrapped
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
-from real2sim_server.synthetic.config import CameraSpec
+from real2sim_server.synthetic.street import CameraSpec
 
 CONFIG = SyntheticConfig(
     seed=3,

@@ -16,7 +16,7 @@ from real2sim_server.reconstruct.training.closed_vehicles import (
 )
 from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
-from real2sim_server.scene.spherical_harmonics import SH_C0
+from real2sim_server.scene.cloud import SH_C0
 
 from .conftest import TINY
 

@@ -17,7 +17,7 @@ from real2sim_server.reconstruct.training.directions import (
     viewing_directions,
 )
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
-from real2sim_server.scene.spherical_harmonics import SH_C0, evaluate_sh
+from real2sim_server.scene.cloud import SH_C0, evaluate_sh
 
 from .conftest import TINY
 

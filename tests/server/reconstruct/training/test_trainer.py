@@ -26,8 +26,8 @@ from real2sim_server.reconstruct.training.threads import one_torch_thread
 from real2sim_server.render import RasterOptions, rasterize
 from real2sim_server.render.images import to_display, to_light
 from real2sim_server.scene import Scene
+from real2sim_server.scene.cloud import sh_basis
 from real2sim_server.scene.io import load_scene, save_scene
-from real2sim_server.scene.spherical_harmonics import sh_basis
 
 from .conftest import TINY
 

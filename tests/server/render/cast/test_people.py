@@ -11,7 +11,7 @@ from real2sim_server.geometry.transform import yaw_quaternion
 from real2sim_server.render import Instance
 from real2sim_server.render.cast import cast
 from real2sim_server.scene import Beams, Lidar, Trajectory
-from real2sim_server.scene.person import person_asset
+from real2sim_server.scene.asset import person_asset
 
 
 def surface(asset, trajectory, t_us):

@@ -11,7 +11,8 @@ import torch
 
 from real2sim_server.scene import BundleError, GaussianCloud
 from real2sim_server.scene.io import read_splats, write_splats
-from real2sim_server.scene.io.formats import FORMATS, SplatFormat, UpAxis
+from real2sim_server.scene.io.splat_format import SplatFormat, UpAxis
+from real2sim_server.scene.io.splats import FORMATS
 
 MakeCloud = Callable[..., GaussianCloud]
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from real2sim_server.scene.io.formats import FORMATS
+from real2sim_server.scene.io.splats import FORMATS
 
 from . import format_contract as contract
 

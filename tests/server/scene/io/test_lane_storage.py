@@ -19,7 +19,7 @@ from real2sim_server.scene import (
     StopLine,
 )
 from real2sim_server.scene.io import load_scene, read_scene_summary, save_scene
-from real2sim_server.scene.io.lane_document import graph_of, lane_document, read_lanes
+from real2sim_server.scene.io.document import graph_of, lane_document, read_lanes
 
 
 def graph():

@@ -12,8 +12,10 @@ import pytest
 
 from real2sim_server._files import atomic_file
 from real2sim_server.scene import BundleError, GaussianCloud
-from real2sim_server.scene.io import export_scene, import_splats
-from real2sim_server.scene.io.formats import FORMATS, InriaPly, UpAxis, register_format, types
+from real2sim_server.scene.io import export_scene, import_splats, splat_format
+from real2sim_server.scene.io.ply import InriaPly
+from real2sim_server.scene.io.splat_format import UpAxis
+from real2sim_server.scene.io.splats import FORMATS, register_format
 
 from .format_contract import check_contract
 
@@ -36,10 +38,10 @@ class SplatCsv:
         lines = path.read_text(encoding="ascii").split("\n")
         if lines[-1]:
             raise BundleError(f"{path}: its last line is cut off")
-        types.check_memory(path, len(lines) - 2, 1, max_bytes)
+        splat_format.check_memory(path, len(lines) - 2, 1, max_bytes)
         rows = np.array([line.split(",") for line in lines[1:-1]], dtype=np.float64)
         means, logits, scales, quats, colours = np.split(rows, [3, 4, 7, 11], axis=1)
-        return types.build_cloud(
+        return splat_format.build_cloud(
             path,
             means=means,
             quats=quats,
@@ -49,13 +51,13 @@ class SplatCsv:
         )
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
-        opacities = types.host_array(cloud.opacities)[:, None].clip(1e-9, 1 - 1e-9)
+        opacities = splat_format.host_array(cloud.opacities)[:, None].clip(1e-9, 1 - 1e-9)
         parts = [
-            types.host_array(cloud.means),
+            splat_format.host_array(cloud.means),
             np.log(opacities / (1 - opacities)),
-            np.log(types.host_array(cloud.scales)),
-            types.host_array(cloud.quats),
-            types.host_array(cloud.sh[:, 0]),
+            np.log(splat_format.host_array(cloud.scales)),
+            splat_format.host_array(cloud.quats),
+            splat_format.host_array(cloud.sh[:, 0]),
         ]
         lines = [",".join(map(repr, row)) for row in np.concatenate(parts, axis=1).tolist()]
         with atomic_file(path) as file:

@@ -6,10 +6,11 @@ import torch
 from hypothesis import HealthCheck, given, settings
 
 from real2sim_server.scene import GaussianCloud, SceneError
+from real2sim_server.scene.cloud import SH_C0
 from real2sim_server.scene.io import read_splats, write_splats
-from real2sim_server.scene.io.formats import FORMATS, Spz
-from real2sim_server.scene.io.formats.morton import morton_order
-from real2sim_server.scene.spherical_harmonics import SH_C0
+from real2sim_server.scene.io.ply import morton_order
+from real2sim_server.scene.io.splats import FORMATS
+from real2sim_server.scene.io.spz import Spz
 
 from .splat_properties import covariances, largest_turn, recipes, rotation_angles
 

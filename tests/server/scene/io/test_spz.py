@@ -11,8 +11,7 @@ import zstandard
 
 from real2sim_server.scene import BundleError
 from real2sim_server.scene.io import read_splats, write_splats
-from real2sim_server.scene.io.formats import Spz
-from real2sim_server.scene.io.formats.spz_container import MAX_SPLATS
+from real2sim_server.scene.io.spz import MAX_SPLATS, Spz
 
 COUNT = 40
 

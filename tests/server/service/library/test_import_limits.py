@@ -11,7 +11,7 @@ import pytest
 from real2sim_proto import ErrorCode
 from real2sim_server.scene import BundleError, BundleTooLargeError
 from real2sim_server.scene.io import StagingLimits, import_splats, stage_scene, write_splats
-from real2sim_server.scene.io.formats.spz_container import Header, Streams, write_streams
+from real2sim_server.scene.io.spz import Header, Streams, write_streams
 from real2sim_server.service.library import imports
 from real2sim_server.service.library.imports import MAX_IMPORTS
 from tests.waiting import LIMIT_S

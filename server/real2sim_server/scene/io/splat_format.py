@@ -1,4 +1,8 @@
-"""What every splat format can do, and what their readers share."""
+"""The protocol of splat formats, helpers for their readers, and the headerless ``.splat``.
+
+``.splat`` comes from early web viewers: 32 bytes a splat, no view-dependent colour. Facts:
+github.com/antimatter15/splat, main.js.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ....geometry.transform import Float
-from ...cloud import GaussianCloud
-from ...errors import BundleError, BundleTooLargeError
+from ..._files import atomic_file
+from ...geometry.transform import Float
+from ..cloud import SH_C0, GaussianCloud
+from ..errors import BundleError, BundleTooLargeError
 
 UpAxis = Literal["z", "y", "-y"]
 """Axis of a file that points up: ``y`` as in glTF (z forward), ``-y`` as in OpenCV and COLMAP."""
 
-SMALLEST_SCALE = 1e-20
+MIN_SCALE = 1e-20
 """Scales whose exponential underflows are lifted to this [m], since a scale is positive."""
 
 
@@ -25,19 +30,19 @@ class SplatFormat(Protocol):
 
     @property
     def name(self) -> str:
-        """What the format is called in messages."""
+        """Name of the format in messages."""
 
     @property
     def suffix(self) -> str:
-        """End of its file names, lower case, with the dot; chooses the format to write."""
+        """Suffix of its file names, lower case, with the dot; selects the format to write."""
 
     @property
     def has_signature(self) -> bool:
-        """Whether the content tells the format; the others are told by ``suffix``."""
+        """Whether the content identifies the format, else ``suffix`` does."""
 
     @property
     def up_axis(self) -> UpAxis:
-        """Axis that users of the format agree on to point up; else the scene's own, ``z``."""
+        """Up axis by convention of the format; else the scene's own, ``z``."""
 
     def recognises(self, head: bytes) -> bool:
         """Whether a file that starts with ``head`` (up to 64 KiB) is of this format.
@@ -68,7 +73,7 @@ class SplatFormat(Protocol):
 
 
 def check_memory(path: Path, count: int, harmonics: int, max_bytes: int | None) -> None:
-    """Refuse a file by what comes out of it, which says nothing of how small it is packed.
+    """Refuse a file by its unpacked size, whatever its compressed size.
 
     Args:
         path: for the message.
@@ -162,7 +167,7 @@ def build_cloud(
             f"the first at {int(np.argmax(zero))}"
         )
     with np.errstate(over="ignore", under="ignore"):
-        scales = np.maximum(np.exp(log_scales), SMALLEST_SCALE)
+        scales = np.maximum(np.exp(log_scales), MIN_SCALE)
         parts = {
             "means": means,
             "quats": quats / norms,
@@ -176,3 +181,83 @@ def build_cloud(
         if count:
             raise BundleError(f"{path}: {count} values of {name} are beyond the range of float32")
     return GaussianCloud(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
+# The headerless ``.splat``.
+
+SPLAT_RECORD = np.dtype(
+    [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
+)
+
+
+class AntimatterSplat:
+    """Records of position, linear scale (float32), RGBA and rotation wxyz (bytes).
+
+    Axes: none are prescribed; files made of trained splats have y down like those. Both ways keep
+    the coordinates as they are.
+
+    Quantisation: positions and scales keep their bits; colours and opacities are multiples of
+    1/255, colours clamped to [0, 1]; parts of the quaternion are multiples of 1/128. Spherical
+    harmonics past the first are lost.
+    """
+
+    name = "antimatter15 .splat"
+    suffix = ".splat"
+    has_signature = False
+    up_axis: UpAxis = "z"
+
+    def recognises(self, head: bytes) -> bool:
+        """Never: there is no header."""
+        return False
+
+    def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
+        """The Gaussians of a file. Raises BundleError naming the file and the reason."""
+        nbytes = path.stat().st_size
+        if nbytes % SPLAT_RECORD.itemsize:
+            raise BundleError(
+                f"{path}: truncated or no .splat file: {nbytes} bytes are no multiple of "
+                f"{SPLAT_RECORD.itemsize}"
+            )
+        check_memory(path, nbytes // SPLAT_RECORD.itemsize, 1, max_bytes)
+        records = np.fromfile(path, dtype=SPLAT_RECORD)
+        for name, bad in {
+            "position": ~np.isfinite(records["position"]),
+            "scale": ~(np.isfinite(records["scale"]) & (records["scale"] >= 0)),
+        }.items():
+            count = int(bad.any(axis=1).sum())
+            if count:
+                raise BundleError(
+                    f"{path}: {name} is NaN, infinite or negative in {count} of {len(records)} "
+                    f"splats, the first at {int(np.argmax(bad.any(axis=1)))}"
+                )
+        with np.errstate(divide="ignore"):
+            log_scales = np.log(records["scale"].astype(np.float64))
+        rgba = records["rgba"] / 255.0
+        return build_cloud(
+            path,
+            means=records["position"],
+            quats=(records["rotation"].astype(np.float64) - 128) / 128,
+            log_scales=log_scales,
+            opacities=rgba[:, 3],
+            sh=((rgba[:, :3] - 0.5) / SH_C0).astype(np.float32)[:, None, :],
+        )
+
+    def write(self, cloud: GaussianCloud, path: Path) -> None:
+        """Write ``cloud``, largest and most opaque splats first, as viewers load it in order.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        records = np.empty(len(cloud), dtype=SPLAT_RECORD)
+        opacities, scales = host_array(cloud.opacities), host_array(cloud.scales)
+        rgb = 0.5 + SH_C0 * host_array(cloud.sh[:, 0])
+        rgba = np.concatenate([rgb, opacities[:, None]], axis=1)
+        quats = host_array(cloud.quats)
+        records["position"] = cloud.means.detach().cpu().numpy()
+        records["scale"] = cloud.scales.detach().cpu().numpy()
+        records["rgba"] = np.clip(np.rint(rgba * 255), 0, 255)
+        records["rotation"] = np.clip(np.rint(quats * 128 + 128), 0, 255)
+        with np.errstate(divide="ignore"):
+            importance = np.log(scales).sum(axis=1) + np.log(opacities)
+        with atomic_file(path) as file:
+            file.write(records[np.argsort(-importance, kind="stable")].tobytes())
