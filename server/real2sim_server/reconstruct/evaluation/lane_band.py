@@ -16,7 +16,7 @@ from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera, Ground, Scene
 from ..logged_view import image_time, points_in_camera, resized, tracks_mask
-from .image_metrics import mean_psnr
+from .images import mean_psnr
 from .lidar_depth import seen_points
 from .rendering import render_view, shifted_pose
 from .shifted import within_an_object

@@ -16,7 +16,7 @@ from ...logs import DrivingLog
 from ...scene import Camera, Scene
 from ..logged_view import resized
 from ..options import ReconstructError
-from .image_metrics import psnr
+from .images import psnr
 from .rendering import render_logged_view
 
 NEAR = 0.5

@@ -17,6 +17,7 @@ from ...render import Frame
 from ...render.frame import uncertainty_picture
 from ...scene import Camera, Scene
 from ..logged_view import image_time
+from .images import Truth, find_truth
 from .pictures import (
     DEPTH_FAR,
     DEPTH_NEAR,
@@ -31,7 +32,6 @@ from .rendering import render_uncertainty, render_view
 from .scores import CameraScore, EvaluateOptions, Evaluation, logged_pair
 from .selection import select_cameras
 from .shifted import true_view
-from .truth import Truth, find_truth
 
 PAGE = "report.html"
 SHOWN_FRAMES, SHOWN_OBJECTS, SHOWN_SHIFT = 3, 3, 2.0

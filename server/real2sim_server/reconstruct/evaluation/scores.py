@@ -15,16 +15,14 @@ from ...scene import Camera, Scene
 from ..logged_view import image_time, moving_tracks, points_in_camera, resized, tracks_mask
 from ..options import ReconstructError
 from ..stages import OnProgress, ReportStep, Stages
-from .around import AroundScore, evaluate_around
 from .box_error import box_error
-from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
+from .images import PSNR_CAP, AroundScore, evaluate_around, find_truth, mean_psnr, psnr, ssim
 from .lane_band import LaneBandScore, evaluate_lane_band
 from .lidar_depth import depth_errors, error_p90, mean_error, median_error
 from .rendering import measure_rate, render_view
 from .selection import select_cameras, select_frames
 from .shifted import MIN_OBJECT_PIXELS, ShiftScore, evaluate_shifts
 from .sweeps import LidarScore, evaluate_sweeps
-from .truth import find_truth
 from .uncertainty import UncertaintyScore, evaluate_uncertainty
 
 

@@ -13,7 +13,7 @@ from ...logs import DrivingLog
 from ...scene import Camera, Scene
 from ...synthetic import SyntheticLog
 from ..logged_view import moving_tracks, tracks_mask
-from .image_metrics import mean_psnr, psnr, ssim
+from .images import mean_psnr, psnr, ssim
 from .lidar_depth import FAR, NEAR, median_error
 from .rendering import render_view, shifted_pose
 

@@ -18,7 +18,7 @@ from ...synthetic import SyntheticConfig
 from ...synthetic.log import LIDAR_ELEVATION, LIDAR_POSITION, SyntheticLog
 from ..lidar import RecordedRays, recorded_rays
 from ..lidar.rings import fit_rings
-from .truth import find_truth
+from .images import find_truth
 
 CHAMFER = "mean squared distance from cast to true points plus from true to cast points"
 F_DISTANCE = 0.05
