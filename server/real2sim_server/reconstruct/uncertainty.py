@@ -22,8 +22,7 @@ from ..render.backend import Backend
 from ..render.select import select_backend
 from ..scene import UNSEEN, Camera, Scene, Sky
 from ..scene.spherical_harmonics import SH_C0
-from .evaluation.rendering import scene_instances
-from .evaluation.selection import listed_held_out, select_cameras
+from .evaluation.rendering import listed_held_out, scene_instances, select_cameras
 from .logged_view import image_time, resized
 from .options import ReconstructError
 from .training.threads import one_torch_thread

@@ -28,9 +28,8 @@ from .pictures import (
     jpeg,
     object_crops,
 )
-from .rendering import render_uncertainty, render_view
+from .rendering import render_uncertainty, render_view, select_cameras
 from .scores import CameraScore, EvaluateOptions, Evaluation, logged_pair
-from .selection import select_cameras
 from .shifted import true_view
 
 PAGE = "report.html"

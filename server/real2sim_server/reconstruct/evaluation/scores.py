@@ -19,8 +19,7 @@ from .box_error import box_error
 from .images import PSNR_CAP, AroundScore, evaluate_around, find_truth, mean_psnr, psnr, ssim
 from .lane_band import LaneBandScore, evaluate_lane_band
 from .lidar_depth import depth_errors, error_p90, mean_error, median_error
-from .rendering import measure_rate, render_view
-from .selection import select_cameras, select_frames
+from .rendering import measure_rate, render_view, select_cameras, select_frames
 from .shifted import MIN_OBJECT_PIXELS, ShiftScore, evaluate_shifts
 from .sweeps import LidarScore, evaluate_sweeps
 from .uncertainty import UncertaintyScore, evaluate_uncertainty
