@@ -14,12 +14,12 @@ from ..render.select import select_backend
 from ..scene import Scene
 from ..scene.io import save_scene
 from .evaluation import evaluate_views, render_logged_view
+from .evaluation.uncertainty import VIEWS, fit_uncertainties
 from .initialise.stage0 import initialise_scene
 from .initialise.views import chosen_frames
 from .options import InitialiseOptions, ReconstructError
 from .stages import OnProgress, Stages
 from .training import OnTraining, TrainOptions, held_out_frames, train, with_box_noise
-from .uncertainty import VIEWS, fit_uncertainties
 
 EVALUATED_FRAMES = 4
 LEAST_VIEWS, STEPS_A_VIEW = 4, 30
