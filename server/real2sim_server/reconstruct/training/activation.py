@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from . import activation_kernels as kernels
+from . import kernels as kernels
 
 
 class Activated(NamedTuple):

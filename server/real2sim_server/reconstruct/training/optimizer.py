@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import optimizer_kernels
+from . import kernels
 
 EPSILON = 1e-15
 
@@ -69,7 +69,7 @@ class SelectiveAdam:
             _update_plain(views, seen, columns, correction)
             return
         values, by_values, first, second = (view.numpy() for view in views)
-        optimizer_kernels.adam_rows(
+        kernels.adam_rows(
             values,
             by_values,
             first,
