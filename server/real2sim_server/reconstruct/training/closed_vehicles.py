@@ -24,11 +24,10 @@ from ...scene.spherical_harmonics import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
 from ..initialise.vehicle_light import light_on
 from ..initialise.vehicle_parts import palette_of
+from .densify import SelectiveAdam, rotation_matrices
 from .directions import ViewingDirections, constant_colours, viewing_directions
 from .gaussians import FIELDS, OBJECT_FIELDS
 from .model import SceneModel
-from .operations import rotation_matrices
-from .optimizer import SelectiveAdam
 from .visibility import OfferedPriors, Viewpoint
 
 ONE_DIRECTION = float(np.radians(5))

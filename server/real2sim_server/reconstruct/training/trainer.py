@@ -23,7 +23,7 @@ from . import losses
 from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from .closed_vehicles import close_followed, offer_bodies
 from .data import TrainingView, TrainingViews, held_out_frames
-from .densify import STRATEGIES, ScreenSums, TrainingStep
+from .densify import STRATEGIES, ScreenSums, SelectiveAdam, TrainingStep, step_generator
 from .directions import (
     paint_unseen_sides,
     plain_lobes,
@@ -33,8 +33,6 @@ from .directions import (
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 from .metrics import MetricsFile
 from .model import RenderedView, SceneModel
-from .operations import step_generator
-from .optimizer import SelectiveAdam
 from .progress import OnTraining, RateMeter, RunningMeans, StepTimer, TrainingProgress
 from .schedule import TrainOptions, from_values, learning_rates_at
 from .visibility import OcclusionPruning

@@ -22,11 +22,9 @@ from torch import Tensor
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Scene, Sky
 from ...scene.spherical_harmonics import SH_C0
-from .densify import DensifyOptions, VisibilityLimits
+from .densify import DensifyOptions, SelectiveAdam, VisibilityLimits, prune, rotation_matrices
 from .gaussians import Gaussians, concatenate
 from .model import SceneModel
-from .operations import prune, rotation_matrices
-from .optimizer import SelectiveAdam
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
