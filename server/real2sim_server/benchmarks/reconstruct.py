@@ -16,8 +16,8 @@ from ..logs import DrivingLog
 from ..reconstruct.initialise.stage0 import initialise_scene
 from ..reconstruct.options import InitialiseOptions
 from ..reconstruct.training.densify import DensifyOptions
+from ..reconstruct.training.run import one_torch_thread
 from ..reconstruct.training.schedule import TrainOptions
-from ..reconstruct.training.threads import one_torch_thread
 from ..reconstruct.training.trainer import Trainer
 from ..scene import GaussianCloud, Scene
 from ..synthetic import CameraSpec, SyntheticConfig, generate_log

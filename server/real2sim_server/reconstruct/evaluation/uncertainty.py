@@ -19,7 +19,7 @@ from ...scene import UNSEEN, Camera, Scene, Sky
 from ...scene.spherical_harmonics import SH_C0
 from ..logged_view import image_time, resized
 from ..options import ReconstructError
-from ..training.threads import one_torch_thread
+from ..training.run import one_torch_thread
 from .rendering import (
     listed_held_out,
     render_logged_view,
