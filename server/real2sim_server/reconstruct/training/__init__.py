@@ -4,7 +4,7 @@ from .data import held_out_frames, training_log
 from .densify import DensifyOptions
 from .losses import LossWeights
 from .model import SceneModel
-from .progress import OnTraining, TrainingProgress
+from .records import OnTraining, TrainingProgress
 from .run import HeldOutScore, TrainResult, score_held_out, smoothed_boxes, train, with_box_noise
 from .schedule import PRESETS, LearningRates, TrainOptions, preset
 from .trainer import Trainer

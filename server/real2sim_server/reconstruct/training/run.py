@@ -34,7 +34,7 @@ from ..stages import OnProgress, Stages
 from . import losses
 from .data import TrainingViews, held_out_frames, training_log
 from .model import SceneModel
-from .progress import OnTraining, TrainingProgress
+from .records import OnTraining, TrainingProgress
 from .schedule import TrainOptions
 from .trainer import CHECKPOINT, Trainer
 

@@ -20,7 +20,6 @@ from ..initialise.vehicle_body import scene_bodies
 from ..logged_view import image_time, objects_mask
 from ..options import ReconstructError
 from . import losses
-from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from .closed_vehicles import close_followed, offer_bodies
 from .data import TrainingView, TrainingViews, held_out_frames
 from .densify import STRATEGIES, ScreenSums, SelectiveAdam, TrainingStep, step_generator
@@ -31,9 +30,18 @@ from .directions import (
     viewing_directions,
 )
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
-from .metrics import MetricsFile
 from .model import RenderedView, SceneModel
-from .progress import OnTraining, RateMeter, RunningMeans, StepTimer, TrainingProgress
+from .records import (
+    Checkpoint,
+    MetricsFile,
+    OnTraining,
+    RateMeter,
+    RunningMeans,
+    StepTimer,
+    TrainingProgress,
+    read_checkpoint,
+    write_checkpoint,
+)
 from .schedule import TrainOptions, from_values, learning_rates_at
 from .visibility import OcclusionPruning
 
