@@ -25,10 +25,15 @@ from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
 from ..initialise.vehicle_light import light_on
 from ..initialise.vehicle_parts import palette_of
 from .densify import SelectiveAdam, rotation_matrices
-from .directions import ViewingDirections, constant_colours, viewing_directions
 from .gaussians import FIELDS, OBJECT_FIELDS
 from .model import SceneModel
-from .visibility import OfferedPriors, Viewpoint
+from .visibility import (
+    OfferedPriors,
+    ViewingDirections,
+    Viewpoint,
+    constant_colours,
+    viewing_directions,
+)
 
 ONE_DIRECTION = float(np.radians(5))
 """Root mean square angle between viewing directions up to which they count as one."""

@@ -23,12 +23,6 @@ from . import losses
 from .closed_vehicles import close_followed, offer_bodies
 from .data import TrainingView, TrainingViews, held_out_frames
 from .densify import STRATEGIES, ScreenSums, SelectiveAdam, TrainingStep, step_generator
-from .directions import (
-    paint_unseen_sides,
-    plain_lobes,
-    unseen_sides,
-    viewing_directions,
-)
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 from .model import RenderedView, SceneModel
 from .records import (
@@ -43,7 +37,13 @@ from .records import (
     write_checkpoint,
 )
 from .schedule import TrainOptions, from_values, learning_rates_at
-from .visibility import OcclusionPruning
+from .visibility import (
+    OcclusionPruning,
+    paint_unseen_sides,
+    plain_lobes,
+    unseen_sides,
+    viewing_directions,
+)
 
 CONSTANT_SH = (-0.55 / SH_C0, 0.55 / SH_C0)
 """Range of the constant coefficients: colours from -0.05 to 1.05."""
