@@ -17,7 +17,7 @@ from ...scene import Beams, Lidar, Scene
 from ...synthetic import SyntheticConfig
 from ...synthetic.log import LIDAR_ELEVATION, LIDAR_POSITION, SyntheticLog
 from ..lidar import RecordedRays, recorded_rays
-from ..lidar.rings import fit_rings
+from ..lidar.rays import fit_rings
 from .images import find_truth
 
 CHAMFER = "mean squared distance from cast to true points plus from true to cast points"

@@ -21,9 +21,8 @@ from .gaussians import SurfaceTable
 from .learn import SeenSweep, learn_surfaces
 from .losses import fit_losses
 from .measured import MeasuredPoints
-from .rays import RecordedRays, recorded_rays
+from .rays import RecordedRays, fit_rings, recorded_rays
 from .reflectivity import fit_reflectivity, light_of
-from .rings import fit_rings
 
 MAX_SWEEPS = 40
 """That are learned from; every sweep gives points."""

@@ -14,7 +14,7 @@ from real2sim_server.logs.driving_log import FrameSource
 from real2sim_server.reconstruct.evaluation.sweeps import evaluate_sweeps, synthetic_lidar
 from real2sim_server.reconstruct.initialise.stage0 import initialise_scene
 from real2sim_server.reconstruct.lidar import RecordedRays, fit_lidar_surfaces, recorded_rays
-from real2sim_server.reconstruct.lidar.rings import fit_rings
+from real2sim_server.reconstruct.lidar.rays import fit_rings
 from real2sim_server.reconstruct.options import InitialiseOptions, ReconstructError
 from real2sim_server.scene import Beams, GaussianCloud, Lidar, Scene
 from real2sim_server.scene.lidar import wrapped
