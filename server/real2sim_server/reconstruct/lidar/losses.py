@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from ...logs import DrivingLog
 from ...scene import Scene
-from .gaussians import SurfaceTable
-from .learn import SeenSweep
-from .meetings import meet, part_of
+from .learn import SeenSweep, SurfaceTable, meet, part_of
 from .reflectivity import LITTLE, LitRays, stopped_shares
 
 PRIOR = 0.5

@@ -19,9 +19,7 @@ from ...logs import DrivingLog
 from ...render.cast.call import facing_of_request
 from ...scene import Scene
 from ...scene.lidar_surfaces import MAX_REFLECTIVITY, RANGE_STEPS, RingResponse
-from .gaussians import SurfaceTable
-from .learn import SeenSweep
-from .meetings import meet, part_of
+from .learn import SeenSweep, SurfaceTable, meet, part_of
 
 RAYS = 60_000
 """Of each sweep, evenly spread."""

@@ -17,8 +17,7 @@ from ...scene import Scene
 from ..initialise.stage0 import initialise_scene
 from ..options import InitialiseOptions, ReconstructError
 from ..stages import OnProgress, Stages
-from .gaussians import SurfaceTable
-from .learn import SeenSweep, learn_surfaces
+from .learn import SeenSweep, SurfaceTable, learn_surfaces
 from .losses import fit_losses
 from .measured import MeasuredPoints
 from .rays import RecordedRays, fit_rings, recorded_rays
