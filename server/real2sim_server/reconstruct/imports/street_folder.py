@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ...geometry.transform import Float
 from ...scene import Camera, CameraRig
 from ...scene.errors import SceneError
-from .checkpoint import CheckpointError
-from .dataset_files import image_size, read_intrinsics, read_json, read_pose
+from .checkpoint import CheckpointError, image_size, read_intrinsics, read_json, read_pose
 
 CAMERA_NAMES = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 WAYMO_SIZES = ((1920, 1280), (1920, 1280), (1920, 1280), (1920, 886), (1920, 886))

@@ -23,10 +23,10 @@ from .checkpoint import (
     cloud_of,
     file_hash,
     load_checkpoint,
+    sky_from_opengl_cube,
     table,
     tied_to_object,
 )
-from .opengl_sky import sky_from_opengl_cube
 from .street_folder import StreetFolder, read_street_folder
 from .street_tracks import StreetTracks, read_street_tracks
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from ...geometry.transform import Float, apply_transform
 from ...scene.trajectory import leads_anywhere
-from .checkpoint import CheckpointError
-from .dataset_files import read_json
+from .checkpoint import CheckpointError, read_json
 from .street_folder import StreetFolder
 
 IGNORED_CLASSES = ("sign", "misc")
