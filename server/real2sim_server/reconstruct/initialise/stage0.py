@@ -24,7 +24,6 @@ from .ground import spread_ground
 from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
 from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
 from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
-from .sky_map import SkySamples
 from .stereo import sweep_planes
 from .surfels import Surfels, fit_surfels, round_surfels
 from .triangulate import TriangulatedPoints, triangulate
@@ -32,7 +31,7 @@ from .vehicle_body import VehicleBody, faced, fitted_body
 from .vehicle_light import LIGHT, pose_amid
 from .vehicle_paint import VehicleSurface, fill_vehicles
 from .vehicle_parts import PARTS
-from .views import PlacedSurfels, ProjectedView, chosen_frames, gather_views
+from .views import PlacedSurfels, ProjectedView, SkySamples, chosen_frames, gather_views
 from .walls import continue_walls, real_walls
 
 OPACITY = 0.95
