@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...geometry.transform import Float
-from .points import PointSet
+from .accumulate import PointSet
 from .surfels import Surfels
 from .vehicle_body import VehicleBody
 

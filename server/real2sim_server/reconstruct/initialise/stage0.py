@@ -19,11 +19,21 @@ from ...scene.spherical_harmonics import SH_C0
 from ..options import InitialiseOptions, ReconstructError
 from ..sky_mask import sky_mask
 from ..stages import OnProgress, Stages
-from .accumulate import Accumulation, accumulate, drive_path
+from .accumulate import (
+    Accumulation,
+    PointSet,
+    accumulate,
+    continue_walls,
+    drive_path,
+    path_distance,
+    real_walls,
+    thin_to,
+    voxel_levels,
+    well_supported,
+)
 from .ground import spread_ground
 from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
 from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
-from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
 from .stereo import sweep_planes
 from .surfels import Surfels, fit_surfels, round_surfels
 from .triangulate import TriangulatedPoints, triangulate
@@ -32,7 +42,6 @@ from .vehicle_light import LIGHT, pose_amid
 from .vehicle_paint import VehicleSurface, fill_vehicles
 from .vehicle_parts import PARTS
 from .views import PlacedSurfels, ProjectedView, SkySamples, chosen_frames, gather_views
-from .walls import continue_walls, real_walls
 
 OPACITY = 0.95
 ABOVE_GROUND = 0.1

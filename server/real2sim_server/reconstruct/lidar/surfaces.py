@@ -11,8 +11,18 @@ from numpy.typing import NDArray
 from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog, ObjectTrack, log_of_frames
 from ...scene import GaussianCloud, Scene
-from ..initialise.accumulate import SHELL, drive_path, near_box, on_recording_vehicle
-from ..initialise.points import PointSet, path_distance, thin, thin_to, voxel_levels, well_supported
+from ..initialise.accumulate import (
+    SHELL,
+    PointSet,
+    drive_path,
+    near_box,
+    on_recording_vehicle,
+    path_distance,
+    thin,
+    thin_to,
+    voxel_levels,
+    well_supported,
+)
 from ..initialise.stage0 import initialise_scene
 from ..initialise.surfels import Surfels, fit_surfels
 from ..options import InitialiseOptions, ReconstructError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from real2sim_server.reconstruct.initialise.points import PointSet
+from real2sim_server.reconstruct.initialise.accumulate import PointSet
 from real2sim_server.reconstruct.initialise.vehicle_body import body_colours, faced, fitted_body
 from real2sim_server.reconstruct.initialise.vehicle_parts import Part, usual_palette, wheel_parts
 from real2sim_server.synthetic.vehicles import SHAPES
