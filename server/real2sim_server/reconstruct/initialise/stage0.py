@@ -31,11 +31,10 @@ from .accumulate import (
     voxel_levels,
     well_supported,
 )
-from .ground import spread_ground
 from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
 from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
 from .stereo import sweep_planes
-from .surfels import Surfels, fit_surfels, round_surfels
+from .surfels import Surfels, fit_surfels, round_surfels, spread_ground
 from .triangulate import TriangulatedPoints, triangulate
 from .vehicle_body import VehicleBody, faced, fitted_body
 from .vehicle_light import LIGHT, pose_amid
