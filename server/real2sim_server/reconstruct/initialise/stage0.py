@@ -37,9 +37,8 @@ from .stereo import sweep_planes
 from .surfels import Surfels, fit_surfels, round_surfels, spread_ground
 from .triangulate import TriangulatedPoints, triangulate
 from .vehicle_body import VehicleBody, faced, fitted_body
-from .vehicle_light import LIGHT, pose_amid
 from .vehicle_paint import VehicleSurface, fill_vehicles
-from .vehicle_parts import PARTS
+from .vehicle_parts import LIGHT, PARTS, pose_amid
 from .views import PlacedSurfels, ProjectedView, SkySamples, chosen_frames, gather_views
 
 OPACITY = 0.95

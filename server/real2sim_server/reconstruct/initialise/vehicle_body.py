@@ -20,8 +20,7 @@ from ...scene import Scene
 from ...synthetic.materials import BODY, PLAIN, WHEEL
 from ...synthetic.vehicles import CARGO_FLOOR, SHAPES, VehicleShape, build_vehicle
 from .inpainting import GREY, modal_colour
-from .vehicle_light import brightness
-from .vehicle_parts import Part, shell_parts, shown_paints, wheel_parts, with_paints
+from .vehicle_parts import Part, brightness, shell_parts, shown_paints, wheel_parts, with_paints
 
 SPACING = 0.05
 """Distance between points on a body [m]."""

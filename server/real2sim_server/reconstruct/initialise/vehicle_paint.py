@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ...geometry.transform import Float
 from .inpainting import GREY, fill_from_mirror
 from .vehicle_body import PAINT_REACH, VehicleBody
-from .vehicle_light import brightness, fit_light
-from .vehicle_parts import Part, fit_palette, shown_paints, with_paints
+from .vehicle_parts import Part, brightness, fit_light, fit_palette, shown_paints, with_paints
 
 ON_PART = 0.06
 """Points this near to a body show the colour of its part there [m]; others lie behind its glass."""

@@ -22,8 +22,7 @@ from ...geometry.transform import Float, matrix_to_quaternion
 from ...scene import GaussianCloud, SceneObject
 from ...scene.spherical_harmonics import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
-from ..initialise.vehicle_light import light_on
-from ..initialise.vehicle_parts import palette_of
+from ..initialise.vehicle_parts import light_on, palette_of
 from .densify import SelectiveAdam, rotation_matrices
 from .gaussians import FIELDS, OBJECT_FIELDS
 from .model import SceneModel
