@@ -32,12 +32,20 @@ from .accumulate import (
     well_supported,
 )
 from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
-from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
 from .stereo import sweep_planes
 from .surfels import Surfels, fit_surfels, round_surfels, spread_ground
 from .triangulate import TriangulatedPoints, triangulate
-from .vehicle_body import VehicleBody, faced, fitted_body
-from .vehicle_paint import VehicleSurface, fill_vehicles
+from .vehicle_body import (
+    VEHICLE_LENGTH,
+    VehicleBody,
+    VehicleSurface,
+    complete_body,
+    faced,
+    fill_vehicles,
+    fitted_body,
+    mirrored,
+    underside,
+)
 from .vehicle_parts import LIGHT, PARTS, pose_amid
 from .views import PlacedSurfels, ProjectedView, SkySamples, chosen_frames, gather_views
 

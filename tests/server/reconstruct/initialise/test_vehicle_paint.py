@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
-from real2sim_server.reconstruct.initialise.vehicle_paint import VehicleSurface, fill_vehicles
+from real2sim_server.reconstruct.initialise.vehicle_body import (
+    VehicleSurface,
+    fill_vehicles,
+    fitted_body,
+)
 from real2sim_server.reconstruct.initialise.vehicle_parts import (
     FROM_ABOVE,
     PARTS,
