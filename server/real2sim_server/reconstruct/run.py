@@ -17,8 +17,7 @@ from .evaluation import evaluate_views, render_logged_view
 from .evaluation.uncertainty import VIEWS, fit_uncertainties
 from .initialise.stage0 import initialise_scene
 from .initialise.views import chosen_frames
-from .options import InitialiseOptions, ReconstructError
-from .stages import OnProgress, Stages
+from .options import InitialiseOptions, OnProgress, ReconstructError, Stages
 from .training import OnTraining, TrainOptions, held_out_frames, train, with_box_noise
 
 EVALUATED_FRAMES = 4

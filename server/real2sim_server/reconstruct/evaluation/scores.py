@@ -13,8 +13,7 @@ from ...logs import DrivingLog, same_part
 from ...render import Frame
 from ...scene import Camera, Scene
 from ..logged_view import image_time, moving_tracks, points_in_camera, resized, tracks_mask
-from ..options import ReconstructError
-from ..stages import OnProgress, ReportStep, Stages
+from ..options import OnProgress, ReconstructError, ReportStep, Stages
 from .images import PSNR_CAP, AroundScore, evaluate_around, find_truth, mean_psnr, psnr, ssim
 from .lane_band import LaneBandScore, evaluate_lane_band
 from .lidar_depth import depth_errors, error_p90, mean_error, median_error

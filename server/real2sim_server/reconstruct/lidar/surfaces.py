@@ -25,8 +25,7 @@ from ..initialise.accumulate import (
 )
 from ..initialise.stage0 import initialise_scene
 from ..initialise.surfels import Surfels, fit_surfels
-from ..options import InitialiseOptions, ReconstructError
-from ..stages import OnProgress, Stages
+from ..options import InitialiseOptions, OnProgress, ReconstructError, Stages
 from .learn import SeenSweep, SurfaceTable, learn_surfaces
 from .losses import fit_losses
 from .rays import RecordedRays, fit_rings, recorded_rays

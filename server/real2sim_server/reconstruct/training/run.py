@@ -29,8 +29,7 @@ from ...scene import Scene, Trajectory
 from ...scene.io import load_scene, save_scene
 from ..initialise.stage0 import initialise_scene
 from ..logged_view import objects_mask
-from ..options import ReconstructError
-from ..stages import OnProgress, Stages
+from ..options import OnProgress, ReconstructError, Stages
 from . import losses
 from .data import TrainingViews, held_out_frames, training_log
 from .model import SceneModel
