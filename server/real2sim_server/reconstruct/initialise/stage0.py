@@ -16,8 +16,8 @@ from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
 from ...scene.spherical_harmonics import SH_C0
+from ..logged_view import sky_mask
 from ..options import InitialiseOptions, OnProgress, ReconstructError, Stages
-from ..sky_mask import sky_mask
 from .accumulate import (
     Accumulation,
     PointSet,

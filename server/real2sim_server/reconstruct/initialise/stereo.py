@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
-from ..logged_view import resized
-from ..sky_mask import still_surfaces
+from ..logged_view import resized, still_surfaces
 from .triangulate import spread_frames
 
 WIDTH = 320

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ...geometry.transform import Float, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
-from ..logged_view import resized
-from ..sky_mask import still_surfaces
+from ..logged_view import resized, still_surfaces
 
 WIDEST = 1280
 """Images are made smaller to this width [px]."""
