@@ -31,9 +31,8 @@ from .accumulate import (
     well_supported,
 )
 from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
-from .stereo import sweep_planes
 from .surfels import Surfels, fit_surfels, round_surfels, spread_ground
-from .triangulate import TriangulatedPoints, triangulate
+from .triangulate import TriangulatedPoints, sweep_planes, triangulate
 from .vehicle_body import (
     VEHICLE_LENGTH,
     VehicleBody,
