@@ -27,9 +27,8 @@ from ..initialise.stage0 import initialise_scene
 from ..initialise.surfels import Surfels, fit_surfels
 from ..options import InitialiseOptions, OnProgress, ReconstructError, Stages
 from .learn import SeenSweep, SurfaceTable, learn_surfaces
-from .losses import fit_losses
 from .rays import RecordedRays, fit_rings, recorded_rays
-from .reflectivity import fit_reflectivity, light_of
+from .reflectivity import fit_losses, fit_reflectivity, light_of
 
 # Flat Gaussians on what the sweeps of a log measured, background and objects apart.
 
