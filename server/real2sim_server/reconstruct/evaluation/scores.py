@@ -15,7 +15,7 @@ from ...scene import Camera, Scene
 from ..logged_view import image_time, moving_tracks, points_in_camera, resized, tracks_mask
 from ..options import OnProgress, ReconstructError, ReportStep, Stages
 from .images import PSNR_CAP, AroundScore, evaluate_around, find_truth, mean_psnr, psnr, ssim
-from .lidar_depth import depth_errors, error_p90, mean_error, median_error
+from .lidar import LidarScore, depth_errors, error_p90, evaluate_sweeps, mean_error, median_error
 from .rendering import measure_rate, render_view, select_cameras, select_frames
 from .shifted import (
     MIN_OBJECT_PIXELS,
@@ -24,7 +24,6 @@ from .shifted import (
     evaluate_lane_band,
     evaluate_shifts,
 )
-from .sweeps import LidarScore, evaluate_sweeps
 from .uncertainty import UncertaintyScore, evaluate_uncertainty
 
 # How far a scene's objects are from the boxes of its log.

@@ -14,7 +14,7 @@ from ...scene import Camera, Ground, Scene
 from ...synthetic import SyntheticLog
 from ..logged_view import image_time, moving_tracks, points_in_camera, resized, tracks_mask
 from .images import mean_psnr, psnr, ssim
-from .lidar_depth import FAR, NEAR, median_error, seen_points
+from .lidar import FAR, NEAR, median_error, seen_points
 from .rendering import render_view, shifted_pose
 
 # How well a scene shows what the recording vehicle would have seen from the next lane.
