@@ -13,7 +13,7 @@ from ..geometry.transform import Float, apply_transform, invert_transform
 from ..logs import DrivingLog, LidarSweep, ObjectTrack
 from ..scene import Camera, Scene
 
-# One image of a log: when it was taken, and where LiDAR points and objects are on it.
+# Image time, and LiDAR points and objects in an image.
 
 NEAR = 0.2
 """Boxes are cut off at this depth in front of the camera [m]."""
@@ -145,14 +145,14 @@ def fill_outline(mask: NDArray[np.bool_], outline: Float) -> None:
     mask[low[1] : high[1], low[0] : high[0]] |= inside
 
 
-# Find the sky in the images of a log, and the surfaces that stand still.
+# Sky masks and static surfaces.
 #
-# The search starts in image columns in which the uppermost LiDAR beams got no return. Down each of
-# them the sky ends at the first strong edge. How strong is chosen so that the colours above and below
-# the border vary least (Shen and Wang 2013). From there the sky grows into other columns, over its
-# own colours and up to the next edge. Patches of the same colours elsewhere in the open columns, such
-# as between a bridge and the trees behind it, count as well. A wall that continues above the
-# uppermost beam does not, however smooth it is.
+# The search starts in image columns in which the uppermost LiDAR beams got no return. In each of
+# them the sky ends at the first strong edge. The edge threshold minimises the variance of the
+# colours above and below the border (Shen and Wang 2013). From there the sky grows into other
+# columns, over its own colours and up to the next edge. Patches of the same colours elsewhere in
+# the open columns, such as between a bridge and the trees behind it, count as well. A smooth wall
+# that continues above the uppermost beam does not.
 
 WIDTH = 640
 """Larger images are masked at this width [px]."""
@@ -170,13 +170,13 @@ SKY_WEIGHT = 2.0
 """How much more the spread of the sky's colours counts than that of the rest."""
 GROWING_GRADIENT = 40.0
 """Greatest gradient across which the sky goes on beyond open columns."""
-LEAST_SHARE = 0.005
+MIN_SHARE = 0.005
 """Least part of the open columns that counts as sky, and as something else."""
-LEAST_PATCH = 0.0005
+MIN_PATCH = 0.0005
 """Least part of an image that counts as a patch apart from the sky at the top."""
 ALIKE = 3.0
 """Standard deviations within which a colour is one of the sky's."""
-LEAST_DEVIATION = 4.0
+MIN_DEVIATION = 4.0
 """Of the sky's colours at least, since they may all be overexposed; of 0 to 255."""
 TRIMMINGS = 3
 """Rounds in which colours beyond that are dropped, such as those of a tree at the top."""
@@ -257,7 +257,7 @@ def sky_of_image(
     labels, _ = _connected(sky | (alike & (gradient <= min(least, GROWING_GRADIENT))))
     grown = np.isin(labels, labels[sky])
     labels, areas = _connected(alike & is_open & (gradient <= least))
-    patches = (labels > 0) & (areas > LEAST_PATCH * sky.size)[labels]
+    patches = (labels > 0) & (areas > MIN_PATCH * sky.size)[labels]
     return np.asarray(grown | patches)
 
 
@@ -336,7 +336,7 @@ def _merits(image: NDArray[np.uint8], ends: NDArray[np.int64]) -> Float:
     above = down[ends, np.arange(width)].sum(1)
     share = above[:, 0] / (height * width)
     merit = 1 / (SKY_WEIGHT * _spreads(above) + _spreads(down[-1].sum(0) - above) + 1e-9)
-    return np.where((share > LEAST_SHARE) & (share < 1 - LEAST_SHARE), merit, 0.0)
+    return np.where((share > MIN_SHARE) & (share < 1 - MIN_SHARE), merit, 0.0)
 
 
 def _spreads(sums: Float) -> Float:
@@ -358,7 +358,7 @@ def _like_most(image: NDArray[np.uint8], colours: NDArray[np.uint8]) -> NDArray[
 
 def _near(values: Float, colours: Float) -> NDArray[np.bool_]:
     """Which of ``values`` [..., 3] are within some standard deviations of ``colours`` [N, 3]."""
-    spread = np.cov(colours.T, bias=True) + LEAST_DEVIATION**2 * np.eye(3)
+    spread = np.cov(colours.T, bias=True) + MIN_DEVIATION**2 * np.eye(3)
     off = values - colours.mean(0)
     return np.asarray(((off @ np.linalg.inv(spread)) * off).sum(-1) < ALIKE**2)
 

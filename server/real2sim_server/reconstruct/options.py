@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 from ..maps import LANE_SOURCES, LaneSource
 
-# Options of stage 0, and the error of this package.
+# Options and errors.
 
 
 class ReconstructError(ValueError):
@@ -76,7 +76,7 @@ class InitialiseOptions:
                 raise ReconstructError(f"{name}={value!r} of InitialiseOptions must be positive")
 
 
-# Names, times and progress of the stages of a reconstruction.
+# Names, times and progress of stages.
 
 OnProgress = Callable[[str, int, int], None]
 """Called with the name of a stage, how many of its steps are done, and how many it has."""

@@ -14,7 +14,7 @@ from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Scene
 from ...synthetic import SyntheticConfig, SyntheticLog, generate_log
 
-# How alike two images are: peak signal-to-noise ratio and structural similarity.
+# Image metrics: PSNR and SSIM.
 
 PSNR_CAP = 100.0
 """Stands for the infinite ratio of equal images where ratios are averaged or written [dB]."""
@@ -72,7 +72,7 @@ def mean_psnr(values: Iterable[float]) -> float:
     return float(np.mean(known)) if known else float("nan")
 
 
-# What really was there: known for synthetic logs, as their street can be built again.
+# Ground truth: a synthetic log's street can be rebuilt.
 
 SAME_DB = 30.0
 """A street built again must show the logged image at least this closely; jpg keeps more [dB]."""
@@ -117,10 +117,10 @@ def find_truth(log: DrivingLog) -> Truth:
     return Truth(street)
 
 
-# How complete vehicles are: views from all around each of them against the truth.
+# Completeness of vehicles: orbit views of each vehicle against the truth.
 #
-# An edited vehicle is seen from where no camera of the log ever was. Its appearance there was never
-# measured; it comes from the mirrored side and from its own frames over time.
+# An edited vehicle is visible from poses that no camera of the log had. Its appearance there was
+# never measured; it comes from the mirrored side and from the vehicle's own frames over time.
 
 AZIMUTHS = 8
 """Views around a vehicle, the first one from ahead of it."""

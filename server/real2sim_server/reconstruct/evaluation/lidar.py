@@ -110,9 +110,8 @@ def error_p90(errors: NDArray[np.float64]) -> float:
     return float(np.percentile(errors, 90, method="inverted_cdf"))
 
 
-# PSNR of logged views over all pixels, and over those that the LiDAR covers.
-#
-# Figures of a reconstruction report; :mod:`.scores` holds the full evaluation.
+# PSNR of logged views, over all pixels and over those that the LiDAR covers (for the
+# reconstruction report; :mod:`.scores` holds the full evaluation).
 
 COVERAGE_NEAR = 0.5
 """LiDAR points nearer to the camera plane do not count as covering [m]."""
@@ -230,7 +229,7 @@ def _mean_coverage(values: list[float]) -> float:
     return float(np.mean(known)) if known else float("nan")
 
 
-# LiDAR sweeps cast through a scene against what was there.
+# Cast LiDAR sweeps against the recorded or true ones.
 
 CHAMFER = "mean squared distance from cast to true points plus from true to cast points"
 F_DISTANCE = 0.05

@@ -18,7 +18,7 @@ from ..logged_view import image_time
 from ..options import ReconstructError
 from ..training.data import held_out_frames
 
-# Views of a scene as recorded, or from beside the recorded path, and how fast they come.
+# Rendered views at recorded and shifted poses, and their frame rate.
 
 
 def scene_instances(scene: Scene, t_us: int) -> list[Instance]:
@@ -143,7 +143,7 @@ def measure_rate(
     return RenderRate(len(cameras) / statistics.median(timed), len(cameras), timed)
 
 
-# Which frames and cameras are compared.
+# Selection of the frames and cameras to compare.
 
 DEFAULT_HOLD_OUT = 4
 """One of so many frames is held out where a scene does not say otherwise."""

@@ -24,7 +24,7 @@ from .rendering import render_uncertainty, render_view, select_cameras
 from .scores import CameraScore, EvaluateOptions, Evaluation, logged_pair
 from .shifted import true_view
 
-# Images that a person compares: errors and depth in colour, crops of moving objects.
+# Images for visual comparison: errors and depth in colour, crops of moving objects.
 
 ERROR_FULL = 64.0
 """Error at which the colours of error images end, of 255."""
@@ -127,7 +127,7 @@ def _area(window: tuple[slice, slice]) -> int:
     return int((rows.stop - rows.start) * (columns.stop - columns.start))
 
 
-# One HTML page with figures and images side by side; it holds everything and loads nothing.
+# The HTML page; all images and styles are inlined.
 
 PAGE = "report.html"
 SHOWN_FRAMES, SHOWN_OBJECTS, SHOWN_SHIFT = 3, 3, 2.0

@@ -26,7 +26,7 @@ from .shifted import (
 )
 from .uncertainty import UncertaintyScore, evaluate_uncertainty
 
-# How far a scene's objects are from the boxes of its log.
+# Distance of a scene's objects from the boxes of its log.
 
 
 def box_error(scene: Scene, log: DrivingLog) -> float:
@@ -50,7 +50,7 @@ def box_error(scene: Scene, log: DrivingLog) -> float:
     return float(np.median(distances)) if distances else float("nan")
 
 
-# All figures of a scene against its log.
+# All figures.
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from .images import mean_psnr, psnr, ssim
 from .lidar import FAR, NEAR, median_error, seen_points
 from .rendering import render_view, shifted_pose
 
-# How well a scene shows what the recording vehicle would have seen from the next lane.
+# Views from the next lane against the truth.
 
 MIN_OBJECT_PIXELS = 50
 """Views in which moving objects cover fewer pixels do not count for them."""
@@ -158,10 +158,10 @@ def _score(shift: float, compared: list[_Compared], total: int) -> ShiftScore:
     )
 
 
-# The road from beside the recorded path, on logs of which no truth exists there.
+# The road band, on logs without ground truth.
 #
-# LiDAR points of the road take the colours of the images that show them from near by, and are
-# projected into views from the next lane: what a scene shows there is compared on these pixels alone.
+# Road points of the LiDAR take the colours of nearby images and are projected into views from the
+# next lane. Only these pixels are compared.
 
 COLOURED_WITHIN = (4.0, 12.0)
 """Road takes its colour from images that show it at such depths [m]."""

@@ -28,14 +28,15 @@ from .rendering import (
     select_cameras,
 )
 
-# How well the training rays tell what each Gaussian looks like: the error they leave there.
+# Estimation from the training rays.
 #
-# An image is linear in the constant colours of its Gaussians, so that the gradients of two sums over
-# its pixels by these colours are, for each Gaussian, the sum of its blending weights and that of
-# weights by residuals. Their quotient over the training views is the mean residual of the rays that
-# met it, and with what a few hundredths of a pixel count for UNSEEN it is so for what none has met.
-# Drawn as a colour it ranks the true errors of new images better than counts of rays do, which say
-# nothing of what is thin, shiny, or moves (docs/reconstruction.md has figures).
+# An image is linear in the constant colours of its Gaussians. The gradients of two sums over its
+# pixels with respect to these colours are therefore, for each Gaussian, the sum of its blending
+# weights and the sum of weights times residuals. Their quotient over the training views is the
+# mean residual of the rays that hit the Gaussian. A prior of a few hundredths of a pixel with the
+# value UNSEEN covers Gaussians without hits. Rendered as a colour, it ranks the true errors of new
+# images better than ray counts do, which ignore thin, shiny and moving surfaces (figures in
+# docs/reconstruction.md).
 
 VIEWS = 48
 """Training views that are looked at, at most."""
@@ -212,7 +213,7 @@ def _with(scene: Scene, sums: list[_Sums], sky: _Sums | None, prior: float) -> S
     return replace(scene, background=background, objects=objects, sky=behind, content_hash="")
 
 
-# Whether what a scene says of its uncertainty is so: drawn uncertainty against true errors.
+# Check: rendered uncertainty against true errors.
 
 Values = NDArray[np.float32]
 """An image [H, W], or a part of one."""

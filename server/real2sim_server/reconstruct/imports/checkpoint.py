@@ -26,7 +26,7 @@ from ...scene.spherical_harmonics import rotate_sh
 from ..options import ReconstructError
 from .torch_file import TorchFileError, read_torch_file
 
-# Reading checkpoint files without trusting them, and what all importers fraction.
+# Safe reading of checkpoint files, and helpers shared by all importers.
 
 
 class CheckpointError(ReconstructError):
@@ -210,7 +210,7 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-# Small files of preprocessed dataset folders: poses, intrinsics, JSON, sizes of images.
+# Small files of preprocessed dataset folders: poses, intrinsics, JSON, image sizes.
 
 PNG_MAGIC = b"\x89PNG"
 
@@ -274,7 +274,7 @@ def image_size(folder: Path, camera: int) -> tuple[int, int] | None:
     return None
 
 
-# Cube maps in the order and orientation of OpenGL (as nvdiffrast samples them) as a Sky.
+# Cube maps in OpenGL order and orientation (as nvdiffrast samples them), converted to a Sky.
 
 
 def sky_from_opengl_cube(faces: Float, R_cube_world: Float) -> Sky:

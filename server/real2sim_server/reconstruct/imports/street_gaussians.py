@@ -34,7 +34,7 @@ from .checkpoint import (
     tied_to_object,
 )
 
-# The preprocessed dataset folder of Street Gaussians: cameras, ego path and time stamps.
+# Dataset folder: cameras, ego path and time stamps.
 
 CAMERA_NAMES = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 WAYMO_SIZES = ((1920, 1280), (1920, 1280), (1920, 1280), (1920, 886), (1920, 886))
@@ -123,11 +123,11 @@ def _times(folder: Path, frames: range) -> NDArray[np.int64]:
     return times
 
 
-# Which column of a Street Gaussians ``actor_pose`` belongs to which track.
+# Assignment of ``actor_pose`` columns to tracks.
 #
-# The checkpoint holds corrections [frames, columns] without saying whose they are; columns are
-# dealt out by ``get_obj_pose_tracking`` in lib/utils/waymo_utils.py of that program when it reads the
-# dataset, so the same has to be done here, step by step.
+# The checkpoint holds corrections [frames, columns] without track ids. Street Gaussians assigns
+# the columns in ``get_obj_pose_tracking`` (lib/utils/waymo_utils.py) when it reads the dataset;
+# the code here repeats these steps.
 
 IGNORED_CLASSES = ("sign", "misc")
 EMPTY = -1
@@ -280,9 +280,9 @@ def _close_gaps(
     )
 
 
-# Checkpoints of Street Gaussians (Yan et al. 2024), with their dataset folder.
+# Checkpoints.
 #
-# Facts: github.com/zju3dv/street_gaussians, lib/models and lib/utils.
+# Reference: github.com/zju3dv/street_gaussians, lib/models and lib/utils.
 
 DEFAULT_CAMERAS = (0, 1, 2)
 CATEGORIES = {"vehicle": "car"}

@@ -158,8 +158,8 @@ def well_supported(points: NDArray[np.float32], reach: NDArray[np.float32]) -> N
 
 # Walls above the LiDAR's field of view.
 #
-# A spinning LiDAR sees a few degrees upwards, a house is higher. Where a wall reaches the upper
-# limit of the scanner it is continued straight up; images then decide which part of that is real.
+# A spinning LiDAR covers a few degrees upwards, and houses are higher. A wall that reaches the
+# scanner's upper limit is continued straight up; images then decide which part is real.
 
 CELL = 0.25
 """Edge of the columns into which walls are divided [m]."""
@@ -282,7 +282,7 @@ def real_walls(
     return np.asarray(known & (deviation < MAX_DEVIATION) & ~blown_out & ~bluish)
 
 
-# Sweeps of a whole log brought together: background in the world, objects in their boxes.
+# Accumulated sweeps: background in the world frame, objects in their boxes.
 
 HALF_SWEEP_US = 50_000
 EGO_MARGIN = 0.45

@@ -11,7 +11,7 @@ from ...geometry.transform import Float, matrix_to_quaternion
 from ...scene import Ground
 from ...scene.ground_fit import GroundFit
 
-# Shape of Gaussians from the layout of points: flat along the local surface, closing its gaps.
+# Surfels: flat along the local surface, large enough to close its gaps.
 
 NEIGHBOURS = 20
 CHUNK = 50_000
@@ -153,10 +153,10 @@ def _gap(local: Float, axis: int) -> Float:
     return np.asarray(np.where(np.isfinite(mean), mean, nearest))
 
 
-# Points spread over the road and the pavement, where Gaussians are laid.
+# Ground points on roads and pavements.
 #
-# LiDAR rings leave gaps on the road, and nothing is ever measured under a parked car. The fitted
-# ground closes both, so that the road is whole when a car is taken away.
+# LiDAR rings leave gaps on the road, and the LiDAR never measures the ground under a parked car.
+# The fitted ground closes both, so the road stays complete when an edit removes the car.
 
 
 @dataclass(frozen=True, eq=False)

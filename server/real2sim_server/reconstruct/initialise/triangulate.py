@@ -14,7 +14,7 @@ from ...logs import DrivingLog
 from ...scene import Camera
 from ..logged_view import resized, still_surfaces
 
-# Points from the images alone, where no LiDAR beam went: features matched between known poses.
+# Triangulation of features matched between known poses.
 
 WIDEST = 1280
 """Images are made smaller to this width [px]."""
@@ -22,7 +22,7 @@ FEATURES = 4000
 """Features of an image at most, the strongest."""
 BASELINES = (0.5, 1.5, 4.0)
 """Two images of a camera are matched when so far apart [m]; and a step further, each."""
-LEAST_STEP = 0.2
+MIN_STEP = 0.2
 """Images of a camera closer to each other than this tell nothing new [m]."""
 NEAREST_DEPTH, FARTHEST_DEPTH = 1.0, 400.0
 EPIPOLAR_ERROR = 1.5
@@ -116,7 +116,7 @@ def spread_frames(log: DrivingLog, camera: Camera, limit: int) -> list[int]:
         return []
     for frame in range(log.frame_count):
         centre = _pose(log, camera, frame)[:3, 3]
-        if last is None or np.linalg.norm(centre - last) >= LEAST_STEP:
+        if last is None or np.linalg.norm(centre - last) >= MIN_STEP:
             kept.append(frame)
             last = centre
     picked = np.unique(np.linspace(0, len(kept) - 1, min(limit, len(kept))).round().astype(int))
@@ -278,11 +278,10 @@ def _intersect(
     return points, normal, ahead, worst
 
 
-# Points from the images where no LiDAR beam went, densely: crowns of trees, upper walls, roofs.
+# Dense stereo for regions without LiDAR returns: tree crowns, upper walls, roofs.
 #
-# A camera that drives sees the same place from many positions. Planes are swept through the view of
-# each image (Collins 1996); the depth at which its neighbours look alike there is that of what it
-# shows, if the depths of its neighbours agree.
+# A plane sweep through the view of each image (Collins 1996): the depth at which neighbouring
+# images agree best is accepted if the depths of the neighbours are consistent with it.
 
 WIDTH = 320
 """Images are compared at this width [px]; depths are some percent right then."""
@@ -293,9 +292,9 @@ NEAREST, FARTHEST = 4.0, 90.0
 """Depths of the planes, evenly spread by their inverse [m]."""
 WINDOW = 5
 """Edge of the squares whose likeness counts [px]."""
-LEAST_CONTRAST = 2.0
+MIN_CONTRAST = 2.0
 """Standard deviation of brightness in a square, 0 to 255, below which nothing can be told."""
-LEAST_LIKENESS = 0.6
+MIN_LIKENESS = 0.6
 """Normalised cross-correlation of squares, mean of the two best neighbours."""
 CLEARNESS, APART = 0.05, 3
 """The best plane is so much better than any more than so many planes away."""
@@ -403,7 +402,7 @@ def _depths(view: _View, neighbours: list[_View]) -> NDArray[np.float32]:
     top = np.take_along_axis(scores, best[None], 0)[0]
     away = np.abs(np.arange(PLANES)[:, None, None] - best) > APART
     second = np.where(away, scores, -1).max(0)
-    clear = (top > LEAST_LIKENESS) & (top - second > CLEARNESS) & (spread > LEAST_CONTRAST)
+    clear = (top > MIN_LIKENESS) & (top - second > CLEARNESS) & (spread > MIN_CONTRAST)
     clear &= (best > 0) & (best < PLANES - 1) & view.free[:rows]
     inner = best.clip(1, PLANES - 2)
     low, high = (np.take_along_axis(scores, inner[None] + s, 0)[0] for s in (-1, 1))
@@ -448,7 +447,7 @@ def _likeness(  # noqa: PLR0917 - what is the same for all planes is given along
     warped = np.where(seen, shown, 0).astype(np.float32)
     theirs, contrast = _moments(warped)
     product = cv2.boxFilter(own * warped, -1, (WINDOW, WINDOW)) - mean * theirs
-    alike = product / np.maximum(spread * contrast, LEAST_CONTRAST)
+    alike = product / np.maximum(spread * contrast, MIN_CONTRAST)
     return np.where(seen, alike, -1).astype(np.float32)
 
 

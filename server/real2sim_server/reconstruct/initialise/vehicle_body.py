@@ -30,10 +30,10 @@ from .vehicle_parts import (
     with_paints,
 )
 
-# Bodies of vehicles as the synthetic street builds them, fitted into the box of a track.
+# Bodies.
 #
-# They say where the sides are that nothing measured, and what is paint there and what is glass,
-# tyre or lamp. The colour of the paint comes from the vehicle itself.
+# The body tells where the unmeasured sides are, and separates paint from glass, tyres and lamps.
+# The paint's colour comes from the vehicle itself.
 
 SPACING = 0.05
 """Distance between points on a body [m]."""
@@ -44,7 +44,7 @@ FLAT = 0.95
 FEW_POINTS = 50
 """Fewer measured points do not tell one shape from another."""
 COMPARED = 1500
-LONGEST_SCALE = 1.35
+MAX_SCALE = 1.35
 """A body that would have to be stretched or pressed more than this is another kind of vehicle."""
 GRAZING = 0.35
 """Cosine to a surface's normal up to which a camera hardly sees it: 20 degrees from edge on."""
@@ -212,7 +212,7 @@ def _stretch(shape: VehicleShape, size: tuple[float, float, float]) -> float:
 
 
 def _fits(shape: VehicleShape, size: tuple[float, float, float]) -> bool:
-    return _stretch(shape, size) < float(np.log(LONGEST_SCALE))
+    return _stretch(shape, size) < float(np.log(MAX_SCALE))
 
 
 def _scaled(
@@ -321,7 +321,7 @@ def _spread(corners: Float) -> tuple[NDArray[np.int64], Float]:
     return np.concatenate(triangles), np.concatenate(weights)
 
 
-# Shape of objects where LiDAR says too little.
+# Shape of objects with too few LiDAR points.
 
 GAP = 0.25
 """The generic body fills where no measured point is this near [m]."""
@@ -444,9 +444,9 @@ def _face(half: Float, axis: int, sign: int, spacing: float) -> Float:
     return points
 
 
-# Colours of the sides of vehicles that no camera saw: mirrored, of their parts, or in one paint.
+# Colours of unseen sides: mirrored, by part, or in one paint.
 #
-# All of it is done with the light taken off, and put on again where a side faces.
+# Shading is removed first and applied again for the side's direction.
 
 ON_PART = 0.06
 """Points this near to a body show the colour of its part there [m]; others lie behind its glass."""

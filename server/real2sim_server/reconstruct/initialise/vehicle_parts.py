@@ -13,11 +13,11 @@ from ...scene import SceneObject, Trajectory
 from ...synthetic.vehicles import VehicleShape, roof_heights
 from .inpainting import MIN_OBSERVED, modal_colour
 
-# How light and shade lie on vehicles: one paint is brighter where it faces sun and sky.
+# Shading: one paint is brighter where it faces the sun and the sky.
 #
-# Images show most vehicles from one side. What the others look like follows from the paint and from
-# how much brighter, on all vehicles of a log, the sides are that face one way than those that face
-# another.
+# Images show most vehicles from one side. The colour of the other sides follows from the paint and
+# from the mean brightness, over all vehicles of a log, of sides that face one direction relative
+# to another.
 
 FROM_ABOVE = (0.0, 0.0, 0.25)
 """Slopes that hold where vehicles say nothing."""
@@ -81,10 +81,10 @@ def pose_amid(trajectory: Trajectory) -> Float:
     return trajectory.transform((trajectory.start_us + trajectory.end_us) // 2)
 
 
-# Parts of the bodies that the synthetic street builds: glass, tyres, lamps, and their colours.
+# Parts and colours.
 #
-# Colours of glass, trim and tyres are those that the log's own vehicles show: a camera in hard
-# sun has darker ones than a camera under clouds.
+# Colours of glass, trim and tyres come from the log's own vehicles: they are darker in hard sun
+# than under clouds.
 
 """Weight of the usual colour of a part, in vehicles that show theirs."""
 PARTS = "vehicle_parts"

@@ -20,7 +20,7 @@ from ...scene.sky import face_directions
 from . import view_kernels as kernels
 from .surfels import Surfels
 
-# What each logged camera view shows of the Gaussians: colours, and pixels that none covers.
+# Camera views: colours of Gaussians, and uncovered pixels.
 
 DEPTH_DOWNSCALE = 2
 """The depth image is this much smaller than the camera image."""
@@ -285,7 +285,7 @@ def _pyramid(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
     return tuple(levels)
 
 
-# The sky, and whatever is out of the LiDAR's reach, as a cube map around the drive.
+# The sky, and everything beyond the LiDAR's range, as a cube map.
 
 Coordinates = NDArray[np.floating[Any]]
 

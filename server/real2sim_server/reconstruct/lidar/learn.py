@@ -13,15 +13,15 @@ from ...geometry.transform import Float, invert_transform, quaternion_to_matrix
 from ...logs import DrivingLog
 from ...render.cast.call import recorded_scene, sensor_poses
 from ...render.cast.cpu import CpuCaster
-from ...render.cast.types import CastRequest, Meetings
+from ...render.cast.types import CastRequest, RayHits
 from ...scene import Beams, GaussianCloud, Lidar, LidarSurfaces, Reflector, Scene
 from .ray_loss import LOGIT, SHIFT, SIZE, ray_gradients
 from .rays import RecordedRays
 
-# The Gaussians of a set for LiDARs in the making: background and objects as one table.
+# Background and object Gaussians as one table.
 
 Array = NDArray[np.float32]
-MOST_OPAQUE = 0.99
+MAX_OPAQUE = 0.99
 
 
 @dataclass(eq=False)
@@ -61,7 +61,7 @@ class SurfaceTable:
             for name in ("means", "quats", "scales", "opacities")
         )
         axes = quaternion_to_matrix(quats).astype(np.float32)
-        opacities = np.clip(opacities, 0.01, MOST_OPAQUE)
+        opacities = np.clip(opacities, 0.01, MAX_OPAQUE)
         firsts = np.cumsum([0, *map(len, clouds)]).astype(np.int64)
         return cls(
             object_ids, firsts, means, quats, axes, scales, np.log(opacities / (1 - opacities))
@@ -73,7 +73,7 @@ class SurfaceTable:
     @property
     def opacities(self) -> Array:
         """[N] as learned."""
-        return np.minimum(1 / (1 + np.exp(-self.logit)), MOST_OPAQUE).astype(np.float32)
+        return np.minimum(1 / (1 + np.exp(-self.logit)), MAX_OPAQUE).astype(np.float32)
 
     @property
     def body_of(self) -> NDArray[np.int32]:
@@ -112,27 +112,27 @@ class SurfaceTable:
         return made
 
 
-# What recorded rays meet of a set in the making.
+# Hits of recorded rays.
 
 
 @dataclass(frozen=True, eq=False)
-class MetBySweep:
-    """Meetings of one sweep, its Gaussians numbered as in the table.
+class SweepHits:
+    """RayHits of one sweep, its Gaussians numbered as in the table.
 
     Attributes:
-        meetings: see there.
+        hits: see :class:`RayHits`.
         request: of the cast.
         bodies: numbers of the bodies in the order of the request.
         of_request: [M] int32, the Gaussians numbered as in the request.
     """
 
-    meetings: Meetings
+    hits: RayHits
     request: CastRequest
     bodies: NDArray[np.int64]
     of_request: NDArray[np.int32]
 
 
-def meet(
+def trace(
     table: SurfaceTable,
     scene: Scene,
     log: DrivingLog,
@@ -140,22 +140,22 @@ def meet(
     frame: int,
     lidar: Lidar,
     reach: NDArray[np.float32],
-) -> MetBySweep:
+) -> SweepHits:
     """Follow the rays of ``lidar`` about ``frame`` through ``scene``, which holds ``table``.
 
     Args:
-        reach: [R], see ``CpuCaster.meetings``.
+        reach: [R], see ``CpuCaster.trace``.
     """
     t_us = int(log.frame_times_us[frame])
     met = recorded_scene(scene, lidar, t_us)
     request = met.request(lidar, sensor_poses(log.ego, lidar, t_us))
-    found = CpuCaster().meetings(request, reach)
+    found = CpuCaster().trace(request, reach)
     # Ids count from 1 over the scene's objects; the background has 0.
     bodies = np.array([instance.instance_id for instance in met.instances])
     counts = [len(instance.cloud) for instance in met.instances]
     shift = np.repeat(table.firsts[bodies] - (np.cumsum(counts) - counts), counts)
     members = (found.members + shift[found.members]).astype(np.int32)
-    return MetBySweep(replace(found, members=members), request, bodies, found.members)
+    return SweepHits(replace(found, members=members), request, bodies, found.members)
 
 
 def part_of(lidar: Lidar, rays: NDArray[np.int64]) -> Lidar:
@@ -165,7 +165,7 @@ def part_of(lidar: Lidar, rays: NDArray[np.int64]) -> Lidar:
     return replace(lidar, beams=chosen)
 
 
-# Surfaces learned from the rays that measured them: what is opaque, how large, and where.
+# Optimisation: opacity, size and position from the measuring rays.
 
 RAYS = 30_000
 """Of one step, evenly spread over a sweep."""
@@ -235,8 +235,8 @@ def _gradients(
     """Gaussians that these rays meet, gradients [seen, 3] and the mean cost of a ray."""
     lidar, measured = part_of(sweep.rays.lidar, chosen), sweep.rays.range[chosen]
     reach = (measured + BEYOND).astype(np.float32)
-    met = meet(table, table.placed(scene), log, frame=sweep.frame, lidar=lidar, reach=reach)
-    found = met.meetings
+    met = trace(table, table.placed(scene), log, frame=sweep.frame, lidar=lidar, reach=reach)
+    found = met.hits
     out, costs = np.empty((len(found.members), 3), np.float32), np.empty(len(measured))
     wide = np.exp(table.size)[:, None]
     ray_gradients(
@@ -258,7 +258,7 @@ def _gradients(
     return seen, np.stack(sums, axis=1).astype(np.float32), float(costs.mean())
 
 
-def _directions(table: SurfaceTable, met: MetBySweep) -> NDArray[np.float32]:
+def _directions(table: SurfaceTable, met: SweepHits) -> NDArray[np.float32]:
     """[bodies, R, 3], unit, of the rays in the frame of each body; zeros of those not there."""
     request = met.request
     beams = request.lidar.beams

@@ -30,7 +30,7 @@ def ray_gradients(
     """Gradients of the cost of each ray by its meetings.
 
     Args:
-        begins, members, alpha, tau: of Meetings.
+        begins, members, alpha, tau: of RayHits.
         measured: [R] float64, range of each ray [m].
         directions: [bodies, R, 3] float32, unit, in the frame of each body.
         body_of: [N] int32, body of each Gaussian.

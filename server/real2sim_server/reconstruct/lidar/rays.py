@@ -15,7 +15,7 @@ from ...render.cast.call import transforms_at
 from ...scene import Beams, Detection, Lidar
 from ...scene.lidar import wrapped
 
-# Recorded sweeps as rays: which way each was fired, from where and when.
+# Rays of recorded sweeps: origin, direction and time.
 
 FAR = 250.0
 """Recorded points beyond this are left out [m]."""
@@ -90,12 +90,12 @@ def _shift(origin: NDArray[np.float32]) -> Float:
     return pose
 
 
-# The beam table of a turning sensor, found from its raw scans.
+# The beam table, estimated from raw scans.
 #
-# Scans of some data sets list one ring after the other, each from the same azimuth on. Where the
-# azimuth falls back a new ring begins. The sensor may be tilted on its vehicle: rays of a ring lie on
-# a cone about its axis, which is the direction in which they scatter least about their mean. The
-# lasers of a sensor leave it at different heights, so a ring is the line z = offset + slope rho.
+# Scans of some data sets list one ring after the other, each from the same azimuth on. A drop in
+# azimuth starts a new ring. The sensor may be tilted on its vehicle: rays of a ring lie on a cone
+# about the sensor's axis, the direction of least scatter about the mean. The lasers leave the
+# sensor at different heights, so a ring is the line z = offset + slope rho.
 
 FALLS_BACK = np.pi
 """A step back by more than this is the begin of a ring [rad]."""

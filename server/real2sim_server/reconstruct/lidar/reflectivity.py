@@ -13,14 +13,14 @@ from ...logs import DrivingLog
 from ...render.cast.call import facing_of_request
 from ...scene import Scene
 from ...scene.lidar_surfaces import MAX_REFLECTIVITY, RANGE_STEPS, RingResponse
-from .learn import SeenSweep, SurfaceTable, meet, part_of
+from .learn import SeenSweep, SurfaceTable, part_of, trace
 
-# How much of a beam each Gaussian sends back, from the intensities that sweeps recorded.
+# Reflectivity from recorded intensities.
 #
-# A recorded intensity is what the surfaces along a ray send back, by the light that each stops, times
-# what the sensor makes of it. Surfaces are taken as reflecting partly alike in all directions and
-# partly with the cosine of incidence; the share is one number for a scene. Lasers of one sensor
-# answer differently, and that with the range: each ring has a gain and an offset of its own by range.
+# A recorded intensity is the light that the surfaces along a ray return, weighted by the share
+# that each stops, times the sensor's response. Surfaces reflect partly diffusely in all directions
+# and partly with the cosine of incidence; the share is one number for a scene. Lasers of one
+# sensor respond differently, depending on range: each ring has its own gain and offset by range.
 
 RAYS = 60_000
 """Of each sweep, evenly spread."""
@@ -99,11 +99,11 @@ def light_of(
         every.append(max(1, -(-len(rays.range) // RAYS)))
         chosen = np.arange(0, len(rays.range), every[-1])
         lidar = part_of(rays.lidar, chosen)
-        met = meet(
+        met = trace(
             table, placed, log, frame=sweep.frame, lidar=lidar,
             reach=np.zeros(len(chosen), np.float32),
         )  # fmt: skip
-        found = met.meetings
+        found = met.hits
         row = np.zeros(len(chosen), np.int64)
         if len(rings) and len(sweep.elevations):
             row = RingResponse.rows(rings, sweep.elevations, sweep.ring[chosen])
@@ -246,10 +246,10 @@ def _line(
     return (one * xy - x * y) / determinant, (xx * y - x * xy) / determinant
 
 
-# Where beams are lost: on glass, on what is dark or wet, on what mirrors them away.
+# Beam loss: on glass, on dark or wet surfaces, and on mirrors.
 #
-# A Gaussian's share of lost rays is learned from the rays that would have stopped there: those that
-# returned and those that did not, where the rings of a scan tell which were fired.
+# The loss probability of a Gaussian is learned from the rays that would stop there, returned or
+# not, where the rings of a scan reveal the fired rays.
 
 """Light that the mean share of all counts for."""
 LOSS_ROUNDS = 8
@@ -276,10 +276,10 @@ def fit_losses(
         for lidar in sweep.missing:
             # As many as of those that returned, or shares would be wrong.
             chosen = np.arange(0, lidar.beams.count, every)
-            met = meet(
+            met = trace(
                 table, placed, log, frame=sweep.frame, lidar=part_of(lidar, chosen),
                 reach=np.zeros(len(chosen), np.float32),
-            ).meetings  # fmt: skip
+            ).hits  # fmt: skip
             ray = np.repeat(np.arange(len(chosen)), np.diff(met.begins))
             share = stopped_shares(met.alpha, met.begins, ray)
             kept = share > LITTLE

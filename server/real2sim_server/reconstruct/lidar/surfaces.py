@@ -30,7 +30,7 @@ from .learn import SeenSweep, SurfaceTable, learn_surfaces
 from .rays import RecordedRays, fit_rings, recorded_rays
 from .reflectivity import fit_losses, fit_reflectivity, light_of
 
-# Flat Gaussians on what the sweeps of a log measured, background and objects apart.
+# Flat Gaussians on the measured points, background and objects apart.
 
 VOXEL, VOXEL_PER_METRE = 0.1, 0.006
 """Edge of voxels in the background [m], and its growth with the distance from the drive."""
@@ -169,11 +169,11 @@ def _filled(
     return GaussianCloud(means_of, quats, scales_of, opacities_of, colours)
 
 
-# The set of Gaussians that LiDARs see: flat, learned from sweeps, with a reflectivity each.
+# The complete set.
 #
-# Images leave haze before and behind surfaces, which a beam measures. So surfaces are laid on what
-# the sweeps measured, filled up where they measured nothing, and learned from the rays themselves.
-# Reflectivity is fitted to the recorded intensities last.
+# Training on images leaves haze around surfaces, and a beam would measure it. Surfaces are
+# therefore placed on the measured points, completed from the scene elsewhere, and learned from the
+# rays. Reflectivity is fitted last.
 
 MAX_SWEEPS = 40
 """That are learned from; every sweep gives points."""

@@ -15,7 +15,7 @@ from ..options import ReconstructError
 from . import kernels
 from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
 
-# Adam that only touches what was seen.
+# Sparse Adam: only rows with gradients are updated.
 
 EPSILON = 1e-15
 
@@ -128,10 +128,10 @@ def _update_plain(views: list[Tensor], seen: Tensor, columns: Tensor, correction
     values.sub_(torch.where(rows, columns * m / (v.sqrt() * correction + EPSILON), 0.0))
 
 
-# What is done to a set of Gaussians while it trains: duplicate, split, prune, relocate, reset.
+# Edits: duplicate, split, prune, relocate, reset.
 #
-# Every operation takes the optimiser along, so that its moments stay with their rows. Rows stay
-# sorted by owner.
+# Every operation also updates the optimiser, so its moments stay with their rows. Rows stay sorted
+# by owner.
 
 SPLIT_SHRINK = 1.6
 """By which the halves of a split Gaussian are smaller (Kerbl et al. 2023)."""
@@ -318,11 +318,10 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-# Strategies of densification: when Gaussians are added and removed, and which.
+# Strategies: when to add and remove which Gaussians.
 #
-# A strategy is called twice a step, as in gsplat: :meth:`Strategy.step_pre_backward` with what
-# was drawn and :meth:`Strategy.step_post_backward` after the optimiser's step. What it does to the
-# Gaussians are the functions of :mod:`.operations`.
+# The trainer calls a strategy twice a step, as in gsplat: :meth:`Strategy.step_pre_backward` with
+# the render and :meth:`Strategy.step_post_backward` after the optimiser's step.
 
 BOX_MARGIN = 1.15
 """Objects' Gaussians may stick out of their boxes by this factor: mirrors, antennas, bad boxes."""

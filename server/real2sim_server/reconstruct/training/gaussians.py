@@ -14,12 +14,12 @@ from torch import Tensor
 
 from ...scene import GaussianCloud, Scene
 from ...scene.colour import TimeColour
-from . import kernels as kernels
+from . import kernels
 
-# From raw parameters of Gaussians to scales, opacities and colours, owner by owner.
+# Activations: raw parameters to scales, opacities and colours, owner by owner.
 #
-# Torch would pass over the parameters a dozen times on one thread, forth and back. On the CPU it is
-# done in one pass each way; :func:`activated_plain` says in plain torch what that computes.
+# Torch would pass over the parameters a dozen times on one thread in each direction. The CPU
+# kernels take one pass each way; :func:`activated_plain` is the reference in plain torch.
 
 
 class Activated(NamedTuple):
@@ -156,7 +156,7 @@ def _array(tensor: Tensor) -> NDArray[np.float32]:
     return tensor.detach().contiguous().numpy()
 
 
-# All trainable Gaussians, packed: background first, then object by object.
+# The packed Gaussians: background first, then object by object.
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh", "fourier")
 OBJECT_FIELDS = ("fourier",)

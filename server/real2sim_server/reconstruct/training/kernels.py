@@ -7,9 +7,8 @@ from numba import prange
 
 from ..._numba import kernel
 
-# From raw parameters of Gaussians to what is drawn, and gradients back, compiled.
-#
-# Every row is its own, so results do not depend on the number of threads.
+# Activations and their gradients. Rows are independent, so results do not depend on the number of
+# threads.
 
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
@@ -94,7 +93,7 @@ def activate_backward(
                         by_fourier[row, f, j] = tones[owner - 1, f] * by_colours[i, 0, j]
 
 
-# One step of Adam over rows, compiled; rows that were not seen are left alone.
+# One step of Adam over rows; rows without gradients stay as they are.
 
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
@@ -128,7 +127,7 @@ def adam_rows(values, gradient, first, second, seen, rates, correction, epsilon)
                 values[i, j] -= rates[j] * m / (np.sqrt(v) * correction + epsilon)
 
 
-# Structural similarity of two images and its gradient, compiled.
+# Structural similarity and its gradient.
 #
 # Rows of interleaved RGB are blurred with a stride of three, so images never change their layout.
 # Every kernel writes whole rows, so results do not depend on the number of threads.

@@ -27,7 +27,7 @@ from .gaussians import Gaussians
 from .losses import second_differences
 from .schedule import TrainOptions
 
-# How much brighter or darker single images were taken than the rest.
+# Exposure of single images.
 
 
 class ImageGains:
@@ -65,7 +65,7 @@ class ImageGains:
         return self.logarithms.square().sum() / max(len(self.logarithms), 1)
 
 
-# Refined poses of objects: small corrections of the tracked boxes at the training frames.
+# Refined object poses: small corrections of the tracked boxes at the training frames.
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +228,7 @@ def _key_times(trajectory: Trajectory, key_times_us: NDArray[np.int64] | None) -
     return np.unique(np.concatenate([ends, inside]))
 
 
-# The scene while it learns: everything that has gradients, drawn for any logged view.
+# The model: all trainable parameters, rendered for any logged view.
 
 SYMMETRIC_CATEGORIES = ("car", "truck", "van", "bus")
 """Categories whose two sides look alike."""

@@ -17,7 +17,7 @@ from ..._files import atomic_folder
 from ..options import ReconstructError
 from .losses import psnr_of
 
-# State of a training run on disk, exact to the last bit.
+# Checkpoints, bit-exact.
 
 FORMAT = "real2sim-training"
 VERSION = 4
@@ -122,7 +122,7 @@ def _upgraded_name(tensor: str) -> str:
     return tensor
 
 
-# The figures of a run, one JSON object a line.
+# Metrics, one JSON object per line.
 
 
 class MetricsFile:
@@ -156,7 +156,7 @@ class MetricsFile:
         temporary.replace(self.path)
 
 
-# Progress and rate of a training run.
+# Progress and rate.
 
 SMOOTHING = 0.98
 """Fraction of the past in the running loss and PSNR."""

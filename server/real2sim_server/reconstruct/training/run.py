@@ -37,7 +37,7 @@ from .records import OnTraining, TrainingProgress
 from .schedule import TrainOptions
 from .trainer import CHECKPOINT, Trainer
 
-# Threads of torch while training.
+# Torch threads.
 
 
 @contextmanager
@@ -56,7 +56,7 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-# Boxes with noise: made for tests, and smoothed before anything is built from them.
+# Box noise: added for tests, and smoothed away before initialisation.
 
 ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
 """What vehicles usually do: standard deviations [m/s^2] and [rad/s^2]."""
@@ -136,7 +136,7 @@ def _with_poses(track: ObjectTrack, positions: Float, yaws: Float) -> ObjectTrac
     return replace(track, trajectory=Trajectory(given.times_us, positions, quaternions))
 
 
-# How well the model shows images it never saw.
+# Held-out score.
 
 MIN_PIXELS = 50
 """Views in which moving objects cover fewer pixels do not count for them."""
@@ -204,7 +204,7 @@ def _score(image: Tensor, truth: Tensor, mask: Tensor) -> tuple[float, float, fl
     return losses.psnr_of(float(squared.mean())), losses.ssim(image, truth), on_objects
 
 
-# From a log to a trained scene: stage 0, training, and the score of what was held out.
+# The run.
 
 INITIAL = "initial.r2s"
 PREVIEWS = "previews"

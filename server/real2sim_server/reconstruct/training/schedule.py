@@ -12,7 +12,7 @@ from ..options import InitialiseOptions, ReconstructError
 from .densify import STRATEGIES, DensifyOptions
 from .losses import LossWeights
 
-# Options of what follows from the directions in which training images show Gaussians.
+# Options for colours and sides seen from few directions.
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class DirectionOptions:
     views: int = 32
 
 
-# Options of training: iterations, learning rates over time, densification, presets.
+# Training options and presets.
 
 COLOUR_BASES = ("cosine", "real_dft")
 HIGHER_HARMONICS_RATE = 1 / 20

@@ -19,14 +19,14 @@ from .densify import DensifyOptions, SelectiveAdam, VisibilityLimits, prune, rot
 from .gaussians import Gaussians, concatenate
 from .model import SceneModel
 
-# Which Gaussians the training images show, and what becomes of those that none shows.
+# Visibility.
 #
-# A Gaussian behind a surface gets gradients only through the thin gaps in that surface, and Adam
-# takes full steps along them: it becomes a floater that a turned or moved object reveals. Little of
-# it is visible, and it lies deep behind what is; the layers of a surface are little visible each as
-# well, but lie close together. Such Gaussians are pruned, and the priors of stage 0 for unobserved
-# places (mirrored sides, body colours, ground under cars) take their place while the surfaces before
-# them finish learning, so that these close up.
+# A Gaussian behind a surface gets gradients only through thin gaps in that surface, and Adam takes
+# full steps along them: the Gaussian becomes a floater that a turned or moved object reveals.
+# Floaters are barely visible and lie deep behind the surface; the layers of a surface are each
+# barely visible as well, but close together. Floaters are pruned, and the priors of stage 0 for
+# unobserved places (mirrored sides, body colours, ground under cars) replace them while the
+# surfaces in front finish learning and close up.
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
@@ -455,11 +455,11 @@ class OcclusionPruning:
         )
 
 
-# From where training images show each Gaussian, and what follows for views from elsewhere.
+# Viewing directions.
 #
-# A colour that depends on the direction can be anything across the one direction from which it was
-# seen, and so can what lies on sides that were only seen edge on: neither changes a training image,
-# and both show when a car is turned.
+# A direction-dependent colour is unconstrained away from the one direction that saw it, and so are
+# sides seen only edge-on: neither changes a training image, and both show when an edit turns a
+# car.
 
 SH_C1 = 0.4886025119029199
 """Of the basis functions of degree 1: -C1 y, C1 z, -C1 x."""
