@@ -303,7 +303,7 @@ def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> Swe
 
 
 def background_hits(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
-    """What rays meet of the background, without erased regions, and its attributes."""
+    """The background as rays hit it, without erased regions, and its attributes."""
     cloud, attributes = met_by_lidar(scene, None)
     if state.erased:
         cloud = kept(scene, ("lidar", state.erased), lambda: without_regions(cloud, state.erased))
@@ -313,8 +313,10 @@ def background_hits(scene: Scene, state: ScenarioState) -> tuple[Instance, Attri
 def object_hits(
     scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
 ) -> tuple[Instance, Attributes | None]:
-    """What rays meet of an object at ``transform``, in its pose of ``t_us`` or, of a person, as far
-    in walking as ``stride`` says, and its attributes."""
+    """An object at ``transform`` as rays hit it, and its attributes.
+
+    It takes its pose of ``t_us``, or for a person the phase of the gait that ``stride`` gives.
+    """
     cloud, attributes = _met(scene, subject, t_us, stride)
     semantic = semantic_class(subject.category)
     instance = Instance(cloud, transform, subject.instance_id, subject.scale, semantic=semantic)

@@ -160,10 +160,10 @@ def evaluate_views(
 ) -> CoverageReport:
     """Render logged views and compare them with the logged images.
 
-    A pixel counts as covered by LiDAR when a point of that frame's own sweep, at least COVERAGE_NEAR in
-    front of the camera, projects into it or into one of the pixels around it, up to 1/600 of the
-    image width away (2 px at 1242 px). Points are taken as the log gives them, without an
-    occlusion test.
+    A pixel counts as covered by LiDAR when a point of that frame's own sweep, at least
+    COVERAGE_NEAR in front of the camera, projects into it or into one of the pixels around it,
+    up to 1/600 of the image width away (2 px at 1242 px). Points are taken as the log gives
+    them, without an occlusion test.
 
     Args:
         scene: reconstructed from ``log``.

@@ -58,7 +58,7 @@ class EvaluateOptions:
     """What is measured.
 
     Attributes:
-        frames: ``held-out``, ``all`` or indices; see :func:`.selection.select_frames`.
+        frames: ``held-out``, ``all`` or indices; see :func:`.rendering.select_frames`.
         width: of the compared images [px]; as logged by default.
         shifts: distances beside the recorded path [m]: of whole images where truth exists, of the
             road by LiDAR and other images on every log.

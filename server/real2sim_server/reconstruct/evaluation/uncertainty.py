@@ -1,4 +1,4 @@
-"""Uncertainty of each Gaussian, estimated from the training rays and checked against true errors."""
+"""Uncertainty of each Gaussian: estimated from training rays, checked against true errors."""
 
 from __future__ import annotations
 

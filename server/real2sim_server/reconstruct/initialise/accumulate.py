@@ -1,4 +1,4 @@
-"""Points of a whole log: accumulated sweeps, thinned, with walls above the LiDAR's field of view."""
+"""Points of a whole log: accumulated sweeps, thinned, and walls above the field of view."""
 
 from __future__ import annotations
 

@@ -166,7 +166,7 @@ def body_colours(
         points: [N, 3] of a vehicle in that box, stage 0's.
         colours: [N, 3] of these; the commonest where there is paint becomes the paint, the light
             taken off, and likewise of a truck's cargo.
-        light: slopes [3] in the frame of the box, see :func:`.vehicle_light.fit_light`.
+        light: slopes [3] in the frame of the box, see :func:`.vehicle_parts.fit_light`.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
     distance, nearest = body.closest(points)

@@ -117,7 +117,7 @@ class SurfaceTable:
 
 @dataclass(frozen=True, eq=False)
 class SweepHits:
-    """RayHits of one sweep, its Gaussians numbered as in the table.
+    """Ray hits of one sweep, with the Gaussians numbered as in the table.
 
     Attributes:
         hits: see :class:`RayHits`.
@@ -147,12 +147,12 @@ def trace(
         reach: [R], see ``CpuCaster.trace``.
     """
     t_us = int(log.frame_times_us[frame])
-    met = recorded_scene(scene, lidar, t_us)
-    request = met.request(lidar, sensor_poses(log.ego, lidar, t_us))
+    targets = recorded_scene(scene, lidar, t_us)
+    request = targets.request(lidar, sensor_poses(log.ego, lidar, t_us))
     found = CpuCaster().trace(request, reach)
     # Ids count from 1 over the scene's objects; the background has 0.
-    bodies = np.array([instance.instance_id for instance in met.instances])
-    counts = [len(instance.cloud) for instance in met.instances]
+    bodies = np.array([instance.instance_id for instance in targets.instances])
+    counts = [len(instance.cloud) for instance in targets.instances]
     shift = np.repeat(table.firsts[bodies] - (np.cumsum(counts) - counts), counts)
     members = (found.members + shift[found.members]).astype(np.int32)
     return SweepHits(replace(found, members=members), request, bodies, found.members)
@@ -232,7 +232,7 @@ def _gradients(
     sweep: SeenSweep,
     chosen: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], float]:
-    """Gaussians that these rays meet, gradients [seen, 3] and the mean cost of a ray."""
+    """Gaussians that these rays hit, gradients [seen, 3] and the mean cost of a ray."""
     lidar, measured = part_of(sweep.rays.lidar, chosen), sweep.rays.range[chosen]
     reach = (measured + BEYOND).astype(np.float32)
     met = trace(table, table.placed(scene), log, frame=sweep.frame, lidar=lidar, reach=reach)

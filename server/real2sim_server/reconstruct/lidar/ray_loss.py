@@ -27,7 +27,7 @@ of a shift along the normal [1/m]."""
 def ray_gradients(
     begins, members, alpha, tau, measured, directions, body_of, axes, scales, opacities, out, costs
 ):
-    """Gradients of the cost of each ray by its meetings.
+    """Gradients of the cost of each ray with respect to its hits.
 
     Args:
         begins, members, alpha, tau: of RayHits.

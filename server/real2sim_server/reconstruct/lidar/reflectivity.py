@@ -165,7 +165,7 @@ def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
 def stopped_shares(
     alpha: NDArray[np.float32], begins: NDArray[np.int64], ray: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Share [M] of the light that a ray loses which it loses at each of its meetings."""
+    """Share [M] of a ray's lost light that it loses at each of its hits."""
     passed = np.log1p(-np.minimum(alpha, 0.9999).astype(np.float64))
     total = np.cumsum(passed)
     before = total - passed - np.concatenate([[0.0], total])[begins[:-1]][ray]

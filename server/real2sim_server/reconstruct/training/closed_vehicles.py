@@ -121,7 +121,7 @@ def body_cloud(
 
     Args:
         item: of stage 0.
-        light: slopes [3] in its frame, see :func:`.vehicle_light.fit_light`.
+        light: slopes [3] in its frame, see :func:`.vehicle_parts.fit_light`.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
     shown = constant_colours(item.cloud)

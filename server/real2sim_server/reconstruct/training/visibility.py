@@ -1,4 +1,4 @@
-"""Visibility of Gaussians in the training images, and the treatment of unseen Gaussians and directions."""
+"""Visibility and viewing directions of Gaussians, and treatment of unseen ones."""
 
 from __future__ import annotations
 
@@ -361,7 +361,7 @@ class OcclusionPruning:
         iterations: of the whole training.
         sample: draws so many training views.
         unseen: of a model, which Gaussians lie on sides that no view shows, see
-            :func:`.directions.unseen_sides`; None knows of no such sides.
+            :func:`unseen_sides`; None knows of no such sides.
         close: changes a model before its priors are chosen and says of which objects, see
             :func:`.closed_vehicles.close_followed`; None changes nothing.
         offer: says, given these, which priors there are, see

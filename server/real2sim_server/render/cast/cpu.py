@@ -58,8 +58,8 @@ class CpuCaster:
         return echo_of(request, lights, timing)
 
     def trace(self, request: CastRequest, reach: NDArray[np.float32]) -> RayHits:
-        """What the rays of a request meet, each up to its ``reach`` [R] [m], or where that is 0
-        until its light has gone."""
+        """Hits of the rays of a request, each up to its ``reach`` [R] [m], or where that is 0
+        until its light is gone."""
         with self._lock:
             records, regions, motions = self._prepare(request)
             layout = layout_of(request.lidar.beams)

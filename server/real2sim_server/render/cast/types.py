@@ -93,7 +93,7 @@ class Echo:
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """Which Gaussians rays meet, from near to far.
+    """Gaussians hit by rays, from near to far.
 
     Attributes:
         begins: [R + 1] int64, where the hits of each ray begin among all M.
