@@ -16,8 +16,8 @@ from real2sim_server.logs import DrivingLog
 from real2sim_server.reconstruct.initialise.stage0 import initialise_scene
 from real2sim_server.reconstruct.options import InitialiseOptions
 from real2sim_server.reconstruct.training.densify import DensifyOptions
+from real2sim_server.reconstruct.training.run import one_torch_thread
 from real2sim_server.reconstruct.training.schedule import TrainOptions
-from real2sim_server.reconstruct.training.threads import one_torch_thread
 from real2sim_server.reconstruct.training.trainer import Trainer
 from real2sim_server.scene import GaussianCloud, Scene
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log

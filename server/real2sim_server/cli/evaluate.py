@@ -21,7 +21,7 @@ from .options import (
 
 if TYPE_CHECKING:
     from ..reconstruct.evaluation import Evaluation
-    from ..reconstruct.evaluation.sweeps import LidarScore
+    from ..reconstruct.evaluation.lidar import LidarScore
 
 
 @command("evaluate")

@@ -133,7 +133,7 @@ def fit_uncertainty(
     """Give a scene images of its uncertainty, as training does with new ones."""
     from dataclasses import asdict
 
-    from ..reconstruct.uncertainty import fit_uncertainties
+    from ..reconstruct.evaluation.uncertainty import fit_uncertainties
 
     def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
         made, report = fit_uncertainties(

@@ -36,7 +36,7 @@ from .options import (
 if TYPE_CHECKING:
     from ..maps import LaneSource
     from ..reconstruct import InitialiseOptions
-    from ..reconstruct.training.progress import TrainingProgress
+    from ..reconstruct.training.records import TrainingProgress
 
 
 @command("reconstruct")

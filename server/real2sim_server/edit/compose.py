@@ -293,28 +293,30 @@ def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> Swe
     """
     placed = state.tracks.at(t_us)
     times = t_us + lidar.beams.slots[0]
-    found = [met_background(scene, state)]
+    found = [background_hits(scene, state)]
     moved: list[Float | None] = [None]
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
-        found.append(met_object(scene, subject, transform, t_us))
+        found.append(object_hits(scene, subject, transform, t_us))
         moved.append(transforms_at(subject.trajectory, times))
     instances, known = zip(*found, strict=True)
     return SweepScene(instances, tuple(moved), known, incidence_of(scene))
 
 
-def met_background(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
-    """What rays meet of the background, without erased regions, and its attributes."""
+def background_hits(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
+    """The background as rays hit it, without erased regions, and its attributes."""
     cloud, attributes = met_by_lidar(scene, None)
     if state.erased:
         cloud = kept(scene, ("lidar", state.erased), lambda: without_regions(cloud, state.erased))
     return Instance(cloud), attributes
 
 
-def met_object(
+def object_hits(
     scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
 ) -> tuple[Instance, Attributes | None]:
-    """What rays meet of an object at ``transform``, in its pose of ``t_us`` or, of a person, as far
-    in walking as ``stride`` says, and its attributes."""
+    """An object at ``transform`` as rays hit it, and its attributes.
+
+    It takes its pose of ``t_us``, or for a person the phase of the gait that ``stride`` gives.
+    """
     cloud, attributes = _met(scene, subject, t_us, stride)
     semantic = semantic_class(subject.category)
     instance = Instance(cloud, transform, subject.instance_id, subject.scale, semantic=semantic)

@@ -1,7 +1,8 @@
-"""One image of a log: when it was taken, and where LiDAR points and objects are on it."""
+"""Logged images: their time, LiDAR points and objects, the sky and static surfaces in them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable
 
 import numpy as np
@@ -11,6 +12,8 @@ from ..geometry.box import box_corners
 from ..geometry.transform import Float, apply_transform, invert_transform
 from ..logs import DrivingLog, LidarSweep, ObjectTrack
 from ..scene import Camera, Scene
+
+# Image time, and LiDAR points and objects in an image.
 
 NEAR = 0.2
 """Boxes are cut off at this depth in front of the camera [m]."""
@@ -140,3 +143,232 @@ def fill_outline(mask: NDArray[np.bool_], outline: Float) -> None:
     for (x, y), (dx, dy) in zip(outline, sides, strict=True):
         inside &= (dx * (v - y) - dy * (u - x)) * np.sign(area) >= 0
     mask[low[1] : high[1], low[0] : high[0]] |= inside
+
+
+# Sky masks and static surfaces.
+#
+# The search starts in image columns in which the uppermost LiDAR beams got no return. In each of
+# them the sky ends at the first strong edge. The edge threshold minimises the variance of the
+# colours above and below the border (Shen and Wang 2013). From there the sky grows into other
+# columns, over its own colours and up to the next edge. Patches of the same colours elsewhere in
+# the open columns, such as between a bridge and the trees behind it, count as well. A smooth wall
+# that continues above the uppermost beam does not.
+
+WIDTH = 640
+"""Larger images are masked at this width [px]."""
+BOX_MARGIN = 0.3
+"""Kept free around the boxes of objects [m]."""
+UPPERMOST = math.radians(1.5)
+"""Returns within this angle of the highest one are from the uppermost beams."""
+FAR = 10.0
+"""Least distance of returns that tell how high a sensor looks [m]."""
+OPEN_MARGIN = 3
+"""Columns on each side of one with a high return that are not open either."""
+GRADIENTS = np.linspace(5.0, 300.0, 40)
+"""Candidates for the least gradient of the border (Sobel, of grey from 0 to 255)."""
+SKY_WEIGHT = 2.0
+"""How much more the spread of the sky's colours counts than that of the rest."""
+GROWING_GRADIENT = 40.0
+"""Greatest gradient across which the sky goes on beyond open columns."""
+MIN_SHARE = 0.005
+"""Least part of the open columns that counts as sky, and as something else."""
+MIN_PATCH = 0.0005
+"""Least part of an image that counts as a patch apart from the sky at the top."""
+ALIKE = 3.0
+"""Standard deviations within which a colour is one of the sky's."""
+MIN_DEVIATION = 4.0
+"""Of the sky's colours at least, since they may all be overexposed; of 0 to 255."""
+TRIMMINGS = 3
+"""Rounds in which colours beyond that are dropped, such as those of a tree at the top."""
+BRIGHTER = 1.2
+"""The sky is at least this many times as bright as the rest of the image."""
+CLEAR = 2
+"""Pixels around a LiDAR return that are not sky."""
+
+
+def sky_mask(
+    log: DrivingLog,
+    camera: Camera,
+    frame: int,
+    image: NDArray[np.uint8],
+    *,
+    sweep: LidarSweep | None = None,
+) -> NDArray[np.bool_]:
+    """Pixels [H, W] of an image of a log that show the sky; without LiDAR none.
+
+    Args:
+        log: with poses.
+        camera: of ``log``, at the size of ``image``.
+        frame: of ``log``.
+        image: [H, W, 3] RGB.
+        sweep: of ``frame``; None reads it.
+
+    Raises:
+        LogError: the sweep cannot be read.
+    """
+    import cv2
+
+    small = camera.resized(min(WIDTH, camera.width))
+    sweep = log.lidar(frame) if sweep is None else sweep
+    t_us = image_time(log, camera.name, frame)
+    pixels, inside = _pixels(small, points_in_camera(log, small, frame, t_us, sweep=sweep))
+    blocked = _hit(small, pixels) | ~_above_horizon(small, small.pose(log.ego.transform(t_us)))
+    blocked |= ~_outside_of_boxes(log, small, frame)
+    is_open = _open_columns(small, pixels, _is_high(sweep)[inside])
+    mask = sky_of_image(resized(image, small), blocked, is_open).astype(np.uint8)
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def still_surfaces(
+    log: DrivingLog, camera: Camera, frame: int, image: NDArray[np.uint8]
+) -> NDArray[np.bool_]:
+    """Pixels [H, W] that show neither the sky nor the inside of a box; see :func:`sky_mask`."""
+    sky = sky_mask(log, camera, frame, image)
+    return np.asarray(_outside_of_boxes(log, camera, frame) & ~sky)
+
+
+def sky_of_image(
+    image: NDArray[np.uint8], blocked: NDArray[np.bool_], is_open: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Pixels [H, W] of an image that show the sky.
+
+    Args:
+        image: [H, W, 3] RGB.
+        blocked: [H, W] pixels that do not show it.
+        is_open: [W] columns in which the search starts.
+    """
+    import cv2
+
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    ends = np.stack([_first_row((gradient > least) | blocked) for least in GRADIENTS])
+    none = np.zeros(grey.shape, np.bool_)
+    if not is_open.any():
+        return none
+    merit = _merits(image[:, is_open], ends[:, is_open])
+    best = int(merit.argmax())
+    sky = (np.arange(len(grey))[:, None] < ends[best]) & is_open
+    if merit[best] == 0 or grey[sky].mean() < BRIGHTER * grey[~sky & is_open].mean():
+        return none
+    least = float(GRADIENTS[best])
+    alike = ~blocked & _like_most(image, image[sky])
+    sky &= alike
+    labels, _ = _connected(sky | (alike & (gradient <= min(least, GROWING_GRADIENT))))
+    grown = np.isin(labels, labels[sky])
+    labels, areas = _connected(alike & is_open & (gradient <= least))
+    patches = (labels > 0) & (areas > MIN_PATCH * sky.size)[labels]
+    return np.asarray(grown | patches)
+
+
+def _outside_of_boxes(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]:
+    """[H, W] pixels outside of the outlines of all boxes."""
+    t_us = image_time(log, camera.name, frame)
+    pose = camera.pose(log.ego.transform(t_us))
+    return ~tracks_mask(log.tracks, camera, pose, t_us, margin=BOX_MARGIN)
+
+
+def _above_horizon(camera: Camera, pose: Float) -> NDArray[np.bool_]:
+    """[H, W] pixels that look upwards."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays, valid = camera.unproject(np.stack([u, v], -1))
+    return valid & (rays @ pose[2, :3] > 0)
+
+
+def _pixels(camera: Camera, points: Float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Column and row [M, 2] of the points [N, 3] in the camera frame that lie ahead, within the
+    columns of the image; and which those are [N]."""
+    pixels, valid = camera.project(points)
+    inside = valid & (points[:, 2] > 0) & (np.abs(pixels) < 1e6).all(1)
+    inside &= (pixels[:, 0] >= 0) & (pixels[:, 0] < camera.width)
+    return np.floor(pixels[inside]).astype(np.int64), inside
+
+
+def _hit(camera: Camera, pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[H, W] pixels that are near those of returns [M, 2]."""
+    import cv2
+
+    u, v = pixels[(pixels[:, 1] >= 0) & (pixels[:, 1] < camera.height)].T
+    hit = np.zeros((camera.height, camera.width), np.uint8)
+    hit[v, u] = 1
+    return np.asarray(cv2.dilate(hit, np.ones((2 * CLEAR + 1,) * 2, np.uint8)) > 0)
+
+
+def _is_high(sweep: LidarSweep) -> NDArray[np.bool_]:
+    """Which returns [N] of a sweep are from its uppermost beams."""
+    x, y, z = (sweep.points - sweep.origin).astype(np.float64).T
+    distance = np.hypot(x, y)
+    elevation = np.arctan2(z, distance)
+    # The lasers of a sensor are centimetres apart: near returns seem higher or lower than they are.
+    far = elevation[distance > FAR]
+    top = float(np.quantile(far, 0.999)) if len(far) else math.pi
+    return np.asarray(elevation > top - UPPERMOST)
+
+
+def _open_columns(
+    camera: Camera, pixels: NDArray[np.int64], high: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Columns [W] of an image with LiDAR returns, but none from the uppermost beams."""
+    import cv2
+
+    hits = np.zeros((2, camera.width), np.uint8)
+    hits[0, pixels[:, 0]] = 1
+    hits[1, pixels[high, 0]] = 1
+    kernel = np.ones((1, 2 * OPEN_MARGIN + 1), np.uint8)
+    any_hit, high_hit = cv2.dilate(hits, kernel) > 0
+    return np.asarray(any_hit & ~high_hit)
+
+
+def _first_row(ends: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Row [W] of the first pixel that is set in each column of [H, W]; H where there is none."""
+    return np.where(ends.any(0), ends.argmax(0), len(ends))
+
+
+def _merits(image: NDArray[np.uint8], ends: NDArray[np.int64]) -> Float:
+    """How well borders [T, W] part an image: 1 over the spreads of the colours above and below; 0
+    where hardly any pixel is on one of the sides."""
+    colours = image.astype(np.float64)
+    products = colours[..., :, None] * colours[..., None, :]
+    height, width = image.shape[:2]
+    first = np.concatenate([np.ones((height, width, 1)), colours], -1)
+    values = np.concatenate([first, products.reshape(height, width, 9)], -1)
+    down = np.concatenate([np.zeros((1, width, 13)), values.cumsum(0)])
+    above = down[ends, np.arange(width)].sum(1)
+    share = above[:, 0] / (height * width)
+    merit = 1 / (SKY_WEIGHT * _spreads(above) + _spreads(down[-1].sum(0) - above) + 1e-9)
+    return np.where((share > MIN_SHARE) & (share < 1 - MIN_SHARE), merit, 0.0)
+
+
+def _spreads(sums: Float) -> Float:
+    """Determinant and largest eigenvalue of covariances, added; of sums [T, 13] over pixels."""
+    count = np.maximum(sums[:, :1], 1.0)
+    mean = sums[:, 1:4] / count
+    covariance = (sums[:, 4:] / count).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
+    largest = np.linalg.eigvalsh(covariance)[:, -1]
+    return np.asarray(np.abs(np.linalg.det(covariance)) + largest)
+
+
+def _like_most(image: NDArray[np.uint8], colours: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Pixels [H, W] of an image that are coloured as most of ``colours`` [N, 3] are."""
+    given, values = colours.astype(np.float64), image.astype(np.float64)
+    for _ in range(TRIMMINGS):
+        given = given[_near(given, given)]
+    return _near(values, given)
+
+
+def _near(values: Float, colours: Float) -> NDArray[np.bool_]:
+    """Which of ``values`` [..., 3] are within some standard deviations of ``colours`` [N, 3]."""
+    spread = np.cov(colours.T, bias=True) + MIN_DEVIATION**2 * np.eye(3)
+    off = values - colours.mean(0)
+    return np.asarray(((off @ np.linalg.inv(spread)) * off).sum(-1) < ALIKE**2)
+
+
+def _connected(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Labels [H, W] of the connected parts of a mask, 0 beside it, and the areas of all labels."""
+    import cv2
+
+    found = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    return np.asarray(found[1], np.int32), np.asarray(found[2][:, cv2.CC_STAT_AREA], np.int32)
+
+
+__all__ = ["sky_mask", "sky_of_image", "still_surfaces"]

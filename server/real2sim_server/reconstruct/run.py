@@ -14,15 +14,14 @@ from ..render.select import select_backend
 from ..scene import Scene
 from ..scene.io import save_scene
 from .evaluation import evaluate_views, render_logged_view
+from .evaluation.uncertainty import VIEWS, fit_uncertainties
 from .initialise.stage0 import initialise_scene
 from .initialise.views import chosen_frames
-from .options import InitialiseOptions, ReconstructError
-from .stages import OnProgress, Stages
+from .options import InitialiseOptions, OnProgress, ReconstructError, Stages
 from .training import OnTraining, TrainOptions, held_out_frames, train, with_box_noise
-from .uncertainty import VIEWS, fit_uncertainties
 
 EVALUATED_FRAMES = 4
-LEAST_VIEWS, STEPS_A_VIEW = 4, 30
+MIN_VIEWS, STEPS_A_VIEW = 4, 30
 """Views that uncertainty is found by after a training, at least, and one more a so many steps: a
 view costs about as much as one of them."""
 
@@ -164,7 +163,7 @@ def reconstruct(
             backend=options.backend,
         )
         with stages("uncertainty") as report_step:
-            views = max(LEAST_VIEWS, min(VIEWS, figures.iterations // STEPS_A_VIEW))
+            views = max(MIN_VIEWS, min(VIEWS, figures.iterations // STEPS_A_VIEW))
             scene, _ = fit_uncertainties(
                 scene, log, views=views, backend=options.backend, on_view=report_step
             )

@@ -12,9 +12,12 @@ import torch
 from real2sim_server.logs import DrivingLog
 from real2sim_server.reconstruct.initialise.stage0 import initialise_scene
 from real2sim_server.reconstruct.options import InitialiseOptions
-from real2sim_server.reconstruct.training.direction_options import DirectionOptions
-from real2sim_server.reconstruct.training.schedule import DensifyOptions, TrainOptions
-from real2sim_server.reconstruct.training.threads import one_torch_thread
+from real2sim_server.reconstruct.training.run import one_torch_thread
+from real2sim_server.reconstruct.training.schedule import (
+    DensifyOptions,
+    DirectionOptions,
+    TrainOptions,
+)
 from real2sim_server.reconstruct.training.trainer import Trainer
 from real2sim_server.render.backend import Backend
 from real2sim_server.scene import GaussianCloud, Scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from real2sim_server.logs import DrivingLog
-from real2sim_server.reconstruct.sky_mask import sky_mask, sky_of_image, still_surfaces
+from real2sim_server.reconstruct.logged_view import sky_mask, sky_of_image, still_surfaces
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, SyntheticLog, generate_log
 
 from .conftest import sweep_of

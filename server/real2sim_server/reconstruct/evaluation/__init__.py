@@ -1,7 +1,7 @@
 """How close a scene comes to its log: images, moving objects, depth, and how fast it is drawn."""
 
-from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
-from .lidar_coverage import CoverageReport, CoverageScore, evaluate_views, lidar_mask
+from .images import PSNR_CAP, mean_psnr, psnr, ssim
+from .lidar import CoverageReport, CoverageScore, evaluate_views, lidar_mask
 from .rendering import render_logged_view
 from .report import write_report
 from .scores import EvaluateOptions, Evaluation, evaluate_scene

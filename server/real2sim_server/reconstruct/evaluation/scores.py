@@ -13,19 +13,44 @@ from ...logs import DrivingLog, same_part
 from ...render import Frame
 from ...scene import Camera, Scene
 from ..logged_view import image_time, moving_tracks, points_in_camera, resized, tracks_mask
-from ..options import ReconstructError
-from ..stages import OnProgress, ReportStep, Stages
-from .around import AroundScore, evaluate_around
-from .box_error import box_error
-from .image_metrics import PSNR_CAP, mean_psnr, psnr, ssim
-from .lane_band import LaneBandScore, evaluate_lane_band
-from .lidar_depth import depth_errors, error_p90, mean_error, median_error
-from .rendering import measure_rate, render_view
-from .selection import select_cameras, select_frames
-from .shifted import MIN_OBJECT_PIXELS, ShiftScore, evaluate_shifts
-from .sweeps import LidarScore, evaluate_sweeps
-from .truth import find_truth
+from ..options import OnProgress, ReconstructError, ReportStep, Stages
+from .images import PSNR_CAP, AroundScore, evaluate_around, find_truth, mean_psnr, psnr, ssim
+from .lidar import LidarScore, depth_errors, error_p90, evaluate_sweeps, mean_error, median_error
+from .rendering import measure_rate, render_view, select_cameras, select_frames
+from .shifted import (
+    MIN_OBJECT_PIXELS,
+    LaneBandScore,
+    ShiftScore,
+    evaluate_lane_band,
+    evaluate_shifts,
+)
 from .uncertainty import UncertaintyScore, evaluate_uncertainty
+
+# Distance of a scene's objects from the boxes of its log.
+
+
+def box_error(scene: Scene, log: DrivingLog) -> float:
+    """Median distance between the centres of moving objects and of their boxes in ``log`` [m].
+
+    On a synthetic log, whose boxes are exact, this is the error of the scene's trajectories. Nan
+    where no moving object of the log is in the scene.
+    """
+    distances = []
+    for track in moving_tracks(log):
+        item = scene.objects.get(track.object_id)
+        if item is None:
+            continue
+        times = [t for t in track.trajectory.times_us if item.trajectory.covers(int(t))]
+        distances += [
+            np.linalg.norm(
+                item.trajectory.transform(int(t))[:3, 3] - track.trajectory.transform(int(t))[:3, 3]
+            )
+            for t in times
+        ]
+    return float(np.median(distances)) if distances else float("nan")
+
+
+# All figures.
 
 
 @dataclass(frozen=True)
@@ -33,7 +58,7 @@ class EvaluateOptions:
     """What is measured.
 
     Attributes:
-        frames: ``held-out``, ``all`` or indices; see :func:`.selection.select_frames`.
+        frames: ``held-out``, ``all`` or indices; see :func:`.rendering.select_frames`.
         width: of the compared images [px]; as logged by default.
         shifts: distances beside the recorded path [m]: of whole images where truth exists, of the
             road by LiDAR and other images on every log.

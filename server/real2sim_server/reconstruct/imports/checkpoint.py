@@ -1,23 +1,31 @@
-"""Reading checkpoint files without trusting them, and what all importers fraction."""
+"""Checkpoint and dataset files, read without trusting them, and helpers shared by all importers."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import simplejpeg
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry.transform import Float
-from ...scene import GaussianCloud, Scene
+from ...geometry.transform import Float, is_rigid
+from ...scene import GaussianCloud, Scene, Sky
 from ...scene.cloud import SH_DEGREES, rotate_sh
 from ...scene.errors import SceneError
 from ...scene.io.splat_format import build_cloud
+from ...scene.scene import face_directions
 from ..options import ReconstructError
 from .torch_file import TorchFileError, read_torch_file
+
+# Safe reading of checkpoint files, and helpers shared by all importers.
 
 
 class CheckpointError(ReconstructError):
@@ -199,3 +207,109 @@ def file_hash(path: Path) -> str:
     """SHA-256 of a file, for provenance."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+# Small files of preprocessed dataset folders: poses, intrinsics, JSON, image sizes.
+
+PNG_MAGIC = b"\x89PNG"
+
+
+def read_numbers(path: Path) -> Float:
+    """All numbers of a text file, in order. Raises CheckpointError naming it."""
+    try:
+        return np.array(path.read_text().split(), dtype=np.float64)
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise CheckpointError(f"{path}: must hold numbers only: {error}") from error
+
+
+def read_pose(path: Path) -> Float:
+    """A rigid transform [4, 4] of a text file. Raises CheckpointError naming it."""
+    numbers = read_numbers(path)
+    if numbers.size != 16 or not is_rigid(numbers.reshape(4, 4)):
+        raise CheckpointError(f"{path}: must hold a rigid 4x4 transform")
+    return numbers.reshape(4, 4)
+
+
+def read_intrinsics(path: Path) -> Float:
+    """Matrix K [3, 3] of a file of fx, fy, cx, cy and distortion, which is left out."""
+    numbers = read_numbers(path)
+    if numbers.size < 4:
+        raise CheckpointError(f"{path}: must hold fx, fy, cx, cy, not {numbers.size} numbers")
+    fx, fy, cx, cy = numbers[:4]
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def read_json(path: Path) -> Mapping[str, Any]:
+    """A JSON object. Raises CheckpointError naming the file."""
+    try:
+        value = json.loads(path.read_bytes())
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise CheckpointError(f"{path}: is no JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise CheckpointError(f"{path}: must hold a JSON object")
+    return value
+
+
+def image_size(folder: Path, camera: int) -> tuple[int, int] | None:
+    """Width and height [px] of a camera's images, None where there are none.
+
+    Raises:
+        CheckpointError: for an image that is neither PNG nor JPEG.
+    """
+    for image in sorted((folder / "images").glob(f"*_{camera}.*"))[:1]:
+        data = image.read_bytes()
+        if data.startswith(PNG_MAGIC) and len(data) >= 24:
+            width, height = struct.unpack_from(">II", data, 16)
+            return width, height
+        try:
+            height, width = simplejpeg.decode_jpeg_header(data)[:2]
+        except ValueError as error:
+            raise CheckpointError(f"{image}: is neither PNG nor JPEG, or is damaged") from error
+        return width, height
+    return None
+
+
+# Cube maps in OpenGL order and orientation (as nvdiffrast samples them), converted to a Sky.
+
+
+def sky_from_opengl_cube(faces: Float, R_cube_world: Float) -> Sky:
+    """The same sky in our face layout, clamped to [0, 1].
+
+    Args:
+        faces: [6, R, R, 3] RGB, faces +x -x +y -y +z -z of OpenGL.
+        R_cube_world: [3, 3] rotation of world directions to those of the cube. Where it only
+            exchanges axes, every pixel is moved and none is interpolated.
+    """
+    directions = face_directions(faces.shape[1]).astype(np.float64) @ R_cube_world.T
+    face, row, column = _nearest_pixel(directions, faces.shape[1])
+    moved = np.clip(faces[face, row, column], 0, 1).astype(np.float32)
+    return Sky(torch.from_numpy(np.ascontiguousarray(moved)))
+
+
+def _nearest_pixel(
+    directions: Float, resolution: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Face, row and column [...] of an OpenGL cube map along ``directions`` [..., 3].
+
+    OpenGL 4.6 specification, table 8.19: s to the right (columns), t down (rows).
+    """
+    x, y, z = np.moveaxis(directions, -1, 0)
+    axis = np.abs(directions).argmax(axis=-1)
+    positive = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0] > 0
+    face = 2 * axis + ~positive
+    right = [-z, z, x, x, x, -x]
+    down = [-y, -y, z, -z, -y, -y]
+    major = np.abs(directions).max(axis=-1)
+    column, row = (
+        np.clip(
+            np.rint((np.choose(face, of) / major + 1) / 2 * resolution - 0.5).astype(np.int64),
+            0,
+            resolution - 1,
+        )
+        for of in (right, down)
+    )
+    return face, row, column

@@ -29,12 +29,14 @@ from .checkpoint import (
     array,
     cloud_of,
     file_hash,
+    image_size,
     load_checkpoint,
+    read_intrinsics,
+    read_pose,
+    sky_from_opengl_cube,
     table,
     tied_to_object,
 )
-from .dataset_files import image_size, read_intrinsics, read_pose
-from .opengl_sky import sky_from_opengl_cube
 
 R_CUBE_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turn of view directions before its sky is looked up."""

@@ -1,4 +1,4 @@
-"""Sweeps of a whole log brought together: background in the world, objects in their boxes."""
+"""Points of a whole log: accumulated sweeps, thinned, and walls above the field of view."""
 
 from __future__ import annotations
 
@@ -13,8 +13,276 @@ from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog, LidarSweep, ObjectTrack
 from ...scene import Trajectory
 from ..options import InitialiseOptions
-from .points import PointSet, path_distance, thin, voxel_levels
-from .walls import ScanLimit
+from .surfels import Surfels
+
+# Measured points and their thinning.
+
+_BITS = 20
+_HALF = 1 << (_BITS - 1)
+MAX_LEVEL = 7
+
+
+@dataclass(frozen=True, eq=False)
+class PointSet:
+    """LiDAR points in one frame.
+
+    Attributes:
+        points: [N, 3] float32 [m].
+        intensity: [N] float32 in [0, 1].
+        weight: [N] float32, how many measurements a point stands for.
+    """
+
+    points: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> PointSet:
+        """The points picked by a mask or by indices."""
+        return PointSet(self.points[index], self.intensity[index], self.weight[index])
+
+    @classmethod
+    def measured(cls, points: Float, intensity: NDArray[np.float32]) -> PointSet:
+        """Points that stand for one measurement each."""
+        return cls(
+            points.astype(np.float32),
+            intensity.astype(np.float32),
+            np.ones(len(points), dtype=np.float32),
+        )
+
+    @classmethod
+    def join(cls, parts: list[PointSet]) -> PointSet:
+        """All points of ``parts``, in order."""
+        if not parts:
+            return cls.measured(np.zeros((0, 3)), np.zeros(0, dtype=np.float32))
+        return cls(
+            np.concatenate([p.points for p in parts]),
+            np.concatenate([p.intensity for p in parts]),
+            np.concatenate([p.weight for p in parts]),
+        )
+
+
+def thin(cloud: PointSet, voxel: float, levels: NDArray[np.int64] | None = None) -> PointSet:
+    """One point for each occupied voxel: the weighted mean of what lies inside.
+
+    Args:
+        cloud: any number of points.
+        voxel: edge of a voxel of level 0 [m].
+        levels: [N] in 0 to MAX_LEVEL, the edge doubles with each level; all 0 by default. Points
+            of different levels are never merged.
+
+    Returns:
+        The means in the order of their voxels; total weight is kept.
+    """
+    if len(cloud) == 0:
+        return cloud
+    order, starts = _group(_voxel_keys(cloud.points, voxel, levels))
+    weight = cloud.weight[order].astype(np.float64)
+    total = np.add.reduceat(weight, starts)
+    points = cloud.points[order].astype(np.float64) * weight[:, None]
+    intensity = cloud.intensity[order].astype(np.float64) * weight
+    return PointSet(
+        (np.add.reduceat(points, starts, axis=0) / total[:, None]).astype(np.float32),
+        (np.add.reduceat(intensity, starts) / total).astype(np.float32),
+        total.astype(np.float32),
+    )
+
+
+def thin_to(
+    cloud: PointSet, voxel: float, limit: int, levels: NDArray[np.int64] | None = None
+) -> PointSet:
+    """Like :func:`thin`, with voxels as much larger as it takes to stay within ``limit`` points."""
+    thinned = thin(cloud, voxel, levels)
+    while len(thinned) > limit:
+        # Points lie on surfaces, so their number falls with the square of the edge.
+        voxel *= max(1.05, (len(thinned) / limit) ** 0.5)
+        thinned = thin(cloud, voxel, levels)
+    return thinned
+
+
+def _voxel_keys(
+    points: NDArray[np.float32], voxel: float, levels: NDArray[np.int64] | None
+) -> NDArray[np.int64]:
+    edge = voxel if levels is None else (voxel * np.exp2(levels))[:, None]
+    cells = np.floor(points.astype(np.float64) / edge).astype(np.int64)
+    cells = np.clip(cells + _HALF, 0, 2 * _HALF - 1)
+    key = (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
+    return key if levels is None else key | (levels << (3 * _BITS))
+
+
+def _group(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Stable order that brings equal keys together, and where each group starts."""
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    return order, starts
+
+
+def path_distance(points: NDArray[np.float32], path: Float) -> NDArray[np.float32]:
+    """Distance [N] [m] of points [N, 3] from the nearest of ``path`` [P, 3], to about a metre.
+
+    All points of one metre cell get the same value, so that levels change between cells only.
+    """
+    from scipy.spatial import cKDTree
+
+    cells, inverse = _unique_cells(points)
+    distance, _ = cKDTree(path).query(cells + 0.5, workers=-1)
+    return np.asarray(distance.astype(np.float32)[inverse])
+
+
+def _unique_cells(points: NDArray[np.float32]) -> tuple[Float, NDArray[np.int64]]:
+    keys = _voxel_keys(points, 1.0, None)
+    unique, inverse = np.unique(keys, return_inverse=True)
+    mask = 2 * _HALF - 1
+    parts = [(unique >> (2 * _BITS)) & mask, (unique >> _BITS) & mask, unique & mask]
+    return np.stack(parts, axis=1).astype(np.float64) - _HALF, inverse
+
+
+def voxel_levels(distance: NDArray[np.float32], voxel: float, growth: float) -> NDArray[np.int64]:
+    """Levels [N] for :func:`thin`: the voxel nearest below ``max(voxel, growth * distance)``."""
+    ratio = np.maximum(distance * (growth / voxel), 1.0)
+    return np.asarray(np.clip(np.floor(np.log2(ratio)), 0, MAX_LEVEL), dtype=np.int64)
+
+
+def well_supported(points: NDArray[np.float32], reach: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which points [N] have three others within their ``reach`` [N] [m]; loners are noise."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 4:
+        return np.zeros(len(points), dtype=np.bool_)
+    third, _ = cKDTree(points).query(points, k=[4], workers=-1)
+    return np.asarray(third[:, 0] < reach)
+
+
+# Walls above the LiDAR's field of view.
+#
+# A spinning LiDAR covers a few degrees upwards, and houses are higher. A wall that reaches the
+# scanner's upper limit is continued straight up; images then decide which part is real.
+
+CELL = 0.25
+"""Edge of the columns into which walls are divided [m]."""
+REACH, HEIGHT = 45.0, 14.0
+"""Walls up to this far from the drive are continued by this much [m]."""
+MIN_POINTS, MIN_EXTENT = 6, 0.8
+"""A column is a wall when it has so many points over such a height [m]."""
+MAX_DEVIATION = 28.0
+"""Views of a real wall differ less than this in brightness, standard deviation of 0 to 255."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScanLimit:
+    """The highest rays of the scanner.
+
+    Attributes:
+        path: [P, 3] float64, positions of the vehicle in the world [m].
+        height: of the scanner over the vehicle's origin [m].
+        slope: tangent of the elevation of its highest ray.
+    """
+
+    path: Float
+    height: float
+    slope: float
+
+
+def continue_walls(structure: Surfels, limit: ScanLimit, *, max_count: int) -> Surfels:
+    """Surfels on walls above what the scanner can see, candidates to be judged by their colours.
+
+    Args:
+        structure: what stands on the ground, world frame.
+        limit: of the scanner.
+        max_count: at most so many; they lie farther apart if need be.
+    """
+    columns = _wall_columns(structure, limit)
+    step = CELL
+    while len(columns.start) * int(HEIGHT / step) > max_count:
+        step *= 1.25
+        if step > 4 * CELL:
+            columns = columns.every_other()
+            step = CELL
+    return _rise(columns, step)
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Wall columns: xy [C, 2], direction [C] of the normal [rad], start [C] height in the world."""
+
+    xy: Float
+    direction: Float
+    start: Float
+
+    def every_other(self) -> _Columns:
+        return _Columns(self.xy[::2], self.direction[::2], self.start[::2])
+
+
+def _wall_columns(structure: Surfels, limit: ScanLimit) -> _Columns:
+    from scipy.spatial import cKDTree
+
+    upright = np.abs(structure.normals[:, 2]) < 0.3
+    points = structure.points[upright].astype(np.float64)
+    normals = structure.normals[upright].astype(np.float64)
+    if len(points) == 0:
+        return _Columns(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    cells = np.floor(points[:, :2] / CELL).astype(np.int64)
+    _, index, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    index = index.reshape(-1)
+    xy = np.stack([np.bincount(index, points[:, a]) for a in (0, 1)], axis=1) / counts[:, None]
+    top, bottom = np.full(len(counts), -np.inf), np.full(len(counts), np.inf)
+    np.maximum.at(top, index, points[:, 2])
+    np.minimum.at(bottom, index, points[:, 2])
+    # A normal and its opposite are the same wall, hence the doubled angle.
+    angle = 2 * np.arctan2(normals[:, 1], normals[:, 0])
+    cosine, sine = (np.bincount(index, f(angle)) / counts for f in (np.cos, np.sin))
+    distance, nearest = cKDTree(limit.path[:, :2]).query(xy, workers=-1)
+    seen_up_to = limit.path[nearest, 2] + limit.height + limit.slope * distance
+    wall = (
+        (counts >= MIN_POINTS)
+        & (top - bottom > MIN_EXTENT)
+        & (np.hypot(cosine, sine) > 0.7)
+        & (top > seen_up_to - 0.1)
+        & (distance < REACH)
+    )
+    return _Columns(xy[wall], np.arctan2(sine, cosine)[wall] / 2, seen_up_to[wall])
+
+
+def _rise(columns: _Columns, step: float) -> Surfels:
+    levels = (np.arange(int(HEIGHT / step)) + 0.5) * step
+    count, rows = len(columns.start), len(levels)
+    points = np.empty((count, rows, 3))
+    points[..., :2] = columns.xy[:, None]
+    points[..., 2] = columns.start[:, None] + levels
+    c, s = np.cos(columns.direction), np.sin(columns.direction)
+    zero, one = np.zeros(count), np.ones(count)
+    along = np.stack([-s, c, zero], axis=1)
+    up = np.stack([zero, zero, one], axis=1)
+    normal = np.stack([c, s, zero], axis=1)
+    axes = np.stack([along, up, normal], axis=2)
+    scales = np.tile(np.array([0.6 * CELL, 0.6 * step, 0.03]), (count * rows, 1))
+    return Surfels(
+        points.reshape(-1, 3).astype(np.float32),
+        np.repeat(axes, rows, axis=0).astype(np.float32),
+        scales.astype(np.float32),
+    )
+
+
+def real_walls(
+    colours: NDArray[np.float32], known: NDArray[np.bool_], deviation: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Which candidates [N] are walls: seen, alike from all views, and not coloured like a sky.
+
+    Args:
+        colours: [N, 3] float32 in [0, 1].
+        known: [N] bool.
+        deviation: [N] float32, standard deviation of brightness between views, 0 to 255.
+    """
+    red, blue = colours[:, 0], colours[:, 2]
+    blown_out = colours.min(axis=1) > 0.9
+    bluish = (blue > red + 0.02) & (blue > 0.45)
+    return np.asarray(known & (deviation < MAX_DEVIATION) & ~blown_out & ~bluish)
+
+
+# Accumulated sweeps: background in the world frame, objects in their boxes.
 
 HALF_SWEEP_US = 50_000
 EGO_MARGIN = 0.45

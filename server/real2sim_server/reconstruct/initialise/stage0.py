@@ -16,24 +16,36 @@ from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky
 from ...scene.cloud import SH_C0
 from ...scene.ground_fit import DrivenPath, GroundFit, box_bottoms, fit_ground
-from ..options import InitialiseOptions, ReconstructError
-from ..sky_mask import sky_mask
-from ..stages import OnProgress, Stages
-from .accumulate import Accumulation, accumulate, drive_path
-from .ground import spread_ground
+from ..logged_view import sky_mask
+from ..options import InitialiseOptions, OnProgress, ReconstructError, Stages
+from .accumulate import (
+    Accumulation,
+    PointSet,
+    accumulate,
+    continue_walls,
+    drive_path,
+    path_distance,
+    real_walls,
+    thin_to,
+    voxel_levels,
+    well_supported,
+)
 from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
-from .object_shape import VEHICLE_LENGTH, complete_body, mirrored, underside
-from .points import PointSet, path_distance, thin_to, voxel_levels, well_supported
-from .sky_map import SkySamples
-from .stereo import sweep_planes
-from .surfels import Surfels, fit_surfels, round_surfels
-from .triangulate import TriangulatedPoints, triangulate
-from .vehicle_body import VehicleBody, faced, fitted_body
-from .vehicle_light import LIGHT, pose_amid
-from .vehicle_paint import VehicleSurface, fill_vehicles
-from .vehicle_parts import PARTS
-from .views import PlacedSurfels, ProjectedView, chosen_frames, gather_views
-from .walls import continue_walls, real_walls
+from .surfels import Surfels, fit_surfels, round_surfels, spread_ground
+from .triangulate import TriangulatedPoints, sweep_planes, triangulate
+from .vehicle_body import (
+    VEHICLE_LENGTH,
+    VehicleBody,
+    VehicleSurface,
+    complete_body,
+    faced,
+    fill_vehicles,
+    fitted_body,
+    mirrored,
+    underside,
+)
+from .vehicle_parts import LIGHT, PARTS, pose_amid
+from .views import PlacedSurfels, ProjectedView, SkySamples, chosen_frames, gather_views
 
 OPACITY = 0.95
 ABOVE_GROUND = 0.1

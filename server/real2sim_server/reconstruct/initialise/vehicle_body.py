@@ -1,12 +1,9 @@
-"""Bodies of vehicles as the synthetic street builds them, fitted into the box of a track.
-
-They say where the sides are that nothing measured, and what is paint there and what is glass,
-tyre or lamp. The colour of the paint comes from the vehicle itself.
-"""
+"""Synthetic vehicle bodies fitted into tracked boxes: shape and colours of unseen sides."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
@@ -19,9 +16,24 @@ from ...logs import DrivingLog, ObjectTrack
 from ...scene import Scene
 from ...synthetic.materials import BODY, PLAIN, WHEEL
 from ...synthetic.vehicles import CARGO_FLOOR, SHAPES, VehicleShape, build_vehicle
-from .inpainting import GREY, modal_colour
-from .vehicle_light import brightness
-from .vehicle_parts import Part, shell_parts, shown_paints, wheel_parts, with_paints
+from .accumulate import PointSet
+from .inpainting import GREY, fill_from_mirror, modal_colour
+from .surfels import Surfels
+from .vehicle_parts import (
+    Part,
+    brightness,
+    fit_light,
+    fit_palette,
+    shell_parts,
+    shown_paints,
+    wheel_parts,
+    with_paints,
+)
+
+# Bodies.
+#
+# The body tells where the unmeasured sides are, and separates paint from glass, tyres and lamps.
+# The paint's colour comes from the vehicle itself.
 
 SPACING = 0.05
 """Distance between points on a body [m]."""
@@ -32,7 +44,7 @@ FLAT = 0.95
 FEW_POINTS = 50
 """Fewer measured points do not tell one shape from another."""
 COMPARED = 1500
-LONGEST_SCALE = 1.35
+MAX_SCALE = 1.35
 """A body that would have to be stretched or pressed more than this is another kind of vehicle."""
 GRAZING = 0.35
 """Cosine to a surface's normal up to which a camera hardly sees it: 20 degrees from edge on."""
@@ -154,7 +166,7 @@ def body_colours(
         points: [N, 3] of a vehicle in that box, stage 0's.
         colours: [N, 3] of these; the commonest where there is paint becomes the paint, the light
             taken off, and likewise of a truck's cargo.
-        light: slopes [3] in the frame of the box, see :func:`.vehicle_light.fit_light`.
+        light: slopes [3] in the frame of the box, see :func:`.vehicle_parts.fit_light`.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
     distance, nearest = body.closest(points)
@@ -200,7 +212,7 @@ def _stretch(shape: VehicleShape, size: tuple[float, float, float]) -> float:
 
 
 def _fits(shape: VehicleShape, size: tuple[float, float, float]) -> bool:
-    return _stretch(shape, size) < float(np.log(LONGEST_SCALE))
+    return _stretch(shape, size) < float(np.log(MAX_SCALE))
 
 
 def _scaled(
@@ -307,3 +319,218 @@ def _spread(corners: Float) -> tuple[NDArray[np.int64], Float]:
         triangles.append(np.repeat(members, len(a)))
         weights.append(np.tile(np.stack([a, b, 1 - a - b], axis=1), (len(members), 1)))
     return np.concatenate(triangles), np.concatenate(weights)
+
+
+# Shape of objects with too few LiDAR points.
+
+GAP = 0.25
+"""The generic body fills where no measured point is this near [m]."""
+WINDOW_LINE, LEAN = 0.58, 0.2
+PROFILES = {
+    "car": ((-0.5, 0.68), (-0.44, 0.75), (-0.3, 0.97), (0.0, 1.0), (0.1, 0.95), (0.25, 0.66),
+            (0.45, 0.58), (0.5, 0.45)),
+    "van": ((-0.5, 0.97), (0.0, 1.0), (0.25, 0.95), (0.38, 0.6), (0.5, 0.5)),
+}  # fmt: skip
+"""Side views: (position along the length from -0.5 to 0.5, height from 0 to 1), front last."""
+
+VEHICLE_LENGTH = 2.5
+"""Objects at least this long are taken for vehicles, with a dark underside [m]."""
+UNDERSIDE_HEIGHT = 0.05
+"""Height of the underside over the box bottom, so that the road does not show through [m]."""
+
+
+def underside(size: tuple[float, float, float], *, spacing: float = 0.08) -> Surfels:
+    """A flat plate under a vehicle, in the object frame; empty for other objects.
+
+    What cameras see below a car is its dark underside and contact shadow. They belong to the car
+    and leave with it; the road keeps its own colour.
+
+    Args:
+        size: (length, width, height) [m].
+        spacing: distance between Gaussians [m].
+    """
+    half = np.array(size) / 2
+    points = _face(half, 2, -1, spacing) if size[0] >= VEHICLE_LENGTH else np.zeros((0, 3))
+    points[:, 2] += UNDERSIDE_HEIGHT
+    axes = np.broadcast_to(np.eye(3, dtype=np.float32), (len(points), 3, 3)).copy()
+    scales = np.tile(np.array([0.6, 0.6, 0.1], np.float32) * np.float32(spacing), (len(points), 1))
+    return Surfels(points.astype(np.float32), axes, scales)
+
+
+def complete_body(
+    measured: PointSet,
+    size: tuple[float, float, float],
+    category: str,
+    *,
+    body: VehicleBody | None = None,
+    spacing: float = 0.06,
+) -> PointSet:
+    """Measured points together with a generic body where nothing was measured.
+
+    LiDAR sees neither the far side of a car, nor its windows, nor the top of a truck. The body is
+    a box with rounded-off corners for most things, and has a bonnet and a cabin for cars and vans.
+    Points of the body nearer than GAP to a measured point, or to its mirror image across y = 0,
+    are left out, and mirrored points of vehicles are used instead.
+
+    Args:
+        measured: points in the object frame.
+        size: (length, width, height) [m].
+        category: class of the object.
+        body: of a vehicle, taken instead of the generic one.
+        spacing: distance between points of the body [m]; larger for large objects.
+    """
+    from scipy.spatial import cKDTree
+
+    spacing = max(spacing, 0.012 * size[0])
+    if body is not None:
+        added = body.points
+    else:
+        added = _with_profile(_box_surface(np.array(size), spacing), np.array(size), category)
+    typical = float(np.median(measured.intensity)) if len(measured) else 0.3
+    if len(measured):
+        distance, _ = cKDTree(measured.points).query(added, workers=-1)
+        added = added[distance > GAP]
+    generic = PointSet.measured(added, np.full(len(added), typical, dtype=np.float32))
+    return PointSet.join([measured, generic])
+
+
+def mirrored(measured: PointSet, *, voxel: float) -> PointSet:
+    """Measured points and, where nothing was measured, their mirror images across y = 0."""
+    from scipy.spatial import cKDTree
+
+    if len(measured) == 0:
+        return measured
+    image = measured.points * np.array([1, -1, 1], dtype=np.float32)
+    distance, _ = cKDTree(measured.points).query(image, workers=-1)
+    lone = distance > 3 * voxel
+    return PointSet.join(
+        [measured, PointSet(image[lone], measured.intensity[lone], measured.weight[lone])]
+    )
+
+
+def _box_surface(size: Float, spacing: float) -> Float:
+    """Points on four sides and the top of a box a little smaller than ``size``."""
+    half = 0.97 * size / 2
+    faces = [_face(half, axis, sign, spacing) for axis in (0, 1) for sign in (-1, 1)]
+    return np.concatenate([*faces, _face(half, 2, 1, spacing)])
+
+
+def _with_profile(points: Float, size: Float, category: str) -> Float:
+    """Press points [N, 3] of a box surface down to the side view of a vehicle."""
+    profile = PROFILES.get(category)
+    points = points.copy()
+    if profile is None:
+        return points
+    along, height = np.array(profile).T
+    bottom = points[:, 2] / size[2] + 0.5
+    roof = np.interp(points[:, 0] / size[0], along, height)
+    points[:, 2] = (np.minimum(bottom, 1) * roof - 0.5) * size[2]
+    # Sides lean inwards from the window line up.
+    above = np.clip((points[:, 2] / size[2] + 0.5 - WINDOW_LINE) / (1 - WINDOW_LINE), 0, 1)
+    points[:, 1] *= 1 - LEAN * above
+    return points
+
+
+def _face(half: Float, axis: int, sign: int, spacing: float) -> Float:
+    others = [a for a in range(3) if a != axis]
+    counts = [max(2, int(np.ceil(2 * half[a] / spacing))) for a in others]
+    grids = np.meshgrid(
+        *(((np.arange(n) + 0.5) / n * 2 - 1) * half[a] for n, a in zip(counts, others, strict=True))
+    )
+    points = np.zeros((grids[0].size, 3))
+    points[:, axis] = sign * half[axis]
+    for a, grid in zip(others, grids, strict=True):
+        points[:, a] = grid.ravel()
+    return points
+
+
+# Colours of unseen sides: mirrored, by part, or in one paint.
+#
+# Shading is removed first and applied again for the side's direction.
+
+ON_PART = 0.06
+"""Points this near to a body show the colour of its part there [m]; others lie behind its glass."""
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleSurface:
+    """What cameras saw of one vehicle.
+
+    Attributes:
+        points: [N, 3] float32 in the frame of its box [m].
+        normals: [N, 3] float64 unit, outwards, in the world.
+        colours: [N, 3] float32 where ``seen``.
+        seen: [N] bool.
+        body: that fits it.
+    """
+
+    points: NDArray[np.float32]
+    normals: Float
+    colours: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+    body: VehicleBody
+
+    def seen_paint(self) -> NDArray[np.bool_]:
+        """[N] bool: seen, and no lamp, glass or tyre."""
+        return np.asarray(self.seen & (self.parts() == Part.PAINT))
+
+    def parts(self, *, reach: float = PAINT_REACH) -> NDArray[np.uint8]:
+        """Parts [N] of the body at the points, see :meth:`.VehicleBody.parts_at`."""
+        return self.body.parts_at(*self.closest, reach=reach)
+
+    @cached_property
+    def closest(self) -> tuple[Float, NDArray[np.int64]]:
+        """Of the points, see :meth:`.VehicleBody.closest`."""
+        return self.body.closest(self.points)
+
+
+def fill_vehicles(
+    surfaces: Sequence[VehicleSurface],
+) -> tuple[list[NDArray[np.float32]], Float, NDArray[np.float32]]:
+    """Colours [N, 3] of all points of each vehicle, the light [3] and the palette [10, 3] of all.
+
+    What was seen stays. The paint of a vehicle of which hardly anything was seen is a grey, as
+    bright as the median of the others': the median of their colours is a colour that none has.
+    """
+    painted = [s.seen_paint() for s in surfaces]
+    light = fit_light(
+        [s.normals[mine] for s, mine in zip(surfaces, painted, strict=True)],
+        [s.colours[mine] for s, mine in zip(surfaces, painted, strict=True)],
+    )
+    paints = [_shown_paints(s, light) for s in surfaces]
+    palette = _shown_palette(surfaces, light)
+    found = [p[Part.PAINT] for p in paints if Part.PAINT in p]
+    usual = np.full(3, np.median(np.mean(found, axis=1)), np.float32) if found else GREY
+    filled = [
+        _filled(s, light, with_paints(palette, mine, usual))
+        for s, mine in zip(surfaces, paints, strict=True)
+    ]
+    return filled, light, palette
+
+
+def _shown_paints(surface: VehicleSurface, light: Float) -> dict[Part, NDArray[np.float32]]:
+    seen = surface.seen
+    return shown_paints(
+        surface.parts()[seen], surface.colours[seen] / brightness(light, surface.normals[seen])
+    )
+
+
+def _shown_palette(surfaces: Sequence[VehicleSurface], light: Float) -> NDArray[np.float32]:
+    parts, colours = [], []
+    for surface in surfaces:
+        parts.append(surface.parts(reach=ON_PART)[surface.seen])
+        lit = brightness(light, surface.normals[surface.seen])
+        colours.append(surface.colours[surface.seen] / lit)
+    return fit_palette(parts, colours)
+
+
+def _filled(
+    surface: VehicleSurface, light: Float, palette: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    lit = brightness(light, surface.normals)
+    mirrored, known = fill_from_mirror(surface.points, surface.colours / lit, surface.seen)
+    own = surface.body.colours(palette)[surface.closest[1]]
+    plain = np.where((surface.parts() != Part.PAINT)[:, None], own, palette[Part.PAINT])
+    filled = np.where(known[:, None], mirrored, plain) * lit
+    filled = np.where(surface.seen[:, None], surface.colours, filled)
+    return np.clip(filled, 0, 1).astype(np.float32)

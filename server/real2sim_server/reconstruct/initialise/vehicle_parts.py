@@ -1,8 +1,4 @@
-"""Parts of the bodies that the synthetic street builds: glass, tyres, lamps, and their colours.
-
-Colours of glass, trim and tyres are those that the log's own vehicles show: a camera in hard
-sun has darker ones than a camera under clouds.
-"""
+"""Parts of synthetic vehicle bodies, their colours, and how light falls on them."""
 
 from __future__ import annotations
 
@@ -13,10 +9,83 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.transform import Float
+from ...scene import SceneObject, Trajectory
 from ...synthetic.vehicles import VehicleShape, roof_heights
 from .inpainting import MIN_OBSERVED, modal_colour
 
+# Shading: one paint is brighter where it faces the sun and the sky.
+#
+# Images show most vehicles from one side. The colour of the other sides follows from the paint and
+# from the mean brightness, over all vehicles of a log, of sides that face one direction relative
+# to another.
+
+FROM_ABOVE = (0.0, 0.0, 0.25)
+"""Slopes that hold where vehicles say nothing."""
 DOUBT = 2.0
+"""Weight of these, in vehicles."""
+FEW = 100
+"""Vehicles of which fewer points are seen do not count."""
+ODD = 0.15
+"""Logarithms of brightness that differ more are of reflections, cast shadows, or no paint."""
+ROUNDS = 10
+DARKEST = 0.02
+LIGHT = "vehicle_light"
+"""Where a scene's reconstruction keeps the slopes."""
+
+
+def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) -> Float:
+    """Slopes [3] of the logarithm of brightness over a surface's normal, the same on all vehicles.
+
+    Args:
+        normals: by vehicle, [N, 3] unit, in a frame that all share.
+        colours: by vehicle, [N, 3] of paint there.
+    """
+    members = [k for k, seen in enumerate(normals) if len(seen) >= FEW]
+    prior = np.array(FROM_ABOVE)
+    if not members:
+        return prior
+    owner = np.repeat(np.arange(len(members)), [len(normals[k]) for k in members])
+    unit = np.concatenate([normals[k] for k in members])
+    bright = np.concatenate([colours[k].mean(axis=1) for k in members])
+    rest = np.log(bright.clip(DARKEST)) - unit @ prior
+    share = np.concatenate([np.full(len(normals[k]), 1 / len(normals[k])) for k in members])
+    # Each vehicle has a paint of its own, of which nothing is known.
+    columns = np.concatenate([unit, np.eye(len(members))[owner]], axis=1)
+    doubt = np.diag([DOUBT / 30] * 3 + [1e-6] * len(members))
+    weight, found = share, np.zeros(columns.shape[1])
+    for _ in range(ROUNDS):
+        weighed = columns.T * weight
+        found = np.linalg.solve(weighed @ columns + doubt, weighed @ rest)
+        weight = share / np.maximum(1, np.abs(rest - columns @ found) / ODD)
+    return np.asarray(prior + found[:3])
+
+
+def brightness(light: Float, normals: Float) -> NDArray[np.float32]:
+    """How bright [N, 1] paint is on surfaces of unit ``normals`` [N, 3], 1 on average."""
+    return np.exp(normals @ light)[:, None].astype(np.float32)
+
+
+def light_on(item: SceneObject, reconstruction: object) -> Float:
+    """The slopes [3] in the frame of an object, as it stands in the middle of its time.
+
+    Args:
+        reconstruction: of the scene's provenance; of one without slopes light comes from above.
+    """
+    known = reconstruction.get(LIGHT) if isinstance(reconstruction, dict) else None
+    light = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)
+    return np.asarray(light @ pose_amid(item.trajectory)[:3, :3])
+
+
+def pose_amid(trajectory: Trajectory) -> Float:
+    """``T_world_object`` [4, 4] in the middle of its time: light is taken as it lies there."""
+    return trajectory.transform((trajectory.start_us + trajectory.end_us) // 2)
+
+
+# Parts and colours.
+#
+# Colours of glass, trim and tyres come from the log's own vehicles: they are darker in hard sun
+# than under clouds.
+
 """Weight of the usual colour of a part, in vehicles that show theirs."""
 PARTS = "vehicle_parts"
 """Where a scene's reconstruction keeps the colours of parts."""

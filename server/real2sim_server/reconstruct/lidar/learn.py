@@ -1,20 +1,171 @@
-"""Surfaces learned from the rays that measured them: what is opaque, how large, and where."""
+"""Surfaces learned from LiDAR rays: their table, ray hits and optimisation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry.transform import Float, invert_transform, quaternion_to_matrix
 from ...logs import DrivingLog
-from ...scene import Lidar, Scene
-from .gaussians import SurfaceTable
-from .meetings import MetBySweep, meet, part_of
+from ...render.cast.call import recorded_scene, sensor_poses
+from ...render.cast.cpu import CpuCaster
+from ...render.cast.types import CastRequest, RayHits
+from ...scene import Beams, GaussianCloud, Lidar, LidarSurfaces, Reflector, Scene
 from .ray_loss import LOGIT, SHIFT, SIZE, ray_gradients
 from .rays import RecordedRays
+
+# Background and object Gaussians as one table.
+
+Array = NDArray[np.float32]
+MAX_OPAQUE = 0.99
+
+
+@dataclass(eq=False)
+class SurfaceTable:
+    """Flat Gaussians of all bodies; the last axis of each is its normal.
+
+    Attributes:
+        object_ids: of the bodies after the background.
+        firsts: [bodies + 1] int64, where each body begins.
+        means, quats, axes, scales: [N, 3], [N, 4], [N, 3, 3] and [N, 3] float32, as laid out.
+        logit, size, shift: [N] float32, what is learned: logit of the opacity, logarithm of the
+            factor of the scales along the surface, shift along the normal [m].
+        attributes: [N, 2] float32, see ``Reflector``.
+    """
+
+    object_ids: tuple[str, ...]
+    firsts: NDArray[np.int64]
+    means: Array
+    quats: Array
+    axes: Array
+    scales: Array
+    logit: Array
+    size: Array = field(init=False)
+    shift: Array = field(init=False)
+    attributes: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        count = len(self.means)
+        self.size, self.shift = np.zeros((2, count), np.float32)
+        self.attributes = np.zeros((count, 2), np.float32)
+
+    @classmethod
+    def of(cls, clouds: list[GaussianCloud], object_ids: tuple[str, ...]) -> SurfaceTable:
+        """The table of clouds, background first."""
+        means, quats, scales, opacities = (
+            np.concatenate([getattr(cloud, name).numpy() for cloud in clouds])
+            for name in ("means", "quats", "scales", "opacities")
+        )
+        axes = quaternion_to_matrix(quats).astype(np.float32)
+        opacities = np.clip(opacities, 0.01, MAX_OPAQUE)
+        firsts = np.cumsum([0, *map(len, clouds)]).astype(np.int64)
+        return cls(
+            object_ids, firsts, means, quats, axes, scales, np.log(opacities / (1 - opacities))
+        )
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def opacities(self) -> Array:
+        """[N] as learned."""
+        return np.minimum(1 / (1 + np.exp(-self.logit)), MAX_OPAQUE).astype(np.float32)
+
+    @property
+    def body_of(self) -> NDArray[np.int32]:
+        """[N], body of each Gaussian."""
+        bodies = np.arange(len(self.firsts) - 1, dtype=np.int32)
+        return np.repeat(bodies, np.diff(self.firsts))
+
+    def placed(self, scene: Scene, incidence: float = 1.0) -> Scene:
+        """The scene with this set for LiDARs."""
+        wide = np.exp(self.size)[:, None]
+        scales = np.concatenate([self.scales[:, :2] * wide, self.scales[:, 2:]], axis=1)
+        means = self.means + self.axes[:, :, 2] * self.shift[:, None]
+        columns = (means, self.quats, scales, self.opacities)
+        parts = []
+        for body in range(len(self.firsts) - 1):
+            part = slice(self.firsts[body], self.firsts[body + 1])
+            own = (torch.from_numpy(np.ascontiguousarray(column[part])) for column in columns)
+            means_of, quats, scales_of, opacities = own
+            cloud = GaussianCloud(
+                means_of, quats, scales_of, opacities, sh=torch.zeros(len(means_of), 1, 3)
+            )
+            attributes = torch.from_numpy(self.attributes[part].copy())
+            parts.append(Reflector(cloud, attributes))
+        objects = dict(zip(self.object_ids, parts[1:], strict=True))
+        return replace(scene, lidar=LidarSurfaces(parts[0], objects, incidence), content_hash="")
+
+    def select(self, kept: NDArray[np.bool_]) -> SurfaceTable:
+        """The Gaussians of a mask, as far as they have been learned."""
+        counts = np.bincount(self.body_of[kept], minlength=len(self.firsts) - 1)
+        laid_out = (
+            getattr(self, name)[kept] for name in ("means", "quats", "axes", "scales", "logit")
+        )
+        made = SurfaceTable(self.object_ids, np.cumsum([0, *counts]).astype(np.int64), *laid_out)
+        for name in ("size", "shift", "attributes"):
+            setattr(made, name, getattr(self, name)[kept])
+        return made
+
+
+# Hits of recorded rays.
+
+
+@dataclass(frozen=True, eq=False)
+class SweepHits:
+    """Ray hits of one sweep, with the Gaussians numbered as in the table.
+
+    Attributes:
+        hits: see :class:`RayHits`.
+        request: of the cast.
+        bodies: numbers of the bodies in the order of the request.
+        of_request: [M] int32, the Gaussians numbered as in the request.
+    """
+
+    hits: RayHits
+    request: CastRequest
+    bodies: NDArray[np.int64]
+    of_request: NDArray[np.int32]
+
+
+def trace(
+    table: SurfaceTable,
+    scene: Scene,
+    log: DrivingLog,
+    *,
+    frame: int,
+    lidar: Lidar,
+    reach: NDArray[np.float32],
+) -> SweepHits:
+    """Follow the rays of ``lidar`` about ``frame`` through ``scene``, which holds ``table``.
+
+    Args:
+        reach: [R], see ``CpuCaster.trace``.
+    """
+    t_us = int(log.frame_times_us[frame])
+    targets = recorded_scene(scene, lidar, t_us)
+    request = targets.request(lidar, sensor_poses(log.ego, lidar, t_us))
+    found = CpuCaster().trace(request, reach)
+    # Ids count from 1 over the scene's objects; the background has 0.
+    bodies = np.array([instance.instance_id for instance in targets.instances])
+    counts = [len(instance.cloud) for instance in targets.instances]
+    shift = np.repeat(table.firsts[bodies] - (np.cumsum(counts) - counts), counts)
+    members = (found.members + shift[found.members]).astype(np.int32)
+    return SweepHits(replace(found, members=members), request, bodies, found.members)
+
+
+def part_of(lidar: Lidar, rays: NDArray[np.int64]) -> Lidar:
+    """The LiDAR with these of its rays alone."""
+    beams = lidar.beams
+    chosen = Beams(beams.azimuth[rays], beams.elevation[rays], beams.time_us[rays])
+    return replace(lidar, beams=chosen)
+
+
+# Optimisation: opacity, size and position from the measuring rays.
 
 RAYS = 30_000
 """Of one step, evenly spread over a sweep."""
@@ -81,11 +232,11 @@ def _gradients(
     sweep: SeenSweep,
     chosen: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], float]:
-    """Gaussians that these rays meet, gradients [seen, 3] and the mean cost of a ray."""
+    """Gaussians that these rays hit, gradients [seen, 3] and the mean cost of a ray."""
     lidar, measured = part_of(sweep.rays.lidar, chosen), sweep.rays.range[chosen]
     reach = (measured + BEYOND).astype(np.float32)
-    met = meet(table, table.placed(scene), log, frame=sweep.frame, lidar=lidar, reach=reach)
-    found = met.meetings
+    met = trace(table, table.placed(scene), log, frame=sweep.frame, lidar=lidar, reach=reach)
+    found = met.hits
     out, costs = np.empty((len(found.members), 3), np.float32), np.empty(len(measured))
     wide = np.exp(table.size)[:, None]
     ray_gradients(
@@ -107,7 +258,7 @@ def _gradients(
     return seen, np.stack(sums, axis=1).astype(np.float32), float(costs.mean())
 
 
-def _directions(table: SurfaceTable, met: MetBySweep) -> NDArray[np.float32]:
+def _directions(table: SurfaceTable, met: SweepHits) -> NDArray[np.float32]:
     """[bodies, R, 3], unit, of the rays in the frame of each body; zeros of those not there."""
     request = met.request
     beams = request.lidar.beams

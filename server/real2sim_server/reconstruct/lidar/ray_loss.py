@@ -27,10 +27,10 @@ of a shift along the normal [1/m]."""
 def ray_gradients(
     begins, members, alpha, tau, measured, directions, body_of, axes, scales, opacities, out, costs
 ):
-    """Gradients of the cost of each ray by its meetings.
+    """Gradients of the cost of each ray with respect to its hits.
 
     Args:
-        begins, members, alpha, tau: of Meetings.
+        begins, members, alpha, tau: of RayHits.
         measured: [R] float64, range of each ray [m].
         directions: [bodies, R, 3] float32, unit, in the frame of each body.
         body_of: [N] int32, body of each Gaussian.

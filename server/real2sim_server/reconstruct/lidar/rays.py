@@ -1,4 +1,4 @@
-"""Recorded sweeps as rays: which way each was fired, from where and when."""
+"""Recorded sweeps as rays, and the beam table of a spinning sensor."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render.cast.call import transforms_at
 from ...scene import Beams, Detection, Lidar
+from ...scene.range_sensors import wrapped
+
+# Rays of recorded sweeps: origin, direction and time.
 
 FAR = 250.0
 """Recorded points beyond this are left out [m]."""
@@ -85,3 +88,181 @@ def _shift(origin: NDArray[np.float32]) -> Float:
     pose = np.eye(4)
     pose[:3, 3] = origin
     return pose
+
+
+# The beam table, estimated from raw scans.
+#
+# Scans of some data sets list one ring after the other, each from the same azimuth on. A drop in
+# azimuth starts a new ring. The sensor may be tilted on its vehicle: rays of a ring lie on a cone
+# about the sensor's axis, the direction of least scatter about the mean. The lasers leave the
+# sensor at different heights, so a ring is the line z = offset + slope rho.
+
+FALLS_BACK = np.pi
+"""A step back by more than this is the begin of a ring [rad]."""
+MIN_RING = 50
+"""Fewer points make no ring."""
+ROUNDS = 5
+"""Times that the farthest points of a ring are left aside and the rest is fitted again."""
+HEIGHT_STEP = 0.05
+"""Lasers whose heights differ by less leave the sensor together [m]."""
+MIN_STEP = 1e-4
+"""Of azimuth, smaller ones are no steps of a turning sensor [rad]."""
+NOT_ONE = np.radians(0.35)
+"""Elevations of a ring scatter less than this [rad], or the scan is not by rings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """A fitted beam table.
+
+    Attributes:
+        elevation: [B] of each ring, as the scan lists them [rad].
+        offset: [B] of each ring's origin above the sensor's [m].
+        residual: root mean square of the points' elevations about their rings' as seen from there
+            [rad], the farthest twentieth left aside.
+        ring: [R] int32, of each ray; -1 for those of no ring.
+        columns: azimuth steps of a turn.
+        clockwise: as seen from above.
+        T_vehicle_lidar: [4, 4], turned so that z is the axis.
+        azimuth, height: [R] of each ray about that axis, and of its ring [rad].
+    """
+
+    elevation: Float
+    offset: Float
+    residual: float
+    ring: NDArray[np.int32]
+    columns: int
+    clockwise: bool
+    T_vehicle_lidar: Float
+    azimuth: Float
+    height: Float
+
+    def beams(self, rays: RecordedRays) -> Beams:
+        """The grid of rings by columns, each column at the instant at which ``rays`` were there."""
+        slope, start = _turn(self.azimuth, rays.lidar.beams.time_us)
+        azimuth = wrapped(-np.pi + 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns)
+        order = np.argsort(wrapped(azimuth - start) * np.sign(slope), kind="stable")
+        azimuth = azimuth[order]
+        time_us = wrapped(azimuth - start) / slope
+        shape = (len(self.elevation), self.columns)
+        return Beams(
+            np.broadcast_to(azimuth, shape),
+            np.broadcast_to(self.elevation[:, None], shape),
+            np.broadcast_to(time_us, shape),
+        )
+
+    def missing(self, rays: RecordedRays) -> list[Lidar]:
+        """Rays of ``rays``' sweep that were fired and did not return.
+
+        A ring fires at even steps of azimuth, so that gaps between its returns tell how many were
+        lost there. One LiDAR for each height at which lasers leave the sensor.
+        """
+        heights = np.round(self.offset / HEIGHT_STEP).astype(int)
+        slope, start = _turn(self.azimuth, rays.lidar.beams.time_us)
+        found = []
+        for height in np.unique(heights):
+            rings = np.flatnonzero(heights == height)
+            lost = [_gaps(self.azimuth[self.ring == ring]) for ring in rings]
+            azimuth = wrapped(np.concatenate(lost))
+            if len(azimuth) == 0:
+                continue
+            pose = self.T_vehicle_lidar.copy()
+            pose[:3, 3] += pose[:3, 2] * self.offset[rings].mean()
+            elevation = np.repeat(self.elevation[rings], list(map(len, lost)))
+            beams = Beams(azimuth, elevation, wrapped(azimuth - start) / slope)
+            found.append(replace(rays.lidar, beams=beams, T_vehicle_lidar=pose))
+        return found
+
+
+def _gaps(azimuth: Float) -> Float:
+    """Azimuths between those of a ring, in the order in which it fired them, at its even steps."""
+    turned = np.unwrap(azimuth)
+    closed = np.append(turned, turned[0] + 2 * np.pi * np.sign(turned[-1] - turned[0]))
+    away = np.diff(closed)
+    step = np.median(np.abs(away))
+    step = np.median(np.abs(away)[np.abs(away) < 1.5 * step])
+    if not step > MIN_STEP:
+        return np.zeros(0)
+    lost = np.maximum(np.rint(np.abs(away) / step).astype(int) - 1, 0)
+    count = np.arange(lost.sum()) - np.repeat(np.cumsum(lost) - lost, lost)
+    share = (count + 1) / np.repeat(lost + 1, lost)
+    between: Float = np.repeat(turned, lost) + share * np.repeat(away, lost)
+    return between
+
+
+def fit_rings(rays: RecordedRays) -> Rings | None:
+    """The rings of a sweep whose rays are in the order of the scan; None where it has none."""
+    # Rings run from ahead to ahead: seen from behind there is one fall back for each.
+    turned = rays.lidar.beams.azimuth % (2 * np.pi)
+    step = np.diff(turned)
+    rises = np.median(step) > 0
+    begins = np.flatnonzero((-step if rises else step) > FALLS_BACK) + 1
+    ring = np.zeros(len(turned), np.int32)
+    ring[begins] = 1
+    ring = np.cumsum(ring).astype(np.int32)
+    counts = np.bincount(ring)
+    kept = np.flatnonzero(counts >= MIN_RING)
+    if len(kept) < 2:
+        return None
+    number = np.full(len(counts), -1, np.int32)
+    number[kept] = np.arange(len(kept))
+    ring = number[ring]
+    turn = _upright(rays.lidar.beams.directions, ring)
+    local = rays.lidar.beams.directions @ turn
+    azimuth = np.arctan2(local[:, 1], local[:, 0])
+    slope_of, offset, off = _cones(local * rays.range[:, None], ring)
+    middle = np.arctan(slope_of)
+    elevation = np.where(ring >= 0, middle[ring], np.arcsin(np.clip(local[:, 2], -1, 1)))
+    residual = float(np.sqrt(np.mean(np.square(off))))
+    if residual > NOT_ONE:
+        return None
+    width = float(np.median(np.abs(step[np.abs(step) < 0.1])))
+    columns = int(np.clip(round(2 * np.pi / max(width, 1e-4)), 1, MAX_RAYS // len(kept)))
+    slope, _ = _turn(azimuth, rays.lidar.beams.time_us)
+    pose = rays.lidar.T_vehicle_lidar.copy()
+    pose[:3, :3] = pose[:3, :3] @ turn
+    return Rings(middle, offset, residual, ring, columns, slope < 0, pose, azimuth, elevation)
+
+
+def _cones(points: Float, ring: NDArray[np.int32]) -> tuple[Float, Float, Float]:
+    """Slope and offset [B] of each ring, and how far [rad] its points are off, without the
+    farthest twentieth."""
+    rho = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-3)
+    count = int(ring.max()) + 1
+    slopes, offsets, off = np.zeros(count), np.zeros(count), []
+    for index in range(count):
+        own = np.flatnonzero(ring == index)
+        far, rise = 1 / rho[own], points[own, 2] / rho[own]
+        kept = np.ones(len(own), np.bool_)
+        for _ in range(ROUNDS):
+            table = np.stack([np.ones(int(kept.sum())), far[kept]], axis=1)
+            (slope, offset), *_ = np.linalg.lstsq(table, rise[kept], rcond=None)
+            error = np.abs(rise - slope - offset * far)
+            kept = error <= np.quantile(error, 0.95)
+        slopes[index], offsets[index] = slope, offset
+        off.append((rise - slope - offset * far)[kept] / (1 + slope**2))
+    return slopes, offsets, np.concatenate(off)
+
+
+def _upright(directions: Float, ring: NDArray[np.int32]) -> Float:
+    """Turn [3, 3] whose columns are the sensor's axes, the last one that of the cones."""
+    scatter = np.zeros((3, 3))
+    for index in range(int(ring.max()) + 1):
+        own = directions[ring == index]
+        away = own - own.mean(0)
+        scatter += away.T @ away
+    axis = np.linalg.eigh(scatter)[1][:, 0]
+    axis = axis if axis[2] > 0 else -axis
+    ahead = np.array([1.0, 0, 0]) - axis[0] * axis
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([ahead, np.cross(axis, ahead), axis], axis=1)
+
+
+def _turn(azimuth: Float, time_us: Float) -> tuple[float, float]:
+    """Speed [rad/us] at which a sweep turns, and where it looks at its time stamp [rad]."""
+    near = np.abs(time_us) < np.abs(time_us).max() / 4
+    start = float(np.angle(np.exp(1j * azimuth[np.abs(time_us) < 2000]).mean()))
+    away = wrapped(azimuth[near] - start)
+    moments = time_us[near]
+    slope = float((away * moments).sum() / max(np.square(moments).sum(), 1e-9))
+    return slope if abs(slope) > 1e-9 else -2 * np.pi / 1e5, start

@@ -1,10 +1,4 @@
-"""How much of a beam each Gaussian sends back, from the intensities that sweeps recorded.
-
-A recorded intensity is what the surfaces along a ray send back, by the light that each stops, times
-what the sensor makes of it. Surfaces are taken as reflecting partly alike in all directions and
-partly with the cosine of incidence; the share is one number for a scene. Lasers of one sensor
-answer differently, and that with the range: each ring has a gain and an offset of its own by range.
-"""
+"""Reflectivity of each Gaussian and loss of beams, fitted to recorded intensities."""
 
 from __future__ import annotations
 
@@ -19,9 +13,14 @@ from ...logs import DrivingLog
 from ...render.cast.call import facing_of_request
 from ...scene import Scene
 from ...scene.lidar_surfaces import MAX_REFLECTIVITY, RANGE_STEPS, RingResponse
-from .gaussians import SurfaceTable
-from .learn import SeenSweep
-from .meetings import meet, part_of
+from .learn import SeenSweep, SurfaceTable, part_of, trace
+
+# Reflectivity from recorded intensities.
+#
+# A recorded intensity is the light that the surfaces along a ray return, weighted by the share
+# that each stops, times the sensor's response. Surfaces reflect partly diffusely in all directions
+# and partly with the cosine of incidence; the share is one number for a scene. Lasers of one
+# sensor respond differently, depending on range: each ring has its own gain and offset by range.
 
 RAYS = 60_000
 """Of each sweep, evenly spread."""
@@ -100,11 +99,11 @@ def light_of(
         every.append(max(1, -(-len(rays.range) // RAYS)))
         chosen = np.arange(0, len(rays.range), every[-1])
         lidar = part_of(rays.lidar, chosen)
-        met = meet(
+        met = trace(
             table, placed, log, frame=sweep.frame, lidar=lidar,
             reach=np.zeros(len(chosen), np.float32),
         )  # fmt: skip
-        found = met.meetings
+        found = met.hits
         row = np.zeros(len(chosen), np.int64)
         if len(rings) and len(sweep.elevations):
             row = RingResponse.rows(rings, sweep.elevations, sweep.ring[chosen])
@@ -166,7 +165,7 @@ def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
 def stopped_shares(
     alpha: NDArray[np.float32], begins: NDArray[np.int64], ray: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Share [M] of the light that a ray loses which it loses at each of its meetings."""
+    """Share [M] of a ray's lost light that it loses at each of its hits."""
     passed = np.log1p(-np.minimum(alpha, 0.9999).astype(np.float64))
     total = np.cumsum(passed)
     before = total - passed - np.concatenate([[0.0], total])[begins[:-1]][ray]
@@ -245,3 +244,74 @@ def _line(
     one, y = one + TRUST, y + TRUST * offset
     determinant = xx * one - x**2
     return (one * xy - x * y) / determinant, (xx * y - x * xy) / determinant
+
+
+# Beam loss: on glass, on dark or wet surfaces, and on mirrors.
+#
+# The loss probability of a Gaussian is learned from the rays that would stop there, returned or
+# not, where the rings of a scan reveal the fired rays.
+
+"""Light that the mean share of all counts for."""
+LOSS_ROUNDS = 8
+
+
+def fit_losses(
+    table: SurfaceTable,
+    scene: Scene,
+    log: DrivingLog,
+    sweeps: list[SeenSweep],
+    *,
+    lit: LitRays,
+    on_sweep: Callable[[int, int], None],
+) -> None:
+    """Fit the share of lost rays of each Gaussian, in place; none where no sweep tells.
+
+    Args:
+        lit: the rays of ``sweeps`` that returned.
+    """
+    returned = len(lit.intensity)
+    rays, members, shares = [lit.ray.astype(np.int64)], [lit.member], [lit.share]
+    placed, before = table.placed(scene), returned
+    for done, (sweep, every) in enumerate(zip(sweeps, lit.every, strict=True)):
+        for lidar in sweep.missing:
+            # As many as of those that returned, or shares would be wrong.
+            chosen = np.arange(0, lidar.beams.count, every)
+            met = trace(
+                table, placed, log, frame=sweep.frame, lidar=part_of(lidar, chosen),
+                reach=np.zeros(len(chosen), np.float32),
+            ).hits  # fmt: skip
+            ray = np.repeat(np.arange(len(chosen)), np.diff(met.begins))
+            share = stopped_shares(met.alpha, met.begins, ray)
+            kept = share > LITTLE
+            rays.append(ray[kept] + before)
+            members.append(met.members[kept])
+            shares.append(share[kept])
+            before += len(chosen)
+        on_sweep(done + 1, len(sweeps))
+    if before > returned:
+        table.attributes[:, 1] = _solved(
+            np.concatenate(rays),
+            np.concatenate(members),
+            np.concatenate(shares),
+            np.repeat([0.0, 1.0], [returned, before - returned]),
+            len(table),
+        )
+
+
+def _solved(
+    ray: NDArray[np.int64],
+    member: NDArray[np.int32],
+    share: NDArray[np.float32],
+    lost: NDArray[np.float64],
+    count: int,
+) -> NDArray[np.float32]:
+    """Shares of lost rays [N], 0 to 1, that explain which rays were lost, by least squares."""
+    light = np.bincount(member, share, count)
+    mean = float(lost.mean())
+    values = np.full(count, mean)
+    for _ in range(LOSS_ROUNDS):
+        off = lost - np.bincount(ray, share * values[member], len(lost))
+        pull = np.bincount(member, share * off[ray], count)
+        values = np.clip(values + (pull + PRIOR * (mean - values)) / (light + PRIOR), 0, 1)
+    values[light == 0] = 0
+    return values.astype(np.float32)

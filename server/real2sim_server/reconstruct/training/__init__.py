@@ -1,13 +1,11 @@
 """Training: from the scene of stage 0 to one that renders like the log."""
 
-from .boxes import smoothed_boxes, with_box_noise
 from .data import held_out_frames, training_log
 from .densify import DensifyOptions
-from .held_out import HeldOutScore, score_held_out
 from .losses import LossWeights
 from .model import SceneModel
-from .progress import OnTraining, TrainingProgress
-from .run import TrainResult, train
+from .records import OnTraining, TrainingProgress
+from .run import HeldOutScore, TrainResult, score_held_out, smoothed_boxes, train, with_box_noise
 from .schedule import PRESETS, LearningRates, TrainOptions, preset
 from .trainer import Trainer
 

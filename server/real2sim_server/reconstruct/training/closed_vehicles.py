@@ -22,14 +22,17 @@ from ...geometry.transform import Float, matrix_to_quaternion
 from ...scene import GaussianCloud, SceneObject
 from ...scene.cloud import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours
-from ..initialise.vehicle_light import light_on
-from ..initialise.vehicle_parts import palette_of
-from .directions import ViewingDirections, constant_colours, viewing_directions
+from ..initialise.vehicle_parts import light_on, palette_of
+from .densify import SelectiveAdam, rotation_matrices
 from .gaussians import FIELDS, OBJECT_FIELDS
 from .model import SceneModel
-from .operations import rotation_matrices
-from .optimizer import SelectiveAdam
-from .visibility import OfferedPriors, Viewpoint
+from .visibility import (
+    OfferedPriors,
+    ViewingDirections,
+    Viewpoint,
+    constant_colours,
+    viewing_directions,
+)
 
 ONE_DIRECTION = float(np.radians(5))
 """Root mean square angle between viewing directions up to which they count as one."""
@@ -118,7 +121,7 @@ def body_cloud(
 
     Args:
         item: of stage 0.
-        light: slopes [3] in its frame, see :func:`.vehicle_light.fit_light`.
+        light: slopes [3] in its frame, see :func:`.vehicle_parts.fit_light`.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
     shown = constant_colours(item.cloud)

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from ...logs import DrivingLog, LidarSweep, log_of_frames
 from ...scene import Camera
-from ..logged_view import image_time, points_in_camera, resized
+from ..logged_view import image_time, points_in_camera, resized, sky_mask
 from ..options import ReconstructError
-from ..sky_mask import sky_mask
 from .schedule import TrainOptions
 
 NEAR, FAR = 0.5, 80.0

@@ -1,22 +1,327 @@
-"""Strategies of densification: when Gaussians are added and removed, and which.
-
-A strategy is called twice a step, as in gsplat: :meth:`Strategy.step_pre_backward` with what
-was drawn and :meth:`Strategy.step_post_backward` after the optimiser's step. What it does to the
-Gaussians are the functions of :mod:`.operations`.
-"""
+"""Densification: the sparse Adam optimiser, edits of the set of Gaussians, and the strategies."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ...render import RenderOutput, ScreenStatistics
 from ..options import ReconstructError
-from . import operations
-from .gaussians import Gaussians
-from .optimizer import SelectiveAdam
+from . import kernels
+from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
+
+# Sparse Adam: only rows with gradients are updated.
+
+EPSILON = 1e-15
+
+
+class SelectiveAdam:
+    """Adam (Kingma and Ba 2015) over named tensors whose first axis are rows.
+
+    Rows that were not seen keep value and moments, so that a Gaussian does not drift while it is
+    out of view; the bias of young moments is corrected by the number of steps of all.
+
+    Args:
+        parameters: by name, float32, updated in place.
+    """
+
+    def __init__(self, parameters: Mapping[str, Tensor]) -> None:
+        self.steps = 0
+        self.first = {name: torch.zeros_like(p) for name, p in parameters.items()}
+        self.second = {name: torch.zeros_like(p) for name, p in parameters.items()}
+
+    @torch.no_grad()
+    def step(
+        self,
+        parameters: Mapping[str, Tensor],
+        rates: Mapping[str, float | Tensor],
+        seen: Mapping[str, Tensor],
+    ) -> None:
+        """One step along the gradients held by ``parameters``.
+
+        Args:
+            parameters: those without a gradient are left alone.
+            rates: learning rate by name, one number or one for each column of a row.
+            seen: [rows] bool by name; all rows where a name is missing.
+        """
+        self.steps += 1
+        for name, parameter in parameters.items():
+            if parameter.grad is not None and parameter.numel():
+                self._update(name, parameter, parameter.grad, rates[name], seen.get(name))
+
+    def _update(
+        self,
+        name: str,
+        parameter: Tensor,
+        gradient: Tensor,
+        rate: float | Tensor,
+        seen: Tensor | None,
+    ) -> None:
+        rows = parameter.shape[0]
+        views = [
+            t.detach().reshape(rows, -1)
+            for t in (parameter, gradient, self.first[name], self.second[name])
+        ]
+        columns = torch.as_tensor(rate, dtype=torch.float32, device=parameter.device)
+        columns = columns.expand(views[0].shape[1]) / (1 - 0.9**self.steps)
+        correction = (1 - 0.999**self.steps) ** -0.5
+        if seen is None:
+            seen = torch.ones(rows, dtype=torch.bool, device=parameter.device)
+        if parameter.device.type != "cpu":
+            _update_plain(views, seen, columns, correction)
+            return
+        values, by_values, first, second = (view.numpy() for view in views)
+        kernels.adam_rows(
+            values,
+            by_values,
+            first,
+            second,
+            seen.numpy(),
+            columns.contiguous().numpy(),
+            np.float32(correction),
+            np.float32(EPSILON),
+        )
+
+    def gather(self, name: str, source: Tensor, fresh: Tensor) -> None:
+        """Follow a change of rows: new row i was row ``source[i]``; ``fresh`` rows start anew.
+
+        Args:
+            source: [M] int64.
+            fresh: [M] bool.
+        """
+        for moments in (self.first, self.second):
+            taken = moments[name][source].contiguous()
+            taken[fresh] = 0
+            moments[name] = taken
+
+    def reset_moments(self, name: str, rows: Tensor | None = None) -> None:
+        """Set moments to zero, of ``rows`` (mask or indices) or of all."""
+        for moments in (self.first, self.second):
+            moments[name][slice(None) if rows is None else rows] = 0
+
+    def state(self) -> dict[str, Tensor]:
+        """Moments by ``first.<name>`` and ``second.<name>``; the tensors themselves."""
+        return {f"first.{k}": v for k, v in self.first.items()} | {
+            f"second.{k}": v for k, v in self.second.items()
+        }
+
+    def restore(self, state: Mapping[str, Tensor], steps: int) -> None:
+        """Take over what :meth:`state` gave after ``steps`` steps; what it lacks begins."""
+        self.steps = steps
+        self.first = {k: state.get(f"first.{k}", held) for k, held in self.first.items()}
+        self.second = {k: state.get(f"second.{k}", held) for k, held in self.second.items()}
+
+
+def _update_plain(views: list[Tensor], seen: Tensor, columns: Tensor, correction: float) -> None:
+    values, gradient, first, second = views
+    # Chosen by where, not by index: an index of unknown length would be waited for.
+    rows = seen[:, None]
+    m = torch.where(rows, 0.9 * first + 0.1 * gradient, first)
+    v = torch.where(rows, 0.999 * second + 0.001 * gradient * gradient, second)
+    first.copy_(m)
+    second.copy_(v)
+    values.sub_(torch.where(rows, columns * m / (v.sqrt() * correction + EPSILON), 0.0))
+
+
+# Edits: duplicate, split, prune, relocate, reset.
+#
+# Every operation also updates the optimiser, so its moments stay with their rows. Rows stay sorted
+# by owner.
+
+SPLIT_SHRINK = 1.6
+"""By which the halves of a split Gaussian are smaller (Kerbl et al. 2023)."""
+RESET_OPACITY = 0.01
+MAX_COPIES = 51
+"""More copies of one Gaussian are shared out as if there were so many."""
+
+
+def step_generator(seed: int, iteration: int) -> np.random.Generator:
+    """Noise that depends on seed and iteration alone, so that a resumed run draws the same."""
+    return np.random.Generator(np.random.Philox(key=[seed, (1 << 40) + iteration]))
+
+
+@torch.no_grad()
+def refine(
+    gaussians: Gaussians,
+    optimizer: SelectiveAdam,
+    *,
+    duplicate: Tensor,
+    split: Tensor,
+    prune: Tensor,
+    rng: np.random.Generator,
+) -> Gaussians:
+    """Duplicate, split and prune at once (Kerbl et al. 2023); every tensor is gathered once.
+
+    Args:
+        duplicate: [N] bool, get a copy with moments of zero.
+        split: [N] bool, become two smaller ones, placed at random within the one.
+        prune: [N] bool, removed; none of them is in the others.
+        rng: places the halves.
+    """
+    kept = (~prune & ~split).nonzero()[:, 0]
+    copies, halves = duplicate.nonzero()[:, 0], split.nonzero()[:, 0].repeat(2)
+    source = torch.cat([kept, copies, halves])
+    place = torch.arange(len(source), device=source.device)
+    is_new, is_half = place >= len(kept), place >= len(kept) + len(copies)
+    order = torch.argsort(gaussians.owners[source], stable=True)
+    refined = select_rows(gaussians, optimizer, source[order], is_new[order])
+    _scatter(refined, is_half[order].nonzero()[:, 0], rng)
+    return refined
+
+
+def _scatter(gaussians: Gaussians, halves: Tensor, rng: np.random.Generator) -> None:
+    """Draw the places of ``halves`` from the Gaussians they came from, and shrink them."""
+    scales = gaussians.log_scales[halves].exp()
+    noise = rng.standard_normal((len(halves), 3), dtype=np.float32)
+    offset = torch.from_numpy(noise).to(scales.device) * scales
+    rotated = torch.einsum("nij,nj->ni", rotation_matrices(gaussians.quats[halves]), offset)
+    gaussians.means[halves] += rotated
+    gaussians.log_scales[halves] -= float(np.log(SPLIT_SHRINK))
+
+
+@torch.no_grad()
+def prune(gaussians: Gaussians, optimizer: SelectiveAdam, mask: Tensor) -> Gaussians:
+    """Without the Gaussians of ``mask`` [N] bool."""
+    kept = (~mask).nonzero()[:, 0]
+    return select_rows(gaussians, optimizer, kept, torch.zeros_like(kept, dtype=torch.bool))
+
+
+@torch.no_grad()
+def relocate(
+    gaussians: Gaussians,
+    optimizer: SelectiveAdam,
+    dead: Tensor,
+    *,
+    count: int,
+    min_opacity: float,
+    rng: np.random.Generator,
+) -> Gaussians:
+    """Replace dead Gaussians by copies of live ones, drawn by opacity (Kheradmand et al. 2024).
+
+    Copies look together like the one they were made from.
+
+    Args:
+        dead: [N] bool.
+        count: of Gaussians afterwards; never fewer than live ones.
+        min_opacity: of copies.
+        rng: draws which ones are copied.
+    """
+    live = (~dead).nonzero()[:, 0]
+    if len(live) == 0:
+        return gaussians
+    opacities = gaussians.logits.sigmoid()
+    drawn = sample_by_weight(opacities[live], max(0, count - len(live)), rng)
+    source = torch.cat([live, live[drawn]])
+    copies = torch.bincount(source, minlength=len(gaussians))
+    source = source[torch.argsort(gaussians.owners[source], stable=True)]
+    relocated = select_rows(gaussians, optimizer, source, copies[source] > 1)
+    copied = (copies[source] > 1).nonzero()[:, 0]
+    opacity, factor = compute_relocation(
+        relocated.logits[copied].sigmoid(), copies[source][copied], min_opacity
+    )
+    relocated.logits[copied] = torch.logit(opacity)
+    relocated.log_scales[copied] += factor.log()[:, None]
+    return relocated
+
+
+def sample_by_weight(weights: Tensor, count: int, rng: np.random.Generator) -> Tensor:
+    """``count`` indices [count] int64 drawn with probability proportional to ``weights`` [N]."""
+    sums = np.cumsum(weights.double().cpu().numpy())
+    chosen = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
+    return torch.from_numpy(np.minimum(chosen, len(sums) - 1)).to(weights.device)
+
+
+def compute_relocation(
+    opacities: Tensor, copies: Tensor, min_opacity: float
+) -> tuple[Tensor, Tensor]:
+    """Opacity [M] of each of ``copies`` [M] that look together like one, and factor on its size.
+
+    Kheradmand et al. 2024, eq. 9.
+    """
+    n = copies.clamp(max=MAX_COPIES)
+    opacities = opacities.clamp(max=1 - 1e-6).double()
+    each = 1 - (1 - opacities) ** (1 / n)
+    total = torch.zeros_like(each)
+    for i in range(1, int(n.max()) + 1 if len(n) else 1):
+        inner = torch.zeros_like(each)
+        for k in range(i):
+            inner += math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * each ** (k + 1)
+        total += torch.where(i <= n, inner, 0.0)
+    factor = opacities / total
+    return each.clamp(min_opacity, 1 - 1e-6).float(), factor.float()
+
+
+@torch.no_grad()
+def inject_noise(
+    gaussians: Gaussians,
+    *,
+    rate: float,
+    strength: float,
+    min_opacity: float,
+    rng: np.random.Generator,
+) -> None:
+    """Move the means by noise along each Gaussian's own shape, in place.
+
+    Kheradmand et al. 2024, eq. 8: the more transparent a Gaussian, the more it moves.
+
+    Args:
+        rate: learning rate of the means [m].
+        strength: of the noise, relative to that.
+        min_opacity: about which the noise ceases.
+    """
+    drawn = rng.standard_normal((len(gaussians), 3), dtype=np.float32)
+    noise = torch.from_numpy(drawn).to(gaussians.means.device)
+    opacity = gaussians.logits.sigmoid()
+    freedom = torch.sigmoid(-100 * (opacity - min_opacity))
+    rotations = rotation_matrices(gaussians.quats)
+    along = torch.einsum("nji,nj->ni", rotations, noise) * (2 * gaussians.log_scales).exp()
+    step = torch.einsum("nij,nj->ni", rotations, along)
+    gaussians.means.add_(step * (freedom * rate * strength)[:, None])
+
+
+@torch.no_grad()
+def reset_opacity(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
+    """Lower all opacities to RESET_OPACITY in place, so that only what is needed comes back."""
+    limit = float(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    gaussians.logits.clamp_(max=limit)
+    optimizer.reset_moments("logits")
+
+
+def select_rows(
+    gaussians: Gaussians, optimizer: SelectiveAdam, source: Tensor, fresh: Tensor
+) -> Gaussians:
+    """Rows ``source`` [M] (sorted by owner) of Gaussians and of all moments.
+
+    Args:
+        fresh: [M] bool, rows that start with moments of zero.
+    """
+    of_objects = source >= gaussians.counts[0]
+    for name in FIELDS:
+        fresh_rows = fresh[of_objects] if name in OBJECT_FIELDS else fresh
+        optimizer.gather(name, gaussians.rows(name, source), fresh_rows)
+    return gaussians.select(source)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """[N, 3, 3] of quaternions [N, 4] wxyz of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+# Strategies: when to add and remove which Gaussians.
+#
+# The trainer calls a strategy twice a step, as in gsplat: :meth:`Strategy.step_pre_backward` with
+# the render and :meth:`Strategy.step_post_backward` after the optimiser's step.
 
 BOX_MARGIN = 1.15
 """Objects' Gaussians may stick out of their boxes by this factor: mirrors, antennas, bad boxes."""
@@ -219,13 +524,13 @@ class GradientStrategy(Strategy):
         dead = self._dead(gaussians)
         growing = self._growing(gaussians, dead)
         large = gaussians.log_scales.amax(-1).exp() > self.options.split_scale
-        refined = operations.refine(
+        refined = refine(
             gaussians,
             optimizer,
             duplicate=growing & ~large,
             split=growing & large,
             prune=dead,
-            rng=operations.step_generator(self._seed, step.iteration),
+            rng=step_generator(self._seed, step.iteration),
         )
         self.initialize_state(len(refined))
         return refined
@@ -234,7 +539,7 @@ class GradientStrategy(Strategy):
         """Reset opacities every ``options.reset_every`` iterations."""
         every = self.options.reset_every
         if 0 < every <= iteration + 1 < self._last and (iteration + 1) % every == 0:
-            operations.reset_opacity(gaussians, optimizer)
+            reset_opacity(gaussians, optimizer)
 
     def _growing(self, gaussians: Gaussians, dead: Tensor) -> Tensor:
         """[N] bool: the strongest gradients above the threshold, as many as the budget allows."""
@@ -263,22 +568,22 @@ class McmcStrategy(Strategy):
         """Inject noise in every step; relocate and grow in rounds."""
         super().step_post_backward(gaussians, optimizer, step)
         options = self.options
-        operations.inject_noise(
+        inject_noise(
             gaussians,
             rate=step.means_rate,
             strength=options.noise,
             min_opacity=options.min_opacity,
-            rng=operations.step_generator(self._seed, step.iteration),
+            rng=step_generator(self._seed, step.iteration),
         )
         if not self._is_due(step.iteration):
             return gaussians
-        relocated = operations.relocate(
+        relocated = relocate(
             gaussians,
             optimizer,
             self._dead(gaussians),
             count=min(options.max_gaussians, round(len(gaussians) * (1 + options.growth))),
             min_opacity=options.min_opacity,
-            rng=operations.step_generator(self._seed, step.iteration),
+            rng=step_generator(self._seed, step.iteration),
         )
         self.initialize_state(len(relocated))
         return relocated

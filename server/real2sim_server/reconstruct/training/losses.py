@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from . import ssim_kernels
+from . import kernels
 
 FRAME_STEP = 0.1
 """Second differences are given as for frames so far apart [s]."""
@@ -104,14 +104,14 @@ def ssim(image: Tensor, truth: Tensor) -> float:
 
 def ssim_plain(image: Tensor, truth: Tensor) -> Tensor:
     """The same in plain torch, on any device, differentiable by torch; [H, W, 3]."""
-    window = torch.from_numpy(ssim_kernels.gaussian_window()).to(image)
+    window = torch.from_numpy(kernels.gaussian_window()).to(image)
     kernel = (window[:, None] * window)[None, None]
     x, y = (t.movedim(-1, 0)[:, None] for t in (image, truth))
     mx, my, xx, yy, xy = (
-        torch.nn.functional.conv2d(m, kernel, padding=ssim_kernels.REACH)
+        torch.nn.functional.conv2d(m, kernel, padding=kernels.REACH)
         for m in (x, y, x * x, y * y, x * y)
     )
-    c1, c2 = float(ssim_kernels.C1), float(ssim_kernels.C2)
+    c1, c2 = float(kernels.C1), float(kernels.C2)
     luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
     structure = (2 * (xy - mx * my) + c2) / (xx - mx * mx + yy - my * my + c2)
     return (luminance * structure).mean()
@@ -131,16 +131,16 @@ def _ssim_and_gradient(image: Tensor, truth: Tensor, *, scale: float) -> tuple[f
     height, width, _ = image.shape
     x = image.contiguous().numpy().reshape(height, 3 * width)
     y = truth.contiguous().numpy().reshape(height, 3 * width)
-    window = ssim_kernels.gaussian_window()
+    window = kernels.gaussian_window()
     blurred = np.empty((5, *x.shape), np.float32)
     slopes = np.empty((3, *x.shape), np.float32)
     sums = np.empty(height, np.float64)
     gradient = np.zeros_like(x)
-    ssim_kernels.blur_rows(x, y, window, blurred)
-    ssim_kernels.compare(blurred, window, sums, slopes)
+    kernels.blur_rows(x, y, window, blurred)
+    kernels.compare(blurred, window, sums, slopes)
     if scale != 0:
         factor = np.float32(scale / x.size)
-        ssim_kernels.gather_slopes(x, y, slopes, window, factor, gradient)
+        kernels.gather_slopes(x, y, slopes, window, factor, gradient)
     return float(sums.sum() / x.size), torch.from_numpy(gradient.reshape(height, width, 3))
 
 

@@ -1,32 +1,210 @@
-"""From a log to a trained scene: stage 0, training, and the score of what was held out."""
+"""From a log to a trained scene: initialisation, training, and the held-out score."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
-from ...logs import DrivingLog, check_log
+from ...geometry.transform import (
+    Float,
+    multiply_quaternions,
+    quaternion_to_matrix,
+    quaternion_yaw,
+    yaw_quaternion,
+)
+from ...logs import DrivingLog, ObjectTrack, check_log
 from ...logs.driving_log import SELECTION
 from ...render.backend import Backend
 from ...render.images import write_png
-from ...scene import Scene
+from ...scene import Scene, Trajectory
 from ...scene.io import load_scene, save_scene
 from ..initialise.stage0 import initialise_scene
-from ..options import ReconstructError
-from ..stages import OnProgress, Stages
-from .boxes import smoothed_boxes
+from ..logged_view import objects_mask
+from ..options import OnProgress, ReconstructError, Stages
+from . import losses
 from .data import TrainingViews, held_out_frames, training_log
-from .held_out import HeldOutScore, score_held_out
 from .model import SceneModel
-from .progress import OnTraining, TrainingProgress
+from .records import OnTraining, TrainingProgress
 from .schedule import TrainOptions
-from .threads import one_torch_thread
 from .trainer import CHECKPOINT, Trainer
+
+# Torch threads.
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Run small torch operations on the calling thread; compiled loops keep all cores.
+
+    A step has hundreds of operations of some microseconds each. Where another program wants the
+    cores as well, torch's threads wait for each other at every one of them: six times slower,
+    measured with two cores and three busy programs.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+# Box noise: added for tests, and smoothed away before initialisation.
+
+ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
+"""What vehicles usually do: standard deviations [m/s^2] and [rad/s^2]."""
+MIN_NOISE, MIN_YAW_NOISE = 0.02, 0.005
+"""Boxes that scatter less are left as they are [m], [rad]."""
+MIN_POSES = 5
+
+
+def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> DrivingLog:
+    """``log`` with boxes that scatter independently from frame to frame.
+
+    Args:
+        fraction: standard deviation of positions as a fraction of the box's length, width and
+            height along its own axes, and of headings [rad].
+    """
+    tracks = []
+    for index, track in enumerate(log.tracks):
+        rng = np.random.default_rng([seed, index])
+        given = track.trajectory
+        count = len(given.times_us)
+        shift = rng.standard_normal((count, 3)) * (fraction * np.array(track.size))
+        rotations = quaternion_to_matrix(given.quaternions)
+        tracks.append(
+            _with_poses(
+                track,
+                given.positions + np.einsum("tij,tj->ti", rotations, shift),
+                rng.standard_normal(count) * fraction,
+            )
+        )
+    return replace(log, tracks=tuple(tracks))
+
+
+def smoothed_boxes(log: DrivingLog) -> DrivingLog:
+    """``log`` with the scatter of its boxes taken out, as far as vehicles cannot move like that.
+
+    The variance of second differences shows how much boxes scatter; where that is more than
+    driving explains, positions and headings are smoothed with the weight that follows from both
+    (Whittaker 1923). Boxes that do not scatter stay as they are, to the bit.
+    """
+    return replace(log, tracks=tuple(_smoothed(track) for track in log.tracks))
+
+
+def _smoothed(track: ObjectTrack) -> ObjectTrack:
+    given = track.trajectory
+    if len(given.times_us) < MIN_POSES:
+        return track
+    step = float(np.median(np.diff(given.times_us))) * 1e-6
+    heading = np.unwrap(quaternion_yaw(given.quaternions))
+    smooth = _whittaker(given.positions, ACCELERATION * step**2, MIN_NOISE)
+    turned = _whittaker(heading[:, None], YAW_ACCELERATION * step**2, MIN_YAW_NOISE)[:, 0]
+    if smooth is given.positions and np.array_equal(turned, heading):
+        return track
+    return _with_poses(track, smooth, turned - heading)
+
+
+def _whittaker(values: Float, driving: float, least: float) -> Float:
+    """``values`` [T, D] smoothed; themselves where they scatter by less than ``least``.
+
+    Args:
+        driving: standard deviation of second differences without any scatter.
+    """
+    second = np.diff(values, n=2, axis=0)
+    # Robust against the few steps at which a driver brakes hard.
+    deviation = 1.4826 * np.median(np.abs(second), axis=0)
+    variance = max(0.0, float((deviation**2).mean()) - driving**2) / 6
+    if variance < least**2:
+        return values
+    difference: NDArray[np.float64] = np.diff(np.eye(len(values)), n=2, axis=0)
+    weight = variance / driving**2
+    system = np.eye(len(values)) + weight * difference.T @ difference
+    return np.asarray(np.linalg.solve(system, values))
+
+
+def _with_poses(track: ObjectTrack, positions: Float, yaws: Float) -> ObjectTrack:
+    given = track.trajectory
+    quaternions = multiply_quaternions(yaw_quaternion(yaws), given.quaternions)
+    return replace(track, trajectory=Trajectory(given.times_us, positions, quaternions))
+
+
+# Held-out score.
+
+MIN_PIXELS = 50
+"""Views in which moving objects cover fewer pixels do not count for them."""
+
+
+@dataclass(frozen=True)
+class HeldOutScore:
+    """Means over held-out views; nan where there are none.
+
+    Attributes:
+        psnr: over all pixels [dB].
+        ssim: mean structural similarity.
+        psnr_objects: over the projected boxes of moving objects [dB].
+        views: how many.
+    """
+
+    psnr: float
+    ssim: float
+    psnr_objects: float
+    views: int
+
+
+@torch.no_grad()
+def score_held_out(
+    model: SceneModel, log: DrivingLog, options: TrainOptions, *, limit: int | None = None
+) -> HeldOutScore:
+    """Compare the held-out images of ``log`` with what ``model`` shows.
+
+    Args:
+        limit: at most so many frames, evenly spread; all by default.
+
+    Raises:
+        LogError: an image cannot be read.
+    """
+    frames = held_out_frames(log.frame_count, options.hold_out)
+    if limit is not None and len(frames) > limit:
+        frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).round().astype(int)]
+    if not frames:
+        return HeldOutScore(float("nan"), float("nan"), float("nan"), 0)
+    views = TrainingViews(log, frames, options, device=model.device)
+    moving = [k for k, o in model.scene.objects.items() if o.trajectory.moves]
+    scores = []
+    for index in range(len(views)):
+        view = views.view(index)
+        image = model.render(view.camera, view.t_us).rgb.clamp(0, 1)
+        inside = objects_mask(model.scene, view.camera, view.t_us, only=moving)
+        mask = torch.from_numpy(inside).to(image.device)
+        scores.append(_score(image, view.image, mask))
+    views.close()
+    psnr, ssim, psnr_objects = np.array(scores).T
+    known = psnr_objects[~np.isnan(psnr_objects)]
+    return HeldOutScore(
+        psnr=float(psnr.mean()),
+        ssim=float(ssim.mean()),
+        psnr_objects=float(known.mean()) if len(known) else float("nan"),
+        views=len(views),
+    )
+
+
+def _score(image: Tensor, truth: Tensor, mask: Tensor) -> tuple[float, float, float]:
+    squared = (image - truth).square().mean(-1)
+    on_objects = float("nan")
+    if int(mask.sum()) >= MIN_PIXELS:
+        on_objects = losses.psnr_of(float(squared[mask].mean()))
+    return losses.psnr_of(float(squared.mean())), losses.ssim(image, truth), on_objects
+
+
+# The run.
 
 INITIAL = "initial.r2s"
 PREVIEWS = "previews"

@@ -20,24 +20,30 @@ from ..initialise.vehicle_body import scene_bodies
 from ..logged_view import image_time, objects_mask
 from ..options import ReconstructError
 from . import losses
-from .checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from .closed_vehicles import close_followed, offer_bodies
 from .data import TrainingView, TrainingViews, held_out_frames
-from .densify import STRATEGIES, ScreenSums, TrainingStep
-from .directions import (
+from .densify import STRATEGIES, ScreenSums, SelectiveAdam, TrainingStep, step_generator
+from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
+from .model import RenderedView, SceneModel
+from .records import (
+    Checkpoint,
+    MetricsFile,
+    OnTraining,
+    RateMeter,
+    RunningMeans,
+    StepTimer,
+    TrainingProgress,
+    read_checkpoint,
+    write_checkpoint,
+)
+from .schedule import TrainOptions, from_values, learning_rates_at
+from .visibility import (
+    OcclusionPruning,
     paint_unseen_sides,
     plain_lobes,
     unseen_sides,
     viewing_directions,
 )
-from .gaussians import FIELDS, OBJECT_FIELDS, Gaussians
-from .metrics import MetricsFile
-from .model import RenderedView, SceneModel
-from .operations import step_generator
-from .optimizer import SelectiveAdam
-from .progress import OnTraining, RateMeter, RunningMeans, StepTimer, TrainingProgress
-from .schedule import TrainOptions, from_values, learning_rates_at
-from .visibility import OcclusionPruning
 
 CONSTANT_SH = (-0.55 / SH_C0, 0.55 / SH_C0)
 """Range of the constant coefficients: colours from -0.05 to 1.05."""

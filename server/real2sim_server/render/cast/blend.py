@@ -355,7 +355,7 @@ def write_rays(rays, state, out, owners, several):
 
 
 @kernel(parallel=PARALLEL_LOOPS)
-def list_meetings(
+def list_hits(
     values, lists, starts, layout, motions, origins, limits, firsts, reach, begins, members, shares
 ):
     """Count the Gaussians that rays meet, or list them from near to far.
@@ -367,7 +367,7 @@ def list_meetings(
         firsts: [bodies] int64, number of the first Gaussian of each.
         reach: [R] float32.
         begins: [R] int64; where ``members`` is empty counts are written here, else it holds where
-            each ray's meetings begin.
+            each ray's hits begin.
         members: [M] int32, written: numbers of Gaussians.
         shares: [M, 2] float32, written: the part of arriving light that is stopped, and where [m].
     """

@@ -11,7 +11,7 @@ from ...geometry.transform import Float, invert_transform
 from .._cpu.blend import sort_records, tile_starts
 from .._cpu.drawing import NO_COVARS, Workspace, array_of, arrays_of, timed
 from .._cpu.records import CHUNK, Records
-from .blend import follow_rays, list_meetings
+from .blend import follow_rays, list_hits
 from .layout import (
     RECORD,
     TILE_CHUNKS,
@@ -24,7 +24,7 @@ from .layout import (
     scatter_rays,
 )
 from .prepare import prepare_body
-from .types import CastRequest, Echo, Meetings, Motion, Return, motions_of
+from .types import CastRequest, Echo, Motion, RayHits, Return, motions_of
 
 NO_ATTRIBUTES = np.zeros((0, 2), np.float32)
 VALUES = 5
@@ -57,9 +57,9 @@ class CpuCaster:
                 lights = _follow(request, motions, records, lists, starts, layout)
         return echo_of(request, lights, timing)
 
-    def meetings(self, request: CastRequest, reach: NDArray[np.float32]) -> Meetings:
-        """What the rays of a request meet, each up to its ``reach`` [R] [m], or where that is 0
-        until its light has gone."""
+    def trace(self, request: CastRequest, reach: NDArray[np.float32]) -> RayHits:
+        """Hits of the rays of a request, each up to its ``reach`` [R] [m], or where that is 0
+        until its light is gone."""
         with self._lock:
             records, regions, motions = self._prepare(request)
             layout = layout_of(request.lidar.beams)
@@ -83,13 +83,13 @@ class CpuCaster:
                 (np.cumsum(counts) - counts).astype(np.int64),
                 np.ascontiguousarray(reach, dtype=np.float32),
             )
-            list_meetings(*given, begins, none, no_shares)
+            list_hits(*given, begins, none, no_shares)
             begins = np.cumsum(begins) - begins
             members = np.empty(max(1, int(begins[-1])), np.int32)
             shares = np.empty((len(members), 2), np.float32)
-            list_meetings(*given, begins, members, shares)
+            list_hits(*given, begins, members, shares)
         found = int(begins[-1])
-        return Meetings(begins, members[:found], shares[:found, 0], shares[:found, 1])
+        return RayHits(begins, members[:found], shares[:found, 0], shares[:found, 1])
 
     def _prepare(self, request: CastRequest) -> tuple[Records, int, Motion]:
         chunks = [-(-len(instance.cloud) // CHUNK) for instance in request.instances]

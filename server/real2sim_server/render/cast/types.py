@@ -92,11 +92,11 @@ class Echo:
 
 
 @dataclass(frozen=True, eq=False)
-class Meetings:
-    """Which Gaussians rays meet, from near to far.
+class RayHits:
+    """Gaussians hit by rays, from near to far.
 
     Attributes:
-        begins: [R + 1] int64, where the meetings of each ray begin among all M.
+        begins: [R + 1] int64, where the hits of each ray begin among all M.
         members: [M] int32, numbers of the Gaussians, counted over all instances in their order.
         alpha: [M] float32, share of the arriving light that is stopped.
         tau: [M] float32, where [m].

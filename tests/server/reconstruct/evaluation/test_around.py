@@ -7,7 +7,7 @@ import pytest
 
 from real2sim_server.geometry.transform import invert_transform
 from real2sim_server.reconstruct import InitialiseOptions, initialise_scene
-from real2sim_server.reconstruct.evaluation.around import (
+from real2sim_server.reconstruct.evaluation.images import (
     HEIGHT,
     WIDTH,
     evaluate_around,

@@ -7,7 +7,7 @@ import pytest
 
 from real2sim_server.logs import ObjectTrack
 from real2sim_server.reconstruct import InitialiseOptions, initialise_scene
-from real2sim_server.reconstruct.evaluation.lane_band import (
+from real2sim_server.reconstruct.evaluation.shifted import (
     evaluate_lane_band,
     projected_road,
     road_colours,

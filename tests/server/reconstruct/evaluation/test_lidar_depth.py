@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.reconstruct.evaluation.lidar_depth import (
+from real2sim_server.reconstruct.evaluation.lidar import (
     depth_errors,
     error_p90,
     median_error,

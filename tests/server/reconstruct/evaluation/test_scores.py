@@ -14,11 +14,10 @@ from real2sim_server.cli import app
 from real2sim_server.logs import open_log, write_native_log
 from real2sim_server.reconstruct import InitialiseOptions, ReconstructError, initialise_scene
 from real2sim_server.reconstruct.evaluation import EvaluateOptions, evaluate_scene
-from real2sim_server.reconstruct.evaluation.box_error import box_error
-from real2sim_server.reconstruct.evaluation.scores import logged_mask
-from real2sim_server.reconstruct.evaluation.selection import select_frames
+from real2sim_server.reconstruct.evaluation.images import find_truth
+from real2sim_server.reconstruct.evaluation.rendering import select_frames
+from real2sim_server.reconstruct.evaluation.scores import box_error, logged_mask
 from real2sim_server.reconstruct.evaluation.shifted import evaluate_shifts, true_view
-from real2sim_server.reconstruct.evaluation.truth import find_truth
 from real2sim_server.scene.io import load_scene, save_scene
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 

@@ -14,11 +14,11 @@ from real2sim_server.logs import write_native_log
 from real2sim_server.reconstruct import InitialiseOptions, ReconstructError, initialise_scene
 from real2sim_server.reconstruct.evaluation.uncertainty import (
     evaluate_uncertainty,
+    fit_uncertainties,
     rank_correlation,
     sparsification,
 )
 from real2sim_server.reconstruct.training import training_log
-from real2sim_server.reconstruct.uncertainty import fit_uncertainties
 from real2sim_server.scene import UNSEEN
 from real2sim_server.scene.io import load_scene, save_scene
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from real2sim_server.reconstruct.initialise.ground import spread_ground
+from real2sim_server.reconstruct.initialise.surfels import spread_ground
 from real2sim_server.scene.ground_fit import BoxBottoms, DrivenPath, GroundFit, fit_ground
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from real2sim_server.reconstruct.initialise.points import PointSet, thin, thin_to, voxel_levels
+from real2sim_server.reconstruct.initialise.accumulate import PointSet, thin, thin_to, voxel_levels
 
 
 def cloud_of(seed: int, count: int) -> PointSet:

@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.reconstruct.initialise.sky_map import SkySamples
-from real2sim_server.reconstruct.initialise.views import ProjectedView
+from real2sim_server.reconstruct.initialise.views import ProjectedView, SkySamples
 from real2sim_server.scene import Camera
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
 

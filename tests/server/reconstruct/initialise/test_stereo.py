@@ -7,7 +7,7 @@ import pytest
 
 from real2sim_server.logs import DrivingLog
 from real2sim_server.reconstruct import InitialiseOptions, ReconstructError, initialise_scene
-from real2sim_server.reconstruct.initialise.stereo import sweep_planes
+from real2sim_server.reconstruct.initialise.triangulate import sweep_planes
 
 from ..conftest import sweep_of
 from .test_triangulate import BOX_X, FRAMES, WALL_X, textured_log

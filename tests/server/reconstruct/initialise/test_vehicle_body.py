@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from real2sim_server.reconstruct.initialise.points import PointSet
+from real2sim_server.reconstruct.initialise.accumulate import PointSet
 from real2sim_server.reconstruct.initialise.vehicle_body import body_colours, faced, fitted_body
 from real2sim_server.reconstruct.initialise.vehicle_parts import Part, usual_palette, wheel_parts
 from real2sim_server.synthetic.vehicles import SHAPES
@@ -122,7 +122,7 @@ def test_other_categories_and_odd_boxes_have_no_body():
 
 
 def test_a_body_fills_where_nothing_was_measured():
-    from real2sim_server.reconstruct.initialise.object_shape import complete_body
+    from real2sim_server.reconstruct.initialise.vehicle_body import complete_body
 
     body = fitted_body(np.zeros((0, 3), np.float32), SALOON, "car")
     tail = body.points[body.points[:, 0] < -2.2]

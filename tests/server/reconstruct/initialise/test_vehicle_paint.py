@@ -6,21 +6,22 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
-from real2sim_server.reconstruct.initialise.vehicle_light import (
+from real2sim_server.reconstruct.initialise.vehicle_body import (
+    VehicleSurface,
+    fill_vehicles,
+    fitted_body,
+)
+from real2sim_server.reconstruct.initialise.vehicle_parts import (
     FROM_ABOVE,
+    PARTS,
+    Part,
     brightness,
     fit_light,
     light_on,
-)
-from real2sim_server.reconstruct.initialise.vehicle_light import LIGHT as LIGHT_KEY
-from real2sim_server.reconstruct.initialise.vehicle_paint import VehicleSurface, fill_vehicles
-from real2sim_server.reconstruct.initialise.vehicle_parts import (
-    PARTS,
-    Part,
     palette_of,
     usual_palette,
 )
+from real2sim_server.reconstruct.initialise.vehicle_parts import LIGHT as LIGHT_KEY
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
 
 SALOON = (4.7, 1.82, 1.46)

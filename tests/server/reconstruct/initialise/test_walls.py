@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from real2sim_server.reconstruct.initialise.surfels import fit_surfels
-from real2sim_server.reconstruct.initialise.walls import (
+from real2sim_server.reconstruct.initialise.accumulate import (
     HEIGHT,
     ScanLimit,
     continue_walls,
     real_walls,
 )
+from real2sim_server.reconstruct.initialise.surfels import fit_surfels
 
 LIMIT = ScanLimit(path=np.zeros((1, 3)), height=1.8, slope=0.05)
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from real2sim_server.logs import LidarSweep
 from real2sim_server.logs.driving_log import FrameSource
-from real2sim_server.reconstruct.evaluation.sweeps import evaluate_sweeps, synthetic_lidar
+from real2sim_server.reconstruct.evaluation.lidar import evaluate_sweeps, synthetic_lidar
 from real2sim_server.reconstruct.initialise.stage0 import initialise_scene
 from real2sim_server.reconstruct.lidar import RecordedRays, fit_lidar_surfaces, recorded_rays
-from real2sim_server.reconstruct.lidar.rings import fit_rings
+from real2sim_server.reconstruct.lidar.rays import fit_rings
 from real2sim_server.reconstruct.options import InitialiseOptions, ReconstructError
 from real2sim_server.scene import Beams, GaussianCloud, Lidar, Scene
 from real2sim_server.scene.range_sensors import wrapped

@@ -14,7 +14,7 @@ from real2sim_server.reconstruct.training import (
     TrainOptions,
     training_log,
 )
-from real2sim_server.reconstruct.training.direction_options import DirectionOptions
+from real2sim_server.reconstruct.training.schedule import DirectionOptions
 from real2sim_server.scene import Scene
 from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from real2sim_server.reconstruct.training.activation import Activated, activated, activated_plain
+from real2sim_server.reconstruct.training.gaussians import Activated, activated, activated_plain
 
 COUNTS = (3000, 0, 40, 2200)
 FUNCTIONS, HARMONICS = 9, 4

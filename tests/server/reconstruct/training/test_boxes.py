@@ -13,7 +13,7 @@ from real2sim_server.reconstruct.training import (
     smoothed_boxes,
     with_box_noise,
 )
-from real2sim_server.reconstruct.training.threads import one_torch_thread
+from real2sim_server.reconstruct.training.run import one_torch_thread
 from real2sim_server.scene import Scene, SceneObject, Trajectory
 
 from .conftest import TINY

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from real2sim_server.reconstruct import ReconstructError
-from real2sim_server.reconstruct.training.checkpoint import (
+from real2sim_server.reconstruct.training.records import (
     STATE_FILE,
     TENSOR_FILE,
     Checkpoint,

@@ -14,7 +14,7 @@ from real2sim_server.reconstruct.training.closed_vehicles import (
     close_followed,
     offer_bodies,
 )
-from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
+from real2sim_server.reconstruct.training.densify import SelectiveAdam
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
 from real2sim_server.scene.cloud import SH_C0
 

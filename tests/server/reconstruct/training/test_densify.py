@@ -12,12 +12,13 @@ from real2sim_server.reconstruct.training.densify import (
     STRATEGIES,
     DensifyOptions,
     ScreenSums,
+    SelectiveAdam,
     Strategy,
     TrainingStep,
+    compute_relocation,
+    rotation_matrices,
 )
 from real2sim_server.reconstruct.training.gaussians import FIELDS, Gaussians, leaf
-from real2sim_server.reconstruct.training.operations import compute_relocation, rotation_matrices
-from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.render import ScreenStatistics
 
 COUNTS = (30, 10, 8)

@@ -9,7 +9,7 @@ import torch
 
 from real2sim_server.reconstruct.initialise.vehicle_body import fitted_body
 from real2sim_server.reconstruct.training import SceneModel
-from real2sim_server.reconstruct.training.directions import (
+from real2sim_server.reconstruct.training.visibility import (
     ViewingDirections,
     paint_unseen_sides,
     plain_lobes,

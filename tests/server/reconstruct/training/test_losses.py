@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from real2sim_server.reconstruct.training import losses
-from real2sim_server.reconstruct.training.ssim_kernels import gaussian_window
+from real2sim_server.reconstruct.training.kernels import gaussian_window
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
+from real2sim_server.reconstruct.training.densify import SelectiveAdam
 
 
 def gradients(step: int) -> torch.Tensor:

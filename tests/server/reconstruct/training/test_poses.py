@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.reconstruct.training.poses import ObjectPoses
+from real2sim_server.reconstruct.training.model import ObjectPoses
 from real2sim_server.scene import Scene
 
 

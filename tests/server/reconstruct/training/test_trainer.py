@@ -18,11 +18,10 @@ from real2sim_server.reconstruct.training import (
     score_held_out,
 )
 from real2sim_server.reconstruct.training.data import TrainingViews
-from real2sim_server.reconstruct.training.direction_options import DirectionOptions
 from real2sim_server.reconstruct.training.gaussians import mirror
 from real2sim_server.reconstruct.training.losses import psnr_of
-from real2sim_server.reconstruct.training.schedule import PRESETS
-from real2sim_server.reconstruct.training.threads import one_torch_thread
+from real2sim_server.reconstruct.training.run import one_torch_thread
+from real2sim_server.reconstruct.training.schedule import PRESETS, DirectionOptions
 from real2sim_server.render import RasterOptions, rasterize
 from real2sim_server.render.images import to_display, to_light
 from real2sim_server.scene import Scene

@@ -8,9 +8,12 @@ import pytest
 import torch
 
 from real2sim_server.reconstruct.training import SceneModel, Trainer
-from real2sim_server.reconstruct.training.densify import DensifyOptions, VisibilityLimits
+from real2sim_server.reconstruct.training.densify import (
+    DensifyOptions,
+    SelectiveAdam,
+    VisibilityLimits,
+)
 from real2sim_server.reconstruct.training.gaussians import Gaussians, concatenate
-from real2sim_server.reconstruct.training.optimizer import SelectiveAdam
 from real2sim_server.reconstruct.training.visibility import (
     GaussianVisibility,
     OfferedPriors,

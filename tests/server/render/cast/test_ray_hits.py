@@ -27,14 +27,14 @@ def sheets(centres: list[list[float]], opacity: float) -> GaussianCloud:
     )
 
 
-def test_meetings_make_up_the_echo() -> None:
+def test_ray_hits_make_up_the_echo() -> None:
     bodies = [
         Instance(sheets([[5.0, 0, 0], [20.0, 1, 0]], 0.4)),
         Instance(sheets([[9.0, 0, 0]], 0.7)),
     ]
     request = checked_request(bodies, LIDAR, np.eye(4))
     echo = CpuCaster().cast(request)
-    found = CpuCaster().meetings(request, np.zeros(40, np.float32))
+    found = CpuCaster().trace(request, np.zeros(40, np.float32))
     assert set(found.members.tolist()) == {0, 1, 2}
     for ray in range(40):
         own = slice(found.begins[ray], found.begins[ray + 1])
@@ -48,7 +48,7 @@ def test_rays_are_followed_up_to_their_reach() -> None:
     # What is opaque before it hides nothing: what lies behind may have to become opaque.
     body = Instance(sheets([[5.0, 0, 0], [9.0, 0, 0], [20.0, 0, 0]], 0.99))
     request = checked_request([body], LIDAR, np.eye(4))
-    found = CpuCaster().meetings(request, np.full(40, 12.0, np.float32))
+    found = CpuCaster().trace(request, np.full(40, 12.0, np.float32))
     assert set(found.members.tolist()) == {0, 1}
     assert (np.diff(found.begins) == 2).all()
 

@@ -1,4 +1,4 @@
-"""LiDAR sweeps cast through a scene against what was there."""
+"""Depth, coverage and cast sweeps of a scene against the LiDAR of its log."""
 
 from __future__ import annotations
 
@@ -9,16 +9,227 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float
+from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render.cast import Echo, recorded_sweep
 from ...render.cast.sensors import drop_probability
-from ...scene import Beams, Lidar, Scene
+from ...scene import Beams, Camera, Lidar, Scene
 from ...synthetic import SyntheticConfig
 from ...synthetic.log import LIDAR_ELEVATION, LIDAR_POSITION, SyntheticLog
 from ..lidar import RecordedRays, recorded_rays
-from ..lidar.rings import fit_rings
-from .truth import find_truth
+from ..lidar.rays import fit_rings
+from ..logged_view import resized
+from ..options import ReconstructError
+from .images import find_truth, psnr
+from .rendering import render_logged_view
+
+# Rendered depth against the LiDAR.
+
+NEAR, FAR = 0.5, 80.0
+"""Points at other depths are not compared [m]."""
+HIDDEN_BEHIND = 0.3
+"""What lies so much nearer hides a point, unless the road alone recedes as quickly [m]."""
+REACH = 0.006
+"""Radius on the image within which an occluder is searched [rad]; about two beams apart."""
+ROAD_BELOW = 1.2
+"""The road is at least so far below the cameras [m]."""
+
+
+def seen_points(
+    points: Float, camera: Camera
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Rows [M], columns [M] and depths [M] [m] of the points that the camera can see.
+
+    The LiDAR stands elsewhere than the camera and looks over things that hide what is behind
+    them. A point counts as hidden when any point within REACH of it on the image is nearer by
+    more than HIDDEN_BEHIND plus what a road ROAD_BELOW the camera recedes over that distance,
+    z^2 angle / height, so that far stretches of road are compared too.
+
+    Args:
+        points: [N, 3] in the camera frame [m].
+        camera: gives size and K.
+    """
+    import cv2
+
+    points = points[(points[:, 2] > NEAR) & (points[:, 2] < FAR)]
+    depth = points[:, 2]
+    column = np.floor(camera.K[0, 0] * points[:, 0] / depth + camera.K[0, 2]).astype(np.int64)
+    row = np.floor(camera.K[1, 1] * points[:, 1] / depth + camera.K[1, 2]).astype(np.int64)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    row, column, depth = row[inside], column[inside], depth[inside]
+    nearest = np.full((camera.height, camera.width), FAR, dtype=np.float64)
+    np.minimum.at(nearest, (row, column), depth)
+    focal = camera.K[0, 0]
+    reach = max(1, round(REACH * focal))
+    # The default border is the largest finite number, which hides nothing.
+    nearest = np.asarray(cv2.erode(nearest, np.ones((2 * reach + 1,) * 2, np.uint8)))
+    # One pixel more, as points are rounded to pixels.
+    recedes = depth**2 * (reach + 1) / (focal * ROAD_BELOW)
+    seen = depth - nearest[row, column] <= HIDDEN_BEHIND + recedes
+    return row[seen], column[seen], depth[seen]
+
+
+def depth_errors(depth: NDArray[np.float32], points: Float, camera: Camera) -> NDArray[np.float64]:
+    """Absolute errors [M] [m] of a rendered depth image at the points the camera can see.
+
+    Infinite where nothing was rendered, so that holes count and a median stays honest.
+
+    Args:
+        depth: [H, W] along the camera's z [m], 0 where nothing is.
+        points: [N, 3] in the camera frame [m].
+        camera: of the image.
+    """
+    row, column, expected = seen_points(points, camera)
+    rendered = depth[row, column].astype(np.float64)
+    return np.where(rendered > 0, np.abs(rendered - expected), np.inf)
+
+
+def median_error(errors: NDArray[np.float64]) -> float:
+    """Median [m]; nan for no points, infinite where most are holes."""
+    # The mean of a finite and an infinite middle value is infinite, as it should be.
+    return float(np.median(errors)) if len(errors) else float("nan")
+
+
+def mean_error(errors: NDArray[np.float64]) -> float:
+    """Mean over the points that are no holes [m]; nan where there are none.
+
+    What a median hides shows here: surfaces that are haze have long tails.
+    """
+    finite = errors[np.isfinite(errors)]
+    return float(finite.mean()) if len(finite) else float("nan")
+
+
+def error_p90(errors: NDArray[np.float64]) -> float:
+    """90th percentile [m]: the smallest error that nine of ten do not exceed.
+
+    Nan for no points, infinite where more than a tenth are holes.
+    """
+    if len(errors) == 0:
+        return float("nan")
+    # Between a finite and an infinite value there is nothing to interpolate.
+    return float(np.percentile(errors, 90, method="inverted_cdf"))
+
+
+# PSNR of logged views, over all pixels and over those that the LiDAR covers (for the
+# reconstruction report; :mod:`.scores` holds the full evaluation).
+
+COVERAGE_NEAR = 0.5
+"""LiDAR points nearer to the camera plane do not count as covering [m]."""
+
+
+@dataclass(frozen=True)
+class CoverageScore:
+    """One rendered view against its logged image.
+
+    Attributes:
+        camera, frame: which view.
+        psnr: over all pixels [dB].
+        psnr_lidar: over the pixels that LiDAR covers [dB]; nan where there are none.
+        lidar_fraction: fraction of pixels that LiDAR covers, 0 to 1.
+    """
+
+    camera: str
+    frame: int
+    psnr: float
+    psnr_lidar: float
+    lidar_fraction: float
+
+
+@dataclass(frozen=True)
+class CoverageReport:
+    """Scores of several views.
+
+    Attributes:
+        views: one score each, camera by camera within a frame.
+        psnr, psnr_lidar: means of the views' values [dB].
+    """
+
+    views: tuple[CoverageScore, ...]
+    psnr: float
+    psnr_lidar: float
+
+
+def evaluate_views(
+    scene: Scene,
+    log: DrivingLog,
+    *,
+    frames: Sequence[int],
+    cameras: Sequence[str] | None = None,
+    width: int | None = None,
+    backend: str = "auto",
+) -> CoverageReport:
+    """Render logged views and compare them with the logged images.
+
+    A pixel counts as covered by LiDAR when a point of that frame's own sweep, at least
+    COVERAGE_NEAR in front of the camera, projects into it or into one of the pixels around it,
+    up to 1/600 of the image width away (2 px at 1242 px). Points are taken as the log gives
+    them, without an occlusion test.
+
+    Args:
+        scene: reconstructed from ``log``.
+        frames: indices of frames.
+        cameras: names; all by default.
+        width: of the compared images [px]; the logged width by default.
+        backend: of the renderer.
+
+    Raises:
+        ReconstructError: no frames or no cameras were named, or the scene lacks a frame.
+        LogError: unknown frames, or files that cannot be read.
+    """
+    names = list(log.rig.names if cameras is None else cameras)
+    if not names or len(frames) == 0:
+        raise ReconstructError("name at least one camera and one frame to evaluate")
+    views = tuple(
+        _coverage_score(scene, log, log.rig[name], frame, width=width, backend=backend)
+        for frame in frames
+        for name in names
+    )
+    return CoverageReport(
+        views=views,
+        psnr=_mean_coverage([v.psnr for v in views]),
+        psnr_lidar=_mean_coverage([v.psnr_lidar for v in views]),
+    )
+
+
+def lidar_mask(log: DrivingLog, camera: Camera, frame: int) -> NDArray[np.bool_]:
+    """[H, W] bool, pixels of ``camera`` that the sweep of ``frame`` covers.
+
+    Defined in :func:`evaluate_views`.
+    """
+    import cv2
+
+    T_camera_vehicle = invert_transform(camera.T_vehicle_camera)
+    points = apply_transform(T_camera_vehicle, log.lidar(frame).points)
+    points = points[points[:, 2] > COVERAGE_NEAR]
+    u = np.floor(camera.K[0, 0] * points[:, 0] / points[:, 2] + camera.K[0, 2])
+    v = np.floor(camera.K[1, 1] * points[:, 1] / points[:, 2] + camera.K[1, 2])
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    mask[v[inside].astype(np.int64), u[inside].astype(np.int64)] = 1
+    reach = max(1, round(camera.width / 600))
+    return np.asarray(cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, np.uint8)) > 0)
+
+
+def _coverage_score(
+    scene: Scene, log: DrivingLog, camera: Camera, frame: int, *, width: int | None, backend: str
+) -> CoverageScore:
+    truth = log.image(camera.name, frame)
+    camera = camera if width is None else camera.resized(width)
+    truth = resized(truth, camera)
+    t_us = int(log.frame_times_us[frame])
+    image = render_logged_view(scene, camera, t_us, backend=backend)
+    mask = lidar_mask(log, camera, frame)
+    return CoverageScore(
+        camera.name, frame, psnr(image, truth), psnr(image, truth, mask), float(mask.mean())
+    )
+
+
+def _mean_coverage(values: list[float]) -> float:
+    known = [v for v in values if not np.isnan(v)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+# Cast LiDAR sweeps against the recorded or true ones.
 
 CHAMFER = "mean squared distance from cast to true points plus from true to cast points"
 F_DISTANCE = 0.05
