@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from real2sim_proto.episode import SensorSpec
     from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
-    from real2sim_proto.ranging import LidarSpec, RadarSpec
+    from real2sim_proto.sensors import LidarSpec, RadarSpec
 
     from ._async.client import AsyncClient, connect_async
     from ._async.sessions import AsyncDriveSession
@@ -141,12 +141,12 @@ _ELSEWHERE = {
     "Job": "real2sim._sync.jobs",
     "Jobs": "real2sim._sync.jobs",
     "LidarCloud": "real2sim.clouds",
-    "LidarSpec": "real2sim_proto.ranging",
+    "LidarSpec": "real2sim_proto.sensors",
     "Observation": "real2sim.observation",
     "PointCloud": "real2sim.clouds",
     "PoseCommand": "real2sim_proto.plans",
     "RadarCloud": "real2sim.clouds",
-    "RadarSpec": "real2sim_proto.ranging",
+    "RadarSpec": "real2sim_proto.sensors",
     "Scenario": "real2sim._sync.scenarios",
     "Scenarios": "real2sim._sync.scenarios",
     "SceneObject": "real2sim._sync.scenarios",
@@ -196,7 +196,7 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         said = ""
         if not name.startswith("_"):
-            from real2sim_proto.guidance import advice
+            from real2sim_proto.base import advice
 
             said = f"; {advice(name, __all__, _INSTEAD)}"
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{said}")

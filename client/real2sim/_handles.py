@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeAlias, TypeVar
 
-from real2sim_proto.guidance import Guided, advice
+from real2sim_proto.base import Guided, advice
 from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_proto.scenarios import OperationResult, ScenarioInfo
 from real2sim_proto.scenes import SceneInfo

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypedDict, TypeVar, cast
 from urllib.parse import urlencode
 
-from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetPerson, AssetUpload
 from real2sim_proto.episode import (
     AgentsSpec,
     ContactSpec,
@@ -34,7 +33,6 @@ from real2sim_proto.jobs import (
 )
 from real2sim_proto.lanes import SceneLanes
 from real2sim_proto.operations import Operation
-from real2sim_proto.ranging import LidarSpec, RadarSpec
 from real2sim_proto.scenarios import (
     CornerCaseChoice,
     Gallery,
@@ -49,8 +47,22 @@ from real2sim_proto.scenarios import (
     ScenarioRename,
     StoryboardResult,
 )
-from real2sim_proto.scenes import Fleet, Readiness, SceneImport, SceneInfo, SceneList, ServerInfo
+from real2sim_proto.scenes import (
+    AssetCut,
+    AssetInfo,
+    AssetList,
+    AssetPerson,
+    AssetUpload,
+    Fleet,
+    Readiness,
+    SceneImport,
+    SceneInfo,
+    SceneList,
+    ServerInfo,
+)
+from real2sim_proto.sensors import LidarSpec, RadarSpec
 from real2sim_proto.sessions import (
+    SceneView,
     SessionClock,
     SessionCreate,
     SessionInfo,
@@ -60,7 +72,6 @@ from real2sim_proto.sessions import (
     StepRequest,
 )
 from real2sim_proto.sweeps import SweepRequest
-from real2sim_proto.views import SceneView
 
 from ._calls import (
     MSGPACK,

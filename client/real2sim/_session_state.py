@@ -16,9 +16,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.drive import Frame, Result, Welcome
+from real2sim_proto.drive import (
+    SHM_FOLDER,
+    SHM_HEADER_BYTES,
+    SHM_MAGIC,
+    SHM_SECRET_BYTES,
+    Frame,
+    Result,
+    Welcome,
+)
 from real2sim_proto.sessions import SessionInfo
-from real2sim_proto.shared_memory import FOLDER, HEADER_BYTES, MAGIC, SECRET_BYTES
 
 from ._calls import RETRYABLE_CODES, RETRYABLE_STATUS
 from ._handles import Handle
@@ -64,8 +71,8 @@ class SharedFrames:
 
     def __init__(self, offer: SharedMemory) -> None:
         self._slot_bytes = offer.slot_bytes
-        self._memory = _mapped(Path(FOLDER, offer.name), self._begin(offer.slots))
-        self.secret = self._memory[len(MAGIC) : len(MAGIC) + SECRET_BYTES]
+        self._memory = _mapped(Path(SHM_FOLDER, offer.name), self._begin(offer.slots))
+        self.secret = self._memory[len(SHM_MAGIC) : len(SHM_MAGIC) + SHM_SECRET_BYTES]
         self._free = list(reversed(range(offer.slots)))
         self._lent: int | None = None
 
@@ -93,7 +100,7 @@ class SharedFrames:
         return [_part(owner.data, frame, begin) for frame in frames]
 
     def _begin(self, slot: int) -> int:
-        return HEADER_BYTES + slot * self._slot_bytes
+        return SHM_HEADER_BYTES + slot * self._slot_bytes
 
 
 def _part(slot: memoryview, frame: Frame, begin: int) -> memoryview | None:
@@ -122,7 +129,7 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
         raise OSError(f"{path} cannot be mapped: {error}") from error
     finally:
         os.close(file)
-    if memory[: len(MAGIC)] != MAGIC:
+    if memory[: len(SHM_MAGIC)] != SHM_MAGIC:
         raise OSError(f"{path} is no shared memory of a worker")
     return memory
 

@@ -5,10 +5,15 @@ Models live in the module of their concept: ``operations``, ``scenes``, ``scenar
 """
 
 from .codec import CodecError, decode, encode
-from .conventions import CONVENTIONS
+from .conventions import (
+    CONVENTIONS,
+    DRIVE_SUBPROTOCOL,
+    PROTOCOL_VERSION,
+    SEMANTIC_CLASSES,
+    SUPPORTED_SUBPROTOCOLS,
+    protocol_mismatch,
+)
 from .errors import HTTP_STATUS, PROBLEM_MEDIA_TYPE, RETRYABLE, ErrorCode, Problem, ProblemDetail
-from .semantics import SEMANTIC_CLASSES
-from .version import DRIVE_SUBPROTOCOL, PROTOCOL_VERSION, SUPPORTED_SUBPROTOCOLS, protocol_mismatch
 
 __all__ = [
     "CONVENTIONS",

@@ -1,8 +1,91 @@
-"""Frames, units and image layouts, stated once and published by ``GET /v1/server``."""
+"""Frames, units, image layouts, semantic classes and protocol versions.
+
+``GET /v1/server`` publishes them.
+"""
 
 from __future__ import annotations
 
-from .semantics import SEMANTIC_CLASSES
+# Classes of semantic images: Cityscapes label numbers, so that its tools read them.
+
+SEMANTIC_CLASSES: dict[str, int] = {
+    "unlabeled": 0,
+    "static": 4,
+    "dynamic": 5,
+    "ground": 6,
+    "pole": 17,
+    "traffic light": 19,
+    "traffic sign": 20,
+    "sky": 23,
+    "person": 24,
+    "rider": 25,
+    "car": 26,
+    "truck": 27,
+    "bus": 28,
+    "trailer": 30,
+    "train": 31,
+    "motorcycle": 32,
+    "bicycle": 33,
+}
+"""Number in the image by name. ``static`` is the background, ``ground`` the part of it that is
+driven or walked on (what is within 15 cm of the fitted ground's height), ``dynamic`` an object of
+another category, ``unlabeled`` where nothing is and the scene has no sky."""
+
+CLASS_OF_CATEGORY = {
+    "car": "car",
+    "van": "car",
+    "truck": "truck",
+    "bus": "bus",
+    "trailer": "trailer",
+    "tram": "train",
+    "train": "train",
+    "pedestrian": "person",
+    "cyclist": "rider",
+    "motorcyclist": "rider",
+    "motorcycle": "motorcycle",
+    "bicycle": "bicycle",
+    "pole": "pole",
+    "sign": "traffic sign",
+    "traffic_sign": "traffic sign",
+    "traffic_light": "traffic light",
+}
+"""Class of objects by their category; all others are ``dynamic``."""
+
+UNLABELED = SEMANTIC_CLASSES["unlabeled"]
+STATIC = SEMANTIC_CLASSES["static"]
+GROUND = SEMANTIC_CLASSES["ground"]
+SKY = SEMANTIC_CLASSES["sky"]
+
+
+def semantic_class(category: str) -> int:
+    """Number of the class of objects of that category."""
+    return SEMANTIC_CLASSES[CLASS_OF_CATEGORY.get(category, "dynamic")]
+
+
+# Versions of the protocol.
+
+PROTOCOL_VERSION = 1
+"""Major version of REST paths (``/v1``) and of the drive socket (field ``v`` of every message)."""
+
+DRIVE_SUBPROTOCOL = "real2sim.v1.msgpack"
+"""WebSocket subprotocol of the drive socket."""
+
+SUPPORTED_SUBPROTOCOLS = (DRIVE_SUBPROTOCOL,)
+
+
+def protocol_mismatch(offered: list[str]) -> str:
+    """Sentence that names both sides' versions and what to do.
+
+    Examples:
+        >>> protocol_mismatch(["real2sim.v9.msgpack"]).partition(";")[0]
+        'the client offers drive protocol real2sim.v9.msgpack'
+    """
+    given = ", ".join(offered) if offered else "none"
+    spoken = ", ".join(SUPPORTED_SUBPROTOCOLS)
+    return (
+        f"the client offers drive protocol {given}; this worker speaks {spoken}. "
+        "Install a client and a worker of the same major version."
+    )
+
 
 CONVENTIONS: dict[str, str] = {
     "world_frame": "right-handed, x forward, y left, z up, metres, recentred near the drive",

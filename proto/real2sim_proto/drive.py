@@ -9,13 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import (
-    ConfigDict,
-    Field,
-    TypeAdapter,
-    WithJsonSchema,
-    model_validator,
-)
+from pydantic import ConfigDict, Field, TypeAdapter, WithJsonSchema, model_validator
 
 from .base import (
     Codec,
@@ -32,7 +26,9 @@ from .episode import MAX_SENSORS, ResetSpec, SensorSpec
 from .lanes import LaneKind
 from .operations import Operation
 from .plans import Gear, Plan, PlanPoses, PlanTimes, check_times
-from .ranging import (
+from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
+from .scenes import CameraInfo, ObjectInfo
+from .sensors import (
     MAX_LIDARS,
     MAX_RADARS,
     CloudCodec,
@@ -42,9 +38,23 @@ from .ranging import (
     LidarSpec,
     RadarSpec,
 )
-from .scenarios import MAX_OPERATIONS_PER_REQUEST, EditWarning
-from .scenes import CameraInfo, ObjectInfo
-from .shared_memory import MAX_SLOTS, NAME, SECRET_BYTES
+
+# Shared memory for images, between a worker and a controller on the same machine.
+#
+# The first bytes of a file hold a marker and a secret; slots of equal size follow. A client that can
+# open the file and returns the secret is on the worker's machine, which no address proves.
+
+SHM_FOLDER = "/dev/shm"
+"""Where POSIX systems keep files that are memory."""
+SHM_NAME = r"^real2sim-[0-9a-f]{32}$"
+"""Names are of this form; no other file is ever opened or removed."""
+SHM_MAGIC = b"real2sim-frames1"
+SHM_SECRET_BYTES = 32
+SHM_HEADER_BYTES = 4096
+SHM_ALIGNMENT = 64
+"""Images begin at multiples of this."""
+MAX_SHM_SLOTS = 64
+
 
 Array = Annotated[
     Any,
@@ -58,7 +68,7 @@ Slot = Annotated[
     int | None,
     Field(
         ge=0,
-        lt=MAX_SLOTS,
+        lt=MAX_SHM_SLOTS,
         description="slot of the shared memory that raw images of the answer may be written to; "
         "None, or without shared memory: they come with the answer",
     ),
@@ -253,7 +263,7 @@ class Attach(Envelope):
 
     type: Literal["attach"] = "attach"
     secret: bytes = Field(
-        min_length=SECRET_BYTES, max_length=SECRET_BYTES, description="read from the memory"
+        min_length=SHM_SECRET_BYTES, max_length=SHM_SECRET_BYTES, description="read from the memory"
     )
 
 
@@ -396,8 +406,8 @@ class PointCloud(ServerModel):
 class SharedMemory(ServerModel):
     """Memory that a controller on the worker's machine may read raw images from."""
 
-    name: str = Field(pattern=NAME, description="of a file in /dev/shm")
-    slots: int = Field(ge=1, le=MAX_SLOTS)
+    name: str = Field(pattern=SHM_NAME, description="of a file in /dev/shm")
+    slots: int = Field(ge=1, le=MAX_SHM_SLOTS)
     slot_bytes: int = Field(ge=1, le=2**40, description="of each; the first begins at byte 4096")
 
 

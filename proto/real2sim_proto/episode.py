@@ -8,8 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from .base import Codec, Identifier, Microseconds, Modality, Model
-from .cameras import CameraEffects, Optics
-from .ranging import MAX_LIDARS, MAX_RADARS, LidarSpec, RadarSpec
+from .sensors import MAX_LIDARS, MAX_RADARS, CameraEffects, LidarSpec, Optics, RadarSpec
 from .storyboard import Storyboard
 
 MAX_SENSORS = 16

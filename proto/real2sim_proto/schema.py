@@ -15,7 +15,6 @@ from typing import Any
 from pydantic import BaseModel, TypeAdapter
 
 from . import (
-    assets,
     drive,
     errors,
     jobs,
@@ -26,7 +25,6 @@ from . import (
     sessions,
     storyboard,
     sweeps,
-    views,
 )
 
 MODELS: dict[str, type[BaseModel]] = {
@@ -62,11 +60,11 @@ MODELS: dict[str, type[BaseModel]] = {
         scenes.SceneList,
         scenes.SceneImport,
         lanes.SceneLanes,
-        views.SceneView,
-        assets.AssetCut,
-        assets.AssetPerson,
-        assets.AssetInfo,
-        assets.AssetList,
+        sessions.SceneView,
+        scenes.AssetCut,
+        scenes.AssetPerson,
+        scenes.AssetInfo,
+        scenes.AssetList,
         jobs.JobInfo,
         jobs.JobList,
         jobs.SimulateRequest,

@@ -12,8 +12,7 @@ import pytest
 from real2sim import MalformedReplyError, _session_state
 from real2sim._session_state import SharedFrames
 from real2sim.images import frame_from_wire
-from real2sim_proto.drive import Frame, SharedMemory, Welcome
-from real2sim_proto.shared_memory import HEADER_BYTES, MAGIC
+from real2sim_proto.drive import SHM_HEADER_BYTES, SHM_MAGIC, Frame, SharedMemory, Welcome
 
 NAME = "real2sim-" + "0" * 32
 SLOT = 64
@@ -23,8 +22,8 @@ OFFER = SharedMemory(name=NAME, slots=2, slot_bytes=SLOT)
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """Holds the memory of a worker: ramps of greys in two slots."""
-    monkeypatch.setattr(_session_state, "FOLDER", str(tmp_path))
-    header = (MAGIC + b"s" * 32).ljust(HEADER_BYTES, b"\0")
+    monkeypatch.setattr(_session_state, "SHM_FOLDER", str(tmp_path))
+    header = (SHM_MAGIC + b"s" * 32).ljust(SHM_HEADER_BYTES, b"\0")
     (tmp_path / NAME).write_bytes(header + bytes(range(2 * SLOT)))
     return tmp_path
 
@@ -49,7 +48,7 @@ def test_images_are_read_where_they_lie(folder):
     memory = SharedFrames(OFFER)
     assert memory.secret == b"s" * 32
     assert memory.lend() == 0
-    wires = [frame(HEADER_BYTES), frame(data=b"\1" * 24), frame(HEADER_BYTES + 32)]
+    wires = [frame(SHM_HEADER_BYTES), frame(data=b"\1" * 24), frame(SHM_HEADER_BYTES + 32)]
     pixels = memory.pixels_of(wires)
     first, second, third = map(frame_from_wire, wires, pixels)
     assert second.array.ravel().tolist() == [1] * 24
@@ -62,10 +61,10 @@ def test_a_slot_is_lent_again_once_nobody_looks_at_it(folder):
     memory = SharedFrames(OFFER)
     slot = memory.lend()
     assert memory.lend() == slot  # The answer has not come yet.
-    wire = frame(HEADER_BYTES + SLOT * slot)
+    wire = frame(SHM_HEADER_BYTES + SLOT * slot)
     view = frame_from_wire(wire, *memory.pixels_of([wire])).array[0, :2]
     other = memory.lend()
-    held = memory.pixels_of([frame(HEADER_BYTES + SLOT * other)])
+    held = memory.pixels_of([frame(SHM_HEADER_BYTES + SLOT * other)])
     assert {slot, other} == {0, 1}
     assert memory.lend() is None
     del view
@@ -76,7 +75,7 @@ def test_a_slot_is_lent_again_once_nobody_looks_at_it(folder):
 
 def test_a_frame_can_be_handed_to_another_process(folder):
     memory = SharedFrames(OFFER)
-    wire = frame(HEADER_BYTES + SLOT * memory.lend())
+    wire = frame(SHM_HEADER_BYTES + SLOT * memory.lend())
     found = frame_from_wire(wire, *memory.pixels_of([wire]))
     again = pickle.loads(pickle.dumps(found))
     np.testing.assert_array_equal(again.array, found.array)
@@ -87,10 +86,10 @@ def test_a_frame_can_be_handed_to_another_process(folder):
     "wrong",
     [
         frame(0),
-        frame(HEADER_BYTES - 1),
-        frame(HEADER_BYTES + 2 * SLOT),
-        frame(HEADER_BYTES, height=6),
-        frame(HEADER_BYTES, shape=[-1, 4, 3]),
+        frame(SHM_HEADER_BYTES - 1),
+        frame(SHM_HEADER_BYTES + 2 * SLOT),
+        frame(SHM_HEADER_BYTES, height=6),
+        frame(SHM_HEADER_BYTES, shape=[-1, 4, 3]),
     ],
 )
 def test_an_image_beyond_the_slot_is_refused(folder, wrong):
@@ -102,10 +101,10 @@ def test_an_image_beyond_the_slot_is_refused(folder, wrong):
 
 def test_an_image_where_no_slot_was_named_is_refused(folder):
     with pytest.raises(MalformedReplyError, match="no slot"):
-        SharedFrames(OFFER).pixels_of([frame(HEADER_BYTES)])
+        SharedFrames(OFFER).pixels_of([frame(SHM_HEADER_BYTES)])
 
 
-@pytest.mark.parametrize("content", [b"", b"x" * 10_000, MAGIC])
+@pytest.mark.parametrize("content", [b"", b"x" * 10_000, SHM_MAGIC])
 def test_a_file_that_is_no_memory_of_a_worker_is_not_read(folder, content):
     (folder / NAME).write_bytes(content)
     with pytest.raises(OSError, match=NAME):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from real2sim_proto import drive, operations, version
+from real2sim_proto import conventions, drive, operations
 from real2sim_proto.base import Pose
 from real2sim_proto.drive import CLIENT_MESSAGE
 from real2sim_proto.errors import HTTP_STATUS, ErrorCode, Problem, title_of
@@ -92,9 +92,9 @@ def test_a_message_of_another_protocol_version_is_refused():
 
 
 def test_mismatch_sentence_names_both_versions():
-    sentence = version.protocol_mismatch(["real2sim.v9.msgpack"])
+    sentence = conventions.protocol_mismatch(["real2sim.v9.msgpack"])
     assert "real2sim.v9.msgpack" in sentence
-    assert version.DRIVE_SUBPROTOCOL in sentence
+    assert conventions.DRIVE_SUBPROTOCOL in sentence
 
 
 def test_every_error_code_has_a_status_of_an_error():

@@ -8,11 +8,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from real2sim_proto.assets import AssetCut, AssetInfo, AssetPerson, AssetUpload
 from real2sim_proto.base import Pose
 from real2sim_proto.lanes import SceneLanes
-from real2sim_proto.scenes import SceneInfo, SceneState
-from real2sim_proto.views import FreeCamera, SceneView
+from real2sim_proto.scenes import (
+    AssetCut,
+    AssetInfo,
+    AssetPerson,
+    AssetUpload,
+    SceneInfo,
+    SceneState,
+)
+from real2sim_proto.sessions import FreeCamera, SceneView
 
 from .. import _requests
 from .._calls import ViewRequest, checked, instant_us
@@ -219,7 +225,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
 
         Args:
             scene: a scene or its name.
-            cameras: models of ``real2sim_proto.views.FreeCamera``, or their fields.
+            cameras: models of ``real2sim_proto.sessions.FreeCamera``, or their fields.
             t, t_us: instant for the objects that are not posed, in seconds or in microseconds;
                 default: the start of the recording.
             objects: poses of box centres in the world by object id.

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from real2sim_proto.base import Pose
+from real2sim_proto.conventions import GROUND, STATIC, semantic_class
 from real2sim_proto.operations import EraseRegion
-from real2sim_proto.semantics import GROUND, STATIC, semantic_class
 
 from ..geometry.transform import Float, invert_transform, quaternion_to_matrix, transform_from
 from ..render.cast.call import Attributes, SweepScene, incidence_of, met_by_lidar, transforms_at

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from real2sim_proto.semantics import CLASS_OF_CATEGORY
+from real2sim_proto.conventions import CLASS_OF_CATEGORY
 
 from ..geometry.transform import Float, apply_transform, invert_transform, quaternion_to_matrix
 from ..scene import Camera, Trajectory

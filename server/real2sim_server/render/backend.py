@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from real2sim_proto.semantics import SKY, UNLABELED
+from real2sim_proto.conventions import SKY, UNLABELED
 
 from ..scene import Camera, GaussianCloud
 from .lens import LensView

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from real2sim_proto.semantics import UNLABELED
+from real2sim_proto.conventions import UNLABELED
 
 from .._numba import is_on_disk, made
 from ..scene import UNSEEN, BrownConrady, Camera, CameraMotion, GaussianCloud, Shutter

@@ -21,7 +21,7 @@ from numba import prange
 from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
-from real2sim_proto.cameras import CameraEffects, NoiseSpec
+from real2sim_proto.sensors import CameraEffects, NoiseSpec
 
 from .._files import atomic_file
 from .._numba import PARALLEL_LOOPS, kernel

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.semantics import GROUND, STATIC
+from real2sim_proto.conventions import GROUND, STATIC
 
 from ..geometry.transform import Float, invert_transform, quaternion_to_matrix
 from ..scene import Camera, Ground

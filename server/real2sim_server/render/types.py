@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from real2sim_proto.semantics import STATIC, UNLABELED
+from real2sim_proto.conventions import STATIC, UNLABELED
 
 from ..scene import GaussianCloud, Sky, TimeColour
 

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.cameras import ShutterDirection
+from real2sim_proto.sensors import ShutterDirection
 
 from ..geometry.transform import (
     Float,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from real2sim_proto.ranging import (
+from real2sim_proto.sensors import (
     MAX_RAYS,
     GridBeams,
     LidarModel,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Pose
-from real2sim_proto.ranging import LidarModel, LidarSpec, RadarModel, RadarSpec
+from real2sim_proto.sensors import LidarModel, LidarSpec, RadarModel, RadarSpec
 
 from ..geometry.transform import (
     Float,

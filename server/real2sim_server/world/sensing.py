@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.semantics import GROUND, STATIC
+from real2sim_proto.conventions import GROUND, STATIC
 
 from ..edit import ScenarioState
 from ..edit.compose import background_hits, compose, object_hits, sweep_of

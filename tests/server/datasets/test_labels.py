@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_proto.semantics import GROUND
+from real2sim_proto.conventions import GROUND
 from real2sim_server.datasets.clips import flow_png, read_flow
 from real2sim_server.datasets.labels import (
     CameraImages,

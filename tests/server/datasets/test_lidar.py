@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_proto.semantics import GROUND, SEMANTIC_CLASSES
+from real2sim_proto.conventions import GROUND, SEMANTIC_CLASSES
 from real2sim_server.datasets.drive import MetSweep
 from real2sim_server.datasets.export import export_dataset
 from real2sim_server.datasets.labels import points_in_boxes

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from real2sim_proto.conventions import GROUND, SEMANTIC_CLASSES
 from real2sim_proto.operations import Translate
-from real2sim_proto.semantics import GROUND, SEMANTIC_CLASSES
 from real2sim_server.cli import export as command
 from real2sim_server.edit import ScenarioState, apply_operations
 from real2sim_server.edit.compose import ROW, ply_of_points, points_at

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from real2sim_proto.cameras import CameraEffects
+from real2sim_proto.sensors import CameraEffects
 from real2sim_server.render.images import to_display, to_light, with_effects
 
 GREY = np.full((40, 60, 3), 100, np.uint8)

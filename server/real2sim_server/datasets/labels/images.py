@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.semantics import SKY, UNLABELED
+from real2sim_proto.conventions import SKY, UNLABELED
 
 from ...geometry.transform import Float, invert_transform
 from ...render import Backend, render_cameras, select_backend

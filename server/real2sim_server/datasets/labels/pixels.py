@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from real2sim_proto.semantics import GROUND, STATIC
+from real2sim_proto.conventions import GROUND, STATIC
 
 from ..._numba import PARALLEL_LOOPS, func, kernel
 

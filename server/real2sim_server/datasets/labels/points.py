@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from real2sim_proto.semantics import GROUND, STATIC, semantic_class
+from real2sim_proto.conventions import GROUND, STATIC, semantic_class
 
 from ...geometry.transform import Float, apply_transform, invert_transform
 from ...render.cast import CastBackend, CastRequest, Echo, Sweep, detect

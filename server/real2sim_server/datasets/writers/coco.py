@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.semantics import SEMANTIC_CLASSES, UNLABELED
+from real2sim_proto.conventions import SEMANTIC_CLASSES, UNLABELED
 
 from ...body.model import KEYPOINTS
 from ...render import encode_image

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.semantics import GROUND
+from real2sim_proto.conventions import GROUND
 
 from ...geometry.transform import Float, apply_transform, invert_transform, matrix_to_quaternion
 from ...render import encode_image

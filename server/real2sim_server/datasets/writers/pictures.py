@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.semantics import GROUND, SKY, STATIC, UNLABELED
+from real2sim_proto.conventions import GROUND, SKY, STATIC, UNLABELED
 
 from ...geometry.box import box_corners
 from ...render import encode_image

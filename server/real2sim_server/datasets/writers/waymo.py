@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from real2sim_proto.semantics import SEMANTIC_CLASSES
+from real2sim_proto.conventions import SEMANTIC_CLASSES
 
 from ...geometry.transform import Float, apply_transform, matrix_to_quaternion, quaternion_yaw
 from ...logs.readers.waymo_common import (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.ranging import MAX_RAYS
+from real2sim_proto.sensors import MAX_RAYS
 
 from ...geometry.transform import Float, apply_transform, invert_transform
 from ...logs import DrivingLog

@@ -20,7 +20,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_proto.semantics import SEMANTIC_CLASSES
+from real2sim_proto.conventions import SEMANTIC_CLASSES
 
 from ...geometry.transform import Float
 from ...scene import Lidar, Radar

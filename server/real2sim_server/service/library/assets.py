@@ -19,7 +19,7 @@ import structlog
 from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.assets import AssetInfo, AssetUpload
+from real2sim_proto.scenes import AssetInfo, AssetUpload
 
 from ...edit.appearance import Colour, ambient_colour, contact_shadow, relighting_gain, relit
 from ...geometry.transform import Float, invert_transform

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from real2sim_proto.base import Track
-from real2sim_proto.cameras import OpticsSpec
 from real2sim_proto.scenes import CameraInfo, ObjectInfo, SceneInfo, SceneState
+from real2sim_proto.sensors import OpticsSpec
 
 from ...edit import ObjectState
 from ...scene import Camera, Trajectory

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from real2sim_proto import encode
-from real2sim_proto.cameras import LensSpec, MotionBlurSpec, Optics
 from real2sim_proto.episode import SensorSpec
+from real2sim_proto.sensors import LensSpec, MotionBlurSpec, Optics
 
 from ...geometry.transform import Float
 from ...render import Instance, RigView

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from real2sim_proto import ErrorCode
 from real2sim_proto import encode as encode_message
 from real2sim_proto.base import Codec, Modality
-from real2sim_proto.cameras import MotionBlurSpec
 from real2sim_proto.episode import SensorSpec
+from real2sim_proto.sensors import MotionBlurSpec
 
 from ...render import (
     Backend,

@@ -15,8 +15,8 @@ from pydantic_core import from_json
 from starlette.datastructures import FormData, UploadFile
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.assets import AssetCut, AssetInfo, AssetList, AssetPerson, AssetUpload
 from real2sim_proto.base import Identifier
+from real2sim_proto.scenes import AssetCut, AssetInfo, AssetList, AssetPerson, AssetUpload
 
 from ...render import encode_image
 from ...scene.asset import person_asset

@@ -12,8 +12,8 @@ from fastapi import Depends, Header, Query, Response
 from real2sim_proto import ErrorCode
 from real2sim_proto.base import Identifier, Microseconds, Modality
 from real2sim_proto.episode import SensorSpec
-from real2sim_proto.ranging import LidarSpec
-from real2sim_proto.views import FreeCamera, SceneView
+from real2sim_proto.sensors import LidarSpec
+from real2sim_proto.sessions import FreeCamera, SceneView
 
 from ...edit import ScenarioState, instances_at, posed_instances
 from ...geometry.transform import Float, apply_transform, transform_from

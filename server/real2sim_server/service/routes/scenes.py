@@ -20,7 +20,7 @@ from real2sim_proto.base import Identifier
 from real2sim_proto.jobs import JobInfo
 from real2sim_proto.lanes import SceneLanes
 from real2sim_proto.scenes import SceneImport, SceneInfo, SceneList, SceneState
-from real2sim_proto.views import SceneView
+from real2sim_proto.sessions import SceneView
 
 from ...edit import ScenarioState
 from ...scene.io import DEMO_SCENE, SHIPPED_STREET

@@ -15,11 +15,11 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from real2sim_proto import CONVENTIONS, PROTOCOL_VERSION, ErrorCode
 from real2sim_proto.base import Codec, Modality
 from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES
+from real2sim_proto.conventions import SUPPORTED_SUBPROTOCOLS
 from real2sim_proto.episode import MAX_SENSORS
 from real2sim_proto.scenarios import MAX_OPERATIONS_PER_REQUEST
 from real2sim_proto.scenes import Fleet, FleetMember, Limits, Readiness, ServerInfo
 from real2sim_proto.sessions import MAX_STEPS_PER_REQUEST
-from real2sim_proto.version import SUPPORTED_SUBPROTOCOLS
 
 from ...scene.range_sensors import RADARS, lidar_names
 from ...settings import Settings

@@ -9,7 +9,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
 from real2sim_proto.drive import Render
 from real2sim_proto.episode import SensorSpec
-from real2sim_proto.ranging import LidarSpec, RadarSpec
+from real2sim_proto.sensors import LidarSpec, RadarSpec
 from real2sim_proto.sessions import SessionRender
 
 from ...edit import ScenarioState

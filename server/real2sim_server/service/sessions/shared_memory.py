@@ -27,7 +27,13 @@ import structlog
 from numpy.typing import NDArray
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.shared_memory import ALIGNMENT, FOLDER, HEADER_BYTES, MAGIC, SECRET_BYTES
+from real2sim_proto.drive import (
+    SHM_ALIGNMENT,
+    SHM_FOLDER,
+    SHM_HEADER_BYTES,
+    SHM_MAGIC,
+    SHM_SECRET_BYTES,
+)
 
 from ..http.auth import secrets_equal
 from ..http.problems import ServiceError
@@ -65,7 +71,7 @@ class Segment:
         self._path = path
         self._slot_bytes = slot_bytes
         self._budget = budget
-        self._secret = secrets.token_bytes(SECRET_BYTES)
+        self._secret = secrets.token_bytes(SHM_SECRET_BYTES)
         self._memory: NDArray[np.uint8] = np.empty(0, np.uint8)
         self._taken = [0] * SLOTS
         self._refused: int | None = None
@@ -74,15 +80,15 @@ class Segment:
         self._file: int | None = os.open(path, flags, READ_ONLY)
         try:
             _lock(self._file)
-            size = HEADER_BYTES + SLOTS * slot_bytes
+            size = SHM_HEADER_BYTES + SLOTS * slot_bytes
             os.ftruncate(self._file, size)
-            os.posix_fallocate(self._file, 0, HEADER_BYTES)
+            os.posix_fallocate(self._file, 0, SHM_HEADER_BYTES)
             # Unmapped with the last array on it, which another thread may be using.
             self._memory = np.frombuffer(mmap.mmap(self._file, size), np.uint8)
         except BaseException:
             self.close()
             raise
-        beginning = np.frombuffer(MAGIC + self._secret, np.uint8)
+        beginning = np.frombuffer(SHM_MAGIC + self._secret, np.uint8)
         self._memory[: len(beginning)] = beginning
 
     @property
@@ -131,12 +137,12 @@ class Segment:
 
         None where they do not fit, or the machine or the budget has no such memory left.
         """
-        memory, begin = self._memory, HEADER_BYTES + number * self._slot_bytes
+        memory, begin = self._memory, SHM_HEADER_BYTES + number * self._slot_bytes
         offsets, end = [], begin
         for frame in frames:
             if frame.codec == "raw":
                 offsets.append(end)
-                end += -(-len(frame.data) // ALIGNMENT) * ALIGNMENT
+                end += -(-len(frame.data) // SHM_ALIGNMENT) * SHM_ALIGNMENT
         if not offsets or not self._take(number, end - begin):
             return None
         places = iter(offsets)
@@ -168,7 +174,7 @@ class Segment:
         with self._lock:
             if self._file is None:
                 return False
-            begin, before = HEADER_BYTES + number * self._slot_bytes, self._taken[number]
+            begin, before = SHM_HEADER_BYTES + number * self._slot_bytes, self._taken[number]
             try:
                 self._reserve(number, size)
                 os.posix_fallocate(self._file, begin, size)
@@ -242,7 +248,7 @@ class Segments:
         """Memory for a controller; None where there is none to be had."""
         if not self._slot_bytes or not hasattr(os, "posix_fallocate"):
             return None
-        path = Path(FOLDER, PREFIX + secrets.token_hex(NAME_BYTES))
+        path = Path(SHM_FOLDER, PREFIX + secrets.token_hex(NAME_BYTES))
         try:
             segment = Segment(path, self._slot_bytes, self._budget)
         except OSError as error:
@@ -254,7 +260,7 @@ class Segments:
 
 def sweep_segments() -> list[Path]:
     """Remove the names that killed workers of this user have left behind; returns them."""
-    found = Path(FOLDER).glob(PREFIX + "[0-9a-f]" * 2 * NAME_BYTES)
+    found = Path(SHM_FOLDER).glob(PREFIX + "[0-9a-f]" * 2 * NAME_BYTES)
     return [path for path in found if _removed_if_left(path)]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from real2sim_proto.semantics import semantic_class
+from real2sim_proto.conventions import semantic_class
 
 from ...edit import ObjectState
 from ...edit.compose import cloud_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_proto.ranging import RadarModel
-from real2sim_proto.semantics import SEMANTIC_CLASSES
+from real2sim_proto.conventions import SEMANTIC_CLASSES
+from real2sim_proto.sensors import RadarModel
 from real2sim_server.render.cast.sensors import (
     CLUTTER_KIND,
     GHOST_KIND,

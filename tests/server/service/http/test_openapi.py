@@ -9,7 +9,6 @@ import httpx2
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from real2sim_proto.assets import AssetCut
 from real2sim_proto.jobs import DatasetRequest, ExportRequest, SimulateRequest
 from real2sim_proto.scenarios import (
     CornerCaseChoice,
@@ -18,6 +17,7 @@ from real2sim_proto.scenarios import (
     ScenarioDocument,
     ScenarioFork,
 )
+from real2sim_proto.scenes import AssetCut
 from real2sim_proto.storyboard import Storyboard
 from real2sim_server.service.app import create_app
 from real2sim_server.service.http.openapi import (

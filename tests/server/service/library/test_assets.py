@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from real2sim_proto import ErrorCode
-from real2sim_proto.assets import AssetInfo
+from real2sim_proto.scenes import AssetInfo
 from real2sim_server.scene.io import export_scene, write_splats
 
 CUT = {"scene": "tiny", "object_id": "car_red", "asset_id": "red"}

@@ -14,8 +14,8 @@ import pytest
 
 import real2sim
 from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
+from real2sim_proto.drive import SHM_FOLDER, SHM_HEADER_BYTES, SHM_MAGIC, SHM_SECRET_BYTES
 from real2sim_proto.episode import SensorSpec
-from real2sim_proto.shared_memory import FOLDER, HEADER_BYTES, MAGIC, SECRET_BYTES
 from real2sim_server.service.library.budgets import MemoryBudget
 from real2sim_server.service.rendering.frames import EncodedFrame, RenderedImage, encode_frame
 from real2sim_server.service.sessions import shared_memory as module
@@ -27,7 +27,7 @@ from tests.waiting import wait_until
 
 pytestmark = [
     pytest.mark.network,
-    pytest.mark.skipif(not Path(FOLDER).is_dir(), reason="no files in memory here"),
+    pytest.mark.skipif(not Path(SHM_FOLDER).is_dir(), reason="no files in memory here"),
 ]
 
 MODALITIES = ["rgb", "depth", "instance"]
@@ -36,7 +36,7 @@ CONTROL = {"kind": "control", "acceleration": 0.5, "steering": 0.02}
 
 
 def path_of(welcome: dict[str, Any]) -> Path:
-    return Path(FOLDER, welcome["shared_memory"]["name"])
+    return Path(SHM_FOLDER, welcome["shared_memory"]["name"])
 
 
 def mapped(path: Path) -> mmap.mmap:
@@ -45,8 +45,8 @@ def mapped(path: Path) -> mmap.mmap:
 
 
 def secret_of(memory: mmap.mmap) -> bytes:
-    assert memory[: len(MAGIC)] == MAGIC
-    return memory[len(MAGIC) : len(MAGIC) + SECRET_BYTES]
+    assert memory[: len(SHM_MAGIC)] == SHM_MAGIC
+    return memory[len(SHM_MAGIC) : len(SHM_MAGIC) + SHM_SECRET_BYTES]
 
 
 def image_of(memory: mmap.mmap, frame: dict[str, Any]) -> np.ndarray:
@@ -99,8 +99,8 @@ def test_images_lie_in_the_slot_that_the_message_names_with_the_bits_of_the_sock
     ):
         assert [f["modality"] for f in answer["frames"]] == MODALITIES
         for frame, expected in zip(answer["frames"], beside["frames"], strict=True):
-            first = HEADER_BYTES + slot * (len(memory) - HEADER_BYTES) // SLOTS
-            assert first <= frame["offset"] < first + (len(memory) - HEADER_BYTES) // SLOTS
+            first = SHM_HEADER_BYTES + slot * (len(memory) - SHM_HEADER_BYTES) // SLOTS
+            assert first <= frame["offset"] < first + (len(memory) - SHM_HEADER_BYTES) // SLOTS
             assert (frame["data"], "offset" in expected) == (b"", False)
             assert image_of(memory, frame).tobytes() == sent(expected).tobytes()
             assert frame["T_world_sensor"].tobytes() == expected["T_world_sensor"].tobytes()
@@ -137,7 +137,7 @@ def test_only_the_controller_learns_the_name(attached, site, join):
     planner, _ = attached
     observer = join(planner.info, role=None)
     assert "shared_memory" not in observer.hello(role="observer")
-    refused = observer.ask("attach", secret=bytes(SECRET_BYTES))
+    refused = observer.ask("attach", secret=bytes(SHM_SECRET_BYTES))
     assert refused["code"] == "NOT_CONTROLLER"
     planner.ask("reset", spec={"sensors": SENSORS}, slot=0)
     assert "offset" not in observer.receive()["frames"][0]
@@ -146,11 +146,11 @@ def test_only_the_controller_learns_the_name(attached, site, join):
 def test_a_wrong_secret_is_refused_and_the_session_goes_on_over_the_socket(site, join):
     planner = join(site.create(), role=None)
     path = path_of(planner.hello())
-    assert planner.ask("attach", secret=bytes(SECRET_BYTES))["code"] == "INVALID_REQUEST"
+    assert planner.ask("attach", secret=bytes(SHM_SECRET_BYTES))["code"] == "INVALID_REQUEST"
     assert not path.exists()
     obs = planner.ask("reset", spec={"sensors": SENSORS}, slot=0)
     assert len(obs["frames"][0]["data"]) == 64 * 96 * 3
-    assert planner.ask("attach", secret=bytes(SECRET_BYTES))["code"] == "INVALID_REQUEST"
+    assert planner.ask("attach", secret=bytes(SHM_SECRET_BYTES))["code"] == "INVALID_REQUEST"
 
 
 def test_a_client_that_does_not_attach_declines(site, join):
@@ -273,7 +273,7 @@ def test_a_machine_without_memory_left_sends_over_the_socket(segments, monkeypat
 
 
 def test_names_that_killed_workers_left_are_swept_and_no_others(segments):
-    path = Path(FOLDER, segments().offer["name"])
+    path = Path(SHM_FOLDER, segments().offer["name"])
     left = path.with_name(f"real2sim-{os.urandom(16).hex()}")
     foreign = path.with_name(f"real2sim-{os.urandom(4).hex()}.txt")
     for file in (left, foreign):
