@@ -41,8 +41,8 @@ from .sensors import (
 
 # Shared memory for images, between a worker and a controller on the same machine.
 #
-# The first bytes of a file hold a marker and a secret; slots of equal size follow. A client that can
-# open the file and returns the secret is on the worker's machine, which no address proves.
+# The first bytes of a file hold a marker and a secret; slots of equal size follow. A client that
+# can open the file and returns the secret is on the worker's machine, which no address proves.
 
 SHM_FOLDER = "/dev/shm"
 """Where POSIX systems keep files that are memory."""
