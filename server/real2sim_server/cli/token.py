@@ -11,7 +11,7 @@ from ..console import CommandError, console, errors
 from .command import command
 
 if TYPE_CHECKING:
-    from ..service.tokens import NamedToken
+    from ..service.accounts import NamedToken
 
 app = typer.Typer(no_args_is_help=True, help="Make, list and remove the named tokens of a worker.")
 
@@ -38,7 +38,7 @@ def add(
     """Make a token and print it, this once; the file keeps its hash."""
     from pydantic import ValidationError
 
-    from ..service.tokens import ROLES, TokenLimits, add_token
+    from ..service.accounts import ROLES, TokenLimits, add_token
 
     if role not in ROLES:
         raise CommandError(f"--role: one of {', '.join(ROLES)}, not {role!r}")
@@ -67,7 +67,7 @@ def add(
 @command("list", group=app)
 def list_(*, file: TokensFile = None) -> None:
     """The names that there are, with their limits."""
-    from ..service.tokens import read_token_file
+    from ..service.accounts import read_token_file
 
     known = read_token_file(_file(file)).tokens
     for token in known:
@@ -78,7 +78,7 @@ def list_(*, file: TokensFile = None) -> None:
 @command("remove", group=app)
 def remove(name: Name, *, file: TokensFile = None) -> None:
     """Make a token invalid; who is connected with it is disconnected."""
-    from ..service.tokens import remove_token
+    from ..service.accounts import remove_token
 
     path = _file(file)
     remove_token(path, name)

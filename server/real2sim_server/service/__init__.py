@@ -6,7 +6,7 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``storage``: a ``Database`` that executes statements, and a ``Store`` of scenarios, sessions, jobs
   and stored answers.
 - ``objects``: what workers share, stored by content.
-- ``tokens``, ``accounts``: named tokens, and what their holders use.
+- ``accounts``: named tokens with roles and limits, and what their holders use.
 - ``preflight``: checks before anything heavy is loaded.
 - ``first_run``: a second process that compiles kernels, started before anything heavy is loaded.
 - ``warm_up``: kernels compiled or loaded before they are needed.
@@ -20,8 +20,7 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``sessions``: closed loops; ``pipeline`` takes a step from the socket to the bytes of its answer.
 - ``drives``: planners that drive sessions as jobs.
 - ``sweeps``: sweeps and searches, in processes of their own, as jobs.
-- ``sharing``: scenes, assets and files of jobs that workers share.
-- ``membership``: a worker within a fleet: its lease, scenes it loads ahead, reports to its proxy.
+- ``membership``: a worker in a fleet: its lease, shared objects, prewarmed scenes, reports.
 - ``tracing``: optional spans of requests and of the engine.
 - ``audit``: the audit log.
 - ``maintenance``: removes leftovers and whatever exceeds the limits.

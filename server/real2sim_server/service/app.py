@@ -21,12 +21,11 @@ from .accounts import ACCOUNT
 from .audit import AuditEntry
 from .clock import now_us
 from .http.auth import READING, LoopbackOnly, OwnPagesOnly, account_of, require_token
-from .http.idempotency import install_replay_handler
 from .http.openapi import published
-from .http.problems import install_problem_handlers
-from .http.requests import BodyLimit, RequestContext
+from .http.requests import BodyLimit, RequestContext, install_replay_handler
+from .http.responses import install_problem_handlers
 from .jobs.jobs import Work
-from .routes import assets, drive, jobs, scenarios, scenes, server, sessions, splats, view
+from .routes import assets, drive, jobs, scenarios, scenes, server, sessions, view
 from .tracing import Tracing, engine_spans, traces_to
 from .worker import Worker
 
@@ -39,8 +38,8 @@ STEPS = ("/step", "/render", "/reset")
 PROTECTED: tuple[APIRouter, ...] = (
     server.router,
     scenes.router,
-    splats.router,
-    splats.object_router,
+    scenes.router,
+    scenes.object_router,
     scenarios.router,
     scenarios.storyboards_router,
     assets.router,

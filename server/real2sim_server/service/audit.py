@@ -15,7 +15,7 @@ import sqlalchemy as sa
 import structlog
 
 from .clock import now_us
-from .storage import tables as t
+from .storage import schema as t
 from .storage.store import Store, StoreError, Write
 
 # --- The log in the store ------------------------------------------------------------------------

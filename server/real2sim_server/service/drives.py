@@ -23,8 +23,8 @@ from ..geometry.transform import matrix_to_quaternion
 from ..world import World, plan_in_world
 from ..world.ego.plan import PlannedTrajectory
 from ..world.recording.recording import Recording, load_recording, to_bytes
-from .http.idempotency import IdempotentRequest
-from .http.problems import ServiceError
+from .http.requests import IdempotentRequest
+from .http.responses import ServiceError
 from .jobs.command_process import CommandProcess
 from .jobs.exports import VideoSource
 from .jobs.jobs import JobContext, JobResult, Jobs, NewJob, require_success

@@ -16,9 +16,9 @@ from .clock import now_us
 from .jobs.jobs import Jobs
 from .sessions import Sessions
 from .sessions.shared_memory import sweep_segments
-from .storage import tables as t
+from .storage import schema as t
 from .storage.backup import RESTORING
-from .storage.errors import StoreError
+from .storage.connection import StoreError
 from .storage.store import Claim, Store, Write
 
 # --- Retention -----------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from .app import create_app
 from .http.auth import check_bind
 from .http.connections import watch
 from .preflight import bind, check_scenes, listen, url_of
-from .storage.errors import StoreError
+from .storage.connection import StoreError
 from .worker import Worker
 
 # --- Garbage collection --------------------------------------------------------------------------

@@ -16,8 +16,8 @@ from real2sim_proto.sweeps import SearchMethod, SweepRequest
 from ..scenarios import ScenarioError
 from ..scenarios.gallery import corner_case
 from ..scenarios.openscenario import ReadOptions, read_openscenario_text
-from .http.idempotency import IdempotentRequest
-from .http.problems import ServiceError
+from .http.requests import IdempotentRequest
+from .http.responses import ServiceError
 from .jobs.command_process import CommandProcess
 from .jobs.exports import pack
 from .jobs.jobs import JobContext, JobResult, Jobs, NewJob, Work

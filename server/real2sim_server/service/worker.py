@@ -24,24 +24,23 @@ from ..render import Backend, describe_backends, select_backend
 from ..render.backend import device_of
 from ..scene.io import DEMO_SCENE, SHIPPED_STREET, StagingLimits
 from ..settings import Settings
-from .accounts import Accounts
+from .accounts import Accounts, worker_key
 from .audit import Audit, AuditLog
 from .drives import Drives
 from .engine import Engine
 from .http.connections import ConnectionLimits, Connections, connection_limit
-from .http.idempotency import Idempotency
 from .http.metrics import Metrics
-from .http.problems import ServiceError
+from .http.requests import Idempotency
+from .http.responses import ServiceError
 from .jobs.exports import VideoSource
 from .jobs.jobs import Jobs
-from .jobs.simulations import Calibrations, Simulations
+from .jobs.rollouts import Calibrations, Simulations
 from .library.assets import AssetLibrary
-from .library.budgets import MemoryBudget, Quota
 from .library.imports import ImportQueue, import_scene
-from .library.scenes import SceneCache, SceneCatalog
-from .library.splat_files import SplatFiles
+from .library.scenes import MemoryBudget, Quota, SceneCache, SceneCatalog
+from .library.views import SplatFiles
 from .maintenance import Maintenance
-from .membership import Agent, Membership, Prewarming, Willingness, takes_work
+from .membership import Agent, Membership, Prewarming, Sharing, Willingness, takes_work
 from .objects.object_store import open_objects
 from .objects.shared_bundles import BundleFolders, BundleLog
 from .rendering.renderer import Renderer
@@ -49,13 +48,11 @@ from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .sessions.shared_memory import Segments
-from .sharing import Sharing
 from .storage.connection import owned_folder
 from .storage.fleet import Leases, Notices
 from .storage.job_log import JobLog
 from .storage.store import Store
 from .sweeps import Sweeps
-from .tokens import worker_key
 from .warm_up import KernelWarmUp
 
 LAG_PERIOD_S = 0.1

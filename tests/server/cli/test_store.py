@@ -8,8 +8,8 @@ import pytest
 
 from real2sim_server.cli.store import migrate, status
 from real2sim_server.console import CommandError
-from real2sim_server.service.storage import schema, tables
-from real2sim_server.service.storage.errors import StoreError
+from real2sim_server.service.storage import schema
+from real2sim_server.service.storage.connection import StoreError
 
 
 @pytest.fixture
@@ -28,14 +28,14 @@ def write_version(data, version: str) -> None:
 
 def test_a_new_store_gets_its_tables_once(tmp_path, capsys):
     migrate(data=tmp_path)
-    assert f"done: {tables.SCHEMA_VERSION}: all tables" in capsys.readouterr().out
+    assert f"done: {schema.SCHEMA_VERSION}: all tables" in capsys.readouterr().out
     migrate(data=tmp_path)
     assert "nothing to do" in capsys.readouterr().out
 
 
 def test_status_tells_pending_migrations_and_changes_nothing(data, capsys, monkeypatch):
     capsys.readouterr()
-    monkeypatch.setattr(tables, "SCHEMA_VERSION", 2)
+    monkeypatch.setattr(schema, "SCHEMA_VERSION", 2)
     monkeypatch.setattr(schema, "_revisions", lambda: [(1, "first"), (2, "colours")])
     for _ in range(2):
         status(data=data)

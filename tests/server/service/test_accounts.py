@@ -20,8 +20,6 @@ from real2sim_server.service.accounts import (
     Meter,
     OverLimitError,
     RevokedError,
-)
-from real2sim_server.service.tokens import (
     TokenFileError,
     TokenLimits,
     add_token,

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 from fastapi.testclient import TestClient
 
-from real2sim_server.service.tokens import TokenLimits, add_token
+from real2sim_server.service.accounts import TokenLimits, add_token
 from tests.waiting import wait_until
 
 from .test_accounts import bearer

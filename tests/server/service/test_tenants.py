@@ -7,8 +7,8 @@ import json
 import pytest
 
 from real2sim_server.cli.store import audit
+from real2sim_server.service.accounts import ROLES, TokenLimits, add_token, read_token_file
 from real2sim_server.service.http.auth import needed_role
-from real2sim_server.service.tokens import ROLES, TokenLimits, add_token, read_token_file
 
 from .test_accounts import bearer
 from .waiting import finished
@@ -144,7 +144,7 @@ def test_entries_wait_while_the_store_is_in_trouble(client, monkeypatch):
     async def fail(_entries) -> None:
         raise worker_error
 
-    from real2sim_server.service.storage.errors import StoreUnavailableError
+    from real2sim_server.service.storage.connection import StoreUnavailableError
 
     worker_error = StoreUnavailableError("gone")
     monkeypatch.setattr(worker.audit._log, "add", fail)

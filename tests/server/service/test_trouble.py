@@ -14,7 +14,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from real2sim_server.service import clock as clock_module
-from real2sim_server.service.storage.errors import StoreTroubleError
+from real2sim_server.service.storage.connection import StoreTroubleError
 from tests.waiting import LIMIT_S, wait_until
 
 from .postgres import Postgres, running_postgres

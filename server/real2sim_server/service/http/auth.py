@@ -23,9 +23,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from real2sim_proto import ErrorCode
 
-from ..accounts import ACCOUNT, Account
-from ..tokens import ROLES, Role
-from .problems import ServiceError
+from ..accounts import ACCOUNT, ROLES, Account, Role
+from .responses import ServiceError
 
 FOREIGN_PAGE = 4403
 """Code with which sockets of other sites' pages are closed."""

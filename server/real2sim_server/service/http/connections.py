@@ -29,8 +29,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, ErrorCode
 
 from .auth import is_loopback
-from .problems import ServiceError, problem_of
-from .responses import SECURITY_HEADERS
+from .responses import SECURITY_HEADERS, ServiceError, problem_of
 
 if TYPE_CHECKING:
     import uvicorn

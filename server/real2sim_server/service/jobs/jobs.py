@@ -21,10 +21,10 @@ from real2sim_proto.jobs import JobFile, JobInfo, JobKind, JobState
 
 from ..accounts import ACCOUNT, owner_name
 from ..clock import now_us
-from ..http.idempotency import IdempotentRequest
-from ..http.problems import ServiceError, problem_of, service_error
-from ..library.budgets import Quota
-from ..scenarios.replies import iso_time
+from ..http.requests import IdempotentRequest
+from ..http.responses import ServiceError, problem_of, service_error
+from ..library.scenes import Quota
+from ..scenarios.scenario_cache import iso_time
 from ..storage.job_log import ClaimedJob, JobLog
 from ..storage.store import FencedError, StoreError, StoreTroubleError
 

@@ -33,9 +33,9 @@ from ...scene.io import (
     save_asset,
     stage_asset,
 )
-from ..http.problems import ServiceError
-from .budgets import IdleItem, MemoryBudget, Quota, folder_usage
+from ..http.responses import ServiceError
 from .imports import bears_claim, import_errors, put_claim, staging_folder
+from .scenes import IdleItem, MemoryBudget, Quota, folder_usage
 
 ASSET_SUFFIX = ".r2a"
 

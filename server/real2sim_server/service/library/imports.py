@@ -27,10 +27,9 @@ from ...scene.io import (
     save_scene,
     stage_scene,
 )
-from ..http.problems import ServiceError
-from ..storage.errors import FULL_ERRNOS, REFUSED_ERRNOS, is_full, is_refused
-from .budgets import Quota, folder_usage
-from .scenes import SCENE_DOCUMENT, bundle_folder
+from ..http.responses import ServiceError
+from ..storage.connection import FULL_ERRNOS, REFUSED_ERRNOS, is_full, is_refused
+from .scenes import SCENE_DOCUMENT, Quota, bundle_folder, folder_usage
 
 # --- Claims --------------------------------------------------------------------------------------
 

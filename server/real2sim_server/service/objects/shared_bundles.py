@@ -25,7 +25,7 @@ import structlog
 
 from ..._files import atomic_folder
 from ..clock import now_us
-from ..storage import tables as t
+from ..storage import schema as t
 from ..storage.fleet import notice
 from ..storage.store import ConflictError, Store, Write
 from .object_store import PIECE_BYTES, ObjectStore, ObjectStoreError

@@ -33,8 +33,8 @@ from ...render.frame import (
 from ...scene import Camera
 from ..engine import Engine
 from ..first_run import awaited, compile_beside
-from ..http.problems import ServiceError
-from ..library.budgets import IdleItem, MemoryBudget
+from ..http.responses import ServiceError
+from ..library.scenes import IdleItem, MemoryBudget
 
 log = structlog.get_logger(__name__)
 

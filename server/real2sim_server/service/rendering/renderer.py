@@ -43,9 +43,8 @@ from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ..engine import Engine, Lane, lower_priority
 from ..http.metrics import Metrics
-from ..http.problems import ServiceError
-from ..http.responses import choose_among, etag
-from ..library.budgets import MemoryBudget
+from ..http.responses import ServiceError, choose_among, etag
+from ..library.scenes import MemoryBudget
 from .background import DetailLevels, KernelsBeside, LensKernels
 from .frames import EncodedFrame, FollowingImage, RenderedImage, blurred, camera_with, encode_frame
 

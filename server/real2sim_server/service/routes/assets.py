@@ -21,9 +21,8 @@ from real2sim_proto.scenes import AssetCut, AssetInfo, AssetList, AssetPerson, A
 from ...render import encode_image
 from ...scene.asset import person_asset
 from ..http.auth import TokenRoute
-from ..http.idempotency import IdempotencyKey, form_digest
-from ..http.problems import ServiceError
-from ..http.responses import info_response
+from ..http.requests import IdempotencyKey, form_digest
+from ..http.responses import ServiceError, info_response
 from ..library.assets import draw_thumbnail, extract_object, import_asset
 from ..library.imports import drop_claim, import_errors, scene_name, staging_folder
 from ..worker import Worker, WorkerOf

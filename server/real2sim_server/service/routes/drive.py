@@ -16,7 +16,7 @@ from real2sim_proto import SUPPORTED_SUBPROTOCOLS, ErrorCode
 
 from ..accounts import Account, RevokedError
 from ..http.auth import act_for, bearer_token, unauthorized
-from ..http.problems import REQUEST_ID_KEY, problem_response, service_error
+from ..http.responses import REQUEST_ID_KEY, problem_response, service_error
 from ..sessions.connection import Connection
 from ..sessions.messages import (
     FatalError,

@@ -27,12 +27,19 @@ from ...edit import ScenarioState, instances_at
 from ...scene import Scene
 from ...world.recording.recording import Recording, RecordingError, recording_of_bytes
 from ..http.auth import TokenRoute, bearer_token, unauthorized
-from ..http.idempotency import IdempotencyKey
-from ..http.problems import cancel_on_disconnect
-from ..http.requests import ClientName
-from ..http.responses import event_stream, info_response
-from ..jobs.datasets import DatasetSource, EngineBackend, check_dataset, make_dataset, plan_of
-from ..jobs.exports import VideoSource, check_camera, export_video, frame_times
+from ..http.requests import ClientName, IdempotencyKey
+from ..http.responses import cancel_on_disconnect, event_stream, info_response
+from ..jobs.exports import (
+    DatasetSource,
+    EngineBackend,
+    VideoSource,
+    check_camera,
+    check_dataset,
+    export_video,
+    frame_times,
+    make_dataset,
+    plan_of,
+)
 from ..jobs.jobs import JobContext, JobResult, Jobs, NewJob, Work, accepted_headers
 from ..rendering.renderer import FRAME_RESPONSES, RenderRequest, frame_response
 from ..sessions.recording import RECORDING, episode_of

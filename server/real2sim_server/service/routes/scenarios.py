@@ -38,10 +38,8 @@ from ...scenarios.fit import fitted_to_scene
 from ...scenarios.gallery import GALLERY, corner_case, shipped_picture
 from ...scenarios.openscenario import ReadOptions, read_openscenario_text, write_openscenario
 from ..http.auth import TokenRoute
-from ..http.idempotency import IdempotencyKey, IdempotentRequest
-from ..http.problems import ServiceError, cancel_on_disconnect
-from ..http.requests import ClientName
-from ..http.responses import etag, info_response, large_response
+from ..http.requests import ClientName, IdempotencyKey, IdempotentRequest
+from ..http.responses import ServiceError, cancel_on_disconnect, etag, info_response, large_response
 from ..jobs.jobs import accepted_headers
 from ..rendering.renderer import FRAME_RESPONSES, frame_response
 from ..scenarios.scenarios import created_headers, tag

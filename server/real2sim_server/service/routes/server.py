@@ -25,7 +25,7 @@ from ...scene.range_sensors import RADARS, lidar_names
 from ...settings import Settings
 from ..http.auth import TokenRoute, require_token
 from ..http.openapi import POLICY, published, reference_page
-from ..http.problems import ServiceError
+from ..http.responses import ServiceError
 from ..worker import WorkerOf
 
 router = APIRouter(prefix="/v1", tags=["server"], route_class=TokenRoute)

@@ -38,18 +38,22 @@ from ..http.auth import (
     require_token,
     unauthorized,
 )
-from ..http.idempotency import IdempotencyKey, IdempotentRequest
-from ..http.problems import ServiceError
-from ..http.requests import ClientName
-from ..http.responses import choose_among, etag, info_response, large_response
+from ..http.requests import ClientName, IdempotencyKey, IdempotentRequest
+from ..http.responses import ServiceError, choose_among, etag, info_response, large_response
 from ..jobs.jobs import accepted_headers
 from ..rendering.renderer import CODEC_OF, choose_media_type
-from ..sessions.describe import session_edited, session_info, session_state, shown_state
 from ..sessions.pipeline import StepPipeline
 from ..sessions.recording import RECORDING, recording_of
 from ..sessions.registry import check_not_closed, created_headers
 from ..sessions.sensors import looking
-from ..sessions.session import Session, opens_session
+from ..sessions.session import (
+    Session,
+    opens_session,
+    session_edited,
+    session_info,
+    session_state,
+    shown_state,
+)
 from ..sessions.step import MakeReply
 from ..storage.store import StoredReply
 from ..worker import Worker, WorkerOf

@@ -30,7 +30,7 @@ from ..accounts import Account, RevokedError, admit_message, owner_name
 from ..engine import QueueFullError
 from ..http.auth import act_for
 from ..http.connections import close_quietly, receive_text
-from ..http.problems import ServiceError, service_error
+from ..http.responses import ServiceError, service_error
 from ..rendering.frames import EncodedFrame
 from ..rendering.renderer import RenderRequest
 from ..worker import Worker, WorkerOf

@@ -23,15 +23,19 @@ from real2sim_proto.scenarios import (
 from ...edit import AssetLookup, EditError, LogEntry, PlannedEntry, Scenario, ScenarioState
 from ...scene.io import SceneSummary
 from ..clock import now_us
-from ..http.idempotency import IdempotentRequest
 from ..http.metrics import Metrics
-from ..http.problems import ServiceError, uncancellable
+from ..http.requests import IdempotentRequest
+from ..http.responses import ServiceError, uncancellable
 from ..library.scenes import BUNDLE_SUFFIX, SceneCache
 from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply
-from .replies import (
+from .scenario_cache import (
+    CachedScenario,
+    ScenarioCache,
     ScenarioView,
+    Snapshots,
     asset_hashes,
     changed_elsewhere,
+    check_made,
     created_headers,
     history_entry,
     iso_time,
@@ -41,7 +45,6 @@ from .replies import (
     stale_revision,
     tag,
 )
-from .scenario_cache import CachedScenario, ScenarioCache, Snapshots, check_made
 
 __all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
 

@@ -33,28 +33,28 @@ from real2sim_proto.drive import (
 
 from .. import clock
 from ..accounts import admit_message
-from ..http.idempotency import IdempotentRequest
-from ..http.problems import ServiceError, service_error
-from .describe import result_fields, welcome_fields
+from ..http.requests import IdempotentRequest
+from ..http.responses import ServiceError, service_error
 from .messages import (
     PROGRESS_S,
     BadMessageError,
+    EncodedMessage,
     FatalError,
     ReceivedMessage,
     bad_message,
     close_with_error,
     error_message,
     is_resuming,
+    pack_message,
     receive,
     send,
     with_progress,
 )
 from .registry import Sessions
 from .sensors import looking
-from .session import ObserverQueue, Session, controller_taken
+from .session import ObserverQueue, Session, controller_taken, result_fields, welcome_fields
 from .shared_memory import FrameSlot, Segment
 from .step import Stepper
-from .wire import EncodedMessage, pack_message
 
 log = structlog.get_logger(__name__)
 

@@ -26,7 +26,7 @@ from real2sim_proto.drive import CLIENT_MESSAGE, Action, ClientMessage, Envelope
 from ..._records import made_quickly
 from ...world.recording.replay import plan_payload
 from ..http.auth import secrets_equal, unauthorized
-from ..http.problems import ServiceError
+from ..http.responses import ServiceError
 from ..storage.store import SessionRow
 from .session import opens_session
 from .wire import EncodedMessage, pack_message

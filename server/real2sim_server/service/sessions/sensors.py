@@ -28,7 +28,7 @@ from ...world.ranging import (
 )
 from ...world.sensing import clouds_of, recorded_cloud
 from ..engine import Engine
-from ..http.problems import ServiceError
+from ..http.responses import ServiceError
 from ..rendering.background import KernelsBeside
 from ..rendering.renderer import check_known, check_sensors
 

@@ -36,8 +36,8 @@ from real2sim_proto.drive import (
 )
 
 from ..http.auth import secrets_equal
-from ..http.problems import ServiceError
-from ..library.budgets import IdleItem, MemoryBudget
+from ..http.responses import ServiceError
+from ..library.scenes import IdleItem, MemoryBudget
 from ..rendering.frames import EncodedFrame, placed_frame
 
 SLOTS = 4

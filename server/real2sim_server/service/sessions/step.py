@@ -1,8 +1,8 @@
-"""From one committed instant to the next, and to the bytes that show it.
+"""A session's step from one committed instant to the next, and to the bytes that show it.
 
 A change is made on a fork of the world and passes the step pipeline (`pipeline`), which writes it
-ahead to the session's log; it takes effect once its observation is encoded and packed. Whatever
-goes wrong before leaves the session as it was, and what is in its log already is withdrawn.
+to the session's log first. It takes effect once its observation is encoded and packed. If anything
+fails before that, the session stays unchanged and the log entry is withdrawn.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from ...world.recording.replay import (
     stop_payload,
 )
 from ..clock import now_us
-from ..http.problems import ServiceError
-from ..storage.errors import FencedError, StoreTroubleError, StoreUnavailableError
+from ..http.responses import ServiceError
+from ..storage.connection import FencedError, StoreTroubleError, StoreUnavailableError
 from ..storage.store import SessionEntry, Store, StoredReply
 from ..warm_up import KernelWarmUp
 from .pipeline import EncodedObservation, LogWrite, Step, StepPipeline

@@ -22,9 +22,8 @@ from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 
 from ..._files import unpack_tar
-from . import tables as t
-from .connection import owned_folder
-from .errors import StoreError
+from . import schema as t
+from .connection import StoreError, owned_folder
 from .schema import check_version
 
 MANIFEST = "backup.json"

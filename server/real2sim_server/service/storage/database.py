@@ -20,24 +20,22 @@ from typing import Any, Literal, NoReturn, TypeVar, cast
 import sqlalchemy as sa
 import structlog
 
-from . import tables as t
+from . import schema as t
 from .connection import (
+    FencedError,
     NameOnServer,
     Prepared,
     PreparedStatements,
     StateFolderError,
-    connect,
-    file_of,
-    owned_name,
-    shown_url,
-)
-from .errors import (
-    FencedError,
     StoreBusyError,
     StoreError,
     StoreFullError,
     StoreTroubleError,
     StoreUnavailableError,
+    connect,
+    file_of,
+    owned_name,
+    shown_url,
     sorted_error,
 )
 from .schema import Policy, prepare_schema

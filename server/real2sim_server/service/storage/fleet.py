@@ -22,11 +22,11 @@ import structlog
 from sqlalchemy.engine import make_url
 
 from ..clock import now_us
-from . import tables as t
+from . import schema as t
 from .connection import native_connection
 from .database import Write
+from .schema import SessionRow
 from .store import Store
-from .tables import SessionRow
 
 
 @dataclass(frozen=True)

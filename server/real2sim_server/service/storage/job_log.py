@@ -11,7 +11,7 @@ import sqlalchemy as sa
 from real2sim_proto.jobs import JobInfo, JobState
 
 from ..clock import now_us
-from . import tables as t
+from . import schema as t
 from .fleet import clock_of, is_alive, notice
 from .store import Store, StoredReply, Write
 

@@ -1,27 +1,315 @@
-"""The schema of a store, and the Alembic revisions that bring an older store up to date.
+"""The tables of a store, their rows, and the Alembic revisions that upgrade an older store.
 
-A new store gets the current tables at once. To change `tables`, raise ``SCHEMA_VERSION`` and add a
-revision with that number to ``revisions/versions``; it turns a store of the previous version into
-what a new store is. Released revisions never change.
+Types are portable between SQLite and PostgreSQL. A new store gets the current tables at once. To
+change a table, raise ``SCHEMA_VERSION`` and add a revision with that number to
+``revisions/versions``; it turns a store of the previous version into a new one. Released revisions
+never change.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import sqlalchemy as sa
 import structlog
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+)
 from sqlalchemy.engine import Connection
 
-from . import tables as t
-from .errors import StoreError
+from ..._records import made_quickly
+from .connection import StoreError
 
 if TYPE_CHECKING:
     from alembic.config import Config
+
+
+# Tables.
+
+SCHEMA_VERSION = 1
+"""Raise it with every change of a table, together with a new file in ``revisions/versions``."""
+
+metadata = MetaData()
+
+alembic_version = Table("alembic_version", MetaData(), Column("version_num", String(32)))
+"""Alembic's own table, which holds the schema version in one row."""
+
+scenarios = Table(
+    "scenarios",
+    metadata,
+    Column("scenario_id", String(80), primary_key=True),
+    Column("name", String(200), nullable=False),
+    Column("scene", String(80), nullable=False),
+    Column("scene_hash", String(64), nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+
+# Append-only. The primary key is what keeps two writers from making the same revision.
+scenario_log = Table(
+    "scenario_log",
+    metadata,
+    Column(
+        "scenario_id",
+        String(80),
+        ForeignKey("scenarios.scenario_id", ondelete="CASCADE"),
+        primary_key=True,
+    ),
+    Column("revision", Integer, primary_key=True, autoincrement=False),
+    Column("kind", String(8), nullable=False),
+    Column("entry", Text, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+
+# What a log has led to at one revision, so that opening need not replay all of it. Made from the
+# log and nothing else: losing a row costs time, never an edit.
+scenario_snapshots = Table(
+    "scenario_snapshots",
+    metadata,
+    Column(
+        "scenario_id",
+        String(80),
+        ForeignKey("scenarios.scenario_id", ondelete="CASCADE"),
+        primary_key=True,
+    ),
+    Column("revision", Integer, nullable=False),
+    Column("made_by", String(80), nullable=False),
+    Column("state", LargeBinary, nullable=False),
+)
+
+sessions = Table(
+    "sessions",
+    metadata,
+    Column("session_id", String(80), primary_key=True),
+    Column("worker_id", String(16), nullable=False),
+    Column("scene", String(80), nullable=False),
+    Column("scene_hash", String(64), nullable=False),
+    Column("scenario_id", String(80), nullable=True),
+    Column("scenario_revision", Integer, nullable=True),
+    Column("token_hash", String(200), nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+    Column("closed_us", BigInteger, nullable=True),
+    Column("reason", Text, nullable=True),
+    Column("owner", String(80), nullable=False, server_default="default"),
+    # Raised whenever a worker takes the session over; who wrote under an earlier one may no more.
+    Column("epoch", Integer, nullable=False, server_default="0"),
+)
+Index("ix_sessions_open", sessions.c.worker_id, sessions.c.closed_us)
+
+# Append-only: resets, actions and edits of a session in the order in which they took effect.
+session_log = Table(
+    "session_log",
+    metadata,
+    Column(
+        "session_id",
+        String(80),
+        ForeignKey("sessions.session_id", ondelete="CASCADE"),
+        primary_key=True,
+    ),
+    Column("seq", Integer, primary_key=True, autoincrement=False),
+    Column("kind", String(16), nullable=False),
+    Column("step", Integer, nullable=True),
+    Column("payload", LargeBinary, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+
+# Workers that share the store, and until when each has promised to be alive.
+workers = Table(
+    "workers",
+    metadata,
+    Column("worker_id", String(16), primary_key=True),
+    Column("lease_until_us", BigInteger, nullable=False),
+    Column("document", Text, nullable=False),
+)
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("job_id", String(80), primary_key=True),
+    Column("worker_id", String(16), nullable=False),
+    Column("kind", String(16), nullable=False),
+    Column("subject", String(80), nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("document", Text, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+    # Raised whenever a worker takes the job over, as of a session.
+    Column("epoch", Integer, nullable=False, server_default="0"),
+    # Times that a worker died at it.
+    Column("deaths", Integer, nullable=False, server_default="0"),
+    # Whether any worker can begin it anew from its document, and whether somebody has cancelled it.
+    Column("portable", Integer, nullable=False, server_default="0"),
+    Column("cancelled", Integer, nullable=False, server_default="0"),
+)
+Index("ix_jobs_created", jobs.c.created_us)
+Index("ix_jobs_state", jobs.c.worker_id, jobs.c.state)
+
+idempotent_replies = Table(
+    "idempotent_replies",
+    metadata,
+    Column("key", String(300), primary_key=True),
+    Column("fingerprint", String(64), nullable=False),
+    Column("status", Integer, nullable=False),
+    Column("headers", Text, nullable=False),
+    Column("body", LargeBinary, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+Index("ix_idempotent_replies_created", idempotent_replies.c.created_us)
+
+# Scenes, assets and files of jobs that lie in a store of objects: of which ones they are made.
+shared_bundles = Table(
+    "shared_bundles",
+    metadata,
+    Column("kind", String(8), primary_key=True),
+    Column("name", String(80), primary_key=True),
+    Column("content", String(64), nullable=False),
+    Column("document", Text, nullable=False),
+    Column("bytes", BigInteger, nullable=False),
+    Column("created_us", BigInteger, nullable=False),
+)
+
+# Requests that changed something, and those that were refused for their token or role.
+audit = Table(
+    "audit",
+    metadata,
+    Column(
+        "entry",
+        BigInteger().with_variant(Integer, "sqlite"),
+        primary_key=True,
+        autoincrement=True,
+    ),
+    Column("at_us", BigInteger, nullable=False),
+    Column("account", String(80), nullable=False),
+    Column("client", String(80), nullable=False),
+    Column("worker_id", String(16), nullable=False),
+    Column("method", String(16), nullable=False),
+    Column("path", Text, nullable=False),
+    Column("status", Integer, nullable=False),
+    Column("request_id", String(80), nullable=False),
+)
+Index("ix_audit_at", audit.c.at_us)
+
+
+# --- Rows ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ScenarioRow:
+    """A scenario as created; its edits are in the log."""
+
+    scenario_id: str
+    name: str
+    scene: str
+    scene_hash: str
+    created_us: int
+
+
+@dataclass(frozen=True)
+class SnapshotRow:
+    """What the log of a scenario has led to.
+
+    Attributes:
+        revision: after which.
+        made_by: the program that made it; another one may read the same log otherwise.
+        state: as :func:`real2sim_server.edit.pack_state` has it.
+    """
+
+    scenario_id: str
+    revision: int
+    made_by: str
+    state: bytes
+
+
+class Claim(NamedTuple):
+    """A worker's right to write the log of a session.
+
+    Attributes:
+        session_id: of the session.
+        epoch: raised whenever a worker takes the session over; of several claims the one with the
+            highest counts.
+    """
+
+    session_id: str
+    epoch: int
+
+
+@dataclass(frozen=True)
+class SessionRow:
+    """A session as created.
+
+    Attributes:
+        worker_id: who has it now.
+        scenario_id, scenario_revision: what it began from; None for the bare scene.
+        token_hash: of the token that opens it, as :func:`~..tokens.token_hash` makes it.
+        closed_us, reason: None while it is open.
+        owner: name of the token that it was made with.
+        epoch: how often it was taken over.
+    """
+
+    session_id: str
+    worker_id: str
+    scene: str
+    scene_hash: str
+    scenario_id: str | None
+    scenario_revision: int | None
+    token_hash: str
+    created_us: int
+    closed_us: int | None = None
+    reason: str | None = None
+    owner: str = "default"
+    epoch: int = 0
+
+    @property
+    def claim(self) -> Claim:
+        """The right of ``worker_id`` to write its log."""
+        return Claim(self.session_id, self.epoch)
+
+
+@made_quickly
+@dataclass(frozen=True)
+class SessionEntry:
+    """One entry of a session's log.
+
+    Attributes:
+        seq: position in the session's log, from 0.
+        kind: ``reset``, ``action`` or ``edit``.
+        step: step of the clock it belongs to.
+        payload: msgpack or JSON of the message.
+    """
+
+    seq: int
+    kind: str
+    step: int | None
+    payload: bytes
+    created_us: int
+
+
+@dataclass(frozen=True)
+class StoredReply:
+    """An answer stored for a request that may be repeated with the same Idempotency-Key.
+
+    Attributes:
+        key: the header's value together with the call it was sent to.
+        fingerprint: SHA-256 of the request; another one under the same key is refused.
+    """
+
+    key: str
+    fingerprint: str
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
 
 SCHEMA_LOCK = 0x5232_5301
 """PostgreSQL's advisory lock, held while the schema is made or changed."""
@@ -58,10 +346,10 @@ def schema_status(engine: sa.Engine) -> SchemaStatus:
     with engine.connect() as connection:
         found = _version(connection)
     if found is None:
-        return SchemaStatus(None, t.SCHEMA_VERSION, (f"{t.SCHEMA_VERSION}: all tables",))
+        return SchemaStatus(None, SCHEMA_VERSION, (f"{SCHEMA_VERSION}: all tables",))
     check_version(found)
     pending = [f"{number}: {what}" for number, what in _revisions() if number > found]
-    return SchemaStatus(found, t.SCHEMA_VERSION, tuple(pending))
+    return SchemaStatus(found, SCHEMA_VERSION, tuple(pending))
 
 
 def prepare_schema(engine: sa.Engine, *, policy: Policy = "auto") -> None:
@@ -77,21 +365,21 @@ def prepare_schema(engine: sa.Engine, *, policy: Policy = "auto") -> None:
     """
     with engine.connect() as connection:
         found = _version(connection)
-    if found == t.SCHEMA_VERSION:
+    if found == SCHEMA_VERSION:
         return
-    if found is not None and 0 < found < t.SCHEMA_VERSION and policy == "refuse":
+    if found is not None and 0 < found < SCHEMA_VERSION and policy == "refuse":
         raise StoreError(
-            f"the store has schema version {found}, this worker needs {t.SCHEMA_VERSION}; make a "
+            f"the store has schema version {found}, this worker needs {SCHEMA_VERSION}; make a "
             "backup and run `real2sim store migrate`, or let workers migrate by themselves with "
             "REAL2SIM_STORE_MIGRATION=auto"
         )
     with _alone(engine) as connection:
         # Another worker may have been faster.
         found = _version(connection)
-        if found == t.SCHEMA_VERSION:
+        if found == SCHEMA_VERSION:
             return
         if found is None:
-            t.metadata.create_all(connection)
+            metadata.create_all(connection)
             _stamp(connection)
             return
         check_version(found)
@@ -101,7 +389,7 @@ def prepare_schema(engine: sa.Engine, *, policy: Policy = "auto") -> None:
 
 def check_version(found: int) -> None:
     """Raises StoreError if this program can neither use nor migrate that schema version."""
-    if 1 <= found <= t.SCHEMA_VERSION:
+    if 1 <= found <= SCHEMA_VERSION:
         return
     if found < 1:
         raise StoreError(
@@ -109,7 +397,7 @@ def check_version(found: int) -> None:
             "give another REAL2SIM_STORE_URL"
         )
     raise StoreError(
-        f"the store has schema version {found}, this program reads 1 to {t.SCHEMA_VERSION}; start "
+        f"the store has schema version {found}, this program reads 1 to {SCHEMA_VERSION}; start "
         "a worker of that version, or restore a backup made before the upgrade: `real2sim restore "
         "FILE --overwrite`, or give another REAL2SIM_STORE_URL"
     )
@@ -130,7 +418,7 @@ def _stamp(connection: Connection) -> None:
     """Record in a new store that no revision is pending."""
     from alembic import command
 
-    command.stamp(_config(connection), f"{t.SCHEMA_VERSION:04}")
+    command.stamp(_config(connection), f"{SCHEMA_VERSION:04}")
 
 
 def _config(connection: Connection | None = None, *, on_step: Any = None) -> Config:
@@ -165,9 +453,9 @@ def _alone(engine: sa.Engine) -> Iterator[Connection]:
 def _version(connection: Connection) -> int | None:
     """The schema version; None for an empty database, 0 for one made before the first release."""
     tables = sa.inspect(connection)
-    if not tables.has_table(t.alembic_version.name) or tables.has_table("schema_version"):
-        return 0 if tables.has_table(t.sessions.name) else None
-    found = connection.execute(sa.select(t.alembic_version.c.version_num)).scalar()
+    if not tables.has_table(alembic_version.name) or tables.has_table("schema_version"):
+        return 0 if tables.has_table(sessions.name) else None
+    found = connection.execute(sa.select(alembic_version.c.version_num)).scalar()
     return None if found is None else int(found)
 
 

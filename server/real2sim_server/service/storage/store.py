@@ -12,12 +12,10 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..clock import now_us
-from . import tables as t
-from .connection import Prepared
+from . import schema as t
+from .connection import ConflictError, FencedError, Prepared, StoreError, StoreTroubleError
 from .database import TIMEOUT_S, Database, Durability, OnCall, Write
-from .errors import ConflictError, FencedError, StoreError, StoreTroubleError
-from .schema import Policy
-from .tables import Claim, ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
+from .schema import Claim, Policy, ScenarioRow, SessionEntry, SessionRow, SnapshotRow, StoredReply
 
 # --- Session logs --------------------------------------------------------------------------------
 

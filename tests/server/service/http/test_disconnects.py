@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from real2sim_server.service.http.problems import uncancellable
+from real2sim_server.service.http.responses import uncancellable
 
 
 def test_a_change_goes_to_its_end_when_its_caller_is_cancelled():

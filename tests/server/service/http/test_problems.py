@@ -6,7 +6,7 @@ from real2sim_proto import HTTP_STATUS, PROBLEM_MEDIA_TYPE, ErrorCode, Problem
 from real2sim_server.render import RenderError
 from real2sim_server.scene import TimeOutOfRangeError, UnknownObjectError
 from real2sim_server.service.engine import QueueFullError
-from real2sim_server.service.http.problems import ServiceError, service_error
+from real2sim_server.service.http.responses import ServiceError, service_error
 
 
 def problem_of(response) -> Problem:

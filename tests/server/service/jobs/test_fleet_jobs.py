@@ -11,8 +11,8 @@ import sqlalchemy as sa
 from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_server.service.jobs import jobs as module
 from real2sim_server.service.jobs.jobs import MAX_DEATHS, JobResult, Jobs, NewJob
-from real2sim_server.service.library.budgets import Quota
-from real2sim_server.service.storage import job_log, tables
+from real2sim_server.service.library.scenes import Quota
+from real2sim_server.service.storage import job_log, schema
 from real2sim_server.service.storage.fleet import Leases
 from real2sim_server.service.storage.job_log import JobLog
 from real2sim_server.service.storage.store import FencedError, Store, Write
@@ -159,7 +159,7 @@ def test_a_job_that_kills_workers_is_given_up_with_the_reason(fleet):
         first, second = await start("w0"), await start("w1")
         job = await first.start(SIMULATION, for_ever)
         await running(first, job)
-        died = sa.update(tables.jobs).values(deaths=MAX_DEATHS - 1)
+        died = sa.update(schema.jobs).values(deaths=MAX_DEATHS - 1)
         await first._log._store.write(Write(died))
         await die(first)
         return await second.wait(job.job_id, LIMIT_S)

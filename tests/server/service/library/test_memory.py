@@ -11,10 +11,9 @@ from real2sim_proto import ErrorCode
 from real2sim_server.scene import Asset, GaussianCloud
 from real2sim_server.scene.io import read_scene_summary, save_asset, save_scene
 from real2sim_server.service.engine import Engine
-from real2sim_server.service.http.problems import ServiceError
+from real2sim_server.service.http.responses import ServiceError
 from real2sim_server.service.library.assets import AssetLibrary
-from real2sim_server.service.library.budgets import MemoryBudget
-from real2sim_server.service.library.scenes import SceneCache, SceneCatalog
+from real2sim_server.service.library.scenes import MemoryBudget, SceneCache, SceneCatalog
 from tests.waiting import wait_until_async
 
 

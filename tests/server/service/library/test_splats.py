@@ -12,7 +12,7 @@ from PIL import Image
 from real2sim_server.scene import GaussianCloud, SceneObject
 from real2sim_server.scene.asset import person_asset
 from real2sim_server.scene.io import read_splats, save_scene
-from real2sim_server.service.library.splat_files import SplatFiles
+from real2sim_server.service.library.views import SplatFiles
 
 
 def received(client, tmp_path, **query):

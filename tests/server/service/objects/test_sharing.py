@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from real2sim_server.service import sharing
+from real2sim_server.service import membership
 from real2sim_server.service.objects.object_store import FolderObjects
 from tests.waiting import LIMIT_S, wait_until
 
@@ -19,7 +19,7 @@ from ..waiting import succeeded
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(sharing, "LOOK_S", 0.05)
+    monkeypatch.setattr(membership, "LOOK_S", 0.05)
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from real2sim_proto.episode import SensorSpec
 from real2sim_server.edit import ScenarioState, things_at_start
 from real2sim_server.render import levels_bytes, scene_levels_bytes, select_backend
 from real2sim_server.render._cpu import detail_levels
-from real2sim_server.service.http.problems import ServiceError
-from real2sim_server.service.library.budgets import MemoryBudget
+from real2sim_server.service.http.responses import ServiceError
+from real2sim_server.service.library.scenes import MemoryBudget
 from real2sim_server.service.rendering.background import DetailLevels
 
 from ...conftest import make_tiny_scene

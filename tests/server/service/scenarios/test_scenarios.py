@@ -331,7 +331,7 @@ def test_a_cancelled_edit_is_on_record_or_not_but_never_half(client):
 
     async def cancel_midway(after: int) -> None:
         from real2sim_proto.operations import OPERATIONS
-        from real2sim_server.service.http.idempotency import IdempotentRequest
+        from real2sim_server.service.http.requests import IdempotentRequest
 
         operations = OPERATIONS.validate_python([MOVE_POST])
         coroutine = worker.scenarios.edit(

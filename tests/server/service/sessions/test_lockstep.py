@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from real2sim_proto import ErrorCode
-from real2sim_server.service.http.problems import ServiceError
+from real2sim_server.service.http.responses import ServiceError
 from real2sim_server.service.sessions.session import LockStep
 
 ACTIONS = st.lists(

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import sqlalchemy as sa
 
-from real2sim_server.service.storage.errors import FencedError
+from real2sim_server.service.storage.connection import FencedError
 from real2sim_server.service.storage.fleet import Leases
 from real2sim_server.service.storage.store import (
     SessionEntry,

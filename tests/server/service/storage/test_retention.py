@@ -9,7 +9,7 @@ import sqlalchemy as sa
 
 from real2sim_server.service import maintenance as module
 from real2sim_server.service.maintenance import DAY_US, Retention, RetentionLimits
-from real2sim_server.service.storage import tables
+from real2sim_server.service.storage import schema
 from real2sim_server.service.storage.store import (
     ScenarioRow,
     SessionEntry,
@@ -40,13 +40,13 @@ async def add(store, session_id, *, days_ago, ended=False, steps=3, payload=b"x"
     row = replace(SESSION, session_id=session_id, created_us=us - DAY_US)
     await store.create_session(row, entries=entries)
     if ended:
-        change = sa.update(tables.sessions).where(tables.sessions.c.session_id == session_id)
+        change = sa.update(schema.sessions).where(schema.sessions.c.session_id == session_id)
         await store.write(Write(change.values(closed_us=us, reason="done")))
 
 
 async def kept(store) -> dict[str, bool]:
     """Sessions that there are, and whether they are open."""
-    rows = await store.read(sa.select(tables.sessions))
+    rows = await store.read(sa.select(schema.sessions))
     return {row["session_id"]: row["closed_us"] is None for row in rows}
 
 
@@ -120,7 +120,7 @@ def test_what_went_is_given_back_to_the_disk(tmp_path):
 def test_as_many_pages_are_given_back_at_once_as_asked_for(tmp_path):
     async def work(store):
         await add(store, "w0.old", days_ago=31, ended=True, steps=200, payload=bytes(10_000))
-        everything = sa.delete(tables.session_log)
+        everything = sa.delete(schema.session_log)
         await store.write(Write(everything))
         more = await store.give_back(300)
         return more, await _free_pages(store), await store.give_back(10_000)

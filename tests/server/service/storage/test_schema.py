@@ -9,9 +9,8 @@ import threading
 import pytest
 import sqlalchemy as sa
 
-from real2sim_server.service.storage import schema, tables
-from real2sim_server.service.storage.connection import connect, keep_write_ahead_journal
-from real2sim_server.service.storage.errors import StoreError
+from real2sim_server.service.storage import schema
+from real2sim_server.service.storage.connection import StoreError, connect, keep_write_ahead_journal
 
 from ..postgres import Postgres
 from .opened_store import run
@@ -44,7 +43,7 @@ def schema_of(url: str) -> dict[str, object]:
 
 
 def test_the_newest_revision_has_the_number_of_the_schema():
-    assert [number for number, _ in schema._revisions()] == [*range(1, tables.SCHEMA_VERSION + 1)]
+    assert [number for number, _ in schema._revisions()] == [*range(1, schema.SCHEMA_VERSION + 1)]
 
 
 REVISION = '''"""scenarios have a colour."""
@@ -67,13 +66,13 @@ def next_version(tmp_path, monkeypatch):
     """Adds one revision to this program; ``then`` is a further statement of it."""
 
     def make(then: str = "pass") -> int:
-        last = tables.SCHEMA_VERSION
+        last = schema.SCHEMA_VERSION
         folder = tmp_path / "revisions"
         shutil.copytree(schema.REVISIONS, folder, dirs_exist_ok=True)
         text = REVISION.format(new=last + 1, last=last, then=then)
         (folder / "versions" / "next.py").write_text(text)
         monkeypatch.setattr(schema, "REVISIONS", folder)
-        monkeypatch.setattr(tables, "SCHEMA_VERSION", last + 1)
+        monkeypatch.setattr(schema, "SCHEMA_VERSION", last + 1)
         return last + 1
 
     return make

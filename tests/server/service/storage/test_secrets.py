@@ -7,7 +7,7 @@ import sqlite3
 
 import pytest
 
-from real2sim_server.service.tokens import sealed, unsealed
+from real2sim_server.service.accounts import sealed, unsealed
 
 
 @pytest.fixture

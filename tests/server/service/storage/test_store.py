@@ -9,8 +9,8 @@ import pytest
 import sqlalchemy as sa
 
 from real2sim_proto.jobs import JobInfo, JobState
-from real2sim_server.service.storage import tables
-from real2sim_server.service.storage.errors import StoreFullError, StoreUnavailableError
+from real2sim_server.service.storage import schema
+from real2sim_server.service.storage.connection import StoreFullError, StoreUnavailableError
 from real2sim_server.service.storage.job_log import JobLog
 from real2sim_server.service.storage.store import (
     Claim,
@@ -275,7 +275,7 @@ def test_what_was_handed_over_is_written_although_the_caller_was_cancelled(url):
         await store.create_scenario(SCENARIO)
         row = {"scenario_id": "sc_1", "revision": 1, "kind": "edit", "created_us": 1}
         row["entry"] = json.dumps(entry("a"))
-        task = asyncio.create_task(store.write(Write(sa.insert(tables.scenario_log), [row])))
+        task = asyncio.create_task(store.write(Write(sa.insert(schema.scenario_log), [row])))
         await asyncio.sleep(0)
         task.cancel()
         with pytest.raises(asyncio.CancelledError):

@@ -9,7 +9,7 @@ import os
 import sqlalchemy as sa
 from alembic import context
 
-from real2sim_server.service.storage import tables
+from real2sim_server.service.storage import schema
 
 
 def run(connection: sa.Connection) -> None:
@@ -17,7 +17,7 @@ def run(connection: sa.Connection) -> None:
     on_step = context.config.attributes.get("on_step")
     context.configure(
         connection=connection,
-        target_metadata=tables.metadata,
+        target_metadata=schema.metadata,
         on_version_apply=on_step,
         # SQLite changes a column by copying its table.
         render_as_batch=connection.dialect.name == "sqlite",
