@@ -38,14 +38,12 @@ from ..http.responses import ServiceError, service_error
 from .messages import (
     PROGRESS_S,
     BadMessageError,
-    EncodedMessage,
     FatalError,
     ReceivedMessage,
     bad_message,
     close_with_error,
     error_message,
     is_resuming,
-    pack_message,
     receive,
     send,
     with_progress,
@@ -55,6 +53,7 @@ from .sensors import looking
 from .session import ObserverQueue, Session, controller_taken, result_fields, welcome_fields
 from .shared_memory import FrameSlot, Segment
 from .step import Stepper
+from .wire import EncodedMessage, pack_message
 
 log = structlog.get_logger(__name__)
 

@@ -18,8 +18,12 @@ from real2sim_server.service.rendering.frames import (
     RenderedImage,
     encode_frame,
 )
-from real2sim_server.service.sessions.messages import pack_message
-from real2sim_server.service.sessions.wire import PhaseTimer, pack_members, pack_with_frames
+from real2sim_server.service.sessions.wire import (
+    PhaseTimer,
+    pack_members,
+    pack_message,
+    pack_with_frames,
+)
 
 MOUNTED = transform_from(np.array([1.5, 0.0, 1.6]), np.array([0.5, -0.5, 0.5, -0.5]))
 
