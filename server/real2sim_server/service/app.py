@@ -38,7 +38,6 @@ STEPS = ("/step", "/render", "/reset")
 PROTECTED: tuple[APIRouter, ...] = (
     server.router,
     scenes.router,
-    scenes.router,
     scenes.object_router,
     scenarios.router,
     scenarios.storyboards_router,
