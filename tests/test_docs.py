@@ -54,8 +54,12 @@ def test_every_page_is_on_the_site(page: Path) -> None:
 
 
 def test_the_newest_release_in_the_changelog_is_the_version() -> None:
-    with (REPOSITORY / "pyproject.toml").open("rb") as file:
-        version = tomllib.load(file)["project"]["version"]
+    texts = [(REPOSITORY / f / "pyproject.toml").read_text("utf-8") for f in ("client", ".")]
+    sdk, server = (tomllib.loads(text)["project"] for text in texts)
+    version = sdk["version"]
+    assert server["version"] == version
+    assert f"real2sim=={version}" in server["dependencies"]
+    assert f"real2sim-server=={version}" in sdk["optional-dependencies"]["server"]
     heads = re.findall(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text("utf-8"), re.M)
     assert heads[:2] == ["Unreleased", version]
 
