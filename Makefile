@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-SOURCES := proto client server benchmarks tests scripts docs/conf.py docs/images/make.py
+SOURCES := proto client server benchmarks examples tests scripts docs/conf.py docs/images/make.py
 # Cache bytecode even where the environment says not to: else every test process compiles it anew.
 unexport PYTHONDONTWRITEBYTECODE
 # Without -q, so that the header shows the random seed; --randomly-seed=N repeats that order.
