@@ -15,7 +15,7 @@ from real2sim_server.cli.options import JsonFile
 from real2sim_server.console import CommandError, print_figures, progress, write_json
 
 app = typer.Typer(
-    name="bench", no_args_is_help=True, help="Measure this machine; ratios to a reference."
+    name="bench", no_args_is_help=True, help="Measure this machine, as ratios to a reference."
 )
 
 
@@ -33,7 +33,7 @@ def render(
     splat: Annotated[Path | None, typer.Option(help="Splat file for the first case.")] = None,
     json: JsonFile = None,
 ) -> None:
-    """Milliseconds by stage and Gaussians per second, as ratio to the plain reference."""
+    """Measure rendering: time per stage and Gaussians per second."""
     from . import render
 
     _report(json, render.run(splat=splat))
@@ -41,7 +41,7 @@ def render(
 
 @command("sensors", group=app)
 def sensors(*, json: JsonFile = None) -> None:
-    """Time of a LiDAR's sweep, and of images through lenses and shutters beside a pinhole's."""
+    """Measure LiDAR sweeps, and lenses and shutters against a pinhole."""
     from . import sensors
 
     _report(json, sensors.run())
@@ -49,7 +49,7 @@ def sensors(*, json: JsonFile = None) -> None:
 
 @command("reconstruct", group=app)
 def reconstruct(*, json: JsonFile = None) -> None:
-    """Training iterations per second by stage, at 76,000 Gaussians and 621x188."""
+    """Measure training iterations per second, at 76,000 Gaussians and 621x188."""
     from . import reconstruct
 
     figures = reconstruct.run()
@@ -63,14 +63,12 @@ def reconstruct(*, json: JsonFile = None) -> None:
 def physics(
     *,
     peers: Annotated[
-        bool, typer.Option("--peers", help="Also measure Taichi and Warp, where installed.")
+        bool, typer.Option("--peers", help="Also measure Taichi and Warp, if installed.")
     ] = False,
-    backend: Annotated[
-        Literal["cpu", "cuda"], typer.Option(help="Where the solver computes.")
-    ] = "cpu",
+    backend: Annotated[Literal["cpu", "cuda"], typer.Option(help="Backend of the solver.")] = "cpu",
     json: JsonFile = None,
 ) -> None:
-    """Particle-substeps per second, and what they depend on."""
+    """Measure the physics solver in particle substeps per second."""
     from real2sim_server.physics.backends import select_backend
 
     from . import physics
@@ -87,7 +85,7 @@ def physics(
 
 @command("serve", group=app)
 def serve(*, json: JsonFile = None) -> None:
-    """Latency of a drive step, share of rendering, lag of the event loop, memory per session."""
+    """Measure latency of a drive step, event loop lag and memory per session."""
     from . import serve
 
     _report(json, serve.run())
@@ -95,7 +93,7 @@ def serve(*, json: JsonFile = None) -> None:
 
 @command("world", group=app)
 def world(*, json: JsonFile = None) -> None:
-    """Time of a step of the world alone: vehicle, traffic, contact, scores; also uncompiled."""
+    """Measure a step of the world alone: vehicle, traffic, contact, scores."""
     from . import world
 
     _report(json, world.run())
@@ -103,7 +101,7 @@ def world(*, json: JsonFile = None) -> None:
 
 @command("planners", group=app)
 def planners(*, json: JsonFile = None) -> None:
-    """Time that the SDK's rule planners take for a plan, beside a step of the world."""
+    """Measure the SDK's rule planners against a step of the world."""
     from . import planners
 
     _report(json, planners.run())
@@ -112,20 +110,18 @@ def planners(*, json: JsonFile = None) -> None:
 @command("search", group=app)
 def search(
     *,
-    episodes: Annotated[int, typer.Option(min=20, help="Of each search, at most.")] = 300,
-    seeds: Annotated[int, typer.Option(min=0, help="Searches of each planner.")] = 5,
-    first_seed: Annotated[int, typer.Option(min=0, help="Of those searches.")] = 0,
+    episodes: Annotated[int, typer.Option(min=20, help="Maximum episodes per search.")] = 300,
+    seeds: Annotated[int, typer.Option(min=0, help="Searches per planner.")] = 5,
+    first_seed: Annotated[int, typer.Option(min=0, help="First seed of the searches.")] = 0,
     planner: Annotated[
         list[str] | None,
-        typer.Option(help="idm, follow_route, pid or learned; all where none is named."),
+        typer.Option(help="idm, follow_route, pid or learned; default: all."),
     ] = None,
     policy: Annotated[Path | None, typer.Option(help="Weights of the learned planner.")] = None,
-    whole: Annotated[
-        int, typer.Option(min=0, help="Searches of each planner through all spaces.")
-    ] = 1,
+    whole: Annotated[int, typer.Option(min=0, help="Searches per planner through all spaces.")] = 1,
     json: JsonFile = None,
 ) -> None:
-    """Episodes to a planner's first avoidable failure, searched for and drawn at random."""
+    """Compare search with random sampling: episodes to the first avoidable failure."""
     from . import search
     from .search import CASES, SearchBenchOptions
 
@@ -147,7 +143,7 @@ def search(
 
 @command("learn", group=app)
 def learn(*, json: JsonFile = None) -> None:
-    """Steps and small images a second, for learning: batches, sessions at once; with ratios."""
+    """Measure steps and small images per second for learning."""
     from . import learn
 
     _report(json, learn.run())
@@ -158,10 +154,12 @@ def soak(
     *,
     sessions: Annotated[int, typer.Option(min=1, max=32)] = 16,
     minutes: Annotated[float, typer.Option(min=0.1, max=1440)] = 10.0,
-    rate: Annotated[float, typer.Option(min=0.1, max=1000, help="Steps/s of a session.")] = 10.0,
+    rate: Annotated[
+        float, typer.Option(min=0.1, max=1000, help="Steps per second and session.")
+    ] = 10.0,
     json: JsonFile = None,
 ) -> None:
-    """Many sessions side by side, misbehaving planners among them; every answer, and memory."""
+    """Stress a worker with many sessions and misbehaving planners."""
     from . import soak
 
     figures = soak.run(soak.SoakOptions(sessions=sessions, minutes=minutes, rate_hz=rate))
@@ -178,7 +176,7 @@ def edit(
     operations: Annotated[int, typer.Option(min=1, max=100_000)] = 1000,
     json: JsonFile = None,
 ) -> None:
-    """Time of an edit, and of opening a scenario that has had many."""
+    """Measure an edit, and opening a scenario with many edits."""
     from . import edit
 
     _report(json, edit.run(edit.EditBenchOptions(operations=operations)))
@@ -187,10 +185,12 @@ def edit(
 @command("dataset", group=app)
 def dataset(
     *,
-    rounds: Annotated[int, typer.Option(min=1, max=100, help="The least of so many counts.")] = 5,
+    rounds: Annotated[
+        int, typer.Option(min=1, max=100, help="Number of rounds; the minimum counts.")
+    ] = 5,
     json: JsonFile = None,
 ) -> None:
-    """CPU time of a labelled frame by part and as share of its colours; frames written a second."""
+    """Measure labelled frames: CPU time per part, frames per second."""
     from . import dataset
 
     figures = dataset.run(rounds=rounds)
@@ -202,14 +202,14 @@ def dataset(
 def recovery(
     *,
     scene: Annotated[
-        Path | None, typer.Option(help="Scene bundle; default: the demo's street.")
+        Path | None, typer.Option(help="Scene bundle; default: the demo street.")
     ] = None,
-    episodes: Annotated[int, typer.Option(min=8, max=1000, help="Of each planner.")] = 64,
-    epochs: Annotated[int, typer.Option(min=1, max=10_000, help="Of training.")] = 300,
+    episodes: Annotated[int, typer.Option(min=8, max=1000, help="Episodes per planner.")] = 64,
+    epochs: Annotated[int, typer.Option(min=1, max=10_000, help="Training epochs.")] = 300,
     seed: Annotated[int, typer.Option(min=0, max=1_000_000)] = 0,
     json: JsonFile = None,
 ) -> None:
-    """What recovery data is worth: the learned planner with and without, from displaced starts."""
+    """Compare the learned planner with and without recovery data."""
     from . import recovery
 
     options = recovery.RecoveryBenchOptions(
@@ -223,16 +223,16 @@ def detector(
     *,
     scene: Annotated[
         Path | None,
-        typer.Option(help="Bundle made of a synthetic drive; default: the demo's street."),
+        typer.Option(help="Bundle of a synthetic drive; default: the demo street."),
     ] = None,
-    frames: Annotated[int, typer.Option(min=20, max=100_000, help="To train on.")] = 2000,
-    epochs: Annotated[int, typer.Option(min=1, max=1000, help="Of training.")] = 8,
-    drives: Annotated[int, typer.Option(min=1, max=100, help="To test on.")] = 4,
+    frames: Annotated[int, typer.Option(min=20, max=100_000, help="Training frames.")] = 2000,
+    epochs: Annotated[int, typer.Option(min=1, max=1000, help="Training epochs.")] = 8,
+    drives: Annotated[int, typer.Option(min=1, max=100, help="Test drives.")] = 4,
     seed: Annotated[int, typer.Option(min=0, max=1_000_000)] = 0,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Processes that export.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Export processes.")] = 1,
     json: JsonFile = None,
 ) -> None:
-    """What exported labels are worth: a detector trained on them, beside one trained on truth."""
+    """Compare a detector trained on exported labels with one trained on truth."""
     from . import detector
 
     options = detector.DetectorBenchOptions(

@@ -47,7 +47,7 @@ def build_app() -> typer.Typer:
     app = typer.Typer(
         name="real2sim",
         cls=_Panels,
-        help="Drive a policy through a reconstructed street, over the network.",
+        help="Drive a policy through a reconstructed street over the network.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
@@ -109,7 +109,7 @@ def _version(wanted: bool) -> None:
 
 def _options(
     _version_wanted: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version and leave."
+        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
     ),
 ) -> None:
     return None

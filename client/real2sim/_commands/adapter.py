@@ -17,12 +17,10 @@ if TYPE_CHECKING:
 
 
 app = typer.Typer()
-adapters = typer.Typer(
-    no_args_is_help=True, help="Let another simulator drive, and draw what its cameras see."
-)
+adapters = typer.Typer(no_args_is_help=True, help="Render for another simulator that drives.")
 app.add_typer(adapters, name="adapter")
 
-Host = Annotated[str, typer.Option(help="Address to listen at.")]
+Host = Annotated[str, typer.Option(help="Address to listen on.")]
 Links = Annotated[
     Path | None,
     typer.Option(
@@ -37,10 +35,10 @@ def alpasim_renderer(
     *,
     links: Links = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Refuse objects that a scene lacks.")
+        bool, typer.Option("--strict", help="Refuse objects that are not in the scene.")
     ] = False,
     host: Host = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any.")] = 8080,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 picks a free one.")] = 8080,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 60.0,
@@ -59,15 +57,15 @@ def alpasim_renderer(
 @adapters.command("neuroncap-renderer")
 def neuroncap_renderer(
     *,
-    scene: Annotated[str, typer.Option(help="Name of a scene, or of one of the links.")],
+    scene: Annotated[str, typer.Option(help="Name of a scene or of a link.")],
     links: Links = None,
     host: Host = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any.")] = 8000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 picks a free one.")] = 8000,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 60.0,
 ) -> None:
-    """Serve NeuroNCAP's renderer: alive, get_actors, update_actors, render_image, start_time."""
+    """Serve NeuroNCAP's renderer API."""
     from ..renderers.linked_scene import SceneLink
     from ..renderers.neuroncap import NeuroNcapRenderer
 
@@ -108,32 +106,34 @@ def ros2(
     commands: Annotated[
         str,
         typer.Option(
-            help="What drives: 'ackermann' (/ackermann_cmd), 'twist' (/cmd_vel) or 'path' (/plan)."
+            help="Command topic: ackermann (/ackermann_cmd), twist (/cmd_vel) or path (/plan)."
         ),
     ] = "ackermann",
-    cameras: Annotated[str, typer.Option(help="Names, with commas between; 'all'.")] = "",
+    cameras: Annotated[str, typer.Option(help="Comma-separated camera names, or 'all'.")] = "",
     width: Annotated[
-        int | None, typer.Option(min=16, help="Pixels of their images; default: recorded.")
+        int | None, typer.Option(min=16, help="Image width [px]; default: as recorded.")
     ] = None,
     real_time: Annotated[
         float | None,
         typer.Option(
             min=0.001,
-            help="The clock goes on at this multiple of wall-clock time, under the newest command. "
+            help="Run at this multiple of wall-clock time with the latest command. "
             "Without it every observation waits for a command.",
         ),
     ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Default: to the episode's end.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the episode.")] = 0,
-    dt_us: Annotated[int, typer.Option(help="Clock step.")] = 50_000,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Maximum steps; default: until the episode ends.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the episode.")] = 0,
+    dt_us: Annotated[int, typer.Option(help="Time step [us].")] = 50_000,
     reset: Annotated[
-        str | None, typer.Option(metavar="JSON", help="Other options of reset.")
+        str | None, typer.Option(metavar="JSON", help="Further reset options.")
     ] = None,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 60.0,
 ) -> None:
-    """Publish what a session shows, and drive it by messages; needs ROS 2 with `rclpy`."""
+    """Run a session as a ROS 2 node; needs ROS 2 with `rclpy`."""
     from ..ros2.bridge import COMMANDS, Ros2Bridge, RosNode
 
     if (scene is None) == (scenario is None):

@@ -42,37 +42,40 @@ def drive(
         str | None,
         typer.Option(
             metavar="ID",
-            help="Drive this session, which the studio or somebody else has made; it stays.",
+            help="Drive this existing session, for example one of the studio; it stays open.",
         ),
     ] = None,
     session_token: Annotated[
         str | None,
-        typer.Option(help="Of --session.", envvar="REAL2SIM_SESSION_TOKEN", show_envvar=True),
+        typer.Option(help="Token of --session.", envvar="REAL2SIM_SESSION_TOKEN", show_envvar=True),
     ] = None,
     planner: Annotated[
         str,
         typer.Option(
-            help="follow_route, pid, idm, depth_sampling, learned=FILE, neuroncap=URL, "
+            help="Planner: follow_route, pid, idm, depth_sampling, learned=FILE, neuroncap=URL, "
             "alpasim=HOST:PORT, carla=FILE, or 'module:Class'."
         ),
     ] = "follow_route",
-    steps: Annotated[int, typer.Option(min=1, help="Clock steps; fewer when it ends.")] = 100,
-    cameras: Annotated[str, typer.Option(help="Names, with commas between; 'all'.")] = "",
+    steps: Annotated[int, typer.Option(min=1, help="Maximum number of steps.")] = 100,
+    cameras: Annotated[str, typer.Option(help="Comma-separated camera names, or 'all'.")] = "",
     width: Annotated[
-        int | None, typer.Option(min=16, help="Pixels of its images; default: recorded.")
+        int | None, typer.Option(min=16, help="Image width [px]; default: as recorded.")
     ] = None,
-    codec: Annotated[str, typer.Option(help="auto, raw, jpeg or png.")] = "auto",
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the episode; default: 0.")] = None,
-    dt_us: Annotated[int | None, typer.Option(help="Clock step [us]; default: 100000.")] = None,
+    codec: Annotated[str, typer.Option(help="Image encoding: auto, raw, jpeg or png.")] = "auto",
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the episode; default: 0.")
+    ] = None,
+    dt_us: Annotated[int | None, typer.Option(help="Time step [us]; default: 100000.")] = None,
     warmup_us: Annotated[
         int | None,
-        typer.Option(min=0, help="The vehicle moves as recorded for so long; plans wait."),
+        typer.Option(
+            min=0, help="Follow the recording for this long before the planner takes over [us]."
+        ),
     ] = None,
     beyond_log: Annotated[
         str | None,
         typer.Option(
-            help="What --steps beyond the recording lead to: 'end' of the episode (default), "
-            "'loop' or 'extend'."
+            help="After the end of the recording: 'end' the episode (default), 'loop' or 'extend'."
         ),
     ] = None,
     spawn: Annotated[
@@ -100,21 +103,21 @@ def drive(
         ),
     ] = None,
     lidar: Annotated[
-        str, typer.Option(help="LiDARs of the worker's catalogue, comma-separated.")
+        str, typer.Option(help="Comma-separated LiDAR models of the worker's catalogue.")
     ] = "",
     radar: Annotated[
-        str, typer.Option(help="Radars of the worker's catalogue, comma-separated.")
+        str, typer.Option(help="Comma-separated radar models of the worker's catalogue.")
     ] = "",
     out: Annotated[
         Path | None,
-        typer.Option(help="Save there: CAMERA/STEP.jpg, LIDAR/STEP.ply, summary.json."),
+        typer.Option(help="Folder for CAMERA/STEP.jpg, LIDAR/STEP.ply and summary.json."),
     ] = None,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 60.0,
     json_file: JsonFile = None,
 ) -> None:
-    """Drive a scene or scenario with a planner, over the drive socket."""
+    """Drive a scene or scenario with a planner."""
     from real2sim.planners import load_planner, needs_of, run_episode
 
     if sum(given is not None for given in (scene, scenario, session)) != 1:

@@ -21,12 +21,10 @@ Token = Annotated[
         "--token", envvar="REAL2SIM_TOKEN", show_envvar=True, help="Bearer token of the worker."
     ),
 ]
-Timeout = Annotated[
-    float, typer.Option("--timeout", min=0.1, help="Seconds that a reply may take.")
-]
+Timeout = Annotated[float, typer.Option("--timeout", min=0.1, help="Seconds to wait for a reply.")]
 JsonFile = Annotated[
     Path | None,
-    typer.Option("--json", metavar="FILE", help="Write the figures there; '-' prints them."),
+    typer.Option("--json", metavar="FILE", help="Write the results as JSON; '-' prints them."),
 ]
 
 DEFAULT_URL = "http://127.0.0.1:8600"

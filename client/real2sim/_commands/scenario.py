@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 
 app = typer.Typer()
-scenario = typer.Typer(no_args_is_help=True, help="What happens in scenarios of a worker.")
+scenario = typer.Typer(
+    no_args_is_help=True, help="Add corner cases and OpenSCENARIO files to scenarios."
+)
 app.add_typer(scenario, name="scenario")
 
 Scenario = Annotated[str, typer.Argument(help="Id of the scenario.")]
@@ -32,7 +34,7 @@ def gallery(
     timeout: Timeout = 30.0,
     json_file: JsonFile = None,
 ) -> None:
-    """List ready corner cases with their parameters."""
+    """List the corner cases of the gallery with their parameters."""
     with connected(url, token, timeout) as client:
         cases = client.scenarios.gallery()
     if json_file is not None:
@@ -50,19 +52,19 @@ def gallery(
 @scenario.command("apply")
 def apply(
     *,
-    case: Annotated[str, typer.Argument(help="Corner case of the gallery.")],
+    case: Annotated[str, typer.Argument(help="Name of the corner case.")],
     scenario_id: Annotated[
-        str | None, typer.Option("--scenario", help="Of this scenario; or --scene.")
+        str | None, typer.Option("--scenario", help="Scenario to change; or use --scene.")
     ] = None,
-    scene: Annotated[str | None, typer.Option(help="Of a new scenario on this scene.")] = None,
+    scene: Annotated[str | None, typer.Option(help="Create a new scenario on this scene.")] = None,
     values: Annotated[
-        list[str] | None, typer.Option("--set", help="Parameter, name=value; repeat it.")
+        list[str] | None, typer.Option("--set", help="Parameter as NAME=VALUE; repeatable.")
     ] = None,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 30.0,
 ) -> None:
-    """Let a corner case happen in sessions of a scenario."""
+    """Add a corner case to a scenario."""
     if (scene is None) == (scenario_id is None):
         raise typer.BadParameter("give exactly one of --scene and --scenario")
     from .. import Real2SimError
@@ -90,14 +92,14 @@ def import_(
     file: Annotated[Path, typer.Argument(help="OpenSCENARIO 1.0 to 1.3 (.xosc).")],
     leave_out: Annotated[
         list[str] | None,
-        typer.Option("--leave-out", help="Element of the file to leave out; repeat it."),
+        typer.Option("--leave-out", help="Element of the file to ignore; repeatable."),
     ] = None,
-    ego: Annotated[str | None, typer.Option(help="Entity that is the ego; default: Ego.")] = None,
+    ego: Annotated[str | None, typer.Option(help="Name of the ego entity; default: Ego.")] = None,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 30.0,
 ) -> None:
-    """Let an OpenSCENARIO file say what happens in sessions of a scenario."""
+    """Use an OpenSCENARIO file in a scenario."""
     with connected(url, token, timeout) as client:
         handle = client.scenarios.get(scenario_id)
         result = handle.read_xosc(file, leave_out=leave_out or (), ego=ego)
@@ -115,7 +117,7 @@ def export(
     token: Token = None,
     timeout: Timeout = 30.0,
 ) -> None:
-    """Write what happens in a scenario as an OpenSCENARIO file."""
+    """Export the storyboard of a scenario as an OpenSCENARIO file."""
     with connected(url, token, timeout) as client:
         client.scenarios.get(scenario_id).write_xosc(file)
     typer.echo(f"wrote {file}")
@@ -145,16 +147,16 @@ def edit(
             allow_dash=True,
         ),
     ],
-    scene: Annotated[str | None, typer.Option(help="Make a new scenario on this scene.")] = None,
+    scene: Annotated[str | None, typer.Option(help="Create a new scenario on this scene.")] = None,
     scenario: Annotated[str | None, typer.Option(help="Edit this scenario.")] = None,
     name: Annotated[str, typer.Option(help="Name of the new scenario.")] = "",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check, change nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Validate only.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 30.0,
     json_file: JsonFile = None,
 ) -> None:
-    """Apply operations to a scenario; all of them, or none.
+    """Apply a file of operations to a scenario, all or none.
 
     A new scenario is only kept where they apply, and never after --dry-run.
     """

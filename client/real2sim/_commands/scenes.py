@@ -40,7 +40,7 @@ def status(
     timeout: Timeout = 10.0,
     json_file: JsonFile = None,
 ) -> None:
-    """Show a worker's version, device, limits and readiness; exit code 1 when not ready."""
+    """Show a worker's version, device and limits; exit code 1 if it is not ready."""
     with connected(url, token, timeout) as client:
         info, readiness = client.server(), client.readiness()
     if json_file is not None:
@@ -101,14 +101,16 @@ def frame(
     out: Annotated[Path, typer.Option("-o", "--out", help="Image to write: .jpg, .png or .npy.")],
     scene: Annotated[str | None, typer.Option(help="Name of a scene.")] = None,
     scenario: Annotated[str | None, typer.Option(help="Id of a scenario.")] = None,
-    t_us: Annotated[int | None, typer.Option(help="Instant; default: the start.")] = None,
-    width: Annotated[int | None, typer.Option(min=16, help="Pixels; default: recorded.")] = None,
-    modality: Annotated[Modality, typer.Option(help="What to show.")] = Modality.RGB,
+    t_us: Annotated[int | None, typer.Option(help="Time [us]; default: the start.")] = None,
+    width: Annotated[
+        int | None, typer.Option(min=16, help="Image width [px]; default: as recorded.")
+    ] = None,
+    modality: Annotated[Modality, typer.Option(help="Kind of image.")] = Modality.RGB,
     url: Url = DEFAULT_URL,
     token: Token = None,
     timeout: Timeout = 60.0,
 ) -> None:
-    """Let a worker render one frame of a scene or scenario, and save it."""
+    """Render one frame of a scene or scenario on a worker."""
     if (scene is None) == (scenario is None):
         raise typer.BadParameter("give exactly one of --scene and --scenario")
     codec = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}.get(out.suffix.lower(), "raw")

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 def calibrate(
     *,
     scene: SceneBundle,
-    subject: Annotated[str, typer.Option("--object", help="Whose values are found.")],
+    subject: Annotated[str, typer.Option("--object", help="Object to calibrate.")],
     fit: Annotated[
         list[str],
-        typer.Option(help="stiffness, yield_stress, viscosity, friction or speed; repeat it."),
+        typer.Option(help="stiffness, yield_stress, viscosity, friction or speed; repeatable."),
     ],
     observed: Annotated[
         Path | None,
@@ -38,25 +38,25 @@ def calibrate(
         ),
     ] = None,
     beside: Annotated[
-        list[str] | None, typer.Option("--with", help="Other objects that take part; repeat it.")
+        list[str] | None, typer.Option("--with", help="Other objects to simulate; repeatable.")
     ] = None,
     physics: Annotated[
         list[str] | None,
-        typer.Option("--physics", help="Initial values, as of simulate."),
+        typer.Option("--physics", help="Initial values, as for simulate."),
     ] = None,
-    gravity: Annotated[
-        float | None, typer.Option(min=0, max=100, help="Downwards [m/s^2].")
-    ] = None,
-    preset: Annotated[str, typer.Option(help="paper or vehicle.")] = "vehicle",
+    gravity: Annotated[float | None, typer.Option(min=0, max=100, help="Gravity [m/s^2].")] = None,
+    preset: Annotated[str, typer.Option(help="Preset: paper or vehicle.")] = "vehicle",
     frame: Annotated[int, typer.Option(min=0, help="Recorded frame to start at.")] = 0,
     duration: Annotated[
-        float, typer.Option(min=0.01, max=30, help="Of the recorded track [s].")
+        float, typer.Option(min=0.01, max=30, help="Duration of the recorded track to use [s].")
     ] = 1.0,
-    max_particles: Annotated[int, typer.Option(min=100, help="Of all bodies.")] = 20_000,
-    steps: Annotated[int, typer.Option(min=1, max=60, help="Of the search at most.")] = 12,
+    max_particles: Annotated[
+        int, typer.Option(min=100, help="Maximum particles of all bodies.")
+    ] = 20_000,
+    steps: Annotated[int, typer.Option(min=1, max=60, help="Maximum steps of the search.")] = 12,
     json: JsonFile = None,
 ) -> None:
-    """Find values of an object with which physics shows what was seen of it.
+    """Fit an object's physical parameters to observations.
 
     Each comes with what it may be wrong by: what observations leave open, and what cells do.
     """

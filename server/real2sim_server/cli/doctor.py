@@ -50,10 +50,10 @@ def doctor(
         bool, typer.Option("--warm", help="Compile all kernels of a worker into the cache.")
     ] = False,
     warmed: Annotated[
-        bool, typer.Option("--warmed", help="Fail if a worker had kernels to compile.")
+        bool, typer.Option("--warmed", help="Fail if any kernel is not compiled yet.")
     ] = False,
     build_gpu: Annotated[
-        bool, typer.Option("--build-gpu", help="Compile gsplat's kernels; takes minutes.")
+        bool, typer.Option("--build-gpu", help="Compile gsplat's kernels (takes minutes).")
     ] = False,
     arch: Annotated[
         list[str] | None,
@@ -62,11 +62,13 @@ def doctor(
         ),
     ] = None,
     need_cuda: Annotated[
-        bool, typer.Option("--need-cuda", help="Fail where rendering on CUDA is not usable.")
+        bool, typer.Option("--need-cuda", help="Fail if CUDA rendering is not usable.")
     ] = False,
     without_device: Annotated[
         bool,
-        typer.Option("--without-device", help="With --need-cuda: the GPU itself may be missing."),
+        typer.Option(
+            "--without-device", help="With --need-cuda: ignore that the GPU itself is missing."
+        ),
     ] = False,
     serving_kernels: Annotated[
         bool,
@@ -81,7 +83,7 @@ def doctor(
         bool,
         typer.Option(
             "--solver-kernels",
-            help="The same for the kernels of the solver on CUDA, in both precisions.",
+            help="The same for the CUDA kernels of the physics solver, in both precisions.",
         ),
     ] = False,
     gpu_check: Annotated[
@@ -93,11 +95,11 @@ def doctor(
         ),
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="With --gpu-check: the table as a Markdown file.")
+        Path | None, typer.Option(help="With --gpu-check: write the table as Markdown.")
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Say what this machine can do, what is missing, and how to mend it."""
+    """Report what this machine can do, what is missing, and how to fix it."""
     findings = {"python": platform.python_version(), "cores": str(os.cpu_count())}
     findings |= {name: _version(name) for name in DISTRIBUTIONS}
     missing = [name for name in SERVER_MODULES if importlib.util.find_spec(name) is None]

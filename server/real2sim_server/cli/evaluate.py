@@ -28,28 +28,30 @@ if TYPE_CHECKING:
 def evaluate(
     *,
     scene: SceneBundle,
-    log: Annotated[Path, typer.Argument(help="Folder of the driving log it was made of.")],
+    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
     frames: Annotated[
-        str, typer.Option(help="held-out, all, or numbers such as 3,7,11")
+        str, typer.Option(help="Frames: held-out, all, or numbers such as 3,7,11.")
     ] = "held-out",
-    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Of images [px].")] = None,
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Image width [px].")] = None,
     shifts: Annotated[
         str, typer.Option(help="Metres beside the path, for images where truth is, or roads.")
     ] = "1,2,3",
     around: Annotated[
-        bool, typer.Option("--around", help="Also see vehicles from all sides (synthetic logs).")
+        bool, typer.Option("--around", help="Also view vehicles from all sides (synthetic logs).")
     ] = False,
     lidar: Annotated[
-        bool, typer.Option("--lidar", help="Also cast LiDAR sweeps and compare them.")
+        bool, typer.Option("--lidar", help="Also simulate LiDAR sweeps and compare them.")
     ] = False,
-    report: Annotated[Path | None, typer.Option(help="Folder for a page with images.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Folder for an HTML report with images.")
+    ] = None,
     backend: RenderBackend = "auto",
     device: RenderDevice = None,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Compare a scene with its log: images, moving objects, LiDAR depth, speed of rendering."""
+    """Compare a scene with its log: images, moving objects, LiDAR depth, rendering speed."""
     from ..logs.open import open_log
     from ..reconstruct.evaluation import EvaluateOptions, evaluate_scene, write_report
     from ..scene.io import load_scene
@@ -86,7 +88,7 @@ def _parse_frames(text: str) -> str | tuple[int, ...]:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
         raise CommandError(
-            f"--frames {text!r}; allowed are held-out, all, or numbers such as 3,7,11"
+            f"--frames {text!r}; allowed are Frames: held-out, all, or numbers such as 3,7,11."
         ) from None
 
 

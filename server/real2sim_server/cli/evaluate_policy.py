@@ -28,7 +28,7 @@ DEFAULT_SEEDS = 3
 @command("evaluate-policy")
 def evaluate_policy(
     *,
-    out: Annotated[Path, typer.Option("--out", help="Folder for report and recordings.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the report and recordings.")],
     policies: Annotated[
         list[str],
         typer.Option(
@@ -36,10 +36,10 @@ def evaluate_policy(
         ),
     ],
     scenes: Annotated[
-        list[str] | None, typer.Option("--scene", help="To drive as recorded; repeat it.")
+        list[str] | None, typer.Option("--scene", help="Scene to drive as recorded; repeatable.")
     ] = None,
     scenarios: Annotated[
-        list[str] | None, typer.Option("--scenario", help="Id, to drive as it is; repeat it.")
+        list[str] | None, typer.Option("--scenario", help="Id of a scenario to drive; repeatable.")
     ] = None,
     suite: Annotated[
         Path | None,
@@ -65,15 +65,18 @@ def evaluate_policy(
         ),
     ] = None,
     url: Annotated[
-        str | None, typer.Option(help="Of a running worker; default: one is started.")
+        str | None, typer.Option(help="Address of a running worker; default: start one.")
     ] = None,
     token: Annotated[str | None, typer.Option(envvar="REAL2SIM_TOKEN", show_default=False)] = None,
     scenes_dir: Annotated[
-        Path | None, typer.Option("--scenes", help="Bundles for the worker that is started.")
+        Path | None,
+        typer.Option("--scenes", help="Folder of bundles for the worker that is started."),
     ] = None,
-    sessions: Annotated[int, typer.Option(min=1, max=64, help="Episodes at a time.")] = 2,
+    sessions: Annotated[
+        int, typer.Option(min=1, max=64, help="Episodes to drive in parallel.")
+    ] = 2,
 ) -> None:
-    """Drive cases with planners; leave scores, recordings and a page that compares them.
+    """Compare planners over cases: scores, recordings and an HTML report.
 
     Each planner runs in a process of its own. One that raises, sends a plan that is refused or
     ends its process fails that episode: the rest is driven, and the exit code is 1.

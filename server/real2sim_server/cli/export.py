@@ -20,15 +20,18 @@ if TYPE_CHECKING:
 def export(
     *,
     scene: SceneBundle,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File, or folder of one per object.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Output file, or folder with one file per object.")
+    ],
     file_format: Annotated[
-        str, typer.Option("--format", help="ply, compressed.ply, spz, splat, gltf or points")
+        str,
+        typer.Option("--format", help="Format: ply, compressed.ply, spz, splat, gltf or points."),
     ] = "ply",
     t_us: Annotated[
-        int | None, typer.Option(help="Bake everything at this time into one file [us].")
+        int | None, typer.Option(help="Bake the whole scene at this time [us] into one file.")
     ] = None,
     objects: Annotated[
-        list[str] | None, typer.Option("--object", help="Only these objects; repeat it.")
+        list[str] | None, typer.Option("--object", help="Export only this object; repeatable.")
     ] = None,
     overwrite: Overwrite = False,
     json: JsonFile = None,

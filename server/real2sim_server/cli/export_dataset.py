@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def export_dataset(
     *,
     scene: SceneBundle,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder that does not exist yet.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="New output folder.")],
     format_: Annotated[
         list[str],
         typer.Option(
@@ -39,24 +39,26 @@ def export_dataset(
             "mcap, pictures",
         ),
     ],
-    operations: Annotated[
-        Path | None, typer.Option(help="JSON list of edits, as scenarios have them.")
-    ] = None,
+    operations: Annotated[Path | None, typer.Option(help="JSON list of operations.")] = None,
     episode: Annotated[
-        Path | None, typer.Option(help="Recorded episode (.r2e) on this scene, instead.")
+        Path | None, typer.Option(help="Export a recorded episode (.r2e) of this scene.")
     ] = None,
-    assets: Annotated[Path | None, typer.Option(help="Asset library that edits use.")] = None,
+    assets: Annotated[Path | None, typer.Option(help="Asset library for the edits.")] = None,
     cameras: Annotated[
-        str | None, typer.Option(help="Such as front,front_left; default: all.")
+        str | None, typer.Option(help="Comma-separated cameras; default: all.")
     ] = None,
-    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Of images [px].")] = None,
-    period: Annotated[float, typer.Option(min=0.001, help="Between frames [s].")] = 0.1,
-    start_us: Annotated[int | None, typer.Option(help="First instant [us].")] = None,
-    end_us: Annotated[int | None, typer.Option(help="Last instant [us].")] = None,
-    clip: Annotated[float, typer.Option(min=0.001, help="Length of a clip [s].")] = 20.0,
-    splits: Annotated[str, typer.Option(help="Shares of the clips.")] = "train=1",
-    seed: Annotated[int, typer.Option(min=0, help="Draws the clips of each split.")] = 0,
-    flow: Annotated[bool, typer.Option(help="Whether optical flow is made.")] = True,
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Image width [px].")] = None,
+    period: Annotated[float, typer.Option(min=0.001, help="Time between frames [s].")] = 0.1,
+    start_us: Annotated[int | None, typer.Option(help="Start time [us].")] = None,
+    end_us: Annotated[int | None, typer.Option(help="End time [us].")] = None,
+    clip: Annotated[float, typer.Option(min=0.001, help="Maximum length of a clip [s].")] = 20.0,
+    splits: Annotated[
+        str, typer.Option(help="Share of clips per split, such as train=0.8,val=0.2.")
+    ] = "train=1",
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the assignment of clips to splits.")
+    ] = 0,
+    flow: Annotated[bool, typer.Option(help="Write optical flow.")] = True,
     lidar: Annotated[
         str | None,
         typer.Option(
@@ -66,14 +68,14 @@ def export_dataset(
     ] = None,
     rig: Annotated[
         Path | None,
-        typer.Option(help="JSON file of cameras and LiDAR, instead of --cameras and --lidar."),
+        typer.Option(help="JSON file of cameras and LiDAR; replaces --cameras and --lidar."),
     ] = None,
     sweep: Annotated[
-        Path | None, typer.Option(help="JSON file of parameters and the edits they are in.")
+        Path | None, typer.Option(help="JSON file of parameters and the operations that use them.")
     ] = None,
     perturb: Annotated[
         str | None,
-        typer.Option(help="The ego starts beside its path: lateral=0.5,heading=4,copies=2."),
+        typer.Option(help="Offset the ego from its path: lateral=0.5,heading=4,copies=2."),
     ] = None,
     noise: Annotated[
         str | None,
@@ -83,23 +85,25 @@ def export_dataset(
         ),
     ] = None,
     workers: Annotated[
-        int, typer.Option(min=1, max=1024, help="Processes that hold the scene each.")
+        int, typer.Option(min=1, max=1024, help="Worker processes; each loads the scene.")
     ] = 1,
     executor: Annotated[
-        str, typer.Option(help="Who makes clips: processes (of this machine), or ray.")
+        str, typer.Option(help="Run clips in local processes or on ray.")
     ] = "processes",
     ray_address: Annotated[
         str | None,
-        typer.Option(help="Of an existing cluster (auto: the environment's); default: one here."),
+        typer.Option(
+            help="Address of a Ray cluster ('auto': from the environment); default: start one."
+        ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say how many frames, bytes and minutes.")
+        bool, typer.Option("--dry-run", help="Only estimate frames, bytes and minutes.")
     ] = False,
     backend: RenderBackend = "auto",
     device: RenderDevice = None,
     json: JsonFile = None,
 ) -> None:
-    """Write labelled images of a scene, edited or as an episode went, in public formats.
+    """Export labelled images of a scene, its edits or an episode in public formats.
 
     Stopped and called again it goes on after the last whole clip, and gives the same bytes.
     """

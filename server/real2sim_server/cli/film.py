@@ -16,17 +16,21 @@ from .options import RenderBackend, RenderDevice, SceneBundle, chosen_backend
 def film(
     *,
     scene: SceneBundle,
-    run: Annotated[Path, typer.Argument(help="Folder that `real2sim simulate` has written.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Default: the same.")] = None,
-    view: Annotated[str, typer.Option(help="near, scene or both")] = "both",
-    width: Annotated[int | None, typer.Option(min=64, max=4096, help="Of each view [px].")] = None,
+    run: Annotated[Path, typer.Argument(help="Output folder of `real2sim simulate`.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; default: the same.")
+    ] = None,
+    view: Annotated[str, typer.Option(help="Camera: near, scene or both.")] = "both",
+    width: Annotated[
+        int | None, typer.Option(min=64, max=4096, help="Width of each view [px].")
+    ] = None,
     slow: Annotated[
-        float | None, typer.Option(min=0.1, max=100, help="Times slower than it was.")
+        float | None, typer.Option(min=0.1, max=100, help="Slow-motion factor.")
     ] = None,
     backend: RenderBackend = "auto",
     device: RenderDevice = None,
 ) -> None:
-    """Draw film.mp4 and strip.png of a simulation without simulating it again."""
+    """Render film.mp4 and strip.png of a finished simulation again."""
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
     from ..simulation.ego import EGO, with_ego

@@ -76,22 +76,22 @@ def fit_scene(
 def fit_lidar(
     *,
     scene: SceneBundle,
-    log: Annotated[Path, typer.Argument(help="Folder of the driving log it was made of.")],
+    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Bundle to write; the scene itself.")
+        Path | None, typer.Option("--out", "-o", help="Output bundle; default: the scene itself.")
     ] = None,
     surfaces: Annotated[
         Path | None,
-        typer.Option(help="initial.r2s of its training folder, which spares making it again."),
+        typer.Option(help="initial.r2s of the training folder, to save time."),
     ] = None,
     steps: Annotated[
-        int, typer.Option(min=0, help="Steps of learning; about a second of one core each.")
+        int, typer.Option(min=0, help="Training steps, about one core second each.")
     ] = 60,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Give a scene surfaces for LiDARs, learned from the recorded sweeps, with reflectivity."""
+    """Fit LiDAR surfaces and reflectivity of a scene to the recorded sweeps."""
     from dataclasses import asdict
 
     from ..reconstruct.lidar import fit_lidar_surfaces
@@ -119,18 +119,20 @@ def fit_lidar(
 def fit_uncertainty(
     *,
     scene: SceneBundle,
-    log: Annotated[Path, typer.Argument(help="Folder of the driving log it was made of.")],
+    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Bundle to write; the scene itself.")
+        Path | None, typer.Option("--out", "-o", help="Output bundle; default: the scene itself.")
     ] = None,
-    views: Annotated[int, typer.Option(min=1, max=10_000, help="Images to compare.")] = 48,
+    views: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Number of images to compare.")
+    ] = 48,
     backend: RenderBackend = "auto",
     device: RenderDevice = None,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Give a scene images of its uncertainty, as training does with new ones."""
+    """Add uncertainty to a scene, as training does for new scenes."""
     from dataclasses import asdict
 
     from ..reconstruct.evaluation.uncertainty import fit_uncertainties

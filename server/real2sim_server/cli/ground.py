@@ -27,12 +27,16 @@ BOX_MARGIN = 0.3
 def ground(
     *,
     scene: SceneBundle,
-    log: Annotated[Path | None, typer.Option(help="Its driving log, for LiDAR.")] = None,
-    frame: Annotated[int, typer.Option(min=0, help="Whose boxes are projected down.")] = 0,
-    picture: Annotated[Path | None, typer.Option(help="PNG with inliers in red.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="Driving log of the scene, for its LiDAR.")
+    ] = None,
+    frame: Annotated[
+        int, typer.Option(min=0, help="Frame whose boxes are projected onto the ground.")
+    ] = 0,
+    picture: Annotated[Path | None, typer.Option(help="PNG to write, with inliers in red.")] = None,
     json: JsonFile = None,
 ) -> None:
-    """Tell the ground under a scene's objects, and what LiDAR and Gaussians say of it."""
+    """Compare the ground below a scene's objects with RANSAC planes of LiDAR and Gaussians."""
     from ..logs.open import open_log
     from ..scene.ground_fit import find_road_plane, ground_points
     from ..scene.io import load_scene

@@ -27,9 +27,9 @@ def import_(
     ],
     out: Annotated[Path, typer.Option("--out", help="Bundle to write.")],
     asset: Annotated[
-        bool, typer.Option("--asset", help="An object to insert, not a scene.")
+        bool, typer.Option("--asset", help="Import an asset instead of a scene.")
     ] = False,
-    category: Annotated[str, typer.Option(help="Class of an asset.")] = "car",
+    category: Annotated[str, typer.Option(help="Category of the asset.")] = "car",
     up_axis: Annotated[
         str | None,
         typer.Option(
@@ -38,7 +38,7 @@ def import_(
         ),
     ] = None,
     dataset: Annotated[
-        Path | None, typer.Option(help="Folder that a checkpoint was trained on.")
+        Path | None, typer.Option(help="Training data folder of a checkpoint.")
     ] = None,
     frames: Annotated[
         tuple[int, int] | None, typer.Option(help="First and last frame of a checkpoint.")

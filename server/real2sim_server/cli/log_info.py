@@ -21,17 +21,16 @@ def log_info(
     ] = None,
     check: Annotated[
         bool,
-        typer.Option("--check", help="Check the header of every file, and name all bad ones."),
+        typer.Option("--check", help="Check the header of every file and list bad files."),
     ] = False,
     everything: Annotated[
-        bool, typer.Option("--all", help="Check by reading all contents of every file.")
+        bool, typer.Option("--all", help="Check the whole content of every file.")
     ] = False,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Say what a log holds, draw its boxes and LiDAR on its images, and check its files; exit
-    code 1 when a file cannot be used."""
+    """Summarise a log, draw its boxes and LiDAR, and check its files; exit code 1 for bad files."""
     from ..logs import check_log, inspect_log, inspected_frames
     from ..logs.open import open_log
 

@@ -23,29 +23,32 @@ def map_(
         str | None,
         typer.Option(
             "--from",
-            help="FILE.xodr, FILE.osm, lanes.json, the folder of a data set's map, or `log`.",
+            help="FILE.xodr, FILE.osm, lanes.json, a data set's map folder, or `log`.",
         ),
     ] = None,
-    log: Annotated[Path | None, typer.Option(help="Its driving log, for `--from log`.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="Driving log of the scene, for `--from log`.")
+    ] = None,
     at: Annotated[
         str | None,
-        typer.Option(help="Where the map's origin lies in the scene: yaw,x,y [rad, m]."),
+        typer.Option(help="Pose of the map's origin in the scene: yaw,x,y [rad, m]."),
     ] = None,
     as_it_is: Annotated[
-        bool, typer.Option("--as-it-is", help="The map is in the scene's frame: no fit.")
+        bool,
+        typer.Option("--as-it-is", help="The map is already in the scene's frame: do not fit it."),
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Bundle to write; the scene itself. Or a lanes.json."),
+        typer.Option("--out", "-o", help="Output bundle or lanes.json; default: the scene itself."),
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option(help="PNG of the lanes over the scene from above.")
+        Path | None, typer.Option(help="PNG to write: lanes over a top view of the scene.")
     ] = None,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Tell the lanes of a scene, or give it some from a map or from its log."""
+    """Show the lanes of a scene, or add lanes from a map or the log."""
     from dataclasses import replace
 
     from ..scene.io import load_scene, save_scene

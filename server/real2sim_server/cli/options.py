@@ -15,31 +15,33 @@ if TYPE_CHECKING:
 
 
 JsonFile = Annotated[
-    Path | None, typer.Option("--json", help="Also write the figures to this file.", dir_okay=False)
+    Path | None,
+    typer.Option("--json", help="Also write the results to this JSON file.", dir_okay=False),
 ]
 SceneBundle = Annotated[Path, typer.Argument(help="Scene bundle.")]
 LogFolder = Annotated[Path, typer.Argument(help="Folder of a driving log.")]
-LogFormat = Annotated[str | None, typer.Option("--format", help="Default: recognised.")]
-Sequence = Annotated[str | None, typer.Option(help="Where a dataset holds several.")]
+LogFormat = Annotated[
+    str | None, typer.Option("--format", help="Format of the log; default: detected.")
+]
+Sequence = Annotated[str | None, typer.Option(help="Sequence of a data set that holds several.")]
 LogFrames = Annotated[
-    str, typer.Option(help="Stretch of the log, first:stop such as 50:100, stop not included.")
+    str, typer.Option(help="Part of the log as FIRST:STOP such as 50:100 (end-exclusive).")
 ]
 LogCameras = Annotated[
-    str | None, typer.Option(help="Of the log, such as front,front_left; default: all.")
+    str | None, typer.Option(help="Comma-separated cameras of the log; default: all.")
 ]
-LogEvery = Annotated[int, typer.Option(min=1, help="Of the log's frames, each so many-th.")]
+LogEvery = Annotated[int, typer.Option(min=1, help="Use every Nth frame.")]
 Follow = Annotated[
     bool,
     typer.Option(
         "--follow",
-        help="For programs: progress as lines of JSON on standard output, and an end with the end "
-        "of standard input.",
+        help="For programs: print progress as JSON lines; stop when standard input closes.",
     ),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
-RenderBackend = Annotated[str, typer.Option(help="auto, cpu, cuda or reference")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")]
+RenderBackend = Annotated[str, typer.Option(help="Renderer: auto, cpu, cuda or reference.")]
 RenderDevice = Annotated[
-    str | None, typer.Option(help="cpu, cuda, cuda:1 ...; default: that of the backend.")
+    str | None, typer.Option(help="Device: cpu, cuda, cuda:1, ...; default: the renderer's.")
 ]
 
 

@@ -45,25 +45,23 @@ def reconstruct(
     log: LogFolder,
     out: Annotated[Path, typer.Option("--out", help="Scene bundle to write.")],
     iterations: Annotated[
-        int, typer.Option(min=0, help="0 builds from LiDAR without training.")
+        int, typer.Option(min=0, help="Training steps; 0 builds from LiDAR without training.")
     ] = 0,
     preset: Annotated[
-        str, typer.Option(help="Of training: cpu-small, standard or paper.")
+        str, typer.Option(help="Training preset: cpu-small, standard or paper.")
     ] = "cpu-small",
     width: Annotated[
-        int | None, typer.Option(min=32, max=8192, help="Of training images [px].")
+        int | None, typer.Option(min=32, max=8192, help="Width of training images [px].")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on where training was broken off.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume interrupted training.")] = False,
     box_noise: Annotated[
-        float, typer.Option(min=0, max=1, help="Scatter added to boxes, a share of their size.")
+        float, typer.Option(min=0, max=1, help="Noise added to boxes, as a share of their size.")
     ] = 0.0,
     lanes: Annotated[
         str,
         typer.Option(
-            help="Of the scene: map (that the log comes with), log (gathered from the drive where "
-            "there is no map) or none."
+            help="Source of lanes: map (of the log), log (from the drive if there is no map) "
+            "or none."
         ),
     ] = "map",
     backend: RenderBackend = "auto",

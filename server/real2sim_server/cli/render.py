@@ -29,21 +29,21 @@ def render(
     scene: SceneBundle,
     out: Annotated[
         Path,
-        typer.Option("--out", "-o", help="Image (.png, .jpg), or sweep (.ply, .npz, .png)."),
+        typer.Option("--out", "-o", help="Output image (.png, .jpg) or sweep (.ply, .npz, .png)."),
     ],
-    camera: Annotated[str | None, typer.Option(help="Default: the first one.")] = None,
-    frame: Annotated[int | None, typer.Option(min=0, help="Recorded frame; default 0.")] = None,
-    t_us: Annotated[int | None, typer.Option(help="Or a time stamp [us].")] = None,
-    width: Annotated[int | None, typer.Option(min=16, max=8192, help="[px]")] = None,
+    camera: Annotated[str | None, typer.Option(help="Camera; default: the first.")] = None,
+    frame: Annotated[int | None, typer.Option(min=0, help="Frame number; default: 0.")] = None,
+    t_us: Annotated[int | None, typer.Option(help="Time [us] instead of a frame.")] = None,
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Image width [px].")] = None,
     modality: Annotated[
-        str, typer.Option(help="rgb, depth, instance, median_depth, semantic or uncertainty")
+        str, typer.Option(help="Kind: rgb, depth, instance, median_depth, semantic or uncertainty.")
     ] = "rgb",
     lidar: Annotated[
-        str | None, typer.Option(help="Cast a sweep instead: name or JSON file of a LiDAR.")
+        str | None, typer.Option(help="Simulate a LiDAR sweep instead: model name or JSON file.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the sweep's noise and losses.")] = 0,
-    delete: Annotated[list[str] | None, typer.Option(help="Objects to leave out.")] = None,
-    log: Annotated[Path | None, typer.Option(help="Compare with this log's image: PSNR.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the sweep's noise.")] = 0,
+    delete: Annotated[list[str] | None, typer.Option(help="Object to remove; repeatable.")] = None,
+    log: Annotated[Path | None, typer.Option(help="Print PSNR against this log's image.")] = None,
     backend: RenderBackend = "auto",
     device: RenderDevice = None,
     json: JsonFile = None,

@@ -23,20 +23,20 @@ def replay(
     *,
     episode: Annotated[Path, typer.Argument(help="Recording of an episode (.r2e).")],
     scene: Annotated[
-        Path | None, typer.Option("--scene", help="Its scene bundle: live through it again.")
+        Path | None, typer.Option("--scene", help="Scene bundle; simulates the episode again.")
     ] = None,
     assets: Annotated[
-        Path | None, typer.Option("--assets", help="Asset library, for scenarios that use it.")
+        Path | None, typer.Option("--assets", help="Asset library of the scenario.")
     ] = None,
-    mcap: Annotated[
-        Path | None, typer.Option("--mcap", help="Also write it for Foxglove and others.")
+    mcap: Annotated[Path | None, typer.Option("--mcap", help="Also write an MCAP file.")] = None,
+    video: Annotated[Path | None, typer.Option("--video", help="Video (MP4) to write.")] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Camera of the video; default: the first.")
     ] = None,
-    video: Annotated[Path | None, typer.Option("--video", help="MP4 to draw.")] = None,
-    camera: Annotated[str | None, typer.Option(help="Of the video; default: the first.")] = None,
-    width: Annotated[int, typer.Option(min=64, max=4096, help="Of the video [px].")] = 640,
+    width: Annotated[int, typer.Option(min=64, max=4096, help="Width of the video [px].")] = 640,
     json: JsonFile = None,
 ) -> None:
-    """Score a recorded episode; with its scene, check that it comes out the same, and film it."""
+    """Score a recorded episode; with its scene, verify and film it."""
     from ..policies.plots import film_episode
     from ..world.recording.mcap_file import save_mcap
     from ..world.recording.recording import first_difference, load_recording

@@ -39,37 +39,41 @@ def run(
         ),
     ] = None,
     planner: Annotated[
-        str, typer.Option(help="As of evaluate-policy; 'storyboard': the ego is scripted too.")
+        str, typer.Option(help="Planner as for evaluate-policy; 'storyboard' scripts the ego too.")
     ] = SCRIPTED,
     values: Annotated[
-        list[str] | None, typer.Option("--set", help="Parameter, name=value; repeat it.")
+        list[str] | None, typer.Option("--set", help="Parameter as NAME=VALUE; repeatable.")
     ] = None,
     leave_out: Annotated[
         list[str] | None,
-        typer.Option("--leave-out", help="Element of the file to leave out; repeat it."),
+        typer.Option("--leave-out", help="Element of the file to ignore; repeatable."),
     ] = None,
-    ego: Annotated[str | None, typer.Option(help="Entity that is the ego; default: Ego.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="At most [s].")] = 30.0,
+    ego: Annotated[str | None, typer.Option(help="Name of the ego entity; default: Ego.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="Maximum duration [s].")] = 30.0,
     speed: Annotated[
         float | None,
-        typer.Option(min=0, max=60, help="Of the ego at the start [m/s]; default: the file's."),
+        typer.Option(min=0, max=60, help="Initial speed of the ego [m/s]; default: from the file."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of what distributions draw.")] = 0,
-    save: Annotated[Path | None, typer.Option("--save", help="Recording (.r2e).")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of random distributions.")] = 0,
+    save: Annotated[Path | None, typer.Option("--save", help="Recording (.r2e) to write.")] = None,
     as_it_is: Annotated[
-        bool, typer.Option("--as-it-is", help="The scene's world is the file's: move nothing.")
+        bool, typer.Option("--as-it-is", help="Use the file's coordinates unchanged.")
     ] = False,
     scene_out: Annotated[
-        Path | None, typer.Option(help="Keep the flat scene as this bundle, for replay.")
+        Path | None, typer.Option(help="Write the generated flat scene to this bundle, for replay.")
     ] = None,
-    video: Annotated[Path | None, typer.Option("--video", help="MP4 or WebM to draw.")] = None,
-    camera: Annotated[str | None, typer.Option(help="Of the video; default: the first.")] = None,
+    video: Annotated[
+        Path | None, typer.Option("--video", help="Video (MP4 or WebM) to write.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Camera of the video; default: the first.")
+    ] = None,
     export: Annotated[
-        Path | None, typer.Option("--export", help="Also write it as OpenSCENARIO 1.3 (.xosc).")
+        Path | None, typer.Option("--export", help="Also export it as OpenSCENARIO 1.3 (.xosc).")
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Run a scenario with a planner; say what happened."""
+    """Run a scenario file with a planner and report what happened."""
     from ..scenarios.fit import fitted_to_scene
     from ..sweeps.episode import recording_of
     from ..world.recording.recording import save_recording

@@ -18,23 +18,28 @@ from .command import command
 def serve(
     *,
     host: Annotated[
-        str | None, typer.Option(help="Default 127.0.0.1; others need a token.")
+        str | None,
+        typer.Option(help="Address to listen on; others than 127.0.0.1 (default) need a token."),
     ] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 picks a free one.")] = None,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Port; 0 picks a free one.")
+    ] = None,
     scenes: Annotated[Path | None, typer.Option(help="Folder of scene bundles.")] = None,
     demo: Annotated[
-        bool, typer.Option("--demo", help="Add the demo street to the scenes, if it is not there.")
+        bool, typer.Option("--demo", help="Add the demo street to the scenes.")
     ] = False,
     data: Annotated[Path | None, typer.Option(help="Folder for scenarios and sessions.")] = None,
     token_file: Annotated[
         Path | None, typer.Option(help="File with the token; or set REAL2SIM_TOKEN.")
     ] = None,
     token: Annotated[
-        str | None, typer.Option(help="Shows in the process list: better --token-file.")
+        str | None, typer.Option(help="Visible in the process list: prefer --token-file.")
     ] = None,
-    backend: Annotated[str | None, typer.Option(help="auto, cpu, cuda, nvrtc or reference")] = None,
+    backend: Annotated[
+        str | None, typer.Option(help="Renderer: auto, cpu, cuda, nvrtc or reference.")
+    ] = None,
 ) -> None:
-    """Start a worker. Settings not given here come from REAL2SIM_* variables."""
+    """Start a worker. Other settings come from REAL2SIM_* variables."""
     from pydantic import ValidationError
 
     from ..service.first_run import begin_compiling

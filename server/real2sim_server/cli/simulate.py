@@ -26,49 +26,54 @@ if TYPE_CHECKING:
 def simulate(
     *,
     scene: SceneBundle,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for film, curves, result.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Output folder for film, curves and results.")
+    ],
     experiment: Annotated[
         str | None,
-        typer.Option(help="Of the paper: wall, pair, drop; crashes: frontal, t_bone, pole, roof."),
+        typer.Option(
+            help="wall, pair or drop (from the paper); frontal, t_bone, pole or roof (crash tests)."
+        ),
     ] = None,
     physics: Annotated[
         list[str] | None,
         typer.Option(
             "--physics",
             help="[OBJECT:]NAME=VALUE,..., e.g. young=2e6,poisson=0.4,density=200,grid=50 for all, "
-            "car_3:friction=0.2 for one; repeat it. Names: mass, material, young, poisson, "
+            "car_3:friction=0.2 for one; repeatable. Names: mass, material, young, poisson, "
             "density, yield_stress, friction, restitution, grid.",
         ),
     ] = None,
-    gravity: Annotated[
-        float | None, typer.Option(min=0, max=100, help="Downwards [m/s^2].")
-    ] = None,
+    gravity: Annotated[float | None, typer.Option(min=0, max=100, help="Gravity [m/s^2].")] = None,
     preset: Annotated[
         str | None, typer.Option(help="paper (soft) or vehicle (kilograms, crush, tyres).")
     ] = None,
     speed: Annotated[
-        float | None, typer.Option(min=0.01, max=100, help="Of an experiment [m/s].")
+        float | None, typer.Option(min=0.01, max=100, help="Speed of the experiment [m/s].")
     ] = None,
     objects: Annotated[
         list[str] | None,
-        typer.Option("--object", help="What takes part, ego: the recording vehicle; repeat it."),
+        typer.Option(
+            "--object", help="Object to simulate ('ego': the recording vehicle); repeatable."
+        ),
     ] = None,
-    duration: Annotated[float | None, typer.Option(min=0.01, max=600, help="[s]")] = None,
-    frame: Annotated[int, typer.Option(min=0, help="Recorded frame to start at.")] = 0,
-    backend: Annotated[str, typer.Option(help="Of the solver.")] = "auto",
+    duration: Annotated[float | None, typer.Option(min=0.01, max=600, help="Duration [s].")] = None,
+    frame: Annotated[int, typer.Option(min=0, help="Frame to start at.")] = 0,
+    backend: Annotated[str, typer.Option(help="Solver: auto, cpu, cuda or reference.")] = "auto",
     max_particles: Annotated[
-        int | None, typer.Option(min=100, help="Of all bodies; fewer are coarser and faster.")
+        int | None,
+        typer.Option(
+            min=100, help="Maximum particles of all bodies; fewer are faster and coarser."
+        ),
     ] = None,
     background: Annotated[
         bool,
-        typer.Option(
-            help="Walls, poles and trees of the scene stop what hits them; not in experiments."
-        ),
+        typer.Option(help="Collide with walls, poles and trees of the scene; not in experiments."),
     ] = True,
-    film: Annotated[bool, typer.Option(help="Draw film and stills.")] = True,
+    film: Annotated[bool, typer.Option(help="Render a film and stills.")] = True,
     json: JsonFile = None,
 ) -> None:
-    """Let objects of a scene collide, deform and come to rest; leave film and curves."""
+    """Simulate collisions and deformation of a scene's objects; write film and curves."""
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
     from ..simulation.ego import EGO, with_ego

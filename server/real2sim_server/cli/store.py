@@ -19,17 +19,15 @@ if TYPE_CHECKING:
     from ..settings import Settings
 
 
-app = typer.Typer(no_args_is_help=True, help="Look at a worker's database, and migrate it.")
+app = typer.Typer(no_args_is_help=True, help="Inspect and migrate a worker's database.")
 
-Data = Annotated[
-    Path | None, typer.Option(help="State folder; default as `real2sim serve` has it.")
-]
+Data = Annotated[Path | None, typer.Option(help="State folder; default: as for `real2sim serve`.")]
 Url = Annotated[str | None, typer.Option(help="Default $REAL2SIM_STORE_URL, or SQLite in DATA.")]
 
 
 @command("status", group=app)
 def status(*, data: Data = None, url: Url = None) -> None:
-    """Say which schema a store has, and what migrating it would do; nothing is changed."""
+    """Show the schema version of a store and pending migrations."""
     from ..service.storage.schema import schema_status
 
     with _engine(data, url, must_exist=True) as engine:
@@ -43,7 +41,7 @@ def status(*, data: Data = None, url: Url = None) -> None:
 
 @command("migrate", group=app)
 def migrate(*, data: Data = None, url: Url = None) -> None:
-    """Bring a store up to date, in one transaction; a new database gets its tables."""
+    """Migrate a store in one transaction; create the tables of a new database."""
     from ..service.storage.schema import prepare_schema, schema_status
 
     with _engine(data, url, must_exist=False) as engine:
@@ -60,10 +58,10 @@ def audit(
     *,
     data: Data = None,
     url: Url = None,
-    who: Annotated[str | None, typer.Option(help="Name of a token; default: all.")] = None,
-    last: Annotated[int, typer.Option(min=1, max=1_000_000, help="Entries.")] = 100,
+    who: Annotated[str | None, typer.Option(help="Token name; default: all.")] = None,
+    last: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of entries.")] = 100,
 ) -> None:
-    """Say who changed what, newest first, a line of JSON each; also who was refused."""
+    """Print the audit log as JSON lines, newest first."""
     import asyncio
     import json
     from dataclasses import asdict
@@ -121,11 +119,11 @@ def _engine(data: Path | None, url: str | None, *, must_exist: bool) -> Iterator
 
 @command("backup")
 def backup(
-    out: Annotated[Path, typer.Argument(help="File to make.", dir_okay=False)],
+    out: Annotated[Path, typer.Argument(help="Output file.", dir_okay=False)],
     *,
     data: Data = None,
 ) -> None:
-    """Copy scenarios, sessions, jobs and assets of a worker into one file, also while it works."""
+    """Back up scenarios, sessions, jobs and assets of a worker, running or not."""
     from ..service.storage.backup import make_backup
 
     settings = _settings(data)
@@ -140,12 +138,12 @@ def backup(
 
 @command("restore")
 def restore(
-    file: Annotated[Path, typer.Argument(help="Made by `real2sim backup`.", dir_okay=False)],
+    file: Annotated[Path, typer.Argument(help="Backup file.", dir_okay=False)],
     *,
     data: Data = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Put a backup into a state folder that no worker uses; a store there is moved aside."""
+    """Restore a backup into an unused state folder; an existing store is moved aside."""
     from ..service.storage.backup import restore_backup
 
     settings = _settings(data)

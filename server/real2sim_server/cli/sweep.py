@@ -16,19 +16,21 @@ from .options import Follow, JsonFile
 def sweep(
     *,
     spec: Annotated[Path, typer.Argument(help="sweep.yaml or .json, see docs/sweeps.md.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder; what is there is gone on with.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder; an existing sweep resumes.")],
     scenes: Annotated[
-        Path | None, typer.Option("--scenes", help="Folder of bundles, for scenes by name.")
+        Path | None, typer.Option("--scenes", help="Folder of scene bundles.")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, max=4096, help="Episodes at a time.")] = 1,
-    executor: Annotated[str, typer.Option(help="processes, or ray.")] = "processes",
+    workers: Annotated[
+        int, typer.Option(min=1, max=4096, help="Episodes to drive in parallel.")
+    ] = 1,
+    executor: Annotated[str, typer.Option(help="Run in local processes or on ray.")] = "processes",
     ray_address: Annotated[
-        str | None, typer.Option(help="Of a Ray cluster; default: one on this machine.")
+        str | None, typer.Option(help="Address of a Ray cluster; default: start one.")
     ] = None,
     json: JsonFile = None,
     follow: Follow = False,
 ) -> None:
-    """Drive points of a parameter space with planners, without images unless they need some.
+    """Drive points of a parameter space with planners; renders only what planners need.
 
     Leaves episodes.parquet, a row an episode, and recordings and scenario files of the worst.
     Killed, the same command goes on; the table is the same bytes whoever drove, and however often
@@ -58,24 +60,26 @@ def search(
     *,
     spaces: Annotated[
         list[str],
-        typer.Argument(help="Files as of `sweep`, or shipped: cut_in, hard_brake, oncoming, ..."),
+        typer.Argument(help="Files as for `sweep`, or shipped: cut_in, hard_brake, oncoming, ..."),
     ],
-    planner: Annotated[str, typer.Option(help="As for `drive`, see docs/policies.md.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder for failures and page.")],
+    planner: Annotated[str, typer.Option(help="Planner as for `drive`, see docs/policies.md.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder for failures and the report.")],
     episodes: Annotated[int, typer.Option(min=20, max=100_000)] = 300,
     seed: Annotated[int, typer.Option(min=0)] = 0,
-    shrink: Annotated[int, typer.Option(min=0, help="Failures whose boundary is sought.")] = 3,
+    shrink: Annotated[
+        int, typer.Option(min=0, help="Number of failures to shrink to their boundary.")
+    ] = 3,
     probability: Annotated[
-        int, typer.Option(min=0, help="Episodes for how often the planner fails; 0: none.")
+        int, typer.Option(min=0, help="Episodes to estimate the failure rate; 0: none.")
     ] = 0,
-    films: Annotated[int, typer.Option(min=0, help="Failures to film.")] = 0,
+    films: Annotated[int, typer.Option(min=0, help="Number of failures to film.")] = 0,
     scenes: Annotated[
-        Path | None, typer.Option("--scenes", help="Folder of bundles, for scenes by name.")
+        Path | None, typer.Option("--scenes", help="Folder of scene bundles.")
     ] = None,
     json: JsonFile = None,
     follow: Follow = False,
 ) -> None:
-    """Find collisions that are a planner's fault and that a driver who knows what comes avoids.
+    """Find avoidable collisions that are the planner's fault.
 
     Leaves failures.json, each failure as a case and as a recording, and a page; see docs/sweeps.md.
     """

@@ -16,18 +16,18 @@ from .options import JsonFile
 @command("synth")
 def synth(
     *,
-    out: Annotated[Path, typer.Option("--out", help="Folder of the log to write.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder.")],
     frames: Annotated[int, typer.Option(min=2, max=10_000)] = 60,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     width: Annotated[int, typer.Option(min=32, max=4096, help="Image width [px].")] = 480,
     height: Annotated[int, typer.Option(min=32, max=4096, help="Image height [px].")] = 320,
     moving_cars: Annotated[int, typer.Option(min=0, max=40)] = 4,
     parked_cars: Annotated[int, typer.Option(min=0, max=80)] = 14,
-    pedestrians: Annotated[int, typer.Option(min=0, max=60, help="People on foot.")] = 0,
+    pedestrians: Annotated[int, typer.Option(min=0, max=60, help="Number of pedestrians.")] = 0,
     cyclists: Annotated[int, typer.Option(min=0, max=20)] = 0,
     json: JsonFile = None,
 ) -> None:
-    """Generate a driving log of a procedural street: cameras, LiDAR, exact poses and boxes."""
+    """Generate a log of a procedural street: cameras, LiDAR, exact poses and boxes."""
     from ..logs.open import open_log
     from ..synthetic import SyntheticConfig, synthesize
 

@@ -13,9 +13,11 @@ from .command import command
 if TYPE_CHECKING:
     from ..service.accounts import NamedToken
 
-app = typer.Typer(no_args_is_help=True, help="Make, list and remove the named tokens of a worker.")
+app = typer.Typer(
+    no_args_is_help=True, help="Create, list and revoke the named tokens of a worker."
+)
 
-Name = Annotated[str, typer.Argument(help="Of whoever holds it; metrics and logs tell it.")]
+Name = Annotated[str, typer.Argument(help="Name of the holder, as in metrics and logs.")]
 TokensFile = Annotated[
     Path | None, typer.Option(help="Default $REAL2SIM_TOKENS_FILE.", dir_okay=False)
 ]
@@ -27,15 +29,15 @@ def add(
     *,
     file: TokensFile = None,
     requests_per_second: Annotated[
-        float | None, typer.Option(help="Requests, and messages of sockets.")
+        float | None, typer.Option(help="Requests and socket messages per second.")
     ] = None,
-    sessions: Annotated[int | None, typer.Option(help="Open at a time.")] = None,
-    jobs: Annotated[int | None, typer.Option(help="Not over, at a time.")] = None,
+    sessions: Annotated[int | None, typer.Option(help="Maximum open sessions.")] = None,
+    jobs: Annotated[int | None, typer.Option(help="Maximum unfinished jobs.")] = None,
     role: Annotated[
-        str, typer.Option(help="What its holder may do: observe, drive, edit or administer.")
+        str, typer.Option(help="Role: observe, drive, edit or administer.")
     ] = "administer",
 ) -> None:
-    """Make a token and print it, this once; the file keeps its hash."""
+    """Create a token and print it once; the file keeps its hash."""
     from pydantic import ValidationError
 
     from ..service.accounts import ROLES, TokenLimits, add_token
@@ -66,7 +68,7 @@ def add(
 
 @command("list", group=app)
 def list_(*, file: TokensFile = None) -> None:
-    """The names that there are, with their limits."""
+    """List names and limits."""
     from ..service.accounts import read_token_file
 
     known = read_token_file(_file(file)).tokens
@@ -77,7 +79,7 @@ def list_(*, file: TokensFile = None) -> None:
 
 @command("remove", group=app)
 def remove(name: Name, *, file: TokensFile = None) -> None:
-    """Make a token invalid; who is connected with it is disconnected."""
+    """Revoke a token and disconnect its holder."""
     from ..service.accounts import remove_token
 
     path = _file(file)

@@ -21,23 +21,27 @@ if TYPE_CHECKING:
 def track(
     *,
     log: Annotated[Path, typer.Argument(help="Folder of a driving log with LiDAR.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the log to write, with boxes.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder of the log with boxes.")],
     keep: Annotated[
-        bool, typer.Option("--keep", help="Keep the log's own boxes and add what they lack.")
+        bool, typer.Option("--keep", help="Keep the log's own boxes and add missing ones.")
     ] = False,
     reach: Annotated[
-        float, typer.Option(min=5, max=200, help="How far from the vehicle to look [m].")
+        float, typer.Option(min=5, max=200, help="Maximum distance from the vehicle [m].")
     ] = 55.0,
     least_distance: Annotated[
-        float, typer.Option(min=0.1, help="How far an object must go [m].")
+        float, typer.Option(min=0.1, help="Minimum distance that an object travels [m].")
     ] = 1.5,
-    least_frames: Annotated[int, typer.Option(min=2, help="In how many frames it is seen.")] = 6,
-    images: Annotated[str, typer.Option(help="png (exact) or jpg (smaller).")] = "jpg",
+    least_frames: Annotated[
+        int, typer.Option(min=2, help="Minimum frames in which it is seen.")
+    ] = 6,
+    images: Annotated[
+        str, typer.Option(help="Image format: png (lossless) or jpg (smaller).")
+    ] = "jpg",
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Find what moves in the LiDAR of a log without boxes, and write the log with them."""
+    """Detect and track moving objects in a log without boxes."""
     from ..logs import inspect_log
     from ..logs.open import open_log
     from ..logs.readers.native import write_native_log

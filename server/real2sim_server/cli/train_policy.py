@@ -28,20 +28,21 @@ def train_policy(
         list[Path],
         typer.Argument(help="Scene bundle, driving log, or data sets of export-dataset."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="File of weights (.safetensors).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Weights to write (.safetensors).")],
     camera: Annotated[
-        str | None, typer.Option(help="Default: the one that looks most nearly ahead.")
+        str | None, typer.Option(help="Camera; default: the most forward-facing.")
     ] = None,
     epochs: Annotated[int, typer.Option(min=1, max=100_000)] = 60,
     shifted: Annotated[
-        int, typer.Option(min=0, max=100, help="Views beside the path per frame, of a scene.")
+        int,
+        typer.Option(min=0, max=100, help="Rendered views beside the path per frame of a scene."),
     ] = 5,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     log_format: LogFormat = None,
     sequence: Sequence = None,
     json: JsonFile = None,
 ) -> None:
-    """Teach a small network to drive as the recording vehicle did; for planner learned=FILE."""
+    """Train a small network to imitate the recorded driving, for --planner learned=FILE."""
     from ..policies.cloning import save_policy, train_network
 
     start = time.perf_counter()

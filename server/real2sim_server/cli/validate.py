@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 @command("validate")
 def validate(
     *,
-    backend: Annotated[str, typer.Option(help="cpu or reference")] = "cpu",
+    backend: Annotated[str, typer.Option(help="Solver: cpu or reference.")] = "cpu",
     cases: Annotated[
         str | None,
         typer.Option(
-            help="Names with commas between them, or 'simulation' or 'published' for a group; all "
-            "but the published crash figures by default."
+            help="Comma-separated names, or a group: 'simulation' or 'published'; default: all "
+            "except the published crash figures."
         ),
     ] = None,
     page: Annotated[
-        Path | None, typer.Option(help="HTML page to write; default: beside the figures.")
+        Path | None, typer.Option(help="HTML report to write; default: next to the JSON file.")
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Hold the physics to cases with known answers; exit code 1 when a line fails."""
+    """Compare the physics with known solutions; exit code 1 if any fails."""
     from ..physics.validation.table import as_figures, render_page
 
     with progress("validating") as report:

@@ -46,11 +46,11 @@ def test_every_word_of_the_help_is_shown(path):
     ("path", "unit"),
     [
         (("synth",), "Image width [px]."),
-        (("track",), "How far an object must go [m]."),
-        (("render",), "Or a time stamp [us]."),
-        (("simulate",), "Of an experiment [m/s]."),
+        (("track",), "Minimum distance that an object travels [m]."),
+        (("render",), "Time [us] instead of a frame."),
+        (("simulate",), "Speed of the experiment [m/s]."),
         (("simulate",), "[s]"),
-        (("replay",), "Of the video [px]."),
+        (("replay",), "Width of the video [px]."),
     ],
 )
 def test_units_are_shown(path, unit):
