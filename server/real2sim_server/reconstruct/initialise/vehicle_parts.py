@@ -86,6 +86,7 @@ def pose_amid(trajectory: Trajectory) -> Float:
 # Colours of glass, trim and tyres come from the log's own vehicles: they are darker in hard sun
 # than under clouds.
 
+PALETTE_DOUBT = 2.0
 """Weight of the usual colour of a part, in vehicles that show theirs."""
 PARTS = "vehicle_parts"
 """Where a scene's reconstruction keeps the colours of parts."""
@@ -153,8 +154,8 @@ def fit_palette(
         members = [c[p == part] for p, c in zip(parts, colours, strict=True)]
         shown = [modal_colour(c) for c in members if len(c) >= MIN_OBSERVED]
         if shown:
-            total = DOUBT * palette[part] + np.sum(shown, axis=0)
-            palette[part] = total / (DOUBT + len(shown))
+            total = PALETTE_DOUBT * palette[part] + np.sum(shown, axis=0)
+            palette[part] = total / (PALETTE_DOUBT + len(shown))
     return palette
 
 

@@ -251,6 +251,7 @@ def _line(
 # The loss probability of a Gaussian is learned from the rays that would stop there, returned or
 # not, where the rings of a scan reveal the fired rays.
 
+LOSS_PRIOR = 0.5
 """Light that the mean share of all counts for."""
 LOSS_ROUNDS = 8
 
@@ -312,6 +313,8 @@ def _solved(
     for _ in range(LOSS_ROUNDS):
         off = lost - np.bincount(ray, share * values[member], len(lost))
         pull = np.bincount(member, share * off[ray], count)
-        values = np.clip(values + (pull + PRIOR * (mean - values)) / (light + PRIOR), 0, 1)
+        values = np.clip(
+            values + (pull + LOSS_PRIOR * (mean - values)) / (light + LOSS_PRIOR), 0, 1
+        )
     values[light == 0] = 0
     return values.astype(np.float32)

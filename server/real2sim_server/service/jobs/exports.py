@@ -39,7 +39,7 @@ from .jobs import JobContext, JobResult
 
 VIDEO = "video.webm"
 VIDEO_TYPE = "video/webm"
-MAX_FRAMES = 20_000
+MAX_VIDEO_FRAMES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +126,10 @@ def frame_times(video_source: VideoSource, request: ExportRequest) -> list[int]:
             hint="leave start_us and end_us out for all of it",
         )
     count = int((end - start) * 1e-6 * request.fps) + 1
-    if count > MAX_FRAMES:
+    if count > MAX_VIDEO_FRAMES:
         raise ServiceError(
-            ErrorCode.INVALID_REQUEST, f"{count} frames; {MAX_FRAMES} is the most in one video"
+            ErrorCode.INVALID_REQUEST,
+            f"{count} frames; {MAX_VIDEO_FRAMES} is the most in one video",
         )
     return [start + round(i * 1e6 / request.fps) for i in range(count)]
 
@@ -170,6 +171,8 @@ def pack(folder: Path, archive: Path, context: JobContext) -> None:
 
 
 # Data sets.
+
+MAX_DATASET_FRAMES = 20_000
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -292,10 +295,10 @@ def check_dataset(variants: Sequence[Variant], plan: ExportPlan, *, max_pixels: 
     cameras, clips = planned_cameras(variants[0].drive, plan), planned_shards(variants, plan)
     planned_lidar(plan)
     frames = sum(len(clip.times_us) for clip in clips)
-    if frames > MAX_FRAMES:
+    if frames > MAX_DATASET_FRAMES:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST,
-            f"{frames} frames; {MAX_FRAMES} is the most in one data set of a worker",
+            f"{frames} frames; {MAX_DATASET_FRAMES} is the most in one data set of a worker",
             hint="ask for a longer period_us or a shorter span",
         )
     pixels = sum(camera.width * camera.height for camera in cameras)
