@@ -56,9 +56,7 @@ class Page:
         script = f"set -aeo pipefail\n. ./state\n{text}\n{{ export -p; declare -f; }} > state"
         environment = os.environ | {
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
-            "PYTHONPATH": os.pathsep.join(
-                str(REPOSITORY / n) for n in ("proto", "client", "server")
-            ),
+            "PYTHONPATH": os.pathsep.join(str(REPOSITORY / n) for n in PACKAGES),
         }
         done = subprocess.run(
             ["bash", "-c", script], cwd=self.folder, env=environment, capture_output=True,

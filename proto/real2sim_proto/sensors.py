@@ -161,11 +161,6 @@ class CameraEffects(Model):
         return [name for name in type(self).model_fields if getattr(self, name) not in (None, 0.0)]
 
 
-def is_plain(optics: Optics, effects: CameraEffects | None) -> bool:
-    """Whether images are those of a pinhole, as they are drawn."""
-    return optics == "pinhole" and effects is None
-
-
 # --- LiDARs and radars ------------------------------------------------------------------------
 
 MAX_LIDARS = 8

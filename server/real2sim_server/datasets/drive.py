@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
-from ..edit.compose import NO_STRIDES, background_hits, object_hits, sweep_of
+from ..edit.compose import NO_STRIDES, background_target, object_target, sweep_of
 from ..geometry.transform import Float, matrix_to_quaternion
 from ..render.cast.call import SweepScene, incidence_of, sensor_poses, transforms_at
 from ..render.types import Instance
@@ -196,10 +196,10 @@ class EpisodeDrive:
         near = self.worlds[max(place - 1, 0) : place + 2]
         world, times = self.worlds[place], t_us + lidar.beams.slots[0]
         shown_us = min(world.t_us, self.scene.end_us)
-        found, moved = [background_hits(self.scene, world.state)], list[Float | None]([None])
+        found, moved = [background_target(self.scene, world.state)], list[Float | None]([None])
         for subject, transform in zip(world.agents.objects, world.agents.transforms, strict=True):
             stride = world.strides.made.get(subject.object_id)
-            found.append(object_hits(self.scene, subject, transform, shown_us, stride=stride))
+            found.append(object_target(self.scene, subject, transform, shown_us, stride=stride))
             moved.append(transforms_at(_way(near, subject.object_id), times))
         instances, known = zip(*found, strict=True)
         ego = _trajectory([(w.t_us, np.array(w.T_world_body)) for w in near])

@@ -19,7 +19,7 @@ from real2sim_proto.conventions import GROUND, STATIC, semantic_class
 from real2sim_proto.operations import EraseRegion
 
 from ..geometry.transform import Float, invert_transform, quaternion_to_matrix, transform_from
-from ..render.cast.call import Attributes, SweepScene, incidence_of, met_by_lidar, transforms_at
+from ..render.cast.call import Attributes, SweepScene, incidence_of, lidar_target, transforms_at
 from ..render.lens import TOLERANCE
 from ..render.types import Instance
 from ..scene import Figure, GaussianCloud, Lidar, Scene, Stride, Trajectory
@@ -293,42 +293,42 @@ def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> Swe
     """
     placed = state.tracks.at(t_us)
     times = t_us + lidar.beams.slots[0]
-    found = [background_hits(scene, state)]
+    found = [background_target(scene, state)]
     moved: list[Float | None] = [None]
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
-        found.append(object_hits(scene, subject, transform, t_us))
+        found.append(object_target(scene, subject, transform, t_us))
         moved.append(transforms_at(subject.trajectory, times))
     instances, known = zip(*found, strict=True)
     return SweepScene(instances, tuple(moved), known, incidence_of(scene))
 
 
-def background_hits(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
+def background_target(scene: Scene, state: ScenarioState) -> tuple[Instance, Attributes | None]:
     """The background as rays hit it, without erased regions, and its attributes."""
-    cloud, attributes = met_by_lidar(scene, None)
+    cloud, attributes = lidar_target(scene, None)
     if state.erased:
         cloud = kept(scene, ("lidar", state.erased), lambda: without_regions(cloud, state.erased))
     return Instance(cloud), attributes
 
 
-def object_hits(
+def object_target(
     scene: Scene, subject: ObjectState, transform: Float, t_us: int, *, stride: Stride | None = None
 ) -> tuple[Instance, Attributes | None]:
     """An object at ``transform`` as rays hit it, and its attributes.
 
     It takes its pose of ``t_us``, or for a person the phase of the gait that ``stride`` gives.
     """
-    cloud, attributes = _met(scene, subject, t_us, stride)
+    cloud, attributes = _object_cloud(scene, subject, t_us, stride)
     semantic = semantic_class(subject.category)
     instance = Instance(cloud, transform, subject.instance_id, subject.scale, semantic=semantic)
     return instance, attributes
 
 
-def _met(
+def _object_cloud(
     scene: Scene, subject: ObjectState, t_us: int, stride: Stride | None
 ) -> tuple[GaussianCloud, Attributes | None]:
     if subject.asset is not None or figure_of(scene, subject) is not None:
         return cloud_of(scene, subject, t_us, stride=stride), None
-    return met_by_lidar(scene, subject.source_id)
+    return lidar_target(scene, subject.source_id)
 
 
 # --- Points --------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from real2sim_proto.conventions import GROUND, STATIC
 
 from ..edit import ScenarioState
-from ..edit.compose import background_hits, compose, object_hits, sweep_of
+from ..edit.compose import background_target, compose, object_target, sweep_of
 from ..geometry.transform import Float, invert_transform, quaternion_to_matrix
 from ..render.cast.call import Attributes, SweepScene, incidence_of, sensor_poses
 from ..render.cast.sensors import Patches, Sweep, detect, radar_detections
@@ -45,11 +45,11 @@ def ray_targets(world: World) -> RayTargets:
     impacts as in images, no shadows."""
     scene, agents = world.scene, world.agents
     shown_us = min(world.t_us, scene.end_us)
-    found = [background_hits(scene, world.state)]
+    found = [background_target(scene, world.state)]
     strides = world.strides.made
     for subject, transform in zip(agents.objects, agents.transforms, strict=True):
         stride = strides.get(subject.object_id)
-        found.append(object_hits(scene, subject, transform, shown_us, stride=stride))
+        found.append(object_target(scene, subject, transform, shown_us, stride=stride))
     ids = [subject.object_id for subject in agents.objects]
     if world.deformation is not None:
         _deform(world, found, ids)

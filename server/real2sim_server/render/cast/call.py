@@ -298,13 +298,13 @@ def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "aut
 def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:
     """Background and the objects that exist at ``t_us``, and how they move over the sweep."""
     times = t_us + lidar.beams.slots[0]
-    cloud, attributes = met_by_lidar(scene, None)
+    cloud, attributes = lidar_target(scene, None)
     instances, known = [Instance(cloud)], [attributes]
     moved: list[Float | None] = [None]
     for index, (object_id, item) in enumerate(scene.objects.items()):
         if not item.trajectory.covers(t_us):
             continue
-        cloud, attributes = met_by_lidar(scene, object_id)
+        cloud, attributes = lidar_target(scene, object_id)
         if item.figure is not None:
             cloud, attributes = item.posed_at(t_us, item.trajectory), None
         pose = item.trajectory.transform(t_us)
@@ -314,7 +314,7 @@ def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:
     return SweepScene(tuple(instances), tuple(moved), tuple(known), incidence_of(scene))
 
 
-def met_by_lidar(scene: Scene, object_id: str | None) -> tuple[GaussianCloud, Attributes | None]:
+def lidar_target(scene: Scene, object_id: str | None) -> tuple[GaussianCloud, Attributes | None]:
     """Gaussians that a LiDAR meets of an object, or of the background, and their attributes."""
     if scene.lidar is not None:
         held = scene.lidar.background if object_id is None else scene.lidar.objects.get(object_id)

@@ -3,7 +3,7 @@
 from .bundle import load_asset, load_scene, save_asset, save_scene
 from .export import export_scene
 from .packed import DEMO_SCENE, SHIPPED_STREET, read_packed, write_packed
-from .splats import import_splats, read_splats, write_ply, write_splats
+from .splats import import_splats, read_splats, write_splats
 from .staging import StagingError, StagingLimits, stage_asset, stage_scene
 from .summary import (
     AssetSummary,
@@ -34,6 +34,5 @@ __all__ = [
     "stage_asset",
     "stage_scene",
     "write_packed",
-    "write_ply",
     "write_splats",
 ]

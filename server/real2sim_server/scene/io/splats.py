@@ -17,7 +17,7 @@ from ..cloud import GaussianCloud
 from ..errors import BundleError, SceneError
 from ..scene import Scene
 from ..trajectory import Trajectory
-from .ply import InriaPly, PlayCanvasPly, write_inria_ply
+from .ply import InriaPly, PlayCanvasPly
 from .splat_format import AntimatterSplat, SplatFormat, UpAxis
 from .spz import Spz
 
@@ -131,17 +131,6 @@ def format_to_write(path: Path) -> SplatFormat:
         if path.name.lower().endswith(splat_format.suffix):
             return splat_format
     raise SceneError(f"{path}: no splat format ends so; allowed are {', '.join(suffixes())}")
-
-
-def write_ply(cloud: GaussianCloud, path: str | PathLike[str]) -> None:
-    """Write ``cloud`` as an INRIA-style PLY, atomically; see :func:`.ply.write_inria_ply`.
-
-    Raises:
-        SceneError: values that are not finite or out of range.
-        OSError: the file cannot be written.
-    """
-    cloud.check_values(f"cloud for {path}")
-    write_inria_ply(cloud, Path(path))
 
 
 @overload

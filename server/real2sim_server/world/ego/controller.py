@@ -43,7 +43,7 @@ class ControlledTracker:
     that a copied world goes on alike.
 
     Attributes:
-        kind: number of the tracker, see :mod:`.driving.trackers`.
+        kind: number of the tracker, see :mod:`..driving.trackers`.
         reference: what is followed.
         spec: of the vehicle.
     """
@@ -127,7 +127,7 @@ class GearedTracker:
     """A controller that changes gear where its plan turns back.
 
     Attributes:
-        kind: number of the tracker, see :mod:`.driving.trackers`.
+        kind: number of the tracker, see :mod:`..driving.trackers`.
         legs: of the plan, one after the other.
         spec: of the vehicle.
     """

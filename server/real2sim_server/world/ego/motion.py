@@ -70,7 +70,7 @@ class Motion(NamedTuple):
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """All but pending commands and gear, as :mod:`.driving` takes a state."""
+        """All but pending commands and gear, as :mod:`..driving` takes a state."""
         x, y, yaw, speed, acceleration, steering, yaw_rate, lateral_speed, drive, _, _ = self
         kinematic = (float(x), float(y), float(yaw), float(speed), float(acceleration))
         return (*kinematic, float(steering), float(yaw_rate), float(lateral_speed), float(drive))
@@ -93,7 +93,7 @@ class ControlLaw(NamedTuple):
     def arguments(
         self, since: float, schedule: Schedules = NO_SCHEDULE
     ) -> tuple[int, Float, float, float, tuple[float, float], Schedules]:
-        """The law ``since`` seconds after its plan began, as :mod:`.driving` takes it."""
+        """The law ``since`` seconds after its plan began, as :mod:`..driving` takes it."""
         return self.kind, self.knots, self.turn_rate, since, self.hold, schedule
 
 

@@ -152,7 +152,7 @@ class SinglePose(NamedTuple):
 
 
 class ReferenceTrajectory:
-    """A planned trajectory as a smooth curve over time, see :mod:`.driving.curve`."""
+    """A planned trajectory as a smooth curve over time, see :mod:`..driving.curve`."""
 
     def __init__(
         self,

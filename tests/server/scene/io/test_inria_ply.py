@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from real2sim_server.scene import BundleError, GaussianCloud, SceneError
-from real2sim_server.scene.io import read_splats, write_ply
+from real2sim_server.scene.io import read_splats, write_splats
 
 BASE = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -35,7 +35,7 @@ def columns() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_written_cloud_comes_back(make_cloud, tmp_path, degree):
     cloud = make_cloud(31, degree=degree)
-    write_ply(cloud, tmp_path / "a.ply")
+    write_splats(cloud, tmp_path / "a.ply")
     back = read_splats(tmp_path / "a.ply")
     assert torch.equal(back.means, cloud.means)
     assert torch.equal(back.sh, cloud.sh)
@@ -47,14 +47,14 @@ def test_a_written_cloud_comes_back(make_cloud, tmp_path, degree):
 def test_opacities_of_zero_and_one_survive(make_cloud, tmp_path):
     cloud = make_cloud(2)
     cloud.opacities[:] = torch.tensor([0.0, 1.0])
-    write_ply(cloud, tmp_path / "a.ply")
+    write_splats(cloud, tmp_path / "a.ply")
     back = read_splats(tmp_path / "a.ply").opacities
     assert back[0] < 1e-16
     assert back[1] == 1
 
 
 def test_an_empty_cloud_comes_back(tmp_path):
-    write_ply(GaussianCloud.empty(sh_degree=2), tmp_path / "a.ply")
+    write_splats(GaussianCloud.empty(sh_degree=2), tmp_path / "a.ply")
     back = read_splats(tmp_path / "a.ply")
     assert (len(back), back.sh_degree) == (0, 2)
 
@@ -162,13 +162,13 @@ def test_a_cloud_that_is_not_finite_is_not_written(make_cloud, tmp_path):
     cloud = make_cloud()
     cloud.means[0, 0] = float("nan")
     with pytest.raises(SceneError, match="not finite"):
-        write_ply(cloud, tmp_path / "a.ply")
+        write_splats(cloud, tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_failure_while_writing_leaves_the_old_file(make_cloud, tmp_path, monkeypatch):
     file = tmp_path / "a.ply"
-    write_ply(make_cloud(3), file)
+    write_splats(make_cloud(3), file)
     before = file.read_bytes()
 
     def fail(*_: object) -> None:
@@ -176,6 +176,6 @@ def test_a_failure_while_writing_leaves_the_old_file(make_cloud, tmp_path, monke
 
     monkeypatch.setattr("os.fsync", fail)
     with pytest.raises(OSError, match="no space left"):
-        write_ply(make_cloud(9), file)
+        write_splats(make_cloud(9), file)
     assert file.read_bytes() == before
     assert [f.name for f in tmp_path.iterdir()] == ["a.ply"]

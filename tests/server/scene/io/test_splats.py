@@ -13,13 +13,13 @@ from real2sim_server.scene.io import (
     read_splats,
     save_asset,
     save_scene,
-    write_ply,
+    write_splats,
 )
 
 
 @pytest.fixture
 def ply(make_cloud, tmp_path):
-    write_ply(make_cloud(400, degree=1), tmp_path / "thing.ply")
+    write_splats(make_cloud(400, degree=1), tmp_path / "thing.ply")
     return tmp_path / "thing.ply"
 
 
@@ -90,7 +90,7 @@ def test_the_box_of_an_asset_is_not_stretched_by_floaters(make_cloud, tmp_path):
     cloud.means[0] = 500
     cloud.means[1:100] = -70
     cloud.opacities[1:100] = 0.01
-    write_ply(cloud, tmp_path / "a.ply")
+    write_splats(cloud, tmp_path / "a.ply")
     asset = import_splats(tmp_path / "a.ply", name="a", as_asset=True)
     assert max(asset.size) < 1.01
     assert len(asset.cloud) == 1000
@@ -103,7 +103,7 @@ def test_the_box_of_an_asset_is_not_stretched_by_floaters(make_cloud, tmp_path):
 def test_up_and_forward_of_the_file_become_z_and_x(make_cloud, tmp_path, up_axis, up, forward):
     cloud = make_cloud(2)
     cloud.means[:] = torch.tensor([up, forward])
-    write_ply(cloud, tmp_path / "a.ply")
+    write_splats(cloud, tmp_path / "a.ply")
     means = import_splats(tmp_path / "a.ply", name="a", up_axis=up_axis).background.means
     torch.testing.assert_close(means, torch.tensor([[0.0, 0, 1], [1, 0, 0]]))
 
@@ -111,7 +111,7 @@ def test_up_and_forward_of_the_file_become_z_and_x(make_cloud, tmp_path, up_axis
 def test_yaw_and_scale_follow(make_cloud, tmp_path):
     cloud = make_cloud(1)
     cloud.means[:] = torch.tensor([1.0, 0, 0.5])
-    write_ply(cloud, tmp_path / "a.ply")
+    write_splats(cloud, tmp_path / "a.ply")
     turned = import_splats(tmp_path / "a.ply", name="a", yaw=np.pi / 2, scale=3.0).background
     torch.testing.assert_close(turned.means, torch.tensor([[0.0, 3, 1.5]]))
     torch.testing.assert_close(turned.scales, cloud.scales * 3)
@@ -126,7 +126,7 @@ def test_bad_options_are_refused(ply, options):
 
 
 def test_a_file_without_splats_is_not_imported(tmp_path):
-    write_ply(GaussianCloud.empty(), tmp_path / "a.ply")
+    write_splats(GaussianCloud.empty(), tmp_path / "a.ply")
     with pytest.raises(BundleError, match="holds no splats"):
         import_splats(tmp_path / "a.ply", name="a")
 

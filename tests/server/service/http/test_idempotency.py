@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from real2sim_proto import ErrorCode
-from real2sim_server.scene.io import write_ply
+from real2sim_server.scene.io import write_splats
 
 KEY = {"Idempotency-Key": "7f3c"}
 MOVE = {"operations": [{"op": "translate", "object_id": "post", "x": 1.0}]}
@@ -179,7 +179,7 @@ def test_an_asset_cut_out_twice_is_one_asset(client):
 def test_an_upload_sent_twice_with_other_boundaries_takes_effect_once(
     client, tmp_path, tiny_scene, path, name
 ):
-    write_ply(tiny_scene.objects["car_red"].cloud, tmp_path / "car.ply")
+    write_splats(tiny_scene.objects["car_red"].cloud, tmp_path / "car.ply")
     content = (tmp_path / "car.ply").read_bytes()
     before = len(client.get(path).json()[name])
     answers = [client.post(path, files={"file": ("car.ply", content)}, headers=KEY) for _ in "ab"]
@@ -198,7 +198,7 @@ def test_what_a_crash_left_without_its_answer_is_known_by_its_request(
 ):
     (tmp_path / "import").mkdir()
     file = tmp_path / "import" / "car.ply"
-    write_ply(tiny_scene.objects["car_red"].cloud, file)
+    write_splats(tiny_scene.objects["car_red"].cloud, file)
     cut = {"scene": "tiny", "object_id": "car_red", "asset_id": "cut"}
     for key, path, request in (
         ("cut", "/v1/assets", {"json": cut}),

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from real2sim_proto import ErrorCode
-from real2sim_server.scene.io import write_ply
+from real2sim_server.scene.io import write_splats
 
 
 @pytest.fixture
@@ -13,7 +13,7 @@ def import_root(tmp_path, tiny_scene, scenes_dir):
     root = tmp_path / "import"
     root.mkdir()
     shutil.copytree(scenes_dir / "tiny.r2s", root / "street.r2s")
-    write_ply(tiny_scene.objects["car_red"].cloud, root / "car.ply")
+    write_splats(tiny_scene.objects["car_red"].cloud, root / "car.ply")
     return root
 
 
