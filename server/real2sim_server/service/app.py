@@ -84,7 +84,7 @@ def create_app(settings: Settings) -> FastAPI:
         RenderError: the backend of the settings cannot be used here.
     """
     worker = Worker.build(settings)
-    worker.jobs.work_again = partial(_work_again, worker)
+    worker.jobs.rebuild = partial(_work_again, worker)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -171,7 +171,7 @@ async def _work_again(worker: Worker, info: JobInfo) -> Work:
     """The work of a job on record, for the account that it was asked for with."""
     ACCOUNT.set(worker.accounts.of_owner(info.owner))
     if info.kind == "simulate":
-        return await worker.simulations.work_again(info)
+        return await worker.simulations.rebuild(info)
     if info.kind == "sweep":
-        return await worker.sweeps.work_again(info)
-    return await jobs.work_again(worker, info)
+        return await worker.sweeps.rebuild(info)
+    return await jobs.rebuild(worker, info)

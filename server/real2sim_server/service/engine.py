@@ -1,4 +1,4 @@
-"""A thread that runs jobs in turn: the one that owns the device, and the one of worlds."""
+"""Worker threads that run queued jobs by priority: one owns the device, one steps worlds."""
 
 from __future__ import annotations
 
@@ -22,83 +22,83 @@ from . import clock
 
 # --- Queue ---------------------------------------------------------------------------------------
 
-# Several kinds of jobs wait; each kind gets its share of the engine.
 
 T = TypeVar("T")
 
 
-class Lane(IntEnum):
-    """Kinds of jobs, the most urgent first."""
+class Priority(IntEnum):
+    """Priorities of jobs, the most urgent first."""
 
     DRIVE = 0
-    """Steps of sessions: somebody's vehicle waits."""
+    """Steps of sessions: a policy is waiting."""
     VIEW = 1
-    """Pictures that somebody looks at, and whatever else takes milliseconds."""
+    """Images for people, and any other job that takes milliseconds."""
     BULK = 2
-    """Large pictures, films, loading."""
+    """Large images, videos, loading of scenes."""
 
 
-WEIGHTS = {Lane.DRIVE: 16.0, Lane.VIEW: 4.0, Lane.BULK: 1.0}
-"""Time that lanes get, in proportion, while all of them have work."""
+WEIGHTS = {Priority.DRIVE: 16.0, Priority.VIEW: 4.0, Priority.BULK: 1.0}
+"""Relative shares of time while every priority has jobs."""
 
 
-class Lanes(Generic[T]):
-    """Queues by lane. The next job is of the lane that has had least time for its weight (stride
-    scheduling, Waldspurger & Weihl 1995), within a lane the first that came.
+class PriorityQueue(Generic[T]):
+    """One first-in, first-out queue per priority, scheduled by weight.
 
-    A lane that was idle begins where the others are: it saves up nothing. Not safe to use on
-    several threads at once.
+    The next job comes from the priority with the least time per weight so far (stride scheduling,
+    Waldspurger & Weihl 1995). An idle priority gathers no credit. Not thread-safe.
 
     Args:
-        length: jobs that may wait in each lane.
+        length: maximum number of waiting jobs per priority.
     """
 
     def __init__(self, length: int) -> None:
         self.length = length
-        self._waiting: dict[Lane, deque[T]] = {lane: deque() for lane in Lane}
-        self._running: list[Lane] = []
-        self._passed_over = dict.fromkeys(Lane, 0)
-        self._had = dict.fromkeys(Lane, 0.0)
+        self._waiting: dict[Priority, deque[T]] = {priority: deque() for priority in Priority}
+        self._running: list[Priority] = []
+        self._passed_over = dict.fromkeys(Priority, 0)
+        self._had = dict.fromkeys(Priority, 0.0)
 
     def __len__(self) -> int:
         return sum(map(len, self._waiting.values()))
 
-    def waiting(self, lane: Lane) -> int:
-        """Jobs that wait in a lane."""
-        return len(self._waiting[lane])
+    def waiting(self, priority: Priority) -> int:
+        """Number of waiting jobs of a priority."""
+        return len(self._waiting[priority])
 
-    def append(self, job: T, lane: Lane) -> None:
-        """Put a job at the end of a lane; whether there is room is for the caller to ask."""
-        if not self._waiting[lane] and lane not in self._running:
-            active = [self._had[other] for other in Lane if self._is_active(other)]
-            self._had[lane] = max([self._had[lane], *([min(active)] if active else [])])
-        self._waiting[lane].append(job)
+    def append(self, job: T, priority: Priority) -> None:
+        """Add a job to the end of its queue. The caller checks that there is room."""
+        if not self._waiting[priority] and priority not in self._running:
+            active = [self._had[other] for other in Priority if self._is_active(other)]
+            self._had[priority] = max([self._had[priority], *([min(active)] if active else [])])
+        self._waiting[priority].append(job)
 
     def begin_next(self) -> T | None:
-        """The job whose turn it is, now running; None where none waits. Let :meth:`end` follow."""
-        return self._begin(lane for lane in Lane if self._waiting[lane])
+        """Start the next job and return it, or None if none waits. Call :meth:`end` after it."""
+        return self._begin(priority for priority in Priority if self._waiting[priority])
 
     def begin_more_urgent(self) -> T | None:
-        """Like :meth:`begin_next`, but only of lanes more urgent than that of the running job, and
-        not beyond what they may have."""
+        """Like :meth:`begin_next`, but only for priorities above the running job's that have not
+        used up their share."""
         present = self._running[-1]
         return self._begin(
-            lane
-            for lane in Lane
-            if lane < present and self._waiting[lane] and self._had[lane] <= self._had[present]
+            priority
+            for priority in Priority
+            if priority < present
+            and self._waiting[priority]
+            and self._had[priority] <= self._had[present]
         )
 
     def begin_with(self, joins: Callable[[T], bool]) -> list[T]:
-        """Jobs of the lane of the job begun last that are run with it, in the order they came.
+        """Take the jobs that run together with the job started last, in order of arrival.
 
-        They leave others behind that came before them. A job is left behind once at most: then it
-        is run before any that came later.
+        Only jobs of the same priority join. They may overtake an earlier job once; after that,
+        no later job overtakes it again.
 
         Args:
-            joins: whether a job is run with it; asked for each in turn.
+            joins: returns whether a waiting job joins; called once per job, in order.
         """
-        lane = self._running[-1]
-        waiting, passed_over = self._waiting[lane], self._passed_over[lane]
+        priority = self._running[-1]
+        waiting, passed_over = self._waiting[priority], self._passed_over[priority]
         joined: list[T] = []
         stayed: list[T] = []
         behind = 0
@@ -113,86 +113,86 @@ class Lanes(Generic[T]):
                 stayed.append(job)
         if joined:
             taken = set(map(id, joined))
-            self._waiting[lane] = deque(job for job in waiting if id(job) not in taken)
-            self._passed_over[lane] = behind
+            self._waiting[priority] = deque(job for job in waiting if id(job) not in taken)
+            self._passed_over[priority] = behind
         return joined
 
     def charge(self, seconds: float) -> None:
-        """Count time to the lane of the job begun last."""
-        lane = self._running[-1]
-        self._had[lane] += seconds / WEIGHTS[lane]
+        """Charge time to the priority of the job started last."""
+        priority = self._running[-1]
+        self._had[priority] += seconds / WEIGHTS[priority]
 
     def end(self) -> None:
-        """The job begun last has ended."""
+        """Mark the job started last as ended."""
         self._running.pop()
 
     def discard(self, unwanted: Callable[[T], bool]) -> None:
         """Drop waiting jobs."""
-        for lane, jobs in self._waiting.items():
+        for priority, jobs in self._waiting.items():
             if any(map(unwanted, jobs)):
                 kept = [not unwanted(job) for job in jobs]
-                self._passed_over[lane] = sum(kept[: self._passed_over[lane]])
-                self._waiting[lane] = deque(compress(jobs, kept))
+                self._passed_over[priority] = sum(kept[: self._passed_over[priority]])
+                self._waiting[priority] = deque(compress(jobs, kept))
 
     def take_all(self) -> list[T]:
-        """All that wait, which wait no more."""
-        jobs = [job for lane in Lane for job in self._waiting[lane]]
-        for lane, waiting in self._waiting.items():
+        """Remove and return all waiting jobs."""
+        jobs = [job for priority in Priority for job in self._waiting[priority]]
+        for priority, waiting in self._waiting.items():
             waiting.clear()
-            self._passed_over[lane] = 0
+            self._passed_over[priority] = 0
         return jobs
 
-    def _is_active(self, lane: Lane) -> bool:
-        return bool(self._waiting[lane]) or lane in self._running
+    def _is_active(self, priority: Priority) -> bool:
+        return bool(self._waiting[priority]) or priority in self._running
 
-    def _begin(self, candidates: Iterable[Lane]) -> T | None:
-        lane = min(candidates, key=lambda lane: (self._had[lane], lane), default=None)
-        if lane is None:
+    def _begin(self, candidates: Iterable[Priority]) -> T | None:
+        priority = min(
+            candidates, key=lambda priority: (self._had[priority], priority), default=None
+        )
+        if priority is None:
             return None
-        self._running.append(lane)
-        self._passed_over[lane] = max(0, self._passed_over[lane] - 1)
-        return self._waiting[lane].popleft()
+        self._running.append(priority)
+        self._passed_over[priority] = max(0, self._passed_over[priority] - 1)
+        return self._waiting[priority].popleft()
 
 
 R = TypeVar("R")
 
 IDLE_TICK_S = 0.25
 NICENESS = 3
-"""Kernels use every core; without a little less weight for them the event loop waits its turn
-behind them for a scheduler slice. On two busy cores this brought its lag down from 7 ms to 4 ms at
-the 95th percentile."""
+"""Niceness of the engine thread. Kernels use every core; the event loop must be scheduled first."""
 SWITCH_INTERVAL_S = 0.0005
-"""How soon a thread that runs Python bytecode hands over to the event loop. The interpreter's
-default of 5 ms would by itself be the whole of the lag we allow the loop."""
+"""How long a thread that runs Python code blocks the event loop at most [s]. Python's default is
+0.005."""
 
 log = structlog.get_logger(__name__)
 
 
 class EngineError(RuntimeError):
-    """The engine cannot take or finish a job."""
+    """The engine cannot accept or finish a job."""
 
 
 class QueueFullError(EngineError):
-    """Too many jobs wait already."""
+    """The queue is full."""
 
 
 class EngineStoppedError(EngineError):
-    """The engine is stopping, or was never started."""
+    """The engine is stopping or was never started."""
 
 
 class DeviceLostError(EngineError):
-    """The device reported an error after which nothing on it works; only a new process helps."""
+    """The device reported an error that only a new process can recover from."""
 
 
 @dataclass(frozen=True, eq=False)
-class Companions:
-    """With what a job may be done in one go: with those that have the same ``compute`` and ``key``.
+class Batchable:
+    """How a job is batched. Jobs with the same ``compute`` and ``key`` may run in one call.
 
     Attributes:
-        compute: makes the results of several arguments, or what was raised instead, in their order.
-        argument: of this job.
+        compute: maps arguments to results or exceptions, in the same order.
+        argument: argument of this job.
         key: compared by identity.
-        share: of what may be done in one go; that of all jobs together is at most 1.
+        share: share of a batch that this job takes; a batch holds at most 1.
     """
 
     compute: Callable[[Sequence[Any]], Sequence[Any]]
@@ -206,31 +206,31 @@ class _EngineJob:
     run: Callable[[], Any]
     label: str
     future: Future[Any]
-    companions: Companions | None = None
+    batch: Batchable | None = None
     queued_at: float = field(default_factory=lambda: clock.monotonic())  # noqa: PLW0108
     on_end: Callable[[str, float, float], None] | None = None
 
 
 class Engine:
-    """Runs jobs one after the other on a thread of its own.
+    """Runs jobs one after another on its own thread.
 
-    Everything that computes runs here, so that kernels never compete for cores and the event loop
-    never waits for them. Jobs are plain functions; their exceptions travel to the caller. Jobs of a
-    lane run in the order they came, lanes take turns, see :class:`.Lanes`. A long job calls
-    :meth:`give_way` between its pieces, and more urgent ones run there and then. Jobs that can be
-    done in one go are, where they wait together; none waits for one to come.
+    All computation runs here, so kernels never compete for cores and the event loop never waits for
+    them. A job is a plain function; its exceptions are raised in the caller. Jobs are scheduled as
+    :class:`.PriorityQueue` describes. A long job calls :meth:`yield_to_urgent` between its parts, which runs more
+    urgent jobs. Waiting jobs that can be batched run in one call; no job waits for a batch to fill.
 
     Args:
-        name: of the thread.
-        queue_length: jobs that may wait in each lane.
-        threads: of torch and numba, 0 for one per core; None for a thread that runs no kernels on
-            every core, and that gives way to nobody.
-        on_job: called on the engine thread after each job with its label, the seconds it waited
-            and the seconds it ran.
+        name: name of the thread.
+        queue_length: maximum number of waiting jobs per priority.
+        threads: threads of torch and numba, 0 for one per core. None for an engine that runs no
+            parallel kernels; its thread keeps its priority.
+        on_job: called on the engine thread after each job with its label, the time it waited [s]
+            and the time it ran [s].
 
     Attributes:
         on_failure: called on the engine thread when the device is lost.
-        on_queued: asked by whoever queues a job; its answer is called as ``on_job`` after that job.
+        on_queued: called when a job is queued; returns a function that is called like ``on_job``
+            after that job, or None.
     """
 
     def __init__(
@@ -246,7 +246,7 @@ class Engine:
         self.on_queued: Callable[[], Callable[[str, float, float], None] | None] | None = None
         self._threads = threads
         self._on_job = on_job
-        self._jobs: Lanes[_EngineJob] = Lanes(queue_length)
+        self._jobs: PriorityQueue[_EngineJob] = PriorityQueue(queue_length)
         self._began = 0.0
         self._changed = threading.Condition()
         self._accepting = False
@@ -258,7 +258,7 @@ class Engine:
     # --- life -------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start the thread and set the thread counts of torch and numba once and for all."""
+        """Start the thread and set the thread counts of torch and numba."""
         sys.setswitchinterval(min(SWITCH_INTERVAL_S, sys.getswitchinterval()))
         self._accepting = True
         self._last_tick = clock.monotonic()
@@ -267,10 +267,10 @@ class Engine:
             self.call_sync(set_thread_counts, self._threads, label="threads")
 
     def stop(self, *, drain: bool = True, timeout_s: float | None = None) -> None:
-        """Take no more jobs and end the thread; without ``drain``, waiting jobs are dropped.
+        """Refuse new jobs and end the thread. Without ``drain``, waiting jobs are dropped.
 
         Raises:
-            TimeoutError: a job still runs after ``timeout_s``.
+            TimeoutError: a job is still running after ``timeout_s``.
         """
         with self._changed:
             self._accepting = False
@@ -289,25 +289,26 @@ class Engine:
         fn: Callable[..., T],
         *args: Any,
         label: str = "work",
-        lane: Lane = Lane.VIEW,
+        priority: Priority = Priority.VIEW,
         **kwargs: Any,
     ) -> T:
-        """``fn(*args, **kwargs)`` on the engine thread, awaited.
+        """Run ``fn(*args, **kwargs)`` on the engine thread and await its result.
 
-        When the awaiting task is cancelled, a job that still waits is dropped; one that runs
-        finishes, and its result is thrown away.
+        If the awaiting task is cancelled, a waiting job is dropped; a running one finishes and its
+        result is discarded.
 
         Args:
-            fn: with ``args`` and ``kwargs``.
-            label: for metrics and messages.
-            lane: with what it takes turns.
+            fn: function to run.
+            args, kwargs: its arguments.
+            label: name for metrics and messages.
+            priority: priority of the job.
 
         Raises:
-            QueueFullError: ``queue_length`` jobs of the lane wait already.
-            EngineStoppedError: the engine does not run, or stopped before the job's turn.
+            QueueFullError: ``queue_length`` jobs of this priority are waiting.
+            EngineStoppedError: the engine is not running, or stopped before the job started.
             DeviceLostError: an earlier job lost the device.
         """
-        job = self._submit(lambda: fn(*args, **kwargs), label, lane)
+        job = self._submit(lambda: fn(*args, **kwargs), label, priority)
         result: T = await self._outcome(job)
         return result
 
@@ -319,25 +320,25 @@ class Engine:
         key: object,
         share: float,
         label: str,
-        lane: Lane,
+        priority: Priority,
     ) -> R:
-        """The result that ``compute`` has for ``argument``, awaited as by :meth:`call`.
+        """Await the result of ``compute`` for ``argument``, batched with other waiting calls.
 
-        What waits with it in its lane, of the same ``compute`` and ``key``, is handed over in the
-        same call; those whose turn it was before wait for it once at most.
+        Waiting calls of the same priority, ``compute`` and ``key`` run in the same batch. A batch
+        overtakes each earlier job at most once.
 
         Args:
-            compute: makes the results of several arguments, or what was raised instead, in order.
-            argument: of this call.
+            compute: maps arguments to results or exceptions, in the same order.
+            argument: argument of this call.
             key: compared by identity.
-            share: of what may be done in one go, above 0; at most 1 comes together.
-            label, lane: as of :meth:`call`.
+            share: share of a batch that this call takes, in (0, 1].
+            label, priority: as for :meth:`call`.
 
         Raises:
-            QueueFullError, EngineStoppedError, DeviceLostError: as :meth:`call`.
+            QueueFullError, EngineStoppedError, DeviceLostError: as for :meth:`call`.
         """
-        companions = Companions(compute, argument, key, share)
-        job = self._submit(lambda: compute([argument])[0], label, lane, companions)
+        batch = Batchable(compute, argument, key, share)
+        job = self._submit(lambda: compute([argument])[0], label, priority, batch)
         result: R = await self._outcome(job)
         return result
 
@@ -349,14 +350,14 @@ class Engine:
         timeout_s: float | None = None,
         **kwargs: Any,
     ) -> T:
-        """Like :meth:`call` for callers without an event loop; on the engine thread, just runs.
+        """Like :meth:`call`, for callers without an event loop. On the engine thread, runs at once.
 
         Raises:
             TimeoutError: no result after ``timeout_s``.
         """
         if threading.current_thread() is self._thread:
             return fn(*args, **kwargs)
-        job = self._submit(lambda: fn(*args, **kwargs), label, Lane.VIEW)
+        job = self._submit(lambda: fn(*args, **kwargs), label, Priority.VIEW)
         try:
             result: T = job.future.result(timeout_s)
         except TimeoutError:
@@ -365,10 +366,10 @@ class Engine:
             raise
         return result
 
-    def give_way(self) -> None:
-        """Run what is more urgent than the running job and whose turn it is.
+    def yield_to_urgent(self) -> None:
+        """Run waiting jobs that are more urgent than the current one.
 
-        For long jobs, between two of their pieces. Does nothing on other threads.
+        A long job calls this between its parts. Does nothing on other threads.
         """
         if threading.current_thread() is not self._thread:
             return
@@ -379,7 +380,7 @@ class Engine:
         self._began = clock.monotonic()
 
     def note_error(self, error: BaseException) -> None:
-        """Something that began here has failed on another thread: the device may be lost."""
+        """Report an error of work that started here and failed on another thread."""
         if self._failure is None and _loses_device(error):
             self._lose_device(error)
 
@@ -387,29 +388,29 @@ class Engine:
 
     @property
     def alive(self) -> bool:
-        """Whether the thread runs and the device is not lost."""
+        """Whether the thread is running and the device works."""
         return self._thread.is_alive() and self._failure is None
 
     @property
     def failure(self) -> BaseException | None:
-        """The error that lost the device, if one did."""
+        """The error that lost the device, or None."""
         return self._failure
 
     @property
     def seconds_since_tick(self) -> float:
-        """Time since the thread last looked for a job; grows while one runs [s]."""
+        """Time since the thread last polled the queue; grows while a job runs [s]."""
         return clock.monotonic() - self._last_tick
 
     @property
     def queue_depth(self) -> int:
-        """Jobs that wait."""
+        """Number of waiting jobs."""
         with self._changed:
             self._discard_cancelled()
             return len(self._jobs)
 
     @property
     def running(self) -> str | None:
-        """Label of the job under way."""
+        """Label of the running job, or None."""
         return self._running
 
     # --- inside -----------------------------------------------------------------------------
@@ -425,10 +426,10 @@ class Engine:
         self,
         run: Callable[[], Any],
         label: str,
-        lane: Lane,
-        companions: Companions | None = None,
+        priority: Priority,
+        batch: Batchable | None = None,
     ) -> _EngineJob:
-        job = _EngineJob(run, label, Future(), companions)
+        job = _EngineJob(run, label, Future(), batch)
         if self.on_queued is not None:
             job.on_end = self.on_queued()
         with self._changed:
@@ -436,14 +437,14 @@ class Engine:
                 raise DeviceLostError(f"the device was lost: {self._failure}")
             if not self._accepting:
                 raise EngineStoppedError("the engine does not take jobs: it is stopping")
-            if self._jobs.waiting(lane) >= self.queue_length:
+            if self._jobs.waiting(priority) >= self.queue_length:
                 self._discard_cancelled()
-            if self._jobs.waiting(lane) >= self.queue_length:
+            if self._jobs.waiting(priority) >= self.queue_length:
                 raise QueueFullError(
-                    f"{self._jobs.waiting(lane)} jobs wait for the engine, {self.queue_length} "
+                    f"{self._jobs.waiting(priority)} jobs wait for the engine, {self.queue_length} "
                     f"may; it runs {self._running!r}"
                 )
-            self._jobs.append(job, lane)
+            self._jobs.append(job, priority)
             self._changed.notify()
         return job
 
@@ -461,10 +462,10 @@ class Engine:
                 lower_priority(NICENESS)
             while (job := self._next()) is not None:
                 self._start(job)
-                # The job holds arguments and result; an idle engine must not keep them alive.
+                # An idle engine must not keep the job's arguments and result alive.
                 del job
         except BaseException as error:
-            # Without its thread an engine answers nobody: who waits is told, and the worker ends.
+            # Fail the waiting jobs and end the worker: without this thread nothing would run.
             log.exception("engine ended")
             self._lose_device(error)
 
@@ -484,7 +485,7 @@ class Engine:
             return self._jobs.begin_more_urgent()
 
     def _start(self, job: _EngineJob) -> None:
-        """Run a job that is wanted still, with those that join it, and count its time."""
+        """Run a job and its batch unless cancelled, and charge the time."""
         self._began = clock.monotonic()
         try:
             jobs = [j for j in self._joined(job) if j.future.set_running_or_notify_cancel()]
@@ -496,16 +497,16 @@ class Engine:
                 self._jobs.end()
 
     def _joined(self, first: _EngineJob) -> list[_EngineJob]:
-        """A job that begins, and those that are done in one go with it."""
-        given = first.companions
-        if given is None:
+        """The job and the waiting jobs that run in its batch."""
+        batch = first.batch
+        if batch is None:
             return [first]
-        left = 1.0 - given.share
+        left = 1.0 - batch.share
 
         def joins(job: _EngineJob) -> bool:
             nonlocal left
-            other = job.companions
-            if other is None or other.key is not given.key or other.compute != given.compute:
+            other = job.batch
+            if other is None or other.key is not batch.key or other.compute != batch.compute:
                 return False
             left -= other.share
             return left > -1e-9
@@ -534,15 +535,15 @@ class Engine:
                 self._hand_over(job, result)
         finally:
             self._running = interrupted
-        # The awaiting thread has been woken, and gets the interpreter before metrics are updated.
+        # Let the awaiting thread run before metrics are updated.
         time.sleep(0)
         for job in jobs:
-            for told in (self._on_job, job.on_end):
-                if told is not None:
-                    told(job.label, started - job.queued_at, clock.monotonic() - started)
+            for callback in (self._on_job, job.on_end):
+                if callback is not None:
+                    callback(job.label, started - job.queued_at, clock.monotonic() - started)
 
     def _hand_over(self, job: _EngineJob, result: Any) -> None:
-        if job.companions is None or not isinstance(result, Exception):
+        if job.batch is None or not isinstance(result, Exception):
             job.future.set_result(result)
             return
         self.note_error(result)
@@ -561,12 +562,12 @@ class Engine:
 def _results(jobs: Sequence[_EngineJob]) -> Sequence[Any]:
     if len(jobs) == 1:
         return [jobs[0].run()]
-    given = [job.companions for job in jobs if job.companions is not None]
-    return given[0].compute([companions.argument for companions in given])
+    batch = [job.batch for job in jobs if job.batch is not None]
+    return batch[0].compute([member.argument for member in batch])
 
 
 def set_thread_counts(threads: int) -> None:
-    """Set the threads of torch and numba in this process; 0 leaves one per core."""
+    """Set the thread counts of torch and numba in this process; 0 means one per core."""
     import numba
     import torch
 
@@ -577,14 +578,14 @@ def set_thread_counts(threads: int) -> None:
 
 
 def lower_priority(niceness: int) -> None:
-    """Of the calling thread and of those that kernels will start from it; Linux can do that.
+    """Raise the niceness of the calling thread and the threads it will start (Linux only).
 
-    Only the superuser may raise a priority: what is lower already stays as it is.
+    Never lowers it: only the superuser may.
     """
     if sys.platform == "linux":
         thread = threading.get_native_id()
         if os.getpriority(os.PRIO_PROCESS, thread) < niceness:
-            # Where a sandbox forbids it, all goes on at one priority.
+            # A sandbox may forbid it; the niceness then stays as it is.
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, thread, niceness)
 
@@ -596,7 +597,7 @@ def _fail(jobs: Iterable[_EngineJob], error: EngineError) -> None:
 
 
 def _loses_device(error: BaseException) -> bool:
-    """Whether CUDA refuses everything after this error. Running out of memory is not such a one."""
+    """Whether CUDA is unusable after this error. Running out of memory is recoverable."""
     torch = sys.modules.get("torch")
     if torch is None or isinstance(error, torch.OutOfMemoryError):
         return False

@@ -207,7 +207,7 @@ class Sweeps:
         new = NewJob("sweep", request.scene, fields, who, portable=portable)
         return await self._jobs.start(new, self._work(request), idempotent=idempotent)
 
-    async def work_again(self, info: JobInfo) -> Work:
+    async def rebuild(self, info: JobInfo) -> Work:
         """The work of a job on record."""
         return self._work(SweepRequest.model_validate(info.request))
 
@@ -232,7 +232,7 @@ class Sweeps:
         """
         context.progress(0.0, "starting")
         process = await CommandProcess.run(_command(request, context.folder), follow=True)
-        process.give_way()
+        process.yield_to_urgent()
         try:
             telling, looked = _Telling(context), time.monotonic()
             while process.running:

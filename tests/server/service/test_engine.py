@@ -14,7 +14,7 @@ from real2sim_server.service.engine import (
     DeviceLostError,
     Engine,
     EngineStoppedError,
-    Lane,
+    Priority,
     QueueFullError,
 )
 from tests.waiting import LIMIT_S, wait_until, wait_until_async
@@ -302,15 +302,15 @@ def test_a_long_job_gives_way_to_a_step_between_its_pieces(make_engine):
         order.append("film begins")
         piece.set()
         assert asked.wait(LIMIT_S)
-        engine.give_way()
+        engine.yield_to_urgent()
         order.append("film ends")
 
     async def ask() -> None:
-        filming = asyncio.ensure_future(engine.call(film, lane=Lane.BULK))
+        filming = asyncio.ensure_future(engine.call(film, priority=Priority.BULK))
         assert await asyncio.to_thread(piece.wait, 10)
         others = [
-            asyncio.ensure_future(engine.call(order.append, lane.name, lane=lane))
-            for lane in (Lane.BULK, Lane.DRIVE)
+            asyncio.ensure_future(engine.call(order.append, priority.name, priority=priority))
+            for priority in (Priority.BULK, Priority.DRIVE)
         ]
         await asyncio.sleep(0)
         asked.set()
@@ -326,13 +326,13 @@ def test_a_step_that_fails_leaves_the_job_that_gave_way(make_engine):
     def film() -> str:
         piece.set()
         assert asked.wait(LIMIT_S)
-        engine.give_way()
+        engine.yield_to_urgent()
         return "filmed"
 
     async def ask() -> None:
-        filming = asyncio.ensure_future(engine.call(film, lane=Lane.BULK, label="film"))
+        filming = asyncio.ensure_future(engine.call(film, priority=Priority.BULK, label="film"))
         assert await asyncio.to_thread(piece.wait, 10)
-        step = asyncio.ensure_future(engine.call(divmod, 1, 0, lane=Lane.DRIVE))
+        step = asyncio.ensure_future(engine.call(divmod, 1, 0, priority=Priority.DRIVE))
         await asyncio.sleep(0)
         asked.set()
         with pytest.raises(ZeroDivisionError):
@@ -347,11 +347,11 @@ def test_giving_way_on_another_thread_runs_nothing(make_engine):
     engine, gate, ran = make_engine(), Gate(), []
 
     async def ask() -> None:
-        first = asyncio.ensure_future(engine.call(gate.job, lane=Lane.BULK))
+        first = asyncio.ensure_future(engine.call(gate.job, priority=Priority.BULK))
         await until_entered(gate)
-        step = asyncio.ensure_future(engine.call(ran.append, "step", lane=Lane.DRIVE))
+        step = asyncio.ensure_future(engine.call(ran.append, "step", priority=Priority.DRIVE))
         await asyncio.sleep(0)
-        engine.give_way()
+        engine.yield_to_urgent()
         assert ran == []
         gate.open()
         await asyncio.gather(first, step)
@@ -364,13 +364,13 @@ def test_a_full_lane_leaves_room_in_the_others(make_engine):
     engine, gate = make_engine(queue_length=1), Gate()
 
     async def ask() -> None:
-        first = asyncio.ensure_future(engine.call(gate.job, lane=Lane.BULK))
+        first = asyncio.ensure_future(engine.call(gate.job, priority=Priority.BULK))
         await until_entered(gate)
-        bulk = asyncio.ensure_future(engine.call(int, lane=Lane.BULK))
+        bulk = asyncio.ensure_future(engine.call(int, priority=Priority.BULK))
         await asyncio.sleep(0)
         with pytest.raises(QueueFullError):
-            await engine.call(int, lane=Lane.BULK)
-        step = asyncio.ensure_future(engine.call(int, "5", lane=Lane.DRIVE))
+            await engine.call(int, priority=Priority.BULK)
+        step = asyncio.ensure_future(engine.call(int, "5", priority=Priority.DRIVE))
         await asyncio.sleep(0)
         gate.open()
         assert await step == 5
@@ -447,7 +447,7 @@ def waiting_together(engine, gate, calls):
 
 def test_calls_of_one_key_that_wait_together_are_made_in_one_go_within_their_shares(make_engine):
     engine, gathered, key = make_engine(), Gathered(), object()
-    options = {"share": 0.4, "label": "drive", "lane": Lane.DRIVE}
+    options = {"share": 0.4, "label": "drive", "priority": Priority.DRIVE}
     calls = [
         engine.call_together(gathered.compute, n, key=key if n != 2 else object(), **options)
         for n in (1, 2, 4, 5)
@@ -458,7 +458,7 @@ def test_calls_of_one_key_that_wait_together_are_made_in_one_go_within_their_sha
 
 def test_what_is_raised_for_one_of_several_calls_reaches_its_caller_alone(make_engine):
     engine, gathered, key = make_engine(), Gathered(), object()
-    options = {"share": 0.1, "label": "drive", "lane": Lane.DRIVE, "key": key}
+    options = {"share": 0.1, "label": "drive", "priority": Priority.DRIVE, "key": key}
     calls = [engine.call_together(gathered.compute, n, **options) for n in (2, 0, 4)]
     first, second, third = waiting_together(engine, Gate(), calls)
     assert (first, third) == (0.5, 0.25)

@@ -262,7 +262,7 @@ class IdempotentRequest:
         return StoredReply(self.key, self.fingerprint, status, dict(headers or {}), body)
 
 
-class AnsweredElsewhereError(Exception):
+class ReplyConflict(Exception):
     """Another worker has answered the same request meanwhile; what was begun here came too late.
 
     Args:
@@ -301,7 +301,7 @@ class Idempotency:
 
         Raises:
             ServiceError: IDEMPOTENCY_CONFLICT when the key was used for another request.
-            AnsweredElsewhereError: another worker was faster.
+            ReplyConflict: another worker was faster.
         """
         if key is None:
             yield IdempotentRequest()
@@ -320,7 +320,7 @@ class Idempotency:
             except Exception as error:
                 with contextlib.suppress(StoreError):
                     if replay is None and (elsewhere := await given()) is not None:
-                        raise AnsweredElsewhereError(elsewhere) from error
+                        raise ReplyConflict(elsewhere) from error
                 raise
 
     async def _given(
@@ -365,10 +365,10 @@ def install_replay_handler(app: FastAPI, replayed: Callable[[Response], Response
     """Answer what another worker was faster with by its answer, which passes ``replayed``."""
 
     async def respond(_request: Request, error: Exception) -> Response:
-        assert isinstance(error, AnsweredElsewhereError)
+        assert isinstance(error, ReplyConflict)
         return replayed(error.answer)
 
-    app.add_exception_handler(AnsweredElsewhereError, respond)
+    app.add_exception_handler(ReplyConflict, respond)
 
 
 async def form_digest(form: FormData) -> bytes:

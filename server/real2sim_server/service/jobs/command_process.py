@@ -64,7 +64,7 @@ class CommandProcess:
         """Whether it has not ended."""
         return self._process.returncode is None
 
-    def give_way(self) -> None:
+    def yield_to_urgent(self) -> None:
         """Let it have what processor time others leave."""
         # It has ended, or the system has no such thing.
         with contextlib.suppress(OSError, AttributeError):

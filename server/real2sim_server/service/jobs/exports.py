@@ -30,7 +30,7 @@ from ...render.backend import RasterRequest
 from ...render.cast import CastRequest, Echo, select_caster
 from ...render.video import VideoError, VideoFile
 from ...scene import Scene
-from ..engine import Engine, Lane, QueueFullError
+from ..engine import Engine, Priority, QueueFullError
 from ..http.responses import ServiceError
 from ..library.scenes import Quota
 from ..rendering.frames import EncodedFrame
@@ -234,7 +234,7 @@ class EngineBackend:
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
         """Draw when interactive requests leave room in the queue. Raises JobCancelled."""
-        yielding = replace(request, between=self.engine.give_way)
+        yielding = replace(request, between=self.engine.yield_to_urgent)
         return self.on_engine(self.backend.rasterize, yielding)
 
     def warm_up(self) -> None:
@@ -244,7 +244,7 @@ class EngineBackend:
         """The result of ``work`` on the engine's thread. Raises JobCancelled."""
         while True:
             self.context.check()
-            awaited = self.engine.call(work, argument, label="dataset", lane=Lane.BULK)
+            awaited = self.engine.call(work, argument, label="dataset", priority=Priority.BULK)
             try:
                 return asyncio.run_coroutine_threadsafe(awaited, self.loop).result()
             except QueueFullError:

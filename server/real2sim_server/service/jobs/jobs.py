@@ -1,4 +1,4 @@
-"""Jobs: long work that answers at once, reports progress, can be cancelled and keeps its result."""
+"""Background jobs: they report progress, can be cancelled, and their results are stored."""
 
 from __future__ import annotations
 
@@ -32,58 +32,59 @@ from ..storage.store import FencedError, StoreError, StoreTroubleError
 
 
 def ended(info: JobInfo, state: JobState, *, error: Problem | None = None) -> JobInfo:
-    """The job once it is over."""
+    """The job record in its final state."""
     return info.model_copy(
         update={"state": state, "finished_at": iso_time(now_us()), "error": error}
     )
 
 
 def interruption() -> Problem:
-    """Of a job whose worker stopped."""
+    """The error of a job whose worker stopped."""
     failure = ServiceError(
         ErrorCode.DRAINING, "the worker stopped before this job was done", hint="start it again"
     )
     return problem_of(failure, path="", request_id=None)
 
 
-def given_up(deaths: int) -> Problem:
-    """Of a job at which so many workers died."""
+def too_many_deaths(deaths: int) -> Problem:
+    """The error of a job that ``deaths`` workers died running."""
     failure = ServiceError(
         ErrorCode.JOB_FAILED,
-        f"{deaths} workers died at this job; it is not begun once more",
-        hint="look at the logs of the workers, and ask for less at once",
+        f"{deaths} workers died while they ran this job; it is not started again",
+        hint="check the workers' logs, and split the job into smaller ones",
     )
     return problem_of(failure, path="", request_id=None)
 
 
 MAX_QUEUED_JOBS = 32
-"""Jobs that may wait for their turn; more are refused."""
+"""Maximum number of waiting jobs; more are refused."""
 
 MAX_EVENTS = 256
-"""Of one job, for readers that come back; older progress is of no use to anybody."""
+"""Events kept per job for clients that reconnect."""
 
 UNKNOWN_EVENTS = 1_000_000
-"""More events than a job has: its end is newer than any progress that was sent but not stored."""
+"""Added to the event number when a job is taken over, so that it exceeds every number that was sent
+but not stored."""
 
 STORE_RETRY_S = 1.0
-"""Between tries to put on record what has become of a job, while the store is in trouble."""
+"""Interval between attempts to store a job's state while the store fails [s]."""
 
-LOOK_S = 1.0
-"""Between two looks for jobs of workers that are gone, and for word about the worker's own."""
+POLL_S = 1.0
+"""Interval between polls for orphaned jobs and for cancellations of own jobs [s]."""
 
 FOLLOW_S = 0.5
-"""Between two looks at a job that another worker has."""
+"""Interval between polls of a job that another worker runs [s]."""
 
 MAX_DEATHS = 3
-"""Of workers at one job; it is not begun once more."""
+"""Workers that may die running one job before it fails."""
 
 MAX_FINISHED_JOBS = 64
-"""Ended jobs in memory; others are read from the store."""
+"""Finished jobs kept in memory; older ones are read from the store."""
 
-JOBS_AT_A_TIME = {"physics": 1, "exports": 2, "drives": 8, "sweeps": 1}
-"""Lanes. Physics takes all cores; a video, a data set or a planner waits for none of it."""
+CONCURRENCY = {"physics": 1, "exports": 2, "drives": 8, "sweeps": 1}
+"""Queues and how many of their jobs run at once. Physics uses all cores."""
 
-LANE_OF: Mapping[str, str] = {
+QUEUE_OF: Mapping[str, str] = {
     "load_scene": "physics",
     "simulate": "physics",
     "calibrate": "physics",
@@ -101,11 +102,11 @@ class JobCancelled(Exception):
 
 @dataclass(frozen=True)
 class JobResult:
-    """What a job leaves.
+    """The result of a job.
 
     Attributes:
-        values: JSON values for its record.
-        files: names in its folder, with their media types.
+        values: JSON values for the job's record.
+        files: media types by file name, relative to the job's folder.
     """
 
     values: dict[str, Any] = field(default_factory=dict)
@@ -113,7 +114,7 @@ class JobResult:
 
 
 class JobContext:
-    """A job as its work sees it; safe to use on any thread."""
+    """What a job's work uses to report progress and notice cancellation. Thread-safe."""
 
     def __init__(self, folder: Path, report: Callable[[float, str], None]) -> None:
         self.folder = folder
@@ -121,7 +122,7 @@ class JobContext:
         self._cancelled = threading.Event()
 
     def progress(self, share: float, stage: str = "") -> None:
-        """Say how far it is, 0 to 1, and what it is doing.
+        """Report progress from 0 to 1 and the current stage.
 
         Raises:
             JobCancelled: the job was cancelled.
@@ -134,19 +135,19 @@ class JobContext:
         return self._cancelled.is_set()
 
     def check(self) -> None:
-        """Raises JobCancelled once the job is cancelled."""
+        """Raise JobCancelled if the job was cancelled."""
         if self._cancelled.is_set():
             raise JobCancelled
 
     def cancel(self) -> None:
-        """Ask the work to end."""
+        """Request the work to end."""
         self._cancelled.set()
 
 
 Work = Callable[[JobContext], Awaitable[JobResult]]
 
-WorkAgain = Callable[[JobInfo], Awaitable[Work]]
-"""Makes the work of a job from its record, on any worker."""
+Rebuild = Callable[[JobInfo], Awaitable[Work]]
+"""Makes a job's work from its record, on any worker."""
 
 
 @dataclass(eq=False)
@@ -165,11 +166,15 @@ class _Job:
 
 @dataclass(frozen=True)
 class NewJob:
-    """What a job is asked to do.
+    """A job to start.
 
     Attributes:
-        light: begins at once.
-        portable: its work can be made from its record alone, see ``Jobs.work_again``.
+        kind: kind of the job.
+        subject: scene, session or sweep that it works on.
+        request: body of the request, stored with the job.
+        who: end user that the client names.
+        light: start at once, without a queue.
+        portable: any worker can rebuild its work from the record, see ``Jobs.rebuild``.
     """
 
     kind: JobKind
@@ -181,15 +186,20 @@ class NewJob:
 
 
 class Jobs:
-    """All jobs of a worker. Belongs to the event loop.
+    """All jobs of a worker. Use on the event loop only.
 
-    Heavy jobs run in the order they came, as many of a lane at a time as ``JOBS_AT_A_TIME`` says,
-    beside those of other lanes; light ones at once.
+    Heavy jobs wait in a queue per kind of work, see ``CONCURRENCY``. Light jobs start at once.
 
     Args:
-        job_log: keeps them.
-        quota: of jobs and their files; below its folder each job has one for its files.
-        on_end: told the kind and the last state of each job.
+        job_log: stores the jobs.
+        quota: limits of jobs and their files; each job has a subfolder in its folder.
+        on_end: called with the kind and the final state of each job.
+
+    Attributes:
+        rebuild: makes the work of a portable job from its record.
+        fetch: downloads the files of another worker's job; returns whether it succeeded.
+        listen: returns a sleep function that wakes early when another worker writes.
+        on_forget: called with the id of each forgotten job.
     """
 
     def __init__(
@@ -200,35 +210,37 @@ class Jobs:
         self._quota = quota
         self._folder = quota.folder
         self._jobs: OrderedDict[str, _Job] = OrderedDict()
-        self._turns = {lane: asyncio.Semaphore(many) for lane, many in JOBS_AT_A_TIME.items()}
+        self._slots = {queue: asyncio.Semaphore(many) for queue, many in CONCURRENCY.items()}
         self._closing = False
-        self.work_again: WorkAgain | None = None
+        self.rebuild: Rebuild | None = None
         self.fetch: Callable[[str], Awaitable[bool]] | None = None
         self.listen: Callable[[], Callable[[float], Awaitable[None]]] = lambda: asyncio.sleep
         self.on_forget: Callable[[str], Awaitable[None]] | None = None
 
     @property
     def quota(self) -> Quota:
-        """Of jobs and their files."""
+        """Limits of jobs and their files."""
         return self._quota
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Jobs]:
-        """Goes on with what an earlier run or a worker that is gone left unfinished, or marks it;
-        leaves what is unfinished at the end to other workers, or marks that."""
+        """Resume unfinished jobs of earlier runs and dead workers while the context is open.
+
+        Jobs that cannot be resumed are marked as interrupted. On exit, see :meth:`leave`.
+        """
         await self._take_over_own()
-        looking = asyncio.create_task(self._look_after(), name="jobs")
+        supervisor = asyncio.create_task(self._supervise(), name="jobs")
         try:
             yield self
         finally:
             self._closing = True
-            looking.cancel()
+            supervisor.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await looking
+                await supervisor
             await self.leave()
 
     async def leave(self) -> None:
-        """Begin no jobs any more, and leave what is unfinished to other workers, or mark it."""
+        """Stop all jobs. Portable ones go back to the queue, others are marked as interrupted."""
         self._closing = True
         tasks = [job.task for job in self._jobs.values() if job.task and not job.task.done()]
         for job in self._jobs.values():
@@ -238,7 +250,7 @@ class Jobs:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def unfinished(self) -> Counter[str]:
-        """How many jobs are not over, by the name of their owner's token."""
+        """Number of unfinished jobs by owner."""
         return Counter(job.info.owner for job in self._jobs.values() if not job.info.over)
 
     # --- life -------------------------------------------------------------------------------
@@ -246,12 +258,12 @@ class Jobs:
     async def start(
         self, new: NewJob, work: Work, *, idempotent: IdempotentRequest | None = None
     ) -> JobInfo:
-        """Put a job on record and let it run.
+        """Store a job and start it.
 
         Args:
-            new: what it is.
-            work: called on the event loop; hands what computes to threads.
-            idempotent: what the answer is stored under.
+            new: the job.
+            work: coroutine function that runs on the event loop; it moves computation to threads.
+            idempotent: key under which the reply is stored.
 
         Raises:
             ServiceError: QUEUE_FULL, QUOTA_EXCEEDED, or DRAINING.
@@ -288,14 +300,17 @@ class Jobs:
             if idempotent
             else None
         )
-        portable = new.portable and self.work_again is not None
+        portable = new.portable and self.rebuild is not None
         await self._log.add(info, reply=reply, portable=portable)
         job = self._hold(info, work, portable=portable)
         await self._begin(job, light=new.light)
         return info
 
     async def cancel(self, job_id: str) -> JobInfo | None:
-        """End a job that is not over, or forget one that is; what it is now, None if forgotten.
+        """Cancel an unfinished job, or forget a finished one.
+
+        Returns:
+            The job as it is now; None if forgotten.
 
         Raises:
             ServiceError: UNKNOWN_JOB.
@@ -303,8 +318,8 @@ class Jobs:
         info = await self.get(job_id)
         job = self._jobs.get(job_id)
         if job is None and not info.over:
-            await self._log.ask_to_cancel(job_id)
-            return await self.wait(job_id, 3 * LOOK_S)
+            await self._log.request_cancel(job_id)
+            return await self.wait(job_id, 3 * POLL_S)
         if job is None or info.over:
             self._jobs.pop(job_id, None)
             await self._log.remove(job_id)
@@ -319,7 +334,7 @@ class Jobs:
         return job.info
 
     async def get(self, job_id: str) -> JobInfo:
-        """The job as it is now. Raises ServiceError: UNKNOWN_JOB."""
+        """The current record of a job. Raises ServiceError: UNKNOWN_JOB."""
         if (job := self._jobs.get(job_id)) is not None:
             return job.info
         if (info := await self._log.get(job_id)) is not None:
@@ -335,7 +350,7 @@ class Jobs:
         return [current.get(info.job_id, info) for info in stored]
 
     async def file(self, job_id: str, name: str) -> tuple[Path, JobFile]:
-        """A file that a job left. Raises ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, NOT_FOUND."""
+        """A file of a job's result. Raises ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, NOT_FOUND."""
         info = await self.get(job_id)
         require_success(info)
         await self.bring_files(info)
@@ -345,22 +360,22 @@ class Jobs:
             if file.name == name:
                 raise ServiceError(
                     ErrorCode.NOT_FOUND,
-                    f"{name!r} of job {job_id!r} lies with worker {info.worker!r}",
-                    hint="ask that worker",
+                    f"{name!r} of job {job_id!r} is stored by worker {info.worker!r}",
+                    hint="request it from that worker",
                 )
         names = ", ".join(f.name for f in info.files) or "none"
         raise ServiceError(
-            ErrorCode.NOT_FOUND, f"job {job_id!r} left no {name!r}; it left: {names}"
+            ErrorCode.NOT_FOUND, f"job {job_id!r} has no file {name!r}; it has: {names}"
         )
 
     async def bring_files(self, info: JobInfo) -> None:
-        """Have the files of a job of another worker here, where workers share them."""
+        """Fetch the files of another worker's job, if workers share files."""
         here = (self._folder / info.job_id).is_dir()
         if not here and info.files and self.fetch is not None:
             await self.fetch(info.job_id)
 
     async def wait(self, job_id: str, seconds: float) -> JobInfo:
-        """The job when it is over, or after ``seconds``. Raises ServiceError: UNKNOWN_JOB."""
+        """Wait up to ``seconds`` for a job to finish. Raises ServiceError: UNKNOWN_JOB."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 if (job := self._jobs.get(job_id)) is not None:
@@ -371,7 +386,7 @@ class Jobs:
         return await self.get(job_id)
 
     async def events(self, job_id: str, *, after: int) -> AsyncIterator[JobInfo]:
-        """What the job becomes, from behind event ``after`` to its end.
+        """Records of a job with event numbers above ``after``, until it finishes.
 
         Raises:
             ServiceError: UNKNOWN_JOB.
@@ -379,7 +394,7 @@ class Jobs:
         pause = self.listen()
         while True:
             if (job := self._jobs.get(job_id)) is None:
-                # It is over, or with another worker.
+                # It is finished, or another worker runs it.
                 events = [await self.get(job_id)]
                 over = events[0].over
                 await pause(0 if over else FOLLOW_S)
@@ -393,7 +408,7 @@ class Jobs:
                 return
 
     async def forget_before(self, created_us: int) -> int:
-        """Forget ended jobs that were begun before, with their files; how many."""
+        """Forget finished jobs created before a time, with their files; returns their number."""
         forgotten = 0
         while found := await self._log.ended_before(created_us):
             for job_id in found:
@@ -403,35 +418,34 @@ class Jobs:
 
     # --- inside -----------------------------------------------------------------------------
 
-    async def _look_after(self) -> None:
+    async def _supervise(self) -> None:
         pause = self.listen()
         while not self._closing:
-            await pause(LOOK_S)
+            await pause(POLL_S)
             try:
-                await self._hear_of_own()
-                while (claimed := await self._log.claim_left_behind()) is not None:
-                    await self._go_on_fenced(claimed)
-                kinds = [kind for kind, lane in LANE_OF.items() if self._has_room(lane)]
-                # One at a time: those who have room as well get the others.
+                await self._poll_own()
+                while (claimed := await self._log.claim_orphaned()) is not None:
+                    await self._resume_fenced(claimed)
+                kinds = [kind for kind, queue in QUEUE_OF.items() if self._has_room(queue)]
+                # Claim one at a time and leave the others to other idle workers.
                 if kinds and (claimed := await self._log.claim_overdue(kinds)) is not None:
-                    await self._go_on_fenced(claimed)
+                    await self._resume_fenced(claimed)
             except StoreError:
-                continue  # it tells of its trouble itself
+                continue  # the store logs its own errors
             except Exception:
-                log.exception("looking after jobs failed")
+                log.exception("supervising jobs failed")
 
-    async def _hear_of_own(self) -> None:
-        """Cancel what somebody has cancelled at another worker, leave what another worker has, and
-        put progress on record for those who ask others."""
+    async def _poll_own(self) -> None:
+        """Apply cancellations from other workers, release lost jobs and store progress."""
         held = {key: job for key, job in self._jobs.items() if not (job.info.over or job.lost)}
         if not held:
             return
         epochs = {key: job.epoch for key, job in held.items()}
-        cancelled, lost = await self._log.asked_to_cancel(epochs)
+        cancelled, lost = await self._log.cancelled_or_lost(epochs)
         for job_id in cancelled:
             self._cancel(held[job_id])
         for job_id in lost:
-            await self._let_go(held[job_id])
+            await self._release(held[job_id])
         for job in held.values():
             if job.info.state is JobState.RUNNING and job.info.event > job.stored_event:
                 info = job.info
@@ -439,34 +453,34 @@ class Jobs:
                 job.stored_event = info.event
 
     async def _take_over_own(self) -> None:
-        for job_id in await self._log.left_behind(own=True):
+        for job_id in await self._log.orphaned(own=True):
             if (claimed := await self._log.claim(job_id, own=True)) is not None:
-                await self._go_on_fenced(claimed)
+                await self._resume_fenced(claimed)
 
-    async def _go_on_fenced(self, claimed: ClaimedJob) -> None:
+    async def _resume_fenced(self, claimed: ClaimedJob) -> None:
         with contextlib.suppress(FencedError):
-            await self._go_on(claimed)
+            await self._resume(claimed)
 
-    async def _go_on(self, claimed: ClaimedJob) -> None:
-        """Begin a job anew that was another worker's, or say why not."""
+    async def _resume(self, claimed: ClaimedJob) -> None:
+        """Restart a claimed job, or store why it ends."""
         newest = {"event": claimed.info.event + UNKNOWN_EVENTS, "attempt": claimed.deaths + 1}
         info = claimed.info.model_copy(update=newest | {"worker": self._log.worker_id})
-        again = self.work_again
+        again = self.rebuild
         if claimed.cancelled:
             last = ended(info, JobState.CANCELLED)
         elif claimed.deaths >= MAX_DEATHS:
-            last = ended(info, JobState.FAILED, error=given_up(claimed.deaths))
+            last = ended(info, JobState.FAILED, error=too_many_deaths(claimed.deaths))
         elif not claimed.portable or again is None:
             last = ended(info, JobState.INTERRUPTED, error=interruption())
         else:
             log.warning("job taken over", job_id=info.job_id, kind=info.kind, deaths=claimed.deaths)
-            await self._begin_again(info, again, claimed.epoch)
+            await self._restart(info, again, claimed.epoch)
             return
         await self._log.update(last, epoch=claimed.epoch)
         await asyncio.to_thread(shutil.rmtree, self._folder / info.job_id, ignore_errors=True)
-        log.warning("job ended in its worker's place", job_id=info.job_id, state=last.state.value)
+        log.warning("orphaned job ended", job_id=info.job_id, state=last.state.value)
 
-    async def _begin_again(self, info: JobInfo, again: WorkAgain, epoch: int) -> None:
+    async def _restart(self, info: JobInfo, again: Rebuild, epoch: int) -> None:
         begun = {"state": JobState.QUEUED, "progress": 0.0, "stage": "", "started_at": None}
         info = info.model_copy(update=begun)
 
@@ -480,20 +494,20 @@ class Jobs:
     async def _begin(self, job: _Job, *, light: bool) -> None:
         running = self._run(job, light=light)
         job.task = asyncio.create_task(running, name=job.info.job_id)
-        # A task that is cancelled before its first step never runs, and never records its end.
+        # A task that is cancelled before its first step would never store the job's end.
         await asyncio.sleep(0)
 
-    def _has_room(self, lane: str) -> bool:
-        return not self._turns[lane].locked()
+    def _has_room(self, queue: str) -> bool:
+        return not self._slots[queue].locked()
 
     def _cancel(self, job: _Job) -> None:
         job.context.cancel()
         if job.info.state is JobState.QUEUED and job.task:
             job.task.cancel()
 
-    async def _let_go(self, job: _Job) -> None:
-        """Leave a job that another worker has; who follows it here follows the record."""
-        log.warning("job gone on elsewhere", job_id=job.info.job_id)
+    async def _release(self, job: _Job) -> None:
+        """Stop a job that another worker has taken over; its readers follow the stored record."""
+        log.warning("job taken over by another worker", job_id=job.info.job_id)
         job.lost = True
         job.context.cancel()
         if job.task is not None and job.task is not asyncio.current_task():
@@ -522,10 +536,10 @@ class Jobs:
             if light:
                 await self._work(job)
             else:
-                async with self._turns[LANE_OF[job.info.kind]]:
+                async with self._slots[QUEUE_OF[job.info.kind]]:
                     await self._work(job)
         except asyncio.CancelledError:
-            # Cancelled while it waited for its turn, or the worker stops, or has the job no more.
+            # Cancelled in the queue, the worker stops, or another worker has taken the job over.
             if job.lost:
                 return
             if self._closing and job.portable:
@@ -536,10 +550,10 @@ class Jobs:
             with contextlib.suppress(FencedError):
                 await asyncio.shield(self._become(job, ended(job.info, state, error=error)))
         except FencedError:
-            await self._let_go(job)
+            await self._release(job)
 
     async def _leave(self, job: _Job) -> None:
-        """Put a job back in the queue, for another worker or the next run."""
+        """Put a job back in the queue for another worker or the next run."""
         waits = {"state": JobState.QUEUED, "stage": "", "started_at": None}
         with contextlib.suppress(FencedError):
             await self._become(job, job.info.model_copy(update=waits))
@@ -567,15 +581,15 @@ class Jobs:
 
     async def _become(self, job: _Job, info: JobInfo) -> None:
         info = info.model_copy(update={"event": job.info.event + 1})
-        # Stored first: what a client was sent is true after a crash as well.
+        # Store before publishing, so that what clients saw survives a crash.
         while True:
             try:
                 await self._log.update(info, epoch=job.epoch)
                 break
             except StoreTroubleError as error:
                 if self._closing:
-                    # The next run finds it unfinished, and says so.
-                    log.error("job not on record", job_id=info.job_id, reason=error.reason)
+                    # The next run finds it unfinished and marks it.
+                    log.error("job not stored", job_id=info.job_id, reason=error.reason)
                     break
                 await asyncio.sleep(STORE_RETRY_S)
         job.info = info
@@ -600,7 +614,7 @@ class Jobs:
 
 
 async def _next_event(job: _Job, after: int) -> None:
-    """Wait until there is an event behind ``after``, or there will be none here."""
+    """Wait for an event above ``after``, or until no more events follow here."""
     async with job.changed:
         await job.changed.wait_for(lambda: job.info.event > after or job.info.over or job.lost)
 
@@ -611,12 +625,12 @@ async def _notify_readers(job: _Job) -> None:
 
 
 def accepted_headers(info: JobInfo) -> dict[str, str]:
-    """Headers of the answer that starts a job."""
+    """Headers of the reply that starts a job."""
     return {"Location": f"/v1/jobs/{info.job_id}"}
 
 
 def require_success(info: JobInfo) -> None:
-    """Refuse what needs a job's result while there is none.
+    """Check that a job succeeded.
 
     Raises:
         ServiceError: JOB_NOT_DONE or JOB_FAILED.

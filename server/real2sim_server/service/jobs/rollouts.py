@@ -459,7 +459,7 @@ class Simulations:
         new = NewJob("simulate", scenario_id, fields, who, portable=True)
         return await self._jobs.start(new, work, idempotent=idempotent)
 
-    async def work_again(self, info: JobInfo) -> Work:
+    async def rebuild(self, info: JobInfo) -> Work:
         """The rollout of a job on record, of the scenario as it was then."""
         fields = dict(info.request)
         scenario_id, revision = fields.pop("scenario"), fields.pop("revision")

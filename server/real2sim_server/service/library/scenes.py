@@ -24,7 +24,7 @@ from real2sim_proto.scenes import WITHOUT_SCENES, SceneState
 from ...render import scene_levels_bytes
 from ...scene import BundleError, Scene, SceneError
 from ...scene.io import SceneSummary, load_scene, read_scene_summary
-from ..engine import Engine, Lane
+from ..engine import Engine, Priority
 from ..http.responses import ServiceError
 from ..objects.shared_bundles import mark_used
 
@@ -556,7 +556,9 @@ class SceneCache:
         try:
             await self.on_disk_thread(partial(mark_used, summary.path))
             scene = await self.on_disk_thread(lambda: load_scene(summary.path))
-            scene = await self._engine.call(scene.to, self.device, label="load", lane=Lane.BULK)
+            scene = await self._engine.call(
+                scene.to, self.device, label="load", priority=Priority.BULK
+            )
         except BundleError as error:
             reason = self.catalog.public(error)
             listing = Listing(name, summary.path, None, reason)

@@ -1,4 +1,4 @@
-"""What the renderer prepares on other threads: rarely used kernels, and levels of detail."""
+"""Background work of the renderer: compiling rarely used kernels and making levels of detail."""
 
 from __future__ import annotations
 
@@ -39,21 +39,20 @@ from ..library.scenes import IdleItem, MemoryBudget
 log = structlog.get_logger(__name__)
 
 NICENESS = 10
-"""Of the process that compiles: the worker draws for others meanwhile."""
+"""Niceness of the compiling process; the worker keeps rendering meanwhile."""
 
 
-class KernelsBeside:
-    """Gets kernels ready while the engine draws for all sessions.
+class BackgroundCompile:
+    """Compiles kernels in another process while the engine keeps rendering.
 
-    A process of its own compiles them on the first run; the engine then loads what that left on
-    disk. Belongs to the event loop.
+    The engine then loads the compiled kernels from disk. Use on the event loop only.
 
     Args:
-        engine: loads them.
-        what: they are for, for the log.
-        warm_up: compiles or loads them: a function at the top of its module.
-        on_disk: whether an earlier run left them.
-        backend: that ``warm_up`` takes, where it takes one; only that of CPUs compiles kernels.
+        engine: loads the kernels.
+        what: purpose of the kernels, for the log.
+        warm_up: module-level function that compiles or loads the kernels.
+        on_disk: returns whether compiled kernels exist on disk.
+        backend: argument of ``warm_up``, if it takes one. Only the CPU backend compiles.
     """
 
     def __init__(
@@ -71,14 +70,14 @@ class KernelsBeside:
         self._made: asyncio.Task[None] | None = None
 
     async def ready(self) -> None:
-        """Return once they are there."""
+        """Wait until the kernels are loaded."""
         if self._made is None or (self._made.done() and self._made.exception() is not None):
             self._made = asyncio.create_task(self._make())
-        # Whoever gives up waiting does not end it for others.
+        # A cancelled caller must not cancel the compilation for others.
         await asyncio.shield(self._made)
 
     def close(self) -> None:
-        """End the process that compiles them, if there is one."""
+        """End the compiling process, if any."""
         if self._made is not None:
             self._made.cancel()
 
@@ -100,11 +99,11 @@ class KernelsBeside:
 
 
 class LensKernels:
-    """Gets them ready beside the engine, see :class:`.KernelsBeside`."""
+    """Compiles the kernels of lenses in the background, see :class:`.BackgroundCompile`."""
 
     def __init__(self, engine: Engine, backend: Backend) -> None:
         self._backend = backend
-        self._kernels = KernelsBeside(
+        self._kernels = BackgroundCompile(
             engine,
             "lenses",
             warm_up_lenses,
@@ -113,10 +112,10 @@ class LensKernels:
         )
 
     async def ready(self, cameras: Sequence[Camera]) -> None:
-        """Return once cameras can be drawn, some of which have lenses or rolling shutters.
+        """Wait until cameras with lenses or rolling shutters can be rendered.
 
         Raises:
-            ServiceError: INVALID_REQUEST where the backend cannot draw them.
+            ServiceError: INVALID_REQUEST if the backend does not support them.
         """
         try:
             refuse_lenses(self._backend, cameras)
@@ -129,14 +128,14 @@ class LensKernels:
 
 
 class DetailLevels:
-    """Makes the merged Gaussians that small images are drawn from, on a thread of its own.
+    """Makes levels of detail (merged Gaussians for small images) on a background thread.
 
-    An image whose levels are missing would make them on the engine, and all sessions would wait.
-    They leave memory with the clouds that they belong to.
+    Otherwise the engine would make them at the first image, and all sessions would wait. Levels are
+    freed with their clouds.
 
     Args:
-        backend: draws.
-        budget: of memory, shared with scenes and assets; without it nothing is counted.
+        backend: rendering backend.
+        budget: memory budget shared with scenes and assets; None for no limit.
     """
 
     def __init__(self, backend: Backend, budget: MemoryBudget | None = None) -> None:
@@ -153,11 +152,11 @@ class DetailLevels:
 
     @property
     def held_bytes(self) -> int:
-        """Memory of all levels that are there or being made."""
+        """Memory of all levels, including those being made [bytes]."""
         return self._reserved + levels_bytes()
 
     def idle(self) -> list[IdleItem]:
-        """Nothing: levels go with their scenes."""
+        """Always empty: levels are freed with their scenes."""
         return []
 
     async def ready(
@@ -166,12 +165,12 @@ class DetailLevels:
         cameras: Sequence[Camera],
         things: Callable[[], Sequence[Instance]],
     ) -> None:
-        """Wait until ``things`` have levels, where a camera needs them.
+        """Wait until ``things`` have the levels that the cameras need.
 
         Args:
-            sensors: and their cameras, in the same order.
-            cameras: at the sizes that the sensors name.
-            things: gives what the cameras may see; called on the thread of the levels.
+            sensors: one per camera, in the same order.
+            cameras: cameras at the sensors' image sizes.
+            things: returns the instances that may be visible; called on the background thread.
 
         Raises:
             ServiceError: OUT_OF_MEMORY.

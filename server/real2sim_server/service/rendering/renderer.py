@@ -41,11 +41,11 @@ from ...render.images import JpegEncoder, jpeg_encoder_for, turbo_jpeg, with_eff
 from ...render.lens import with_ground
 from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
-from ..engine import Engine, Lane, lower_priority
+from ..engine import Engine, Priority, lower_priority
 from ..http.metrics import Metrics
 from ..http.responses import ServiceError, choose_among, etag
 from ..library.scenes import MemoryBudget
-from .background import DetailLevels, KernelsBeside, LensKernels
+from .background import BackgroundCompile, DetailLevels, LensKernels
 from .frames import EncodedFrame, FollowingImage, RenderedImage, blurred, camera_with, encode_frame
 
 log = structlog.get_logger(__name__)
@@ -133,7 +133,7 @@ class Renderer:
         self._metrics = metrics
         self._max_pixels = max_pixels
         self._lenses = LensKernels(engine, backend)
-        self.small_images = KernelsBeside(
+        self.small_images = BackgroundCompile(
             engine,
             "small images",
             warm_up_small_images,
@@ -175,15 +175,15 @@ class Renderer:
         check_known(request.scene, request.sensors)
         await self.ready(request.sensors, cameras, lambda: request.instances)
         submitted = time.perf_counter()
-        lane = _lane(cameras, stream)
+        priority = _priority(cameras, stream)
         images, render_ms = await self._engine.call(
-            partial(self.render_images, request, cameras, between=self._engine.give_way),
+            partial(self.render_images, request, cameras, between=self._engine.yield_to_urgent),
             label="render",
-            lane=lane,
+            priority=priority,
         )
         queue_ms = (time.perf_counter() - submitted) * 1e3 - render_ms
         started = time.perf_counter()
-        frames = await self.encode(images, lane=lane)
+        frames = await self.encode(images, priority=priority)
         encode_ms = (time.perf_counter() - started) * 1e3
         timing = {"queue": queue_ms, "render": render_ms, "encode": encode_ms}
         self._count(frames, timing, stream)
@@ -211,17 +211,19 @@ class Renderer:
             await self.levels.ready(sensors, cameras, things)
 
     async def encode(
-        self, images: Iterable[RenderedImage], *, lane: Lane = Lane.DRIVE
+        self, images: Iterable[RenderedImage], *, priority: Priority = Priority.DRIVE
     ) -> list[EncodedFrame]:
         """The frames of images, in order, on the encoder threads."""
-        return await self.on_encoders(partial(encode_frame, jpeg=self.jpeg), images, lane=lane)
+        return await self.on_encoders(
+            partial(encode_frame, jpeg=self.jpeg), images, priority=priority
+        )
 
     async def on_encoders(
-        self, fn: Callable[[T], R], items: Iterable[T], *, lane: Lane = Lane.DRIVE
+        self, fn: Callable[[T], R], items: Iterable[T], *, priority: Priority = Priority.DRIVE
     ) -> list[R]:
         """``fn`` of each item, in order, on the encoder threads."""
         loop = asyncio.get_running_loop()
-        encoders = self._bulk_encoders if lane is Lane.BULK else self._encoders
+        encoders = self._bulk_encoders if priority is Priority.BULK else self._encoders
         work = [loop.run_in_executor(encoders, fn, item) for item in items]
         try:
             return await asyncio.gather(*work)
@@ -349,10 +351,10 @@ def encoder_threads() -> int:
     return max(2, min(MOST_ENCODERS, cores // 2))
 
 
-def _lane(cameras: Sequence[Camera], stream: str) -> Lane:
+def _priority(cameras: Sequence[Camera], stream: str) -> Priority:
     """With what a request takes turns: nobody waits for the frames of a film."""
     pixels = sum(camera.width * camera.height for camera in cameras)
-    return Lane.BULK if stream == "export" or pixels > VIEW_PIXELS else Lane.VIEW
+    return Priority.BULK if stream == "export" or pixels > VIEW_PIXELS else Priority.VIEW
 
 
 Pass = tuple[RasterOptions, tuple[str, ...]]

@@ -226,7 +226,7 @@ async def create(
         return info_response(info, status=202, headers=accepted_headers(info))
 
 
-async def work_again(worker: Worker, info: JobInfo) -> Work:
+async def rebuild(worker: Worker, info: JobInfo) -> Work:
     """The export of a job on record, of the scenario as it was then."""
     fields = dict(info.request)
     revision = fields.pop("revision", None)

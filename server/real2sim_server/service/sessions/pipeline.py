@@ -37,7 +37,7 @@ from ...render import Instance
 from ...scene import Camera, Scene
 from ...world import World
 from ...world.ranging import NO_SENSORS, Cloud, Mounted, MountedLidar, RangingSensors
-from ..engine import Engine, Lane
+from ..engine import Engine, Priority
 from ..http.metrics import Metrics
 from ..rendering.frames import EncodedFrame, RenderedImage, cloud_parts, needs_motion
 from ..rendering.renderer import Renderer, RenderRequest
@@ -259,7 +259,7 @@ class StepPipeline:
 
     async def on_world_thread(self, fn: Callable[..., T], *args: Any) -> T:
         """``fn(*args)`` on the thread that moves worlds without sensors."""
-        return await self._worlds.call(fn, *args, label="world", lane=Lane.DRIVE)
+        return await self._worlds.call(fn, *args, label="world", priority=Priority.DRIVE)
 
     # --- a change of the world ------------------------------------------------------------------
 
@@ -289,7 +289,7 @@ class StepPipeline:
         else:
             thread, key, share = self._worlds, self, 1 / MAX_TOGETHER
         await thread.call_together(
-            self.compute, step, key=key, share=share, label="drive", lane=Lane.DRIVE
+            self.compute, step, key=key, share=share, label="drive", priority=Priority.DRIVE
         )
 
     def compute(self, steps: Sequence[Step]) -> list[Exception | None]:
@@ -426,7 +426,9 @@ class StepPipeline:
         self._require_kernels(world)
         if sensors:
             requests = [(_request(world, sensors), cameras)]
-            (images,) = self._renderer.render_together(requests, between=self._engine.give_way)
+            (images,) = self._renderer.render_together(
+                requests, between=self._engine.yield_to_urgent
+            )
             step.images = _estimated(world, images)
         step.timer.stage("render")
         if ranging:
@@ -460,7 +462,7 @@ class StepPipeline:
             t_us=scene.start_us,
             sensors=(SensorSpec(camera=camera.name, width=WARM_UP_WIDTH),),
         )
-        draw = partial(self._renderer.render_images, between=self._engine.give_way)
+        draw = partial(self._renderer.render_images, between=self._engine.yield_to_urgent)
         await self._engine.call(draw, request, [camera], label="warm-up")
 
     def _count(self, observation: EncodedObservation) -> None:

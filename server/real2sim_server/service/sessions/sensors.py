@@ -29,7 +29,7 @@ from ...world.ranging import (
 from ...world.sensing import clouds_of, recorded_cloud
 from ..engine import Engine
 from ..http.responses import ServiceError
-from ..rendering.background import KernelsBeside
+from ..rendering.background import BackgroundCompile
 from ..rendering.renderer import check_known, check_sensors
 
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
@@ -111,7 +111,7 @@ class WorldClouds:
         self._max_rays = max_rays
         self._name = caster
         self._caster: CastBackend | None = None
-        self._kernels = KernelsBeside(
+        self._kernels = BackgroundCompile(
             engine,
             "LiDAR and radar",
             warm_up_casting,

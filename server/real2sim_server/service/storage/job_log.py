@@ -1,4 +1,4 @@
-"""Jobs in the store: a row each, rewritten when a job changes state."""
+"""The jobs table of the store: one row per job, rewritten when the job changes state."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ UNFINISHED = (JobState.QUEUED.value, JobState.RUNNING.value)
 
 
 OVERDUE_US = 1_000_000
-"""That a job has waited with a worker when others may take it from there [us]."""
+"""Waiting time after which another worker may claim a queued job [us]."""
 
 
 @dataclass(frozen=True)
 class ClaimedJob:
-    """A job that a worker has taken over.
+    """A job that this worker has taken over.
 
     Attributes:
-        info: as it was last on record.
-        epoch: under which the worker may write it.
-        deaths: workers that died at it.
-        portable: whether it can be begun anew from ``info``.
-        cancelled: whether somebody has cancelled it.
+        info: the last stored record.
+        epoch: fencing number; writes with an older one are refused.
+        deaths: workers that died while they ran it.
+        portable: whether it can be rebuilt from ``info``.
+        cancelled: whether a client has cancelled it.
     """
 
     info: JobInfo
@@ -42,11 +42,11 @@ class ClaimedJob:
 
 
 class JobLog:
-    """Jobs beyond the life of the process.
+    """Reads and writes jobs in the store.
 
     Args:
-        store: open while this is used.
-        worker_id: whose jobs they are.
+        store: an open store.
+        worker_id: id of this worker.
     """
 
     def __init__(self, store: Store, worker_id: str) -> None:
@@ -55,44 +55,44 @@ class JobLog:
 
     @property
     def worker_id(self) -> str:
-        """Whose jobs they are."""
+        """Id of this worker."""
         return self._worker_id
 
     async def add(self, job: JobInfo, *, reply: StoredReply | None, portable: bool = False) -> None:
-        """Put a new job on record, with the answer to the request for it.
+        """Store a new job.
 
         Args:
-            job: what it is.
-            reply: stored for a repeated request.
-            portable: whether any worker can begin it from its document.
+            job: the job.
+            reply: reply to the request, stored for repeated requests.
+            portable: whether any worker can rebuild its work from the record.
         """
         row = _row(job) | {"worker_id": self._worker_id, "created_us": now_us()}
         row["portable"] = int(portable)
         await self._store.write(Write(sa.insert(t.jobs), [row]), *self._notice(), reply=reply)
 
     async def update(self, job: JobInfo, *, epoch: int) -> None:
-        """Keep what the job is now. Raises FencedError: another worker has it, or it is gone."""
+        """Store the job's state. Raises FencedError: another worker has it, or it was deleted."""
         mine = (t.jobs.c.job_id == job.job_id) & (t.jobs.c.epoch == epoch)
         change = sa.update(t.jobs).where(mine).values(_row(job))
         await self._store.write(Write(change, fenced=1), *self._notice())
 
     async def update_progress(self, job: JobInfo, *, epoch: int) -> None:
-        """Keep how far a job is, unless it has ended meanwhile."""
+        """Store the job's progress, unless it has ended."""
         mine = (t.jobs.c.job_id == job.job_id) & (t.jobs.c.epoch == epoch)
         running = t.jobs.c.state == JobState.RUNNING.value
         change = sa.update(t.jobs).where(mine & running).values(_row(job))
         await self._store.write(Write(change), *self._notice())
 
-    async def ask_to_cancel(self, job_id: str) -> None:
-        """Leave word for whichever worker has the job."""
+    async def request_cancel(self, job_id: str) -> None:
+        """Request the worker that runs the job to cancel it."""
         change = sa.update(t.jobs).where(t.jobs.c.job_id == job_id).values(cancelled=1)
         await self._store.write(Write(change), *self._notice())
 
-    async def asked_to_cancel(self, epochs: Mapping[str, int]) -> tuple[set[str], set[str]]:
-        """Which jobs somebody has cancelled, and which this worker has no more.
+    async def cancelled_or_lost(self, epochs: Mapping[str, int]) -> tuple[set[str], set[str]]:
+        """The ids of jobs that clients have cancelled, and of those this worker has lost.
 
         Args:
-            epochs: of jobs that the worker had, by their ids.
+            epochs: fencing numbers by job id.
         """
         j = t.jobs.c
         rows = await self._store.read(
@@ -101,29 +101,26 @@ class JobLog:
         kept = {r["job_id"]: r for r in rows if r["epoch"] == epochs[r["job_id"]]}
         return {name for name, row in kept.items() if row["cancelled"]}, set(epochs) - set(kept)
 
-    async def left_behind(self, *, own: bool) -> list[str]:
-        """Unfinished jobs whose worker is dead, oldest first; or those of an earlier run of this
-        worker."""
-        return await self._ids(self._is_left_behind(own=own))
+    async def orphaned(self, *, own: bool) -> list[str]:
+        """Ids of unfinished jobs, oldest first: of dead workers, or of this worker's earlier runs
+        if ``own``."""
+        return await self._ids(self._is_orphaned(own=own))
 
     async def claim(self, job_id: str, *, own: bool = False) -> ClaimedJob | None:
-        """Take over a job that is left behind or overdue, in one statement: of several workers that
-        try, one gets it; None for the others."""
-        free = self._is_left_behind(own=own) | self._is_overdue()
+        """Take over an orphaned or overdue job, atomically; None if another worker has it."""
+        free = self._is_orphaned(own=own) | self._is_overdue()
         return await self._claim((t.jobs.c.job_id == job_id) & free)
 
-    async def claim_left_behind(self) -> ClaimedJob | None:
-        """Take over the oldest job whose worker is dead; None where there is none."""
-        return await self._claim(self._is_first_of(self._is_left_behind(own=False)))
+    async def claim_orphaned(self) -> ClaimedJob | None:
+        """Take over the oldest unfinished job of a dead worker, or return None."""
+        return await self._claim(self._is_first_of(self._is_orphaned(own=False)))
 
     async def claim_overdue(self, kinds: Collection[str]) -> ClaimedJob | None:
-        """Take over the oldest job of some kinds that waits with another worker though any could
-        begin it; None where there is none."""
+        """Take over the oldest overdue portable job of the given kinds, or return None."""
         return await self._claim(self._is_first_of(self._is_overdue() & t.jobs.c.kind.in_(kinds)))
 
     def _is_first_of(self, free: sa.ColumnElement[bool]) -> sa.ColumnElement[bool]:
-        """Workers that look at the same time get different jobs, and none waits for another's
-        transaction: on a server rows that somebody is just taking are passed over."""
+        """Concurrent workers get different jobs: a database server skips rows locked by others."""
         j = t.jobs.c
         first = sa.select(j.job_id).where(free).order_by(j.created_us, j.job_id).limit(1)
         first = first.with_for_update(skip_locked=True).correlate(None)
@@ -145,7 +142,7 @@ class JobLog:
     def _notice(self) -> list[Write]:
         return notice("jobs", on_server=self._store.database.is_server)
 
-    def _is_left_behind(self, *, own: bool) -> sa.ColumnElement[bool]:
+    def _is_orphaned(self, *, own: bool) -> sa.ColumnElement[bool]:
         j = t.jobs.c
         mine = j.worker_id == self._worker_id
         gone = mine if own else ~mine & ~is_alive(j.worker_id, self._store)
@@ -163,11 +160,11 @@ class JobLog:
         return [row["job_id"] for row in await self._store.read(query)]
 
     async def remove(self, job_id: str) -> None:
-        """Forget a job."""
+        """Delete a job."""
         await self._store.write(Write(sa.delete(t.jobs).where(t.jobs.c.job_id == job_id)))
 
     async def get(self, job_id: str) -> JobInfo | None:
-        """The job of that id."""
+        """The job with this id, or None."""
         rows = await self._select(t.jobs.c.job_id == job_id, limit=1)
         return rows[0] if rows else None
 
@@ -177,12 +174,12 @@ class JobLog:
         return await self._select(everything, limit=limit)
 
     async def count(self) -> int:
-        """Jobs on record."""
+        """Number of stored jobs."""
         rows = await self._store.read(sa.select(sa.func.count().label("jobs")).select_from(t.jobs))
         return int(rows[0]["jobs"])
 
     async def ended_before(self, created_us: int, *, limit: int = 100) -> list[str]:
-        """Ids of ended jobs of this worker that were begun before."""
+        """Ids of this worker's finished jobs created before a time."""
         mine = (t.jobs.c.worker_id == self._worker_id) & ~t.jobs.c.state.in_(UNFINISHED)
         query = sa.select(t.jobs.c.job_id).where(mine & (t.jobs.c.created_us < created_us))
         return [row["job_id"] for row in await self._store.read(query.limit(limit))]

@@ -33,7 +33,7 @@ def url(request, tmp_path) -> str:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(module, "LOOK_S", 0.05)
+    monkeypatch.setattr(module, "POLL_S", 0.05)
     monkeypatch.setattr(module, "FOLLOW_S", 0.02)
     # Jobs that wait are taken where a test says so.
     monkeypatch.setattr(job_log, "OVERDUE_US", 3_600_000_000)
@@ -65,7 +65,7 @@ async def worker(url, name, tmp_path, alive):
         await Leases(store, name, seconds=3600 if alive else 0).renew({})
         quota = Quota(tmp_path / name, "jobs", 1000, 1 << 30, "JOBS_QUOTA", "delete jobs")
         jobs = Jobs(JobLog(store, name), quota)
-        jobs.work_again = remade(name)
+        jobs.rebuild = remade(name)
         async with jobs.running():
             yield jobs
     finally:
@@ -73,13 +73,13 @@ async def worker(url, name, tmp_path, alive):
 
 
 def remade(name: str):
-    async def work_again(info: JobInfo):
+    async def rebuild(info: JobInfo):
         async def work(_context) -> JobResult:
             return JobResult({"by": name, "asked": info.request})
 
         return work
 
-    return work_again
+    return rebuild
 
 
 async def for_ever(context) -> JobResult:
@@ -91,7 +91,7 @@ async def for_ever(context) -> JobResult:
 async def die(jobs: Jobs) -> None:
     """What a killed worker leaves: nothing of it moves any more, and its lease runs out."""
     jobs._closing = True
-    jobs._log.claim_overdue = jobs._log.claim_left_behind = none
+    jobs._log.claim_overdue = jobs._log.claim_orphaned = none
     for job in jobs._jobs.values():
         job.lost = True
         job.task.cancel()

@@ -314,9 +314,9 @@ def test_jobs_survive_closing_and_are_found_by_state_and_subject(url):
 
     async def read(store):
         log = JobLog(store, "w0")
-        other = await JobLog(store, "w1").left_behind(own=True)
+        other = await JobLog(store, "w1").orphaned(own=True)
         by_subject = await log.newest(subject="a", limit=5)
-        return await log.get("job_2"), await log.left_behind(own=True), other, by_subject
+        return await log.get("job_2"), await log.orphaned(own=True), other, by_subject
 
     run(url, write)
     assert run(url, read) == (stuck, ["job_2"], [], [done])
