@@ -160,14 +160,6 @@ class Standing(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class BoxTrack:
-    """A box that stood on the ground, and where; the least that :class:`Standing` asks for."""
-
-    size: Size
-    trajectory: Trajectory
-
-
-@dataclass(frozen=True, eq=False)
 class GroundFit:
     """What a fit finds.
 

@@ -216,8 +216,9 @@ class Engine:
 
     All computation runs here, so kernels never compete for cores and the event loop never waits for
     them. A job is a plain function; its exceptions are raised in the caller. Jobs are scheduled as
-    :class:`.PriorityQueue` describes. A long job calls :meth:`yield_to_urgent` between its parts, which runs more
-    urgent jobs. Waiting jobs that can be batched run in one call; no job waits for a batch to fill.
+    :class:`.PriorityQueue` describes. A long job calls :meth:`yield_to_urgent` between its parts,
+    which runs more urgent jobs. Waiting jobs that can be batched run in one call; no job waits for
+    a batch to fill.
 
     Args:
         name: name of the thread.

@@ -110,7 +110,7 @@ def test_a_job_is_left_behind_once_at_most():
     assert [queue.begin_next(), queue.begin_next()] == ["b1", "c2"]
 
 
-def test_jobs_that_leave_a_lane_do_not_move_who_was_left_behind():
+def test_cancelled_jobs_do_not_change_which_job_was_overtaken():
     queue = a_begun_priority("a1", "b1", "b2", "a2")
     assert queue.begin_with(lambda job: job[0] == "a") == ["a2"]
     queue.discard(lambda job: job == "b1")

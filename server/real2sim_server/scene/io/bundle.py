@@ -20,7 +20,6 @@ from ..cloud import GaussianCloud, TimeColour
 from ..errors import BundleError, SceneError
 from ..figure import Figure
 from ..ground import Ground, of_bundle
-from ..ground_fit import BoxTrack, fit_scene_ground
 from ..lane_graph import LaneGraph
 from ..lidar_surfaces import RANGE_STEPS, LidarSurfaces, Reflector, RingResponse
 from ..scene import Scene, SceneObject, Sky
@@ -142,7 +141,7 @@ def load_scene(
             sizes are checked.
 
     Raises:
-        BundleError: with the file and the reason: missing, cut short, changed, of a newer version.
+        BundleError: with the file and the reason: missing, cut short, changed, of another version.
     """
     folder = Path(path)
     document = read_container(folder, SceneDocument, verify=verify)
@@ -161,7 +160,7 @@ def load_scene(
             ego_size=content.ego.size,
             provenance=document.provenance,
             content_hash=document.content_hash,
-            stored_ground=_ground(folder, document, verify) if content.ground else None,
+            stored_ground=_ground(folder, document, verify),
             lidar=_lidar(folder, document, verify) if content.lidar else None,
             lanes=_lanes(folder, document, verify) if content.lanes else None,
         )
@@ -169,8 +168,7 @@ def load_scene(
 
 
 def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
-    """The ground of a scene bundle, without its scene: the stored one or, for older bundles, the
-    one that :attr:`~..Scene.ground` fits. Shared with the loaded scene.
+    """The ground of a scene bundle, without its scene. Shared with the loaded scene.
 
     Args:
         path: folder of the bundle.
@@ -182,9 +180,7 @@ def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
     folder = Path(path)
     document = _document_of(folder, content_hash)
     with _as_bundle_error(folder):
-        if document.content.ground is not None:
-            return of_bundle(content_hash, lambda: _read_ground(folder, document, verify=True))
-        return of_bundle(content_hash, lambda: _fit_ground(folder, document))
+        return _ground(folder, document, verify=True)
 
 
 def load_lanes(path: str | PathLike[str], content_hash: str) -> LaneGraph | None:
@@ -518,7 +514,6 @@ def _ground(folder: Path, document: SceneDocument, verify: bool) -> Ground:
 
 def _read_ground(folder: Path, document: SceneDocument, *, verify: bool) -> Ground:
     part = document.content.ground
-    assert part is not None
     file = _open(folder, GROUND_FILE, document.files, verify)
     taken = file.take(
         "",
@@ -528,14 +523,6 @@ def _read_ground(folder: Path, document: SceneDocument, *, verify: bool) -> Grou
     )
     origin = np.array(part.origin)
     return Ground(origin, part.cell, taken["heights"].numpy(), taken["is_ground"].numpy() != 0)
-
-
-def _fit_ground(folder: Path, document: SceneDocument) -> Ground:
-    content = document.content
-    file = _open(folder, BACKGROUND_FILE, document.files, verify=False)
-    background = _cloud(file, "", content.background, "background")
-    standing = [BoxTrack(o.size, o.trajectory.build()) for o in content.objects]
-    return fit_scene_ground(background, content.ego.trajectory.build(), standing)
 
 
 @contextmanager

@@ -168,8 +168,7 @@ def check_file(path: Path, nbytes: int) -> None:
 
 
 FORMAT = "real2sim-scene"
-VERSION = 7
-"""Newest readable version; a bundle is written in the lowest one that holds its content."""
+VERSION = 1
 DOCUMENT_NAME = "scene.json"
 
 
@@ -202,7 +201,7 @@ def write_container(
         document = document.model_copy(
             update={
                 "format": FORMAT,
-                "version": document.content.version,
+                "version": VERSION,
                 "content_hash": content_hash(document.kind, content),
                 "files": {name: write_tensors(t, folder / name) for name, t in tensors.items()},
             }
@@ -216,7 +215,7 @@ def read_container(path: Path, model: type[DocumentT], *, verify: bool) -> Docum
     """The document of the bundle at ``path``; with ``verify`` its hash is compared.
 
     Raises:
-        BundleError: no bundle, a newer version, another kind, or not as the format asks.
+        BundleError: no bundle, another version, another kind, or not as the format asks.
     """
     file = path / DOCUMENT_NAME
     given = _load_json(path, file)
@@ -283,12 +282,10 @@ def _check_head(given: Any, file: Path, kind: str) -> None:
     if not isinstance(given, dict) or given.get("format") != FORMAT:
         raise BundleError(f"{file}: not of format {FORMAT!r}")
     version = given.get("version")
-    if type(version) is not int or version < 1:
-        raise BundleError(f"{file}: version must be a number from 1, not {version!r}")
-    if version > VERSION:
+    if type(version) is not int or version != VERSION:
         raise BundleError(
-            f"{file}: written in version {version} of {FORMAT}, this program reads up to version "
-            f"{VERSION}; update real2sim, or save the bundle again with an older one"
+            f"{file}: version {version!r} of {FORMAT}; this program reads version {VERSION}. "
+            "Update real2sim, or make the bundle again from its log"
         )
     if given.get("kind") != kind:
         raise BundleError(f"{file}: holds a bundle of kind {given.get('kind')!r}, not {kind!r}")

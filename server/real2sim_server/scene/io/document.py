@@ -36,12 +36,23 @@ Vector4 = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Bounds = tuple[Vector3, Vector3]
 UNCERTAINTIES = "uncertainties"
-"""Tensor that a cloud or sky may have, from version 5 on."""
+"""Name of the optional tensor of a cloud or sky."""
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class _Part(BaseModel):
+    """A part of ``scene.json``. Optional parts are left out of the JSON where there are none."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_serializer(mode="wrap")
+    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        return {
+            name: value
+            for name, value in handler(self).items()
+            if value is not None or fields[name].is_required()
+        }
 
 
 class TrajectoryPart(_Part):
@@ -99,17 +110,13 @@ class OpticsPart(_Part):
         shutter = GLOBAL if self.shutter is None else Shutter(**self.shutter.model_dump())
         return Optics(np.array(self.K, dtype=np.float64), lens_from(self.lens), shutter)
 
-    @model_serializer(mode="wrap")
-    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {k: v for k, v in handler(self).items() if v is not None}
-
 
 class CameraPart(_Part):
     """A camera; see :class:`~real2sim_server.scene.Camera`.
 
     Attributes:
-        lens, shutter, recorded: left out of the JSON where the camera is a pinhole with a global
-            shutter, and known to be nothing else, as versions 1 to 3 of the format ask.
+        lens, shutter: None for a pinhole with a global shutter.
+        recorded: optics of the recorded images, None where they are those of the camera.
     """
 
     name: str
@@ -120,15 +127,6 @@ class CameraPart(_Part):
     lens: dict[str, Any] | None = None
     shutter: ShutterPart | None = None
     recorded: OpticsPart | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {k: v for k, v in handler(self).items() if v is not None}
-
-    @property
-    def has_optics(self) -> bool:
-        """Whether it says more than a pinhole needs."""
-        return any(part is not None for part in (self.lens, self.shutter, self.recorded))
 
     @classmethod
     def of(cls, camera: Camera) -> CameraPart:
@@ -222,12 +220,7 @@ class FigurePart(_Part):
 
 
 class ObjectPart(_Part):
-    """One object of a scene; its tensors are keyed by its position in the list.
-
-    Attributes:
-        colour: left out of the JSON where there is none, as version 1 of the format asks.
-        figure: left out of the JSON where there is none, as versions 1 to 6 of the format ask.
-    """
+    """One object of a scene; its tensors are keyed by its position in the list."""
 
     object_id: str
     category: str
@@ -236,15 +229,6 @@ class ObjectPart(_Part):
     cloud: CloudPart
     colour: ColourPart | None = None
     figure: FigurePart | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _present(handler(self), "colour", "figure")
-
-
-def _present(values: dict[str, Any], *names: str) -> dict[str, Any]:
-    """``values`` without those of ``names`` that are None."""
-    return {k: v for k, v in values.items() if v is not None or k not in names}
 
 
 class ReflectorPart(_Part):
@@ -268,7 +252,7 @@ class LidarPart(_Part):
     background: ReflectorPart
     objects: dict[str, ReflectorPart]
     incidence: Annotated[float, Field(ge=0, le=1)] = 1.0
-    response: ResponsePart | None = None
+    response: ResponsePart | None
 
 
 class LanesPart(_Part):
@@ -283,13 +267,7 @@ class LanesPart(_Part):
 
 
 class SceneContent(_Part):
-    """The content of a scene, input of the content hash.
-
-    Attributes:
-        ground: left out of the JSON where there is none, as versions 1 and 2 of the format ask.
-        lidar: left out of the JSON where there is none, as versions 1 to 4 of the format ask.
-        lanes: left out of the JSON where there are none, as versions 1 to 5 of the format ask.
-    """
+    """The content of a scene, input of the content hash."""
 
     cameras: list[CameraPart]
     ego: EgoPart
@@ -297,34 +275,9 @@ class SceneContent(_Part):
     background: CloudPart
     objects: list[ObjectPart]
     sky: SkyPart | None
-    ground: GroundPart | None = None
+    ground: GroundPart
     lidar: LidarPart | None = None
     lanes: LanesPart | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_absent_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        for name in ("ground", "lidar", "lanes"):
-            if values.get(name) is None:
-                values.pop(name, None)
-        return values
-
-    @property
-    def version(self) -> int:
-        """Lowest version of the format that holds this content."""
-        if any(o.figure is not None for o in self.objects):
-            return 7
-        if self.lanes is not None:
-            return 6
-        stored = [self.background.tensors, *(o.cloud.tensors for o in self.objects)]
-        stored += [] if self.sky is None else [self.sky.tensors]
-        if self.lidar is not None or any(UNCERTAINTIES in tensors for tensors in stored):
-            return 5
-        if any(camera.has_optics for camera in self.cameras):
-            return 4
-        if self.ground is not None:
-            return 3
-        return 2 if any(o.colour is not None for o in self.objects) else 1
 
     def build_rig(self) -> CameraRig:
         """The camera rig. Raises SceneError like its constructor."""
@@ -332,27 +285,12 @@ class SceneContent(_Part):
 
 
 class AssetContent(_Part):
-    """The content of an asset, input of the content hash.
-
-    Attributes:
-        figure: left out of the JSON where there is none, as versions 1 to 6 of the format ask.
-    """
+    """The content of an asset, input of the content hash."""
 
     category: str
     size: Vector3
     cloud: CloudPart
     figure: FigurePart | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_absent_figure(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _present(handler(self), "figure")
-
-    @property
-    def version(self) -> int:
-        """Lowest version of the format that holds this content."""
-        if self.figure is not None:
-            return 7
-        return 5 if UNCERTAINTIES in self.cloud.tensors else 1
 
 
 class _Document(_Part):

@@ -37,7 +37,7 @@ from ..ground import Ground
 from ..scene import Scene, SceneObject, Sky
 from .document import UNCERTAINTIES, CameraPart, GaitPart, TrajectoryPart
 
-FORMAT, VERSION = "real2sim-packed", 3
+FORMAT, VERSION = "real2sim-packed", 1
 DOCUMENT = "scene.json"
 MAX_BYTES = 1 << 32
 """Of all arrays when unpacked; a small file cannot ask for more memory than this."""
@@ -85,7 +85,7 @@ class _PackedObject(_Part):
     trajectory: TrajectoryPart
     cloud: _PackedCloud
     colour: _PackedColour | None
-    figure: _PackedFigure | None = None
+    figure: _PackedFigure | None
 
 
 class _PackedGround(_Part):
@@ -103,7 +103,7 @@ class _PackedDocument(_Part):
     frame_times_us: list[int]
     background: _PackedCloud
     objects: list[_PackedObject]
-    ground: _PackedGround | None = None
+    ground: _PackedGround
     provenance: dict[str, Any]
 
 
@@ -148,7 +148,7 @@ def read_packed(path: str | PathLike[str]) -> Scene:
     """Read a packed scene.
 
     Raises:
-        BundleError: with the file and the reason: missing, cut short, of a newer version.
+        BundleError: with the file and the reason: missing, cut short, of another version.
     """
     file = Path(path)
     try:
@@ -178,10 +178,10 @@ def _document(data: bytes, file: Path) -> _PackedDocument:
     values = json.loads(data)
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise BundleError(f"{file}: holds no packed scene; its format must be {FORMAT!r}")
-    if values.get("version") not in range(1, VERSION + 1):
+    if values.get("version") != VERSION:
         raise BundleError(
             f"{file}: version {values.get('version')!r} of {FORMAT}; "
-            f"this program reads 1 to {VERSION}"
+            f"this program reads version {VERSION}"
         )
     try:
         return _PackedDocument.model_validate(values)
@@ -307,7 +307,7 @@ def _scene(document: _PackedDocument, arrays: Arrays) -> Scene:
         frame_times_us=np.array(document.frame_times_us, dtype=np.int64),
         ego_size=document.ego_size,
         provenance=document.provenance,
-        stored_ground=_unpack_ground(document.ground, arrays) if document.ground else None,
+        stored_ground=_unpack_ground(document.ground, arrays),
     )
 
 

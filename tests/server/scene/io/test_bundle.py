@@ -151,9 +151,8 @@ def test_lenses_and_shutters_come_back_bit_for_bit(scene, tmp_path):
     assert (read["rear"].recorded.lens, read["rear"].recorded.shutter) == (known.lens, shutter)
 
 
-def test_pinholes_are_written_as_before_lenses_were_known(bundle):
+def test_pinholes_are_written_without_optics(bundle):
     document = json.loads((bundle / "scene.json").read_text())
-    assert document["version"] < 4
     assert all(set(c) == CAMERA_KEYS for c in document["content"]["cameras"])
 
 

@@ -1,11 +1,8 @@
-"""The ground in bundles and packed scenes, and what becomes of scenes stored without one."""
+"""The ground in bundles and packed scenes."""
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,20 +15,6 @@ from real2sim_server.scene.io import (
     save_scene,
     write_packed,
 )
-from real2sim_server.scene.io.container import content_hash
-
-
-def without_ground(bundle: Path) -> Path:
-    """The bundle as programs before version 3 wrote it."""
-    file = bundle / "scene.json"
-    document = json.loads(file.read_text())
-    del document["content"]["ground"]
-    del document["files"]["ground.safetensors"]
-    document["version"] = 1
-    document["content_hash"] = content_hash("scene", document["content"])
-    file.write_text(json.dumps(document))
-    (bundle / "ground.safetensors").unlink()
-    return bundle
 
 
 def test_a_bundle_keeps_the_ground_bit_for_bit(scene, bundle):
@@ -41,7 +24,6 @@ def test_a_bundle_keeps_the_ground_bit_for_bit(scene, bundle):
     assert np.array_equal(loaded.is_ground, scene.ground.is_ground)
     assert np.array_equal(loaded.origin, scene.ground.origin)
     assert loaded.cell == scene.ground.cell
-    assert json.loads((bundle / "scene.json").read_text())["version"] == 3
 
 
 def test_saving_says_which_ground_was_stored(scene, tmp_path):
@@ -79,18 +61,6 @@ def test_a_damaged_ground_is_refused(bundle):
         load_scene(bundle)
 
 
-def test_a_bundle_of_version_1_gets_the_ground_that_fits_it(scene, bundle):
-    loaded = load_scene(without_ground(bundle))
-    assert loaded.stored_ground is None
-    assert np.array_equal(loaded.ground.heights, scene.ground.heights)
-
-
-def test_a_summary_of_version_1_tells_the_same_ground_as_its_scene(scene, bundle):
-    summary = read_scene_summary(without_ground(bundle))
-    assert np.array_equal(summary.ground.heights, scene.ground.heights)
-    assert load_scene(bundle).ground is summary.ground
-
-
 def test_a_packed_scene_keeps_the_ground_to_half_a_millimetre(scene, tmp_path):
     write_packed(scene, tmp_path / "a.r2s.zip")
     unpacked = read_packed(tmp_path / "a.r2s.zip").stored_ground
@@ -98,21 +68,3 @@ def test_a_packed_scene_keeps_the_ground_to_half_a_millimetre(scene, tmp_path):
     np.testing.assert_allclose(unpacked.heights, scene.ground.heights, atol=0.000_51)
     assert np.array_equal(unpacked.is_ground, scene.ground.is_ground)
     assert np.array_equal(unpacked.origin, scene.ground.origin)
-
-
-def test_a_packed_scene_of_version_1_gets_a_fitted_ground(scene, tmp_path):
-    new, old = tmp_path / "new.r2s.zip", tmp_path / "old.r2s.zip"
-    write_packed(scene, new)
-    with zipfile.ZipFile(new) as source, zipfile.ZipFile(old, "w") as target:
-        for name in source.namelist():
-            data = source.read(name)
-            if name == "scene.json":
-                document = json.loads(data) | {"version": 1}
-                del document["ground"]
-                data = json.dumps(document).encode()
-            if not name.startswith("ground."):
-                target.writestr(name, data)
-    unpacked = read_packed(old)
-    assert unpacked.stored_ground is None
-    x, y, z = unpacked.ego.positions[0].tolist()
-    assert unpacked.ground.height(x, y) == pytest.approx(z, abs=0.01)

@@ -55,7 +55,6 @@ def same(a, b):
 
 def test_lanes_come_back_from_a_bundle_bit_for_bit(tiny_scene, tmp_path):
     saved = save_scene(replace(tiny_scene, lanes=graph()), tmp_path / "a.r2s")
-    assert json.loads((tmp_path / "a.r2s" / "scene.json").read_text())["version"] == 6
     assert same(load_scene(tmp_path / "a.r2s").lanes, graph())
     summary = read_scene_summary(tmp_path / "a.r2s")
     assert summary.lane_count == 2
@@ -63,11 +62,10 @@ def test_lanes_come_back_from_a_bundle_bit_for_bit(tiny_scene, tmp_path):
     assert saved.content_hash != save_scene(tiny_scene, tmp_path / "b.r2s").content_hash
 
 
-def test_a_scene_without_lanes_is_written_as_before(tiny_scene, tmp_path):
+def test_a_scene_without_lanes_is_written_without_them(tiny_scene, tmp_path):
     save_scene(tiny_scene, tmp_path / "a.r2s")
     document = json.loads((tmp_path / "a.r2s" / "scene.json").read_text())
     assert "lanes" not in document["content"]
-    assert document["version"] < 6
     assert load_scene(tmp_path / "a.r2s").lanes is None
     assert read_scene_summary(tmp_path / "a.r2s").lanes is None
 
