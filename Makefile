@@ -79,7 +79,7 @@ format: $(STAMP)
 schema: $(STAMP)
 	rm -rf out/contract
 	$(BIN)/python -m real2sim_proto.schema out/contract/schema
-	$(BIN)/python -m real2sim_server.service.write_openapi out/contract/openapi.json
+	$(BIN)/python -c 'from real2sim_server.service.app import openapi_text; print(openapi_text(), end="")' > out/contract/openapi.json
 	cd out/contract && sha256sum openapi.json schema/*.json > ../../proto/contract.sha256
 
 coverage: $(STAMP)

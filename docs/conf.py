@@ -31,7 +31,7 @@ os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 import real2sim  # noqa: E402 - of this checkout
 from real2sim.version import VERSION  # noqa: E402
 from real2sim_proto.schema import write_schemas  # noqa: E402
-from real2sim_server.service.write_openapi import write as write_openapi  # noqa: E402
+from real2sim_server.service.app import openapi_text  # noqa: E402
 
 project = "Real2Sim"
 author = "the Real2Sim authors"
@@ -104,7 +104,7 @@ def write_contract(app: Sphinx, error: Exception | None) -> None:
     """Put the schemas of all messages and the OpenAPI document on the site."""
     if error is None:
         write_schemas(Path(app.outdir) / "schema")
-        write_openapi(Path(app.outdir) / "openapi.json")
+        (Path(app.outdir) / "openapi.json").write_text(openapi_text())
 
 
 def show_root_page(app: Sphinx, page: str, text: list[str]) -> None:

@@ -57,9 +57,6 @@ LAYERS = (
 PLAY_THEIR_OWN_USER = {"demo", "policies", "sweeps", "cli"}
 """Only these use the client SDK, since there the program plays its own user."""
 
-APART = {"write_openapi"}
-"""Modules of the service that are programs of their own."""
-
 FORBIDDEN = {
     "real2sim_proto": {"real2sim", SERVER, "torch", "fastapi", "numba", "cv2"},
     "real2sim": {SERVER, "torch", "fastapi", "numba"},
@@ -174,7 +171,7 @@ def test_folders_of_a_package_import_each_other_in_no_circle(package):
 
 def test_the_service_lists_every_part():
     parts = {name.split(".")[2] for name in modules() if name.startswith(f"{SERVER}.service.")}
-    assert set(service_order()) == parts - APART
+    assert set(service_order()) == parts
 
 
 @pytest.mark.parametrize("part", service_order())

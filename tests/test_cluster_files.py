@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from real2sim_server.service.http.metrics import Metrics
+from real2sim_server.service.http.telemetry import Metrics
 from real2sim_server.settings import OTHER_VARIABLES, Settings
 
 DOCKER = Path(__file__).parents[1] / "docker"

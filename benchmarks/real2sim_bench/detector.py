@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from real2sim_server.console import print_figures, staged_progress
+from real2sim_server.datasets.clips import ClipMakers
 from real2sim_server.datasets.export import export_dataset
-from real2sim_server.datasets.makers import ClipMakers
 from real2sim_server.datasets.plan import ExportPlan, planned_shards
 from real2sim_server.demo.street import SHIPPED
 from real2sim_server.executors import Processes

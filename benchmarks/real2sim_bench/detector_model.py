@@ -111,7 +111,7 @@ PRIOR = 0.01
 """Score of a cell before training."""
 ALPHA, GAMMA = 0.25, 2.0
 BATCH, RATE, DECAY = 16, 3e-3, 1e-4
-OVERLAP, LEAST_SCORE, MOST = 0.55, 0.02, 100
+OVERLAP, MIN_SCORE, MOST = 0.55, 0.02, 100
 """Of two boxes that overlap by more the better one is kept; those of a lower score are none."""
 
 
@@ -292,7 +292,7 @@ def _kept(
     boxes: NDArray[np.float32], scores: NDArray[np.float32], width: int, height: int
 ) -> tuple[Boxes, NDArray[np.float64]]:
     limit = np.array([width, height, width, height], np.float64)
-    order = [k for k in np.argsort(-scores, kind="stable").tolist() if scores[k] >= LEAST_SCORE]
+    order = [k for k in np.argsort(-scores, kind="stable").tolist() if scores[k] >= MIN_SCORE]
     whole = np.clip(boxes.astype(np.float64), 0, limit)
     kept: list[int] = []
     while order and len(kept) < MOST:

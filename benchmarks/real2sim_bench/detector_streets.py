@@ -42,7 +42,7 @@ CLEAR = 0.5
 """Doubles stand so far from everything else [m]."""
 EGO_CENTRE, EGO_ROOM = np.eye(4), (16.0, 3.5, 4.0)
 """What is kept free about the ego: a box [m] about its rear axle."""
-LEAST_PIXELS, LEAST_SIDE = 40, 6.0
+MIN_PIXELS, MIN_SIDE = 40, 6.0
 """An object counts from so many visible pixels and so large a box on [px]."""
 FORMATS = ("coco", "labels")
 FINER = 2
@@ -245,7 +245,7 @@ def boxes_in(instance: NDArray[np.uint16]) -> TrueBoxes:
 
 def _counts(pixels: int, width: float, height: float) -> bool:
     """By the finer picture."""
-    return pixels >= LEAST_PIXELS * FINER**2 and min(width, height) >= LEAST_SIDE * FINER
+    return pixels >= MIN_PIXELS * FINER**2 and min(width, height) >= MIN_SIDE * FINER
 
 
 def _averaged(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -40,8 +40,8 @@ from real2sim_proto.operations import (
     TimeRange,
     Translate,
 )
+from real2sim_server.demo.run import worker_process
 from real2sim_server.demo.street import unpack_street
-from real2sim_server.demo.worker import worker_process
 from real2sim_server.scene.io import save_scene
 from real2sim_server.synthetic.gaussian_street import street
 

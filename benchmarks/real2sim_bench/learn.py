@@ -32,11 +32,10 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 from real2sim_proto.sessions import SessionInfo
 from real2sim_server.console import print_figures
+from real2sim_server.demo.run import worker_process
 from real2sim_server.demo.street import SHIPPED, unpack_street
-from real2sim_server.demo.worker import worker_process
 from real2sim_server.edit import ScenarioState, instances_at
-from real2sim_server.learning import VectorDriveEnv
-from real2sim_server.learning.batch_images import fitted
+from real2sim_server.learning import VectorDriveEnv, fitted
 from real2sim_server.render import RasterOptions, View, rasterize, rasterize_batch
 from real2sim_server.scene import Scene
 from real2sim_server.scene.io import read_packed

@@ -52,11 +52,11 @@ AT_ONCE = 16
 INSTANTS = 8
 """At which episodes begin."""
 SEED_STEP = 1_000_003
-FAR_SHARE, MOST_DRAWS = 0.75, 100_000
+FAR_SHARE, MAX_DRAWS = 0.75, 100_000
 """Starts are at least this share of the largest one away; so many are drawn to find them."""
 OFFSET_M, TURNED = 0.5, math.radians(5)
 """Within these of the recorded path at its end, an episode has come back."""
-LEAST_WAY = 0.5
+MIN_PATH_LENGTH = 0.5
 """And it has driven at least this share of the way that was recorded in the time."""
 
 
@@ -224,7 +224,7 @@ def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) ->
         CommandError: the scene is too short, or hardly a start is free.
     """
     found: list[World] = []
-    for seed in range(options.seed * SEED_STEP, options.seed * SEED_STEP + MOST_DRAWS):
+    for seed in range(options.seed * SEED_STEP, options.seed * SEED_STEP + MAX_DRAWS):
         draws = Draws(seed)
         least = {"start.lateral": options.lateral, "start.heading": options.heading}
         if any(abs(draws.around(w, name, 0)) < FAR_SHARE * w for name, w in least.items()):
@@ -280,7 +280,7 @@ def _outcome(world: World) -> Outcome:
     recorded = float(np.linalg.norm(np.subtract(end, start)[:2]))
     contact, off_road = world.terminated, world.accumulator.off_road
     back = abs(near.offset) <= OFFSET_M and abs(turned) <= TURNED
-    on = world.accumulator.distance >= LEAST_WAY * recorded
+    on = world.accumulator.distance >= MIN_PATH_LENGTH * recorded
     return Outcome(not contact and not off_road and back and on, contact, off_road, near.offset)
 
 

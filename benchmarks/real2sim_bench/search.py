@@ -18,8 +18,7 @@ from real2sim_server.sweeps.episode import drive_episode, recording_of
 from real2sim_server.sweeps.search.evaluation import Evaluation, Evaluator
 from real2sim_server.sweeps.search.optimise import SearchBudget, SearchState, random_search, search
 from real2sim_server.sweeps.search.run import wilson
-from real2sim_server.sweeps.spec import load_space
-from real2sim_server.sweeps.storyboard_space import open_scene
+from real2sim_server.sweeps.spec import load_space, open_scene
 from real2sim_server.world import warm_up
 from real2sim_server.world.recording.recording import first_difference
 

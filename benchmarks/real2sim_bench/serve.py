@@ -25,8 +25,8 @@ from rich.console import Console
 from rich.table import Table
 
 import real2sim
+from real2sim_server.demo.run import worker_process
 from real2sim_server.demo.street import unpack_street
-from real2sim_server.demo.worker import worker_process
 from real2sim_server.scene.io import save_scene
 from real2sim_server.synthetic.gaussian_street import street
 

@@ -250,7 +250,7 @@ def _checked_id(value: Any, what: str, allowed: str) -> str:
 OnProgress = Callable[[JobInfo], object]
 
 FIRST_POLL = 0.05
-SLOWEST_POLL = 1.0
+MAX_POLL_S = 1.0
 
 
 class JobBase(Handle):
@@ -292,7 +292,7 @@ def poll_delays(job_id: str, timeout: float | None) -> Iterator[float]:
     started, delay = time.monotonic(), FIRST_POLL
     while timeout is None or time.monotonic() - started < timeout:
         yield delay
-        delay = min(delay * 1.5, SLOWEST_POLL)
+        delay = min(delay * 1.5, MAX_POLL_S)
     raise ReplyTimeoutError(
         f"end of job {job_id!r}", timeout or 0.0, hint="it goes on; wait again, or cancel it"
     )

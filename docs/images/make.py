@@ -29,9 +29,8 @@ from PIL import Image
 import real2sim
 from real2sim.planners import FollowRoute
 from real2sim_proto.operations import Delete, Duplicate, Operation, Rotate, Translate
-from real2sim_server.demo.run import SCENE
+from real2sim_server.demo.run import SCENE, worker_process
 from real2sim_server.demo.street import DURATION_S, TRAINING_HZ, record_street, unpack_street
-from real2sim_server.demo.worker import worker_process
 from real2sim_server.edit import ScenarioState, apply_operations, instances_at, posed_instances
 from real2sim_server.render import render_cameras
 from real2sim_server.scene import Fisheye, Scene, Shutter

@@ -21,7 +21,7 @@ from pydantic_core import CoreSchema, core_schema
 
 # Errors for missing names, which say what to write instead.
 
-MOST_SHOWN = 24
+MAX_SHOWN = 24
 
 
 class Guided:
@@ -70,7 +70,7 @@ def advice(
         return f"write {instead[name]}"
     if close := difflib.get_close_matches(name, there := list(there), n=2):
         return f"did you mean {' or '.join(close)}?"
-    shown = there if len(there) <= MOST_SHOWN else [*there[:MOST_SHOWN], "..."]
+    shown = there if len(there) <= MAX_SHOWN else [*there[:MAX_SHOWN], "..."]
     return f"{otherwise} {', '.join(shown) or 'none'}"
 
 

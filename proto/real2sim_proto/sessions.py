@@ -158,7 +158,7 @@ class SessionRender(Model):
 
 MAX_POSED = 4096
 
-SHORTEST_FOCAL = 0.1
+MIN_FOCAL = 0.1
 """[px]."""
 
 Pixels = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -167,10 +167,10 @@ Row = tuple[Pixels, Pixels, Pixels]
 
 def _intrinsics(K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
     (fx, skew, _), (below, fy, _), last = K
-    if min(fx, fy) < SHORTEST_FOCAL or skew != 0 or below != 0 or last != (0.0, 0.0, 1.0):
+    if min(fx, fy) < MIN_FOCAL or skew != 0 or below != 0 or last != (0.0, 0.0, 1.0):
         raise ValueError(
             f"K {K!r} is not that of a pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], "
-            f"fx and fy {SHORTEST_FOCAL} pixels or more"
+            f"fx and fy {MIN_FOCAL} pixels or more"
         )
     return K
 

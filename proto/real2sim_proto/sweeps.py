@@ -19,10 +19,10 @@ Number = Annotated[float, Field(ge=-1e18, le=1e18)]
 ParameterName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")]
 SweepSeed = Annotated[int, Field(ge=0, lt=2**63)]
 
-MOST_POINTS = 1_000_000
+MAX_POINTS = 1_000_000
 """Points of a sweep, wherever it is driven."""
 
-MOST_EPISODES = 10_000
+MAX_EPISODES = 10_000
 """That one job drives; a sweep of the command may be larger."""
 
 SET_BY_SWEEPS = frozenset({"seed", "sensors", "action", "privileged"})
@@ -130,7 +130,7 @@ class SpreadMethod(Model):
     """So many points: independent ones, a Latin hypercube, or a low-discrepancy sequence."""
 
     kind: Literal["random", "latin_hypercube", "sobol", "halton"] = "sobol"
-    count: int = Field(default=64, ge=1, le=MOST_POINTS)
+    count: int = Field(default=64, ge=1, le=MAX_POINTS)
     seed: SweepSeed = 0
 
 
@@ -149,7 +149,7 @@ class ImportanceMethod(Model):
     """
 
     kind: Literal["importance"]
-    count: int = Field(default=64, ge=1, le=MOST_POINTS)
+    count: int = Field(default=64, ge=1, le=MAX_POINTS)
     seed: SweepSeed = 0
     towards: dict[ParameterName, ImportanceBump] = Field(min_length=1)
     defensive: Annotated[float, Field(gt=0, le=1)] = 0.1
@@ -159,7 +159,7 @@ class SearchMethod(Model):
     """Points that are chosen by what came of the others: avoidable failures of one planner."""
 
     kind: Literal["search"]
-    episodes: int = Field(default=300, ge=20, le=MOST_EPISODES)
+    episodes: int = Field(default=300, ge=20, le=MAX_EPISODES)
     seed: SweepSeed = 0
     shrink: int = Field(default=3, ge=0, le=20, description="failures whose boundary is sought")
     probability: int = Field(
@@ -243,9 +243,9 @@ class SweepRequest(Model):
         ResetSpec.model_validate(self.reset)
         if isinstance(self.method, SearchMethod):
             self._check_search()
-        elif (count := self.most_episodes()) > MOST_EPISODES:
+        elif (count := self.most_episodes()) > MAX_EPISODES:
             raise ValueError(
-                f"{count} episodes; {MOST_EPISODES} is the most of a job: ask for fewer points, "
+                f"{count} episodes; {MAX_EPISODES} is the most of a job: ask for fewer points, "
                 "planners or seeds, or drive it with `real2sim sweep`"
             )
         return self

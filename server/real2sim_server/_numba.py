@@ -101,7 +101,7 @@ class Made:
 made = Made()
 COMPILING = "compiling kernels, on the first run only"
 
-LONGEST_WAIT_S = 120.0
+MAX_WAIT_S = 120.0
 """For another process that compiles the same kernel; the longest take half a minute."""
 
 LOW_PRIORITY = 10
@@ -270,7 +270,7 @@ class _Index(IndexDataCacheFile):
 @contextlib.contextmanager
 def _locked(path: str) -> Iterator[None]:
     """No other process is in such a block with the same path; without effect where files cannot be
-    locked, and after ``LONGEST_WAIT_S``. Belongs to who has the compiler's lock."""
+    locked, and after ``MAX_WAIT_S``. Belongs to who has the compiler's lock."""
     if path in _LOCKED:
         yield
         return
@@ -288,7 +288,7 @@ def _locked(path: str) -> Iterator[None]:
 
 
 def _wait_for(file: IO[str]) -> None:
-    deadline = time.monotonic() + LONGEST_WAIT_S
+    deadline = time.monotonic() + MAX_WAIT_S
     while time.monotonic() < deadline:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -49,9 +49,9 @@ from real2sim_server.scene.io.document import (
     SceneDocument,
 )
 from real2sim_server.service.accounts import TokenLimits, read_token_file
-from real2sim_server.service.http.metrics import Metrics
-from real2sim_server.service.objects.object_store import FolderObjects, S3Objects, open_objects
+from real2sim_server.service.http.telemetry import Metrics
 from real2sim_server.service.serve import running_worker
+from real2sim_server.service.shared_objects import FolderObjects, S3Objects, open_objects
 from real2sim_server.settings import OTHER_VARIABLES, Settings
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 from tests.pages import LIMIT_S, REPOSITORY, Page

@@ -20,7 +20,7 @@ from real2sim.renderers.linked_scene import read_links
 from real2sim_server.demo.street import unpack_street
 from real2sim_server.policies.suite import load_suite
 from real2sim_server.scene.range_sensors import read_lidar
-from real2sim_server.service.routes.view import VIEW_REQUEST
+from real2sim_server.service.routes.sockets import VIEW_REQUEST
 from real2sim_server.service.serve import running_worker
 from real2sim_server.settings import Settings
 from tests.pages import LIMIT_S, REPOSITORY, Page

@@ -231,7 +231,7 @@ def test_a_process_of_low_priority_holds_nobody_up(package):
 def test_a_lock_that_another_never_gives_back_delays_only(package):
     change(package, "FACTOR = 2.0", "FACTOR = 3.0")
     (lock,) = package.rglob("*.lock")
-    impatient = "import real2sim_server._numba as n; n.LONGEST_WAIT_S = 0.2\n"
+    impatient = "import real2sim_server._numba as n; n.MAX_WAIT_S = 0.2\n"
     with lock.open() as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         assert run(package, before=impatient) == (BEFORE + 2.0, "compiled")

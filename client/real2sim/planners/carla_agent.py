@@ -43,7 +43,7 @@ OTHER_SENSORS = ("sensor.other.gnss", "sensor.other.imu", "sensor.speedometer")
 REAR_OVERHANG = 0.95
 """Rear axle to the rear end of the ego's box [m]; CARLA's origin is the middle of the box."""
 
-LEAST_SEEN, MOST_UNSEEN = 0.2, 0.1
+MIN_SEEN, MAX_UNSEEN = 0.2, 0.1
 """Of the image of a wanted camera: what must be seen at least, and what may be black unsaid."""
 
 EARTH_RADIUS = 6_378_137.0
@@ -82,7 +82,7 @@ class _AgentNeeds(Needs):
         widths: dict[str, int] = {}
         for name, wanted in self.views.items():
             coarse = lookup_of(_smaller(wanted, 48), there)
-            if coarse.covered < LEAST_SEEN:
+            if coarse.covered < MIN_SEEN:
                 raise PeerError(
                     f"the agent's camera {name!r} looks where the scene's cameras "
                     f"({', '.join(there) or 'none'}) see {coarse.covered:.0%} of its image",
@@ -148,7 +148,7 @@ class CarlaAgent:
         there = _views_in(obs) if views else {}
         self._lookups = {name: lookup_of(wanted, there) for name, wanted in views.items()}
         for name, lookup in self._lookups.items():
-            if lookup.covered < 1 - MOST_UNSEEN:
+            if lookup.covered < 1 - MAX_UNSEEN:
                 warnings.warn(
                     f"{1 - lookup.covered:.0%} of the agent's camera {name!r} stay black: no "
                     "camera of the scene looks there",

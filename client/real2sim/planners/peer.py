@@ -150,7 +150,7 @@ def cameras_for(
     return {name: _camera_for(name, there, known, given) for name in names}
 
 
-MOST_APART = math.radians(60)
+MAX_ANGLE = math.radians(60)
 """Between the axes of two cameras that stand for each other [rad]."""
 
 
@@ -173,7 +173,7 @@ def _camera_for(
     def apart(camera: str) -> float:
         return abs(math.remainder(there[camera].turn - look.turn, math.tau))
 
-    near = [camera for camera in there if apart(camera) <= MOST_APART]
+    near = [camera for camera in there if apart(camera) <= MAX_ANGLE]
     if not near:
         raise PeerError(
             f"the planner wants camera {name!r}, and none of {cameras} looks that way",

@@ -192,10 +192,10 @@ def optical(camera: str) -> str:
 SPEED_TIME = 0.3
 """Within which a wanted speed is to be reached [s]."""
 
-MOST_ACCELERATION, MOST_BRAKING = 4.0, 8.0
+MAX_ACCELERATION, MAX_BRAKING = 4.0, 8.0
 """Where a message asks for no acceleration of its own [m/s^2]."""
 
-SLOWEST_TURN = 0.1
+MIN_TURN_SPEED = 0.1
 """Below this speed a turn rate says nothing about the wheels [m/s]."""
 
 
@@ -216,7 +216,7 @@ def of_twist(message: Any, obs: Observation, *, wheelbase: float = 2.8) -> Contr
     about z [rad/s], which becomes the angle of the wheels of a vehicle of a ``wheelbase`` [m]."""
     twist = getattr(message, "twist", message)
     speed, turn = float(twist.linear.x), float(twist.angular.z)
-    steering = math.atan(wheelbase * turn / speed) if abs(speed) > SLOWEST_TURN else 0.0
+    steering = math.atan(wheelbase * turn / speed) if abs(speed) > MIN_TURN_SPEED else 0.0
     return _towards(speed, steering, obs, limit=0.0)
 
 
@@ -251,7 +251,7 @@ def of_path(message: Any, obs: Observation) -> TrajectoryPlan:
 def standing(action: str, obs: Observation) -> Control | TrajectoryPlan:
     """What is done before there is any command: stop."""
     if action == "control":
-        return Control(acceleration=-MOST_ACCELERATION, steering=0.0)
+        return Control(acceleration=-MAX_ACCELERATION, steering=0.0)
     return TrajectoryPlan(times_us=[obs.t_us + 1_000_000], poses=[(0.0, 0.0, 0.0)])
 
 
@@ -262,7 +262,7 @@ def _towards(speed: float, steering: float, obs: Observation, *, limit: float) -
     now = obs.ego.speed
     backwards = speed < 0 or (speed == 0 and now < 0)
     ahead = -1.0 if backwards else 1.0
-    most, least = limit or MOST_ACCELERATION, -(limit or MOST_BRAKING)
+    most, least = limit or MAX_ACCELERATION, -(limit or MAX_BRAKING)
     wanted = (abs(speed) - ahead * now) / SPEED_TIME
     return Control(
         acceleration=min(max(wanted, least), most),

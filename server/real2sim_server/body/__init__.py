@@ -5,8 +5,17 @@ pelvis, x forward, y left, z up, metres. Joint rotations are those of SMPL-like 
 rest pose, and each turns what lies below its joint, about the axes of the body's frame.
 """
 
-from .model import JOINTS, Body, BodyModel, body_model
-from .skinning import Pose, joint_transforms, keypoints, rest_pose, skin
+from .model import (
+    JOINTS,
+    Body,
+    BodyModel,
+    Pose,
+    body_model,
+    joint_transforms,
+    keypoints,
+    rest_pose,
+    skin,
+)
 
 __all__ = [
     "JOINTS",

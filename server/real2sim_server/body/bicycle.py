@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.transform import Float, matrix_to_quaternion
 from .gait import GRAVITY, leg_lengths, put_leg, put_spine
-from .limbs import LATERAL, about, aim, bend
-from .model import JOINTS, Body
-from .skinning import Pose, chain_transforms, joint_positions
+from .model import JOINTS, LATERAL, Body, Pose, about, aim, bend, chain_transforms, joint_positions
 
 FRAME, TYRE, RIM, CRANK, SADDLE = range(5)
 SURFACES = ("bicycle_frame", "tyre", "rim", "crank", "saddle")

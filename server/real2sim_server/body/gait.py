@@ -21,9 +21,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.transform import Float, matrix_to_quaternion
-from .limbs import LATERAL, UP, about, aim, bend, frame, partial_turn, smooth, unit
-from .model import JOINTS, Body
-from .skinning import Pose
+from .model import (
+    JOINTS,
+    LATERAL,
+    UP,
+    Body,
+    Pose,
+    about,
+    aim,
+    bend,
+    frame,
+    partial_turn,
+    smooth,
+    unit,
+)
 
 GRAVITY = 9.81
 WALK_TO_RUN = (0.4, 0.8)

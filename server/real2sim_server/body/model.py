@@ -1,7 +1,4 @@
-"""The body model: a mesh with joints, skinning weights and a linear basis of shapes.
-
-Its data, ``asset.npz``, come from MakeHuman (CC0); ``ASSET.md`` says how.
-"""
+"""The body model: a mesh with joints and a linear basis of shapes, forward kinematics, skinning."""
 
 from __future__ import annotations
 
@@ -11,9 +8,13 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float
+from .._numba import kernel
+from ..geometry.transform import Float, quaternion_to_matrix
+
+# Its data, ``asset.npz``, come from MakeHuman (CC0); see ``ASSET.md``.
 
 _SIDED = ("clavicle", "upper_arm", "forearm", "hand", "thigh", "calf", "foot", "ball")
 
@@ -174,3 +175,200 @@ def body_model() -> BodyModel:
         mirror=arrays["mirror"].astype(np.int64),
         face=arrays["keypoints"].astype(np.int64),
     )
+
+
+# --- Skinning kernels -----------------------------------------------------------------------------
+
+# A vertex maps to ``sum_k w_k (R_k x + t_k)``: Magnenat-Thalmann et al., "Joint-dependent local
+# deformations for hand animation and object grasping", 1988.
+
+
+@kernel(parallel=True)
+def skin_vertices(vertices, weight_joints, weights, transforms):
+    """Vertices [N, V, 3] of poses [N, J, 3, 4]; see :func:`.skinning.skin`."""
+    poses, count = len(transforms), len(vertices)
+    out = np.empty((poses, count, 3))
+    for i in prange(poses * count):
+        pose, v = i // count, i % count
+        x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+        for axis in range(3):
+            total = 0.0
+            for k in range(weights.shape[1]):
+                m = transforms[pose, weight_joints[v, k]]
+                moved = m[axis, 0] * x + m[axis, 1] * y + m[axis, 2] * z + m[axis, 3]
+                total += weights[v, k] * moved
+            out[pose, v, axis] = total
+    return out
+
+
+@kernel
+def mesh_normals(vertices, triangles):
+    """See :func:`.skinning.vertex_normals`."""
+    out = np.zeros_like(vertices)
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        ux, uy, uz = vertices[b] - vertices[a]
+        vx, vy, vz = vertices[c] - vertices[a]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        for corner in (a, b, c):
+            out[corner, 0] += nx
+            out[corner, 1] += ny
+            out[corner, 2] += nz
+    for i in range(len(out)):
+        length = np.sqrt(out[i, 0] ** 2 + out[i, 1] ** 2 + out[i, 2] ** 2)
+        out[i] /= max(length, 1e-12)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Poses of a body, one or many.
+
+    Attributes:
+        rotations: [..., J, 4] ``wxyz``, of each joint against the one it hangs on; the identity
+            in the rest pose.
+        pelvis: [..., 3] where the pelvis joint is, body frame [m].
+    """
+
+    rotations: Float
+    pelvis: Float
+
+
+def rest_pose(body: Body) -> Pose:
+    """The pose of ``body.vertices``."""
+    rotations = np.zeros((len(body.joints), 4))
+    rotations[:, 0] = 1.0
+    return Pose(rotations, body.joints[0].copy())
+
+
+def joint_transforms(body: Body, pose: Pose) -> Float:
+    """``[..., J, 3, 4]`` that take points of the rest pose to where each joint carries them."""
+    return chain_transforms(body, quaternion_to_matrix(pose.rotations), pose.pelvis)
+
+
+def chain_transforms(body: Body, rotations: Float, pelvis: Float) -> Float:
+    """As :func:`joint_transforms`, of matrices [..., J, 3, 3]."""
+    turned = np.empty_like(rotations)
+    places = np.empty(rotations.shape[:-1])
+    for joint, parent in enumerate(body.model.parents):
+        if parent < 0:
+            turned[..., joint, :, :], places[..., joint, :] = rotations[..., joint, :, :], pelvis
+            continue
+        above = turned[..., parent, :, :]
+        turned[..., joint, :, :] = above @ rotations[..., joint, :, :]
+        bone = body.joints[joint] - body.joints[parent]
+        places[..., joint, :] = places[..., parent, :] + above @ bone
+    shift = places - (turned @ body.joints[:, :, None])[..., 0]
+    return np.concatenate([turned, shift[..., None]], axis=-1)
+
+
+def joint_positions(body: Body, transforms: Float) -> Float:
+    """Joints [..., J, 3] of transforms [..., J, 3, 4]."""
+    turned: Float = (transforms[..., :3] @ body.joints[:, :, None])[..., 0]
+    return turned + transforms[..., 3]
+
+
+def skin(body: Body, transforms: Float) -> Float:
+    """Vertices [..., V, 3] of transforms [..., J, 3, 4], body frame [m]."""
+    many = np.ascontiguousarray(transforms, dtype=np.float64).reshape(-1, len(body.joints), 3, 4)
+    out: Float = skin_vertices(body.vertices, body.model.weight_joints, body.model.weights, many)
+    return out.reshape(*transforms.shape[:-3], -1, 3)
+
+
+def skin_reference(body: Body, transforms: Float) -> Float:
+    """The plain twin of :func:`skin`."""
+    chosen = transforms[..., body.model.weight_joints, :, :]
+    blended: Float = (chosen * body.model.weights[:, :, None, None]).sum(axis=-3)
+    turned: Float = (blended[..., :3] @ body.vertices[:, :, None])[..., 0]
+    return turned + blended[..., 3]
+
+
+def keypoints(body: Body, vertices: Float, transforms: Float) -> Float:
+    """COCO's 17 keypoints [..., 17, 3] of skinned vertices [..., V, 3] and their transforms."""
+    face = vertices[..., body.model.face, :]
+    joints = joint_positions(body, transforms)[..., list(KEYPOINT_JOINTS), :]
+    return np.concatenate([face, joints], axis=-2)
+
+
+def vertex_normals(vertices: Float, triangles: NDArray[np.int64]) -> Float:
+    """Unit normals [V, 3] of vertices [V, 3], means of their triangles' by area."""
+    out: Float = mesh_normals(np.ascontiguousarray(vertices), triangles)
+    return out
+
+
+# --- Limbs ----------------------------------------------------------------------------------------
+
+# Points and directions are [T, 3], rotations [T, 3, 3], for many instants at once.
+
+UP = np.array([0.0, 0.0, 1.0])
+LATERAL = np.array([0.0, 1.0, 0.0])
+
+
+def unit(v: Float) -> Float:
+    """Directions [..., 3] of vectors."""
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+
+
+def about(axis: ArrayLike, angle: ArrayLike) -> Float:
+    """Rotations [..., 3, 3] about a unit axis [3] by angles [...] (Rodrigues)."""
+    x, y, z = np.asarray(axis, dtype=np.float64)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.asarray(angle, dtype=np.float64)[..., None, None]
+    turned: Float = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+    return turned
+
+
+def aim(start: ArrayLike, end: Float) -> Float:
+    """The shortest rotations [T, 3, 3] that take directions [3] or [T, 3] to directions [T, 3]."""
+    a, b = np.broadcast_arrays(unit(np.asarray(start, dtype=np.float64)), unit(end))
+    v, c = np.cross(a, b), (a * b).sum(axis=-1)
+    cross = np.zeros((*v.shape[:-1], 3, 3))
+    cross[..., 0, 1], cross[..., 0, 2] = -v[..., 2], v[..., 1]
+    cross[..., 1, 0], cross[..., 1, 2] = v[..., 2], -v[..., 0]
+    cross[..., 2, 0], cross[..., 2, 1] = -v[..., 1], v[..., 0]
+    scale = 1.0 / np.maximum(1.0 + c, 1e-6)
+    turned: Float = np.eye(3) + cross + (cross @ cross) * scale[..., None, None]
+    return turned
+
+
+def frame(along: Float, lateral: Float) -> Float:
+    """Right-handed frames [..., 3, 3], columns: along, lateral made square to it, the third."""
+    along = unit(along)
+    square = unit(lateral - (lateral * along).sum(axis=-1, keepdims=True) * along)
+    return np.stack([along, square, np.cross(along, square)], axis=-1)
+
+
+def partial_turn(rotations: Float, fraction: float) -> Float:
+    """The rotations [T, 3, 3] by a fraction of their angles, about their own axes."""
+    trace = np.trace(rotations, axis1=-2, axis2=-1)
+    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    skew = (rotations - np.swapaxes(rotations, -1, -2)) / 2
+    axis = skew / np.maximum(np.sin(angle), 1e-9)[..., None, None]
+    part = (angle * fraction)[..., None, None]
+    turned: Float = np.eye(3) + np.sin(part) * axis + (1 - np.cos(part)) * (axis @ axis)
+    return turned
+
+
+def bend(start: Float, end: Float, upper: float, lower: float, towards: Float) -> Float:
+    """Where the middle joint [T, 3] of two bones is.
+
+    Args:
+        start, end: of the limb [T, 3]; what is out of reach is met by a straight limb.
+        upper, lower: lengths of its bones [m].
+        towards: [T, 3], which way the middle joint points.
+    """
+    line = end - start
+    reach = np.clip(
+        np.linalg.norm(line, axis=-1), abs(upper - lower) + 1e-6, (upper + lower) * (1 - 1e-9)
+    )
+    along = unit(line)
+    aside = unit(towards - (towards * along).sum(axis=-1, keepdims=True) * along)
+    ahead = (upper**2 - lower**2 + reach**2) / (2 * reach)
+    off = np.sqrt(np.maximum(upper**2 - ahead**2, 0.0))
+    return start + ahead[..., None] * along + off[..., None] * aside
+
+
+def smooth(x: ArrayLike) -> Float:
+    """From 0 to 1 over [0, 1], level at both ends."""
+    x = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
+    return x * x * (3 - 2 * x)

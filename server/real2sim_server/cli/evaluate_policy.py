@@ -170,8 +170,8 @@ def _own_worker(scenes: Path | None, out: Path) -> Iterator[str]:
     """A worker with the bundles in ``scenes``, or with the demo's street; its address."""
     import real2sim
 
+    from ..demo.run import worker_process
     from ..demo.street import unpack_street
-    from ..demo.worker import worker_process
     from ..scene.io import DEMO_SCENE
 
     with contextlib.ExitStack() as stack:

@@ -107,9 +107,9 @@ def export_dataset(
 
     Stopped and called again it goes on after the last whole clip, and gives the same bytes.
     """
+    from ..datasets.clips import ClipMakers
     from ..datasets.export import estimate
     from ..datasets.export import export_dataset as export
-    from ..datasets.makers import ClipMakers
     from ..datasets.plan import ExportPlan, read_rig
     from ..executors import executor_of
     from ..scene.io import load_scene

@@ -37,7 +37,7 @@ def replay(
     json: JsonFile = None,
 ) -> None:
     """Score a recorded episode; with its scene, verify and film it."""
-    from ..policies.plots import film_episode
+    from ..policies.page import film_episode
     from ..world.recording.mcap_file import save_mcap
     from ..world.recording.recording import first_difference, load_recording
 

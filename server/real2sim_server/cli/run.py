@@ -74,7 +74,7 @@ def run(
     json: JsonFile = None,
 ) -> None:
     """Run a scenario file with a planner and report what happened."""
-    from ..scenarios.fit import fitted_to_scene
+    from ..scenarios.flat_scene import fitted_to_scene
     from ..sweeps.episode import recording_of
     from ..world.recording.recording import save_recording
 
@@ -181,7 +181,7 @@ def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made:
     from ..scenarios import ScenarioError
     from ..scenarios.flat_scene import flat_scene
     from ..scene.io import load_scene, save_scene
-    from ..sweeps.storyboard_space import open_scene
+    from ..sweeps.spec import open_scene
     from ..world import WorldError
 
     if bundle is not None:
@@ -203,7 +203,7 @@ def _drive(
     from real2sim.planners import load_planner
 
     from ..sweeps.episode import Drive, drive_episode
-    from ..sweeps.storyboard_space import run_options
+    from ..sweeps.spec import run_options
 
     driver: Any = _Scripted() if planner == SCRIPTED else load_planner(planner)
     options = run_options(board, seed=seed, seconds=seconds)
@@ -237,7 +237,7 @@ class _Scripted:
 
 
 def _film(recording: Recording, scene: Scene, video: Path, camera: str | None) -> None:
-    from ..policies.plots import film_episode
+    from ..policies.page import film_episode
 
     film_episode(recording, recording.replayer(scene), scene, video, camera=camera)
     console.print(f"wrote {video}", highlight=False)

@@ -42,8 +42,7 @@ def serve(
     """Start a worker. Other settings come from REAL2SIM_* variables."""
     from pydantic import ValidationError
 
-    from ..service.first_run import begin_compiling
-    from ..service.preflight import check_start
+    from ..service.preflight import begin_compiling, check_start
     from ..settings import Settings, read_token
 
     _check_variables()

@@ -18,14 +18,13 @@ from typing import Any
 
 from ..render import Backend, encode_image
 from ..scene import Camera, Scene
-from .clips import Clip, write_shard
+from .clips import Clip, ClipMakers, write_shard
 from .drive import DatasetError, Drive
 from .labels import HOW
 from .labels.points import ROOF
-from .makers import ClipMakers
 from .plan import ExportPlan, PlannedClip, Variant, planned_cameras, planned_lidar, planned_shards
 from .writers import LabelledDrive, writer_of
-from .writers.pictures import labels_sheet
+from .writers.plain import labels_sheet
 
 # --- Previews ------------------------------------------------------------------------------------
 

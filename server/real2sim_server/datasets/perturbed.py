@@ -22,7 +22,7 @@ from .drive import Drive, MetSweep, Moment
 
 STEP_US = 50_000
 """Between poses of which the way driven is measured [us]."""
-LEAST_WAY = 8.0
+MIN_PATH_LENGTH = 8.0
 """The way back is at least so long [m]."""
 TRIES = 20
 """Draws in search of one that is clear of every object; each after the first is smaller."""
@@ -81,7 +81,7 @@ class PerturbedDrive:
         # Speed over the first half second, whatever the steps of an episode are.
         first = min(10, len(way) - 1)
         speed = way[first] / max(first * STEP_US * 1e-6, 1e-6)
-        length = max(LEAST_WAY, speed * recover_s)
+        length = max(MIN_PATH_LENGTH, speed * recover_s)
         return cls(base, lateral, heading, times.astype(np.float64), way, float(length))
 
     @property

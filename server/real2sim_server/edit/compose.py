@@ -346,7 +346,7 @@ ROW = np.dtype(
 )
 """A point in the world [m]; its normal is the thinnest axis of its Gaussian."""
 
-LEAST_OPACITY = 0.1
+MIN_OPACITY = 0.1
 """Fainter Gaussians are left out."""
 
 _TYPES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
@@ -359,7 +359,7 @@ def points_at(
     *,
     part: Part = "all",
     instance_id: int | None = None,
-    least_opacity: float = LEAST_OPACITY,
+    least_opacity: float = MIN_OPACITY,
 ) -> NDArray[np.void]:
     """Rows of ROW of a scenario at an instant.
 

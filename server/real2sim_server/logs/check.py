@@ -1,16 +1,28 @@
-"""Checks the files of a log before hours of work are spent on it."""
+"""Checks of a log: its files, and values that look wrong (frames, units and orders)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+import difflib
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from .driving_log import ChecksFiles, DrivingLog, LogError, damage_named
+from real2sim_proto.conventions import CLASS_OF_CATEGORY
 
-FARTHEST_M = 100_000.0
+from ..geometry.transform import Float, apply_transform, invert_transform, quaternion_to_matrix
+from ..scene import Camera, Trajectory
+from .drawing import points_in_box
+from .driving_log import ChecksFiles, DrivingLog, LidarSweep, LogError, ObjectTrack, damage_named
+
+# --- Files ----------------------------------------------------------------------------------------
+
+MAX_DISTANCE_M = 100_000.0
 """Of the world's zero; single precision is 8 mm there."""
 NAMED_FILES = 5
 """How many bad images, and how many bad sweeps, are named in a summary."""
@@ -179,7 +191,7 @@ def _times(log: DrivingLog) -> Iterator[str]:
 
 def _place(log: DrivingLog) -> Iterator[str]:
     far = float(np.abs(log.ego.positions).max())
-    if far > FARTHEST_M:
+    if far > MAX_DISTANCE_M:
         yield (
             f"log {log.name!r}: its drive lies {far / 1e3:,.0f} km from the world's zero, where "
             f"Gaussians could only move by {float(np.spacing(np.float32(far))):.2g} m; subtract "
@@ -198,3 +210,388 @@ def _tracks(log: DrivingLog) -> Iterator[str]:
                 f"log {log.name!r}: object {track.object_id!r} needs a positive length, width and "
                 f"height, not {track.size}"
             )
+
+
+# --- Plausibility ---------------------------------------------------------------------------------
+
+# These are hints for the owner of the log; nothing is refused. Where a typical mistake explains a
+# value, the hint names it.
+
+GAP_FACTOR = 1.6
+"""A frame is missing where the time step is this many times the usual one."""
+MIN_RATE, MAX_RATE = 0.2, 500.0
+"""Frames a second beyond which times are hardly in microseconds."""
+PRECISE_DISTANCE_M = 10_000.0
+"""Of the world's zero; the float32 of Gaussians is 1 mm there."""
+MAX_EGO_SPEED = 70.0
+OFF_HEADING, RIGHT_HEADING = math.radians(45), math.radians(15)
+FRAME_OF_BOXES = "T_world_object, not of the vehicle's frame, x forward"
+MANY_OFF = 0.3
+"""A share of the vehicles; a few may drive backwards."""
+DRIVEN_STEP_M = 0.3
+"""Between two poses whose direction of motion counts."""
+MIN_UP = 0.3
+"""Of an axis that should point up, its part along z."""
+CAMERA_REACH = np.array([15.0, 4.0]), (-0.5, 6.0)
+"""How far a camera sits from the rear axle along x and y, and in which heights [m]."""
+NEAR_BOXES = 30.0
+FAR_BOXES = 150.0
+STANDING_M, FLOATS_M = 15.0, 0.6
+"""Boxes so near should stand on the road, to within so much."""
+FEW_POINTS = 5
+BETWEEN_SWEEPS_M, SWEEPS_AHEAD = 1.5, 20
+"""The ego's way between two sweeps that are compared, and how many frames it may take."""
+COMPARED_POINTS = 4000
+ABOVE_TRAFFIC_M, AROUND_BOX_M = 2.0, 0.3
+BETTER = 0.6
+"""Sweeps fit better in another way where they are that much nearer to each other."""
+
+VEHICLES = ("car", "van", "truck", "bus")
+CATEGORIES = (*CLASS_OF_CATEGORY, "animal", "other")
+"""What objects are told apart by; all others are of no known kind."""
+MANY_UNKNOWN = 0.2
+"""A share of all objects."""
+AXES_OF_CV = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""Columns: x right, y down, z forward, in a frame of x forward, y left, z up."""
+
+
+def questions_to(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
+    """What looks wrong, in plain words; empty for a good log.
+
+    Args:
+        log: any log.
+        sweeps: some of its sweeps, by frame; empty where none of these could be read. One or two
+            more are read.
+    """
+    found = [*_odd_times(log), *_world(log), *_ego(log)]
+    for camera in log.rig:
+        found += _camera(camera)
+    found += [*_categories(log.tracks), *_headings(log.tracks), *_sizes(log.tracks)]
+    if not sweeps:
+        return found
+    if not any(len(s.points) for s in sweeps.values()):
+        return [*found, "there is no LiDAR: nothing to start a reconstruction from"]
+    if not log.tracks:
+        found.append("there are no boxes: moving objects have to be tracked first")
+    found += [*_intensity(sweeps), *_ground(sweeps), *_boxes(log, sweeps), *_standing(log, sweeps)]
+    return found + _registration(log)
+
+
+def gaps_between(steps: Float) -> tuple[tuple[int, float], ...]:
+    """(frame before it, length [s]) of each gap among steps [F - 1] between frames [s]."""
+    if len(steps) < 2:
+        return ()
+    wide = np.flatnonzero(steps > GAP_FACTOR * np.median(steps))
+    return tuple((int(i), float(steps[i])) for i in wide)
+
+
+def ego_steps(log: DrivingLog) -> Float:
+    """Way of the ego from frame to frame, [F - 1] [m]."""
+    positions = np.array([log.ego.pose(int(t))[0] for t in log.frame_times_us])
+    return np.asarray(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+
+
+def _odd_times(log: DrivingLog) -> list[str]:
+    steps = np.diff(log.frame_times_us) * 1e-6
+    if not len(steps):
+        return []
+    rate = 1 / float(np.median(steps))
+    if not MIN_RATE <= rate <= MAX_RATE:
+        unit = "milliseconds or seconds" if rate > MAX_RATE else "nanoseconds"
+        return [f"{rate:.4g} frames a second: are times in {unit}? They must be in microseconds"]
+    found = [f"{s:.2f} s pass after frame {i}: are frames missing?" for i, s in gaps_between(steps)]
+    without = log.provenance.get("cameras_without_images")
+    if without:
+        found.append(f"cameras without images, left out: {', '.join(without)}")
+    lost = [t * 1e-6 for t in log.provenance.get("frames_without_sweep_us", ())]
+    if lost:
+        found.append(
+            f"frames without a LiDAR sweep, left out: {len(lost)}, at "
+            f"{', '.join(f'{t:.2f}' for t in lost[:5])}{' ...' if len(lost) > 5 else ''} s"
+        )
+    speed = ego_steps(log) / steps
+    if speed.max() > MAX_EGO_SPEED:
+        frame = int(speed.argmax())
+        found.append(f"the ego jumps after frame {frame} ({speed[frame]:.0f} m/s)")
+    return found
+
+
+def _world(log: DrivingLog) -> list[str]:
+    far = float(np.abs(log.ego.positions).max())
+    if far <= PRECISE_DISTANCE_M:
+        return []
+    return [
+        f"the drive lies {far / 1e3:,.0f} km from the world's zero, where single precision is "
+        f"{float(np.spacing(np.float32(far))) * 1e3:.2g} mm: subtract the first pose's position "
+        "from all poses and boxes"
+    ]
+
+
+# --- poses ------------------------------------------------------------------------------------
+
+
+def _ego(log: DrivingLog) -> list[str]:
+    ups = np.array([quaternion_to_matrix(q)[2, 2] for q in log.ego.quaternions])
+    off = _off_heading(log.ego)
+    if np.median(ups) >= MIN_UP and (off is None or off <= OFF_HEADING):
+        return []
+    seen = (
+        f"the ego's z axis is {math.degrees(math.acos(np.median(ups).clip(-1, 1))):.0f} degrees "
+        "from up"
+        if np.median(ups) < MIN_UP or off is None
+        else f"the ego drives {math.degrees(off):.0f} degrees off its x axis"
+    )
+    if _makes_sense(_inverted(log.ego)):
+        return [f"{seen}: are its poses inverted? They must be T_world_vehicle"]
+    return [f"{seen}: {_explained(log.ego, 'T_world_vehicle, its x axis forward and z up')}"]
+
+
+def _headings(tracks: tuple[ObjectTrack, ...]) -> list[str]:
+    moving = [t for t in tracks if t.category in VEHICLES and t.trajectory.moves]
+    offs = [(off, t) for t in moving if (off := _off_heading(t.trajectory)) is not None]
+    wrong = [t for off, t in offs if off > OFF_HEADING]
+    if len(wrong) < max(2, MANY_OFF * len(offs)):
+        return []
+    answers = Counter(_explained(t.trajectory, FRAME_OF_BOXES) for t in wrong)
+    return [
+        f"{len(wrong)} of {len(offs)} moving vehicles do not drive along the x axis of their box: "
+        f"{answers.most_common(1)[0][0]}"
+    ]
+
+
+def _explained(path: Trajectory, expected: str) -> str:
+    """The mistake that would make sense of a trajectory, or what is expected."""
+    swapped = Trajectory(path.times_us, path.positions, path.quaternions[:, [3, 0, 1, 2]])
+    if _makes_sense(swapped):
+        return "are its quaternions x y z w? They must be w x y z"
+    return f"are its poses {expected}?"
+
+
+def _inverted(path: Trajectory) -> Trajectory:
+    inverse = [invert_transform(path.transform(int(t))) for t in path.times_us]
+    return Trajectory.from_transforms(path.times_us, inverse)
+
+
+def _makes_sense(path: Trajectory) -> bool:
+    ups = [quaternion_to_matrix(q)[2, 2] for q in path.quaternions]
+    off = _off_heading(path)
+    return off is not None and off < RIGHT_HEADING and float(np.median(ups)) > 1 - MIN_UP
+
+
+def _off_heading(path: Trajectory) -> float | None:
+    """Median angle between where something drives and its x axis [rad]; None where it stands."""
+    kept = [0]
+    for i, position in enumerate(path.positions):
+        if np.linalg.norm(position[:2] - path.positions[kept[-1], :2]) > DRIVEN_STEP_M:
+            kept.append(i)
+    if len(kept) < 3:
+        return None
+    ways = np.diff(path.positions[kept, :2], axis=0)
+    # The axis in the middle of a way is that of an arc; of its ends it lags or leads.
+    middle = [(a + b) // 2 for a, b in pairwise(kept)]
+    axes = np.array([quaternion_to_matrix(path.quaternions[i])[:2, 0] for i in middle])
+    crossed = ways[:, 0] * axes[:, 1] - ways[:, 1] * axes[:, 0]
+    return float(np.median(np.abs(np.arctan2(crossed, (ways * axes).sum(axis=1)))))
+
+
+# --- cameras ----------------------------------------------------------------------------------
+
+
+def _camera(camera: Camera) -> list[str]:
+    found = []
+    pose = camera.T_vehicle_camera
+    if not _sits_on_a_vehicle(pose):
+        x, y, z = pose[:3, 3]
+        tilt = math.degrees(math.acos(float(np.clip(-pose[2, 1], -1, 1))))
+        found.append(
+            f"camera {camera.name!r} sits at ({x:.1f}, {y:.1f}, {z:.1f}) m, the top of its image "
+            f"{tilt:.0f} degrees from up: {_mounted_wrongly(pose)}"
+        )
+    (fx, _, cx), (_, _, cy) = camera.K[0], camera.K[1]
+    across = math.degrees(2 * math.atan(camera.width / 2 / fx))
+    centred = 0.3 <= cx / camera.width <= 0.7 and 0.1 <= cy / camera.height <= 0.9
+    if not (centred and 3.0 <= across <= 160.0):
+        found.append(
+            f"camera {camera.name!r} is {across:.0f} degrees wide with its centre at "
+            f"({cx:.0f}, {cy:.0f}) of {camera.width} x {camera.height} px: is K of another size?"
+        )
+    return found
+
+
+def _mounted_wrongly(pose: Float) -> str:
+    if _sits_on_a_vehicle(invert_transform(pose)):
+        return "is T_vehicle_camera inverted?"
+    turned = pose.copy()
+    turned[:3, :3] = pose[:3, :3] @ AXES_OF_CV
+    if _sits_on_a_vehicle(turned):
+        return "is its frame x forward, z up? It must be x right, y down, z forward (OpenCV)"
+    return "is T_vehicle_camera of the frame on the ground below the rear axle?"
+
+
+def _sits_on_a_vehicle(pose: Float) -> bool:
+    reach, (low, high) = CAMERA_REACH
+    near = bool((np.abs(pose[:2, 3]) <= reach).all()) and low <= pose[2, 3] <= high
+    return near and float(-pose[2, 1]) >= MIN_UP
+
+
+# --- objects ----------------------------------------------------------------------------------
+
+
+def _categories(tracks: tuple[ObjectTrack, ...]) -> list[str]:
+    """Categories that look misspelt, or that many objects have and nothing here knows."""
+    unknown = Counter(t.category for t in tracks if t.category not in CATEGORIES)
+    found = []
+    for category, count in sorted(unknown.items()):
+        like = difflib.get_close_matches(category.lower(), CATEGORIES, n=1, cutoff=0.7)
+        if like or count > MANY_UNKNOWN * len(tracks):
+            meant = f"did you mean {like[0]!r}?" if like else f"known: {', '.join(CATEGORIES)}"
+            found.append(
+                f"{count} objects are of category {category!r}, which gets the mass and the label "
+                f"of 'other'; {meant}"
+            )
+    return found
+
+
+def _sizes(tracks: tuple[ObjectTrack, ...]) -> list[str]:
+    sizes = np.array([t.size for t in tracks if t.category in VEHICLES])
+    if not len(sizes):
+        return []
+    length, width, height = np.median(sizes, axis=0)
+    found = []
+    if (sizes[:, 1] > sizes[:, 0]).mean() > 0.5 or height > 1.5 * length:
+        found.append(
+            f"vehicles are {length:.1f} m long, {width:.1f} m wide and {height:.1f} m high: is "
+            "size length, width, height?"
+        )
+    if not 1.0 <= max(length, width) <= 25.0:
+        found.append(f"vehicles are {max(length, width):.3g} m long: is size in metres?")
+    return found
+
+
+def _boxes(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
+    held = near = 0
+    away = []
+    for frame, sweep in sweeps.items():
+        here = log.ego.transform(int(log.frame_times_us[frame]))
+        points = apply_transform(here, sweep.points.astype(np.float64))
+        for track, pose in _poses(log, frame):
+            away.append(float(np.linalg.norm(pose[:2, 3] - here[:2, 3])))
+            if away[-1] < NEAR_BOXES:
+                near += 1
+                held += points_in_box(points, pose, track.size) >= FEW_POINTS
+    if away and min(away) > FAR_BOXES:
+        return [f"the nearest box is {min(away):,.0f} m away: are they in the world's frame?"]
+    if near < 3 or held >= near / 3:
+        return []
+    return [
+        f"only {held} of {near} boxes within {NEAR_BOXES:.0f} m hold LiDAR points: are they in the "
+        "right frame?"
+    ]
+
+
+def _standing(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
+    """Whether boxes nearby stand on the road."""
+    bottoms = []
+    for frame in sweeps:
+        to_vehicle = invert_transform(log.ego.transform(int(log.frame_times_us[frame])))
+        for track, pose in _poses(log, frame):
+            x, y, z = (to_vehicle @ pose[:, 3])[:3].tolist()
+            if track.category in VEHICLES and math.hypot(x, y) < STANDING_M:
+                bottoms.append((z - track.size[2] / 2, track.size[2]))
+    if len(bottoms) < 3:
+        return []
+    bottom, height = np.median(np.array(bottoms), axis=0)
+    if abs(bottom) <= FLOATS_M:
+        return []
+    half = abs(bottom + height / 2) < 0.3
+    why = "is their position on the road? It must be the box's centre" if half else "is z right?"
+    return [f"vehicles nearby stand {bottom:+.1f} m above the road: {why}"]
+
+
+def _poses(log: DrivingLog, frame: int) -> list[tuple[ObjectTrack, Float]]:
+    t_us = int(log.frame_times_us[frame])
+    here = [t for t in log.tracks if t.trajectory.covers(t_us)]
+    return [(t, t.trajectory.transform(t_us)) for t in here]
+
+
+# --- LiDAR ------------------------------------------------------------------------------------
+
+
+def _intensity(sweeps: Mapping[int, LidarSweep]) -> list[str]:
+    largest = max((float(s.intensity.max()) for s in sweeps.values() if len(s.points)), default=0.0)
+    if largest <= 1.0:
+        return []
+    return [f"LiDAR intensity goes up to {largest:.4g}: divide it so that it lies from 0 to 1"]
+
+
+def _ground(sweeps: Mapping[int, LidarSweep]) -> list[str]:
+    heights = []
+    for sweep in sweeps.values():
+        x, y, z = sweep.points.T
+        beside = (np.abs(x) < 12) & (np.abs(y) < 5) & ((np.abs(x) > 3) | (np.abs(y) > 1.5))
+        if beside.sum() > 100:
+            heights.append(float(np.percentile(z[beside], 10)))
+    if not heights or abs(np.median(heights)) < 0.5:
+        return []
+    return [
+        f"the road near the vehicle lies {np.median(heights):+.1f} m from the vehicle frame's "
+        "zero: is the LiDAR's pose right?"
+    ]
+
+
+def _registration(log: DrivingLog) -> list[str]:
+    """Whether the ego's motion brings one sweep onto another."""
+    pair = _compared_frames(log)
+    if pair is None:
+        return []
+    try:
+        one, other = (_standing_points(log, frame) for frame in pair)
+    except LogError:
+        return []  # Whoever looks at every file says which.
+    if min(len(one), len(other)) < 100:
+        return []
+    first, second = (log.ego.transform(int(log.frame_times_us[frame])) for frame in pair)
+    motion = invert_transform(second) @ first
+    tree = cKDTree(other)
+
+    def apart(moved: Float) -> float:
+        return float(np.median(tree.query(apply_transform(moved, one))[0]))
+
+    given, still, backward = (apart(m) for m in (motion, np.eye(4), invert_transform(motion)))
+    between = f"frames {pair[0]} and {pair[1]}"
+    if backward < BETTER * min(given, still):
+        return [
+            f"sweeps of {between} fit best ({backward:.2f} m, as given {given:.2f} m) where the "
+            "ego goes the other way: are its poses inverted? They must be T_world_vehicle"
+        ]
+    if still < BETTER * given:
+        return [
+            f"sweeps of {between} fit best ({still:.2f} m, as given {given:.2f} m) where the ego "
+            "stands still: are points in the world's frame? They must be in the vehicle's"
+        ]
+    return []
+
+
+def _compared_frames(log: DrivingLog) -> tuple[int, int] | None:
+    """Two frames between which the ego has gone some way, as soon as possible."""
+    way = np.concatenate([[0.0], np.cumsum(ego_steps(log))])
+    for first in range(len(way)):
+        later = way[first + 1 : first + 1 + SWEEPS_AHEAD] - way[first]
+        far = np.flatnonzero(later > BETWEEN_SWEEPS_M)
+        if len(far):
+            return first, first + 1 + int(far[0])
+    return None
+
+
+def _standing_points(log: DrivingLog, frame: int) -> Float:
+    """Points of what stands: outside of boxes, and above most traffic and the road, which fits
+    itself however it is moved."""
+    sweep = log.lidar(frame)
+    points = sweep.points.astype(np.float64)
+    away = np.linalg.norm(points - sweep.origin, axis=1)
+    kept = points[(away < 40.0) & (points[:, 2] > np.median(points[:, 2]) + ABOVE_TRAFFIC_M)]
+    to_vehicle = invert_transform(log.ego.transform(int(log.frame_times_us[frame])))
+    for track, pose in _poses(log, frame):
+        local = apply_transform(invert_transform(to_vehicle @ pose), kept)
+        kept = kept[(np.abs(local) > np.array(track.size) / 2 + AROUND_BOX_M).any(axis=1)]
+    return np.asarray(kept[:: max(1, len(kept) // COMPARED_POINTS)])

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .check import ego_steps, gaps_between, questions_to
 from .drawing import draw_frame, draw_top_view
 from .driving_log import DrivingLog, LidarSweep, LogError
 from .images import write_image
-from .plausibility import ego_steps, gaps_between, questions_to
 
 INSPECTED_FRAMES = 3
 PICTURE_WIDTH = 960

@@ -21,7 +21,7 @@ STEP_M = 1.0
 SAME_LANE_M, SAME_HEADING = 1.7, 0.5
 """Ways no farther apart, of about one direction, are of one lane."""
 SHARED = 0.6
-SHORTEST_M = 8.0
+MIN_LENGTH_M = 8.0
 BRIDGED_M = 40.0
 SMOOTH_M = 4.0
 WIDTH_M, WIDTHS_M = 3.4, (2.5, 4.5)
@@ -58,9 +58,9 @@ def lanes_from_log(log: DrivingLog) -> LaneGraph:
     ways = [_line(log.ego.positions)]
     tracks = (t for t in log.tracks if t.category in VEHICLES)
     ways += [_line(t.trajectory.positions - [0, 0, t.size[2] / 2]) for t in tracks]
-    driven = [way for way in ways if len(way) * STEP_M >= SHORTEST_M]
+    driven = [way for way in ways if len(way) * STEP_M >= MIN_LENGTH_M]
     if not driven:
-        raise MapError(f"log {log.name!r}: nobody drives {SHORTEST_M:.0f} m in it")
+        raise MapError(f"log {log.name!r}: nobody drives {MIN_LENGTH_M:.0f} m in it")
     points, intensity = _ground_returns(log)
     made = [_marked(line, points, intensity) for line in _gathered(driven)]
     lanes = [
@@ -126,7 +126,7 @@ def _gathered(ways: list[Float]) -> list[Float]:
         for i, line in enumerate(lanes):
             _, left, agree = _beside(line, way)
             same = (np.abs(left) < SAME_LANE_M) & (agree > np.cos(SAME_HEADING))
-            if same.mean() >= SHARED or same.sum() * STEP_M >= 3 * SHORTEST_M:
+            if same.mean() >= SHARED or same.sum() * STEP_M >= 3 * MIN_LENGTH_M:
                 lanes[i] = _extended(line, way, same)
                 break
         else:

@@ -1,7 +1,7 @@
 """Pictures of corner cases from above: where everybody comes from, and where they meet.
 
 ``python -m real2sim_server.scenarios.picture`` writes those that are shipped, into
-``gallery/pictures``.
+``scenarios/pictures``.
 """
 
 from __future__ import annotations
@@ -17,17 +17,15 @@ from real2sim_proto.storyboard import Storyboard
 from ..edit import ScenarioState
 from ..scene import Scene
 from ..world import World
-from .fit import fitted_to_scene
-from .flat_scene import flat_scene
-from .gallery import GALLERY, CornerCase, corner_case
-from .gallery.case import PICTURES
+from .flat_scene import fitted_to_scene, flat_scene
+from .gallery import GALLERY, PICTURES, CornerCase, corner_case
 
 EGO_SPEED = 10.0
 """At which the ego goes on straight in the pictures [m/s]."""
 
-LONGEST_S = 12.0
+MAX_DURATION_S = 12.0
 LANE, MARGIN = 3.5, 6.0
-MOST_ACROSS = 20.0
+MAX_WIDTH_M = 20.0
 """To either side of the ego's lane [m]."""
 
 ASPECT = 3.0
@@ -94,7 +92,7 @@ def _courses(case: CornerCase, scene: Scene) -> list[DrivenBox]:
     board = fitted_to_scene(_with_speed(case.storyboard()), scene)
     spec = ResetSpec(
         storyboard=board.model_copy(update={"drives_ego": True}),
-        horizon=round(LONGEST_S * 10),
+        horizon=round(MAX_DURATION_S * 10),
         action="pose",
         contact={"dents": False},
     )
@@ -129,7 +127,7 @@ def _passed(courses: Sequence[DrivenBox]) -> bool:
 def _drawn(title: str, courses: Sequence[DrivenBox]) -> str:
     everywhere = [s for course in courses for s in course.poses if abs(s.x) < 1e3]
     low, high = (f(s.x for s in everywhere) for f in (min, max))
-    across = min(max(abs(s.y) for s in everywhere) + 2.0, MOST_ACROSS)
+    across = min(max(abs(s.y) for s in everywhere) + 2.0, MAX_WIDTH_M)
     width = max(high - low + 2 * MARGIN, 2 * ASPECT * across)
     low, half = (low + high - width) / 2, width / ASPECT / 2
     high = low + width

@@ -28,7 +28,7 @@ from torch import Tensor
 from .._numba import kernel
 from ..body import JOINTS, Body, body_model, joint_transforms, keypoints, skin
 from ..body.gait import LEAD, STANDING, Gait, GaitStyle, plan_gait, stride_length
-from ..body.skinning import joint_positions
+from ..body.model import joint_positions
 from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix, quaternion_yaw
 from .cloud import GaussianCloud
 from .errors import SceneError

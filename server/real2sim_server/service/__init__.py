@@ -5,13 +5,12 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``clock``: time as the worker reads it.
 - ``storage``: a ``Database`` that executes statements, and a ``Store`` of scenarios, sessions, jobs
   and stored answers.
-- ``objects``: what workers share, stored by content.
+- ``shared_objects``: bundles and files that workers share, stored by content.
 - ``accounts``: named tokens with roles and limits, and what their holders use.
-- ``preflight``: checks before anything heavy is loaded.
-- ``first_run``: a second process that compiles kernels, started before anything heavy is loaded.
+- ``preflight``: checks, and a second process that compiles kernels, before anything heavy is loaded.
 - ``warm_up``: kernels compiled or loaded before they are needed.
 - ``engine``: the thread that owns the device, and its queue.
-- ``http``: what all answers share: errors, authorisation, idempotency, limits, metrics and
+- ``http``: what all replies share: errors, authorisation, idempotency, limits, telemetry and
   connections.
 - ``library``: scenes and assets, on disk and in memory.
 - ``rendering``: render requests, and images as frames of the wire.
@@ -21,7 +20,6 @@ Its parts, lowest first; each imports only those before it, and no file is part 
 - ``drives``: planners that drive sessions as jobs.
 - ``sweeps``: sweeps and searches, in processes of their own, as jobs.
 - ``membership``: a worker in a fleet: its lease, shared objects, prewarmed scenes, reports.
-- ``tracing``: optional spans of requests and of the engine.
 - ``audit``: the audit log.
 - ``maintenance``: removes leftovers and whatever exceeds the limits.
 - ``worker``: puts all of it together.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, Depends, FastAPI
@@ -21,12 +23,12 @@ from .accounts import ACCOUNT
 from .audit import AuditEntry
 from .clock import now_us
 from .http.auth import READING, LoopbackOnly, OwnPagesOnly, account_of, require_token
-from .http.openapi import published
+from .http.openapi import document, published, text_of
 from .http.requests import BodyLimit, RequestContext, install_replay_handler
 from .http.responses import install_problem_handlers
+from .http.telemetry import Tracing, engine_spans, traces_to
 from .jobs.jobs import Work
-from .routes import assets, drive, jobs, scenarios, scenes, server, sessions, view
-from .tracing import Tracing, engine_spans, traces_to
+from .routes import assets, jobs, scenarios, scenes, server, sessions, sockets
 from .worker import Worker
 
 if TYPE_CHECKING:
@@ -51,8 +53,8 @@ PROTECTED: tuple[APIRouter, ...] = (
 OPEN: tuple[APIRouter, ...] = (
     server.health_router,
     sessions.router,
-    drive.router,
-    view.router,
+    sockets.router,
+    sockets.view_router,
     server.ui_router,
     server.docs_router,
 )
@@ -175,3 +177,9 @@ async def _work_again(worker: Worker, info: JobInfo) -> Work:
     if info.kind == "sweep":
         return await worker.sweeps.rebuild(info)
     return await jobs.rebuild(worker, info)
+
+
+def openapi_text() -> str:
+    """The OpenAPI document of a worker with default settings, as JSON."""
+    with tempfile.TemporaryDirectory() as folder:
+        return text_of(document(create_app(Settings(data_dir=Path(folder)))))

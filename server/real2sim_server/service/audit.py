@@ -83,7 +83,7 @@ class AuditLog:
 
 FLUSH_S = 1.0
 """Between writes; the last second is lost with a worker that is killed."""
-MOST_WAITING = 10_000
+MAX_WAITING = 10_000
 """Entries that wait while the store is in trouble; older ones are dropped then."""
 
 log = structlog.get_logger(__name__)
@@ -98,11 +98,11 @@ class Audit:
 
     def __init__(self, audit_log: AuditLog) -> None:
         self._log = audit_log
-        self._waiting: deque[AuditEntry] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[AuditEntry] = deque(maxlen=MAX_WAITING)
 
     def note(self, entry: AuditEntry) -> None:
         """Remember an entry; it is on record a second later."""
-        if len(self._waiting) == MOST_WAITING:
+        if len(self._waiting) == MAX_WAITING:
             log.error("audit entry dropped", entry=vars(self._waiting[0]))
         self._waiting.append(entry)
 

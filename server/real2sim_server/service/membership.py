@@ -23,9 +23,8 @@ from .accounts import Accounts
 from .http.responses import ServiceError
 from .library.assets import ASSET_SUFFIX, AssetLibrary
 from .library.scenes import BUNDLE_SUFFIX, SceneCache, SceneCatalog
-from .objects.object_store import ObjectStoreError
-from .objects.shared_bundles import BundleFolders, BundleLog, BundleRow, SharedBundle
 from .sessions import Sessions
+from .shared_objects import BundleFolders, BundleLog, BundleRow, ObjectStoreError, SharedBundle
 from .storage.connection import StoreError
 from .storage.fleet import Leases, WorkerRow
 from .storage.job_log import JobLog

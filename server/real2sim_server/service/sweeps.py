@@ -16,9 +16,9 @@ from real2sim_proto.sweeps import SearchMethod, SweepRequest
 from ..scenarios import ScenarioError
 from ..scenarios.gallery import corner_case
 from ..scenarios.openscenario import ReadOptions, read_openscenario_text
+from .drives import CommandProcess
 from .http.requests import IdempotentRequest
 from .http.responses import ServiceError
-from .jobs.command_process import CommandProcess
 from .jobs.exports import pack
 from .jobs.jobs import JobContext, JobResult, Jobs, NewJob, Work
 from .library.scenes import SceneCache

@@ -24,7 +24,7 @@ from ..world import (
     warm_up_planning,
 )
 from ..world import warm_up as warm_up_world
-from .first_run import LOWEST_PRIORITY, Counter, awaited, compile_beside, take_begun
+from .preflight import LOWEST_PRIORITY, Counter, awaited, compile_beside, take_begun
 
 TELL_EVERY_S = 0.5
 

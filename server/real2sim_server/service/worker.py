@@ -29,9 +29,9 @@ from .audit import Audit, AuditLog
 from .drives import Drives
 from .engine import Engine
 from .http.connections import ConnectionLimits, Connections, connection_limit
-from .http.metrics import Metrics
 from .http.requests import Idempotency
 from .http.responses import ServiceError
+from .http.telemetry import Metrics
 from .jobs.exports import VideoSource
 from .jobs.jobs import Jobs
 from .jobs.rollouts import Calibrations, Simulations
@@ -41,13 +41,12 @@ from .library.scenes import MemoryBudget, Quota, SceneCache, SceneCatalog
 from .library.views import SplatFiles
 from .maintenance import Maintenance
 from .membership import Agent, Membership, Prewarming, Sharing, Willingness, takes_work
-from .objects.object_store import open_objects
-from .objects.shared_bundles import BundleFolders, BundleLog
 from .rendering.renderer import Renderer
 from .scenarios.scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .sessions.shared_memory import Segments
+from .shared_objects import BundleFolders, BundleLog, open_objects
 from .storage.connection import owned_folder
 from .storage.fleet import Leases, Notices
 from .storage.job_log import JobLog

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from real2sim_proto.sweeps import (
-    MOST_POINTS,
+    MAX_POINTS,
     ChoiceParameter,
     DerivedParameter,
     FloatParameter,
@@ -31,8 +31,8 @@ from real2sim_proto.sweeps import (
 
 # Numbers, names, ``+ - * / **`` and a few functions.
 
-MOST_CHARACTERS = 200
-MOST_POWER = 64.0
+MAX_CHARACTERS = 200
+MAX_POWER = 64.0
 """An exponent beyond this is refused: such numbers are a mistake."""
 
 BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
@@ -89,7 +89,7 @@ def evaluate(expression: str, values: Mapping[str, float], *, check_only: bool =
 
 
 def _parsed(expression: str) -> ast.Expression:
-    if len(expression) > MOST_CHARACTERS:
+    if len(expression) > MAX_CHARACTERS:
         raise ValueError(f"an expression of {len(expression)} characters; at most 200 are read")
     try:
         return ast.parse(expression.strip(), mode="eval")
@@ -121,8 +121,8 @@ def _value(node: ast.expr, values: Mapping[str, float]) -> Any:
 def _binary(node: ast.BinOp, values: Mapping[str, float]) -> float:
     left, right = _value(node.left, values), _value(node.right, values)
     if isinstance(node.op, ast.Pow):
-        if abs(right) > MOST_POWER:
-            raise ValueError(f"exponent {right:g}; at most {MOST_POWER:g} either way is allowed")
+        if abs(right) > MAX_POWER:
+            raise ValueError(f"exponent {right:g}; at most {MAX_POWER:g} either way is allowed")
         found = left**right
         if isinstance(found, complex):
             raise ArithmeticError("no real number")
@@ -327,8 +327,8 @@ def _grid(method: GridMethod, drawn: Mapping[str, Drawn]) -> Points:
     given = levels if isinstance(levels, dict) else dict.fromkeys(drawn, levels)
     _check_names(given, drawn)
     axes = [p.levels(max(given.get(name, 5), 1)) for name, p in drawn.items()]
-    if (count := math.prod(len(a) for a in axes)) > MOST_POINTS:
-        raise ValueError(f"a grid of {count} points; {MOST_POINTS} are the most")
+    if (count := math.prod(len(a) for a in axes)) > MAX_POINTS:
+        raise ValueError(f"a grid of {count} points; {MAX_POINTS} are the most")
     return np.array(list(itertools.product(*axes)), np.float64).reshape(count, len(drawn))
 
 

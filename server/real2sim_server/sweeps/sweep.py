@@ -25,8 +25,7 @@ from ..world.recording.recording import save_recording
 from ..world.scoring import metrics_version
 from .episode import CameraFeed, Drive, Driven, drive_episode, recording_of
 from .parameters import Choice, IntRange, Value, drawn_parameters, points_of, values_at
-from .spec import SweepSpec
-from .storyboard_space import open_scene, write_scenario_file
+from .spec import SweepSpec, open_scene, write_scenario_file
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,8 +36,8 @@ if TYPE_CHECKING:
 # Rows of episodes on disk, so that a sweep continues where it was killed.
 
 FORMAT = "real2sim-episodes 1"
-MOST_BYTES = 4 << 30
-MOST_LINE = 1 << 20
+MAX_BYTES = 4 << 30
+MAX_LINE = 1 << 20
 
 
 class Journal:
@@ -95,11 +94,11 @@ class Journal:
 
     def _read(self) -> int:
         """Take in all whole lines; where the last of them ends."""
-        if (size := self._path.stat().st_size) > MOST_BYTES:
-            raise ValueError(f"{self._path} has {size} bytes; at most {MOST_BYTES} are read")
+        if (size := self._path.stat().st_size) > MAX_BYTES:
+            raise ValueError(f"{self._path} has {size} bytes; at most {MAX_BYTES} are read")
         end = 0
         with self._path.open("rb") as file:
-            first = file.readline(MOST_LINE)
+            first = file.readline(MAX_LINE)
             if not first.endswith(b"\n"):
                 if not (FORMAT.encode() + b"\n").startswith(first):
                     raise ValueError(f"{self._path} is no journal of episodes")
@@ -107,7 +106,7 @@ class Journal:
             if first.rstrip(b"\n") != FORMAT.encode():
                 raise ValueError(f"{self._path} is no journal of episodes of this version")
             end = file.tell()
-            while (line := file.readline(MOST_LINE)).endswith(b"\n"):
+            while (line := file.readline(MAX_LINE)).endswith(b"\n"):
                 end = file.tell()
                 if (found := _row(line)) is not None:
                     self.rows[found[0]] = found[1]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..body.bicycle import CRANK, FRAME, RIM, SADDLE, SURFACES, TYRE, Ride
-from ..body.skinning import vertex_normals
+from ..body.model import vertex_normals
 from ..geometry.transform import Float, apply_transform, invert_transform
 from .casting import Geometry, Instances, append_geometry, refit
 from .materials import PLAIN

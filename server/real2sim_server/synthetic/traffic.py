@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..body import Body, Pose, body_model, joint_transforms, keypoints, skin
 from ..body.bicycle import Ride, plan_ride
 from ..body.gait import Gait, GaitStyle, plan_gait
-from ..body.skinning import joint_positions
+from ..body.model import joint_positions
 from ..geometry.transform import Float, slerp, transform_from, yaw_quaternion
 from ..scene import Trajectory
 from .materials import PARKING_BAY

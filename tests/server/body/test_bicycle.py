@@ -7,8 +7,7 @@ import pytest
 
 from real2sim_server.body import body_model, joint_transforms
 from real2sim_server.body.bicycle import GEAR, TYRE, plan_ride
-from real2sim_server.body.model import JOINTS
-from real2sim_server.body.skinning import joint_positions
+from real2sim_server.body.model import JOINTS, joint_positions
 
 MODEL = body_model()
 T = np.arange(0.0, 4.0, 0.1)

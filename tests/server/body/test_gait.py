@@ -7,9 +7,7 @@ import pytest
 
 from real2sim_server.body import body_model, joint_transforms
 from real2sim_server.body.gait import Foot, Gait, GaitStyle, plan_gait, stride_length
-from real2sim_server.body.limbs import UP, about
-from real2sim_server.body.model import JOINTS
-from real2sim_server.body.skinning import joint_positions
+from real2sim_server.body.model import JOINTS, UP, about, joint_positions
 
 MODEL = body_model()
 T = np.arange(0.0, 6.0, 0.1)

@@ -10,8 +10,14 @@ import pytest
 
 import real2sim_server.body
 from real2sim_server.body import body_model, joint_transforms, keypoints, rest_pose, skin
-from real2sim_server.body.model import JOINTS, KEYPOINTS
-from real2sim_server.body.skinning import Pose, joint_positions, skin_reference, vertex_normals
+from real2sim_server.body.model import (
+    JOINTS,
+    KEYPOINTS,
+    Pose,
+    joint_positions,
+    skin_reference,
+    vertex_normals,
+)
 
 MODEL = body_model()
 MODEL_FILE = Path(real2sim_server.body.__file__).with_name("asset.npz")

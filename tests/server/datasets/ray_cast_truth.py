@@ -15,7 +15,7 @@ from real2sim_server.scene import Scene
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 from real2sim_server.synthetic.sensors import shoot_image
 
-LEAST_PIXELS = 100
+MIN_PIXELS = 100
 ABOVE_ALL = 1000.0
 """A vehicle and the camera lifted so high [m] have nothing around them."""
 
@@ -105,7 +105,7 @@ def _compare_objects(figures: Figures, log: SyntheticLog, view, truth, t_us: int
     for seen in view.objects:
         true = instance == names[seen.object_id]
         count = int(true.sum())
-        if count < LEAST_PIXELS:
+        if count < MIN_PIXELS:
             continue
         mask = images.instance == seen.instance_id
         iou = float((mask & true).sum() / (mask | true).sum())

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from real2sim_server.datasets.clips import ClipMakers
 from real2sim_server.datasets.drive import ScenarioDrive
 from real2sim_server.datasets.export import export_dataset
-from real2sim_server.datasets.makers import ClipMakers
 from real2sim_server.datasets.plan import ExportPlan, Variant
 from real2sim_server.edit import ScenarioState
 from real2sim_server.executors import executor_of

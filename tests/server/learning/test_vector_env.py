@@ -11,10 +11,10 @@ from gymnasium.vector import AutoresetMode
 
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
+from real2sim_server import learning
 from real2sim_server.demo.street import SHIPPED
 from real2sim_server.edit import ScenarioState
-from real2sim_server.learning import VectorDriveEnv, vector_env
-from real2sim_server.learning.batch_images import fitted
+from real2sim_server.learning import VectorDriveEnv, fitted
 from real2sim_server.render import rasterize
 from real2sim_server.render.images import to_uint8
 from real2sim_server.render.rasterize import SMALL_IMAGES
@@ -161,4 +161,4 @@ def test_bad_calls_are_refused(street: Scene) -> None:
 
 
 def test_the_example_runs() -> None:
-    assert doctest.testmod(vector_env).failed == 0
+    assert doctest.testmod(learning).failed == 0

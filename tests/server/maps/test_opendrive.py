@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from real2sim_server.maps import MapError, read_map
-from real2sim_server.maps.opendrive.roads import arc, cubic, line, read_plan_view, spiral
+from real2sim_server.maps.opendrive_roads import arc, cubic, line, read_plan_view, spiral
 
 HEADER = '<header revMajor="1" revMinor="7" name="m"/>'
 LANES = """<lanes>{offset}<laneSection s="0"><left><lane id="1" type="driving">

@@ -9,8 +9,7 @@ import pytest
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import ScenarioState
-from real2sim_server.scenarios.fit import fitted_to_scene
-from real2sim_server.scenarios.flat_scene import flat_scene
+from real2sim_server.scenarios.flat_scene import fitted_to_scene, flat_scene
 from real2sim_server.scenarios.gallery import GALLERY, corner_case
 from real2sim_server.scenarios.openscenario import read_openscenario_text, write_openscenario
 from real2sim_server.world import World

@@ -30,8 +30,8 @@ from websockets.sync.client import connect
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
 from real2sim_server.scene.io import save_scene
-from real2sim_server.service.http.metrics import Metrics
-from real2sim_server.service.routes import view as view_route
+from real2sim_server.service.http.telemetry import Metrics
+from real2sim_server.service.routes import sockets as view_route
 from real2sim_server.service.serve import RunningWorker, running_worker
 from real2sim_server.service.sessions import messages
 from real2sim_server.settings import Settings

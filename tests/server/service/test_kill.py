@@ -36,7 +36,7 @@ exports._render_frame = render_unless_held
 """Code for a worker, whose videos wait behind their first frame for as long as a file exists."""
 
 KILLS = 2
-MOST_BETWEEN = 6
+MAX_BETWEEN = 6
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_nothing_acknowledged_is_lost_between_any_two_requests(start):
             assert again.json()["revision"] == last["revision"]
         if round_ == KILLS:
             break
-        for n in range(choose.randint(1, MOST_BETWEEN)):
+        for n in range(choose.randint(1, MAX_BETWEEN)):
             key = f"{round_}-{n}"
             json = {"operations": [{"op": "translate", "object_id": "post", "x": 0.5}]}
             target = f"{url}/operations"

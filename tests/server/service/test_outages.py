@@ -14,7 +14,7 @@ import httpx2
 import pytest
 
 from real2sim_proto import DRIVE_SUBPROTOCOL, decode, encode
-from real2sim_server.demo.worker import worker_process
+from real2sim_server.demo.run import worker_process
 from real2sim_server.scene.io import save_scene, write_splats
 from tests.waiting import wait_until
 
@@ -25,7 +25,7 @@ from .waiting import accepted, finished, is_ready, succeeded, wait_ready
 
 pytestmark = pytest.mark.network
 
-OUTAGE_S, LEAST_ROUNDS = 30.0, 20
+OUTAGE_S, MIN_ROUNDS = 30.0, 20
 PATIENT = {"REAL2SIM_STORE_TIMEOUT_SECONDS": "60"}
 """No disk that works is slower, however busy the machine is."""
 JOB = {"scene": "tiny", "camera": "front", "fps": 2, "width": 64}
@@ -142,7 +142,7 @@ def test_a_clock_that_goes_back_by_an_hour_and_forth_again_changes_nothing(apart
 def rounds() -> Iterator[None]:
     """Rounds of an outage, until it has lasted long enough and there were some."""
     began, count = time.monotonic(), 0
-    while count < LEAST_ROUNDS or time.monotonic() - began < OUTAGE_S:
+    while count < MIN_ROUNDS or time.monotonic() - began < OUTAGE_S:
         yield
         time.sleep(0.5)
         count += 1

@@ -8,7 +8,7 @@ import re
 import pytest
 
 from real2sim_server.service.app import create_app, trace
-from real2sim_server.service.tracing import provider_of
+from real2sim_server.service.http.telemetry import provider_of
 from tests.waiting import LIMIT_S
 
 from .test_placement import site  # noqa: F401, a fixture

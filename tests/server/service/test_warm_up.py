@@ -8,7 +8,7 @@ import pytest
 
 from real2sim_proto.episode import ContactSpec, EgoSpec, ResetSpec, SensorSpec
 from real2sim_server._numba import Made
-from real2sim_server.service import first_run, warm_up
+from real2sim_server.service import preflight, warm_up
 from real2sim_server.service.warm_up import KernelWarmUp
 from real2sim_server.world import plans_ahead
 from real2sim_server.world.driving import advance_vehicle
@@ -126,7 +126,7 @@ def test_on_the_first_run_another_process_compiles_beside_the_renderer(monkeypat
     monkeypatch.setattr(warm_up, "kernels_on_disk", lambda: False)
     monkeypatch.setattr(warm_up, "warm_up_world", lambda: None)
     left = tmp_path / "left"
-    monkeypatch.setattr(first_run, "_PROGRAM", f"open({str(left)!r}, 'w').write('done')")
+    monkeypatch.setattr(preflight, "_PROGRAM", f"open({str(left)!r}, 'w').write('done')")
 
     asyncio.run(KernelWarmUp().run(nothing))
 
@@ -135,7 +135,7 @@ def test_on_the_first_run_another_process_compiles_beside_the_renderer(monkeypat
 
 def test_kernels_that_the_other_process_has_made_ready_count(monkeypatch):
     program = "import sys; print('1 28'); print('2 28', flush=True); sys.stdin.read()"
-    monkeypatch.setattr(first_run, "_PROGRAM", program)
+    monkeypatch.setattr(preflight, "_PROGRAM", program)
     monkeypatch.setattr(warm_up, "kernels_on_disk", lambda: False)
     monkeypatch.setattr(warm_up, "made", Made(3, 12))
     monkeypatch.setattr(warm_up, "warm_up_world", lambda: None)
@@ -151,7 +151,7 @@ def test_kernels_that_the_other_process_has_made_ready_count(monkeypatch):
 
 
 def test_the_other_process_tells_how_many_it_has_made_ready(worker_kernels):
-    process = first_run.compile_beside("warm_up")
+    process = preflight.compile_beside("warm_up")
     written, _ = process.communicate(timeout=LIMIT_S)
     assert written.split()[-2:] == [b"28", b"28"]
 
@@ -161,14 +161,14 @@ def test_compiling_begins_before_libraries_are_loaded_where_nothing_is_kept(
     monkeypatch, tmp_path, kept
 ):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(first_run, "_PROGRAM", "")
+    monkeypatch.setattr(preflight, "_PROGRAM", "")
     for name in kept:
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).touch()
 
-    first_run.begin_compiling()
+    preflight.begin_compiling()
 
-    process = first_run.take_begun()
+    process = preflight.take_begun()
     assert (process is None) == bool(kept)
     if process is not None:
         process.communicate(timeout=LIMIT_S)
@@ -177,17 +177,17 @@ def test_compiling_begins_before_libraries_are_loaded_where_nothing_is_kept(
 
 def test_what_names_the_kernel_on_disk_names_it_as_numba_does():
     index = advance_vehicle._cache._impl.filename_base
-    assert fnmatch(f"{index}.py311.nbi", first_run.KEPT)
+    assert fnmatch(f"{index}.py311.nbi", preflight.KEPT)
 
 
 def test_a_worker_that_ends_early_takes_the_second_process_with_it(monkeypatch):
-    monkeypatch.setattr(first_run, "_PROGRAM", "import time; time.sleep(3600)")
-    process = first_run.compile_beside("warm_up")
-    monkeypatch.setattr(first_run, "_begun", [process])
+    monkeypatch.setattr(preflight, "_PROGRAM", "import time; time.sleep(3600)")
+    process = preflight.compile_beside("warm_up")
+    monkeypatch.setattr(preflight, "_begun", [process])
 
     async def ended_early() -> None:
         task = asyncio.ensure_future(KernelWarmUp().run(nothing))
-        await wait_until_async(lambda: not first_run._begun, "the worker to wait for it")
+        await wait_until_async(lambda: not preflight._begun, "the worker to wait for it")
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task

@@ -14,8 +14,7 @@ from scipy.stats import norm
 from real2sim.planners import Needs, load_planner
 from real2sim_server.policies.suite import Case
 from real2sim_server.scene.io import load_scene
-from real2sim_server.sweeps.criticality import Danger, adversaries_of
-from real2sim_server.sweeps.episode import Drive, begin, drive_episode
+from real2sim_server.sweeps.episode import Danger, Drive, adversaries_of, begin, drive_episode
 from real2sim_server.sweeps.search.evaluation import (
     SIDEWAYS,
     Evaluation,

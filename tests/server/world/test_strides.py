@@ -9,8 +9,7 @@ import torch
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import ScenarioState
-from real2sim_server.scenarios.fit import fitted_to_scene
-from real2sim_server.scenarios.flat_scene import flat_scene
+from real2sim_server.scenarios.flat_scene import fitted_to_scene, flat_scene
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.world import World
 from real2sim_server.world.sensing import ray_targets

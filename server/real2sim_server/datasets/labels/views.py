@@ -19,7 +19,7 @@ from .boxes import NEAR, Box2D, ObjectBox, area, cut_at_border, projected_box
 from .images import CameraImages, body_of, rays_of, window_about
 from .pixels import surface_mask
 
-SMALLEST_BLOB = 8
+MIN_BLOB_PIXELS = 8
 """Connected pixels of an object that are fewer do not count [px]."""
 
 ALONE = RasterOptions(depth=False, instance=True, median_depth=True)
@@ -117,11 +117,11 @@ def _modal(instance: NDArray[np.uint16], window: Window) -> tuple[Box2D | None, 
 
 
 def without_blobs(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A mask [H, W] without connected parts of fewer than SMALLEST_BLOB pixels."""
+    """A mask [H, W] without connected parts of fewer than MIN_BLOB_PIXELS pixels."""
     if not mask.any():
         return mask
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST_BLOB
+    large = stats[:, cv2.CC_STAT_AREA] >= MIN_BLOB_PIXELS
     large[0] = False
     kept: NDArray[np.bool_] = large[labels]
     return kept

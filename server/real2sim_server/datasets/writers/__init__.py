@@ -4,13 +4,11 @@ from ..drive import DatasetError
 from .argoverse2 import Argoverse2Writer
 from .coco import CocoWriter
 from .kitti import KittiRawWriter, KittiWriter
-from .labels import LabelsWriter
 from .mcap import McapWriter
 from .ncore import NCoreWriter
 from .nuscenes import NuScenesWriter
-from .pictures import PicturesWriter
+from .plain import LabelsWriter, PicturesWriter, WebDatasetWriter
 from .waymo import WaymoWriter
-from .webdataset import WebDatasetWriter
 from .writer import DatasetWriter, LabelledDrive
 
 WRITERS: list[DatasetWriter] = [

@@ -42,7 +42,7 @@ EGO_KEYS = ("size", *POSE_KEYS)
 TRACK_KEYS = ("object_id", "category", "size", *POSE_KEYS)
 SWEEP_SHAPES = {"points": (-1, 3), "intensity": (-1,), "offset_us": (-1,), "origin": (3,)}
 """-1 stands for the number of points."""
-FARTHEST_OFFSET_US = 10_000_000
+MAX_OFFSET_US = 10_000_000
 """Points of one sweep are measured nearer to its frame's time than this."""
 
 
@@ -318,7 +318,7 @@ def _read_sweep(path: Path) -> LidarSweep:
                 f"{path}: {name} must be finite, but {bad} of its values are NaN or infinite; "
                 "leave such points out"
             )
-    if len(points) and np.abs(offset_us.astype(np.float64)).max() > FARTHEST_OFFSET_US:
+    if len(points) and np.abs(offset_us.astype(np.float64)).max() > MAX_OFFSET_US:
         raise LogError(
             f"{path}: offset_us goes from {offset_us.min()} to {offset_us.max()}; it must be "
             "relative to the frame's time, in microseconds (the point's time minus the frame's)"

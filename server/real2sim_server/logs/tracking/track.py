@@ -13,8 +13,15 @@ from numpy.typing import NDArray
 from ...geometry.transform import Float, apply_transform, invert_transform, yaw_quaternion
 from ...scene import Trajectory
 from ..driving_log import DrivingLog, LidarSweep, ObjectTrack
-from .association import FittedBox, Track, associate, fit_box
-from .clusters import LidarCluster, SweepRays, find_clusters
+from .association import (
+    FittedBox,
+    LidarCluster,
+    SweepRays,
+    Track,
+    associate,
+    find_clusters,
+    fit_box,
+)
 
 MAX_LENGTH, MAX_WIDTH, MAX_HEIGHT = 20.0, 3.9, 4.3
 MIN_STRAIGHTNESS = 0.6

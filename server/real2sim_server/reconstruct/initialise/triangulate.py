@@ -24,7 +24,7 @@ BASELINES = (0.5, 1.5, 4.0)
 """Two images of a camera are matched when so far apart [m]; and a step further, each."""
 MIN_STEP = 0.2
 """Images of a camera closer to each other than this tell nothing new [m]."""
-NEAREST_DEPTH, FARTHEST_DEPTH = 1.0, 400.0
+MIN_DEPTH, MAX_DEPTH = 1.0, 400.0
 EPIPOLAR_ERROR = 1.5
 """Largest distance of a match from its epipolar line, and of an image from its point [px]."""
 RATIO = 0.8
@@ -237,8 +237,8 @@ def _points(
         (single == counts)
         & in_front
         & (worst <= EPIPOLAR_ERROR)
-        & (distance >= NEAREST_DEPTH)
-        & (distance <= FARTHEST_DEPTH)
+        & (distance >= MIN_DEPTH)
+        & (distance <= MAX_DEPTH)
         & (deviation <= RELATIVE_ERROR * distance)
     )
     return TriangulatedPoints(

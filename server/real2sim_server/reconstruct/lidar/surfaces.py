@@ -36,7 +36,7 @@ VOXEL, VOXEL_PER_METRE = 0.1, 0.006
 """Edge of voxels in the background [m], and its growth with the distance from the drive."""
 OBJECT_VOXEL = 0.05
 MAX_BACKGROUND, MAX_OBJECT = 300_000, 40_000
-LARGEST_OBJECT = 0.15
+MAX_OBJECT_SURFEL = 0.15
 """Scale along surfaces of objects, at most [m]."""
 SMALLEST = 0.004
 """Scale along normals, at least [m]; beams measure to millimetres."""
@@ -97,7 +97,7 @@ class MeasuredPoints:
             points = thin_to(points, OBJECT_VOXEL, MAX_OBJECT)
             return _filled(
                 points,
-                fit_surfels(points.points, largest=LARGEST_OBJECT, smallest=SMALLEST),
+                fit_surfels(points.points, largest=MAX_OBJECT_SURFEL, smallest=SMALLEST),
                 completion,
                 np.zeros(len(completion), np.float32),
             )

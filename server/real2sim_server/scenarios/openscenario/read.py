@@ -27,8 +27,7 @@ from .elements import (
     top_level,
     unread,
 )
-from .read_actions import Actions
-from .read_conditions import Conditions, Fields, Positions, plain_value
+from .parts import Actions, Conditions, Fields, Positions, plain_value
 
 # --- Catalogs ------------------------------------------------------------------------------------
 

@@ -34,10 +34,10 @@ from .responses import SECURITY_HEADERS, ServiceError, problem_of
 if TYPE_CHECKING:
     import uvicorn
 
-    from .metrics import Metrics
+    from .telemetry import Metrics
 
 SWEEP_S = 1.0
-SLOWEST_BYTES_PER_S = 10_000
+MIN_BYTES_PER_S = 10_000
 """A client that sends or reads faster than this is never dropped for being slow."""
 NEAR, FAR = 0.8, 0.6
 """Shares of the limit at which a warning is given, and below which it may be given again."""
@@ -347,7 +347,7 @@ class Connection(asyncio.Protocol):
             return DropReason.HEAD_TIMEOUT
         if self._body_since is not None:
             waited = self._body_waited_s + now - self._body_since
-            if waited > limits.body_s + self.received / SLOWEST_BYTES_PER_S:
+            if waited > limits.body_s + self.received / MIN_BYTES_PER_S:
                 return DropReason.BODY_TIMEOUT
         return None
 
@@ -417,7 +417,7 @@ class Backlog:
     """What a client has not read yet, as the sweep sees it.
 
     Args:
-        allowed_s: without reading at :data:`SLOWEST_BYTES_PER_S`.
+        allowed_s: without reading at :data:`MIN_BYTES_PER_S`.
     """
 
     def __init__(self, allowed_s: float) -> None:
@@ -433,7 +433,7 @@ class Backlog:
             self._since, self._read = now, 0
         self._read += max(0, self._bytes - size)
         self._bytes = size
-        return size > 0 and now - self._since > self._allowed_s + self._read / SLOWEST_BYTES_PER_S
+        return size > 0 and now - self._since > self._allowed_s + self._read / MIN_BYTES_PER_S
 
     def cleared(self) -> None:
         """The client has read all but what the transport takes without asking."""
@@ -527,7 +527,7 @@ _FAILURES = {
     ),
     DropReason.BODY_TIMEOUT: lambda limits: ServiceError(
         ErrorCode.REQUEST_TIMEOUT,
-        f"the body came more slowly than {SLOWEST_BYTES_PER_S} bytes a second, and "
+        f"the body came more slowly than {MIN_BYTES_PER_S} bytes a second, and "
         f"{limits.body_s:g} s more",
         hint="send it again, whole",
     ),

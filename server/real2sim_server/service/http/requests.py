@@ -30,7 +30,7 @@ from .auth import account_of
 from .responses import REQUEST_ID_KEY, ServiceError, problem_response, secure, service_error
 
 if TYPE_CHECKING:
-    from .metrics import Metrics
+    from .telemetry import Metrics
 
 
 CLIENT_HEADER = "X-Real2Sim-Client"

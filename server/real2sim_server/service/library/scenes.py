@@ -26,7 +26,7 @@ from ...scene import BundleError, Scene, SceneError
 from ...scene.io import SceneSummary, load_scene, read_scene_summary
 from ..engine import Engine, Priority
 from ..http.responses import ServiceError
-from ..objects.shared_bundles import mark_used
+from ..shared_objects import mark_used
 
 # Budgets: memory for loaded scenes and assets, disk space for the worker's folders.
 

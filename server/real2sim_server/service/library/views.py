@@ -140,7 +140,7 @@ def track(trajectory: Trajectory) -> Track:
 GZIP_LEVEL = 1
 """Packs in a sixth of the time of level 9, into 3 % more bytes."""
 
-MOST_BYTES = 64 << 20
+MAX_BYTES = 64 << 20
 
 Kept = TypeVar("Kept", bytes, Tensor)
 
@@ -155,7 +155,7 @@ class SplatFiles:
         most_bytes: of what is kept: orders and files.
     """
 
-    def __init__(self, *, most_bytes: int = MOST_BYTES) -> None:
+    def __init__(self, *, most_bytes: int = MAX_BYTES) -> None:
         self._most_bytes = most_bytes
         self._kept: OrderedDict[tuple[object, ...], bytes | Tensor] = OrderedDict()
         self._bytes = 0

@@ -32,9 +32,9 @@ from ...render.frame import (
 )
 from ...scene import Camera
 from ..engine import Engine
-from ..first_run import awaited, compile_beside
 from ..http.responses import ServiceError
 from ..library.scenes import IdleItem, MemoryBudget
+from ..preflight import awaited, compile_beside
 
 log = structlog.get_logger(__name__)
 

@@ -42,8 +42,8 @@ from ...render.lens import with_ground
 from ...render.modalities import modality_names, modality_of, options_for
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ..engine import Engine, Priority, lower_priority
-from ..http.metrics import Metrics
 from ..http.responses import ServiceError, choose_among, etag
+from ..http.telemetry import Metrics
 from ..library.scenes import MemoryBudget
 from .background import BackgroundCompile, DetailLevels, LensKernels
 from .frames import EncodedFrame, FollowingImage, RenderedImage, blurred, camera_with, encode_frame
@@ -53,7 +53,7 @@ log = structlog.get_logger(__name__)
 T = TypeVar("T")
 R = TypeVar("R")
 
-MOST_ENCODERS = 8
+MAX_ENCODERS = 8
 BULK_NICENESS = 10
 """Of the thread that encodes large pictures; the engine's is less, see there."""
 
@@ -348,7 +348,7 @@ def encoder_threads() -> int:
     """Images that are encoded at a time: on half of the cores, two at least."""
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
-    return max(2, min(MOST_ENCODERS, cores // 2))
+    return max(2, min(MAX_ENCODERS, cores // 2))
 
 
 def _priority(cameras: Sequence[Camera], stream: str) -> Priority:

@@ -34,7 +34,7 @@ from real2sim_proto.storyboard import Storyboard
 
 from ...edit.compose import Part, ply_of_points, points_at
 from ...scenarios import ScenarioError
-from ...scenarios.fit import fitted_to_scene
+from ...scenarios.flat_scene import fitted_to_scene
 from ...scenarios.gallery import GALLERY, corner_case, shipped_picture
 from ...scenarios.openscenario import ReadOptions, read_openscenario_text, write_openscenario
 from ..http.auth import TokenRoute

@@ -23,9 +23,9 @@ from real2sim_proto.scenarios import (
 from ...edit import AssetLookup, EditError, LogEntry, PlannedEntry, Scenario, ScenarioState
 from ...scene.io import SceneSummary
 from ..clock import now_us
-from ..http.metrics import Metrics
 from ..http.requests import IdempotentRequest
 from ..http.responses import ServiceError, uncancellable
+from ..http.telemetry import Metrics
 from ..library.scenes import BUNDLE_SUFFIX, SceneCache
 from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply
 from .scenario_cache import (

@@ -38,7 +38,7 @@ from ...scene import Camera, Scene
 from ...world import World
 from ...world.ranging import NO_SENSORS, Cloud, Mounted, MountedLidar, RangingSensors
 from ..engine import Engine, Priority
-from ..http.metrics import Metrics
+from ..http.telemetry import Metrics
 from ..rendering.frames import EncodedFrame, RenderedImage, cloud_parts, needs_motion
 from ..rendering.renderer import Renderer, RenderRequest
 from ..storage.store import Claim, SessionEntry, Store

@@ -27,9 +27,9 @@ from ...world.recording.replay import Entry, Replayer, last_episode, no_action_i
 from ...world.scoring import scores_of
 from .. import clock
 from ..accounts import Accounts, owner_name, token_hash
-from ..http.metrics import Metrics
 from ..http.requests import IdempotentRequest
 from ..http.responses import ServiceError
+from ..http.telemetry import Metrics
 from ..library.scenes import SceneCache
 from ..scenarios.scenarios import Scenarios
 from ..storage.fleet import Leases

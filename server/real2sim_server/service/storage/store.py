@@ -26,7 +26,7 @@ from .schema import Claim, Policy, ScenarioRow, SessionEntry, SessionRow, Snapsh
 ClaimedEntries = tuple[Claim, Sequence[SessionEntry]]
 """What a session's log gets, and by which right."""
 
-MOST_ROWS = 32
+MAX_ROWS = 32
 """Entries that one statement appends; more of them take turns."""
 
 COLUMNS = "session_id, seq, kind, step, payload, created_us"
@@ -47,9 +47,9 @@ def appended(logs: Sequence[ClaimedEntries], *, on_server: bool) -> list[Write]:
         for entry in entries
     ]
     if on_server:
-        pieces = [values[k : k + MOST_ROWS] for k in range(0, len(values), MOST_ROWS)]
+        pieces = [values[k : k + MAX_ROWS] for k in range(0, len(values), MAX_ROWS)]
         return [_appended_on_server(piece) for piece in pieces]
-    if len(values) > MOST_ROWS:
+    if len(values) > MAX_ROWS:
         return [Write(_append(1), values, fenced=len(values))]
     return [Write(_append(len(values)), [tuple(chain.from_iterable(values))], fenced=len(values))]
 

@@ -15,8 +15,7 @@ from real2sim_proto.plans import TrajectoryPlan
 
 from ...scene import Scene
 from ...world import World
-from ..criticality import adversaries_of, signed_gaps
-from ..episode import OPERATIONS, Drive, Driven, begin, drive_episode
+from ..episode import OPERATIONS, Drive, Driven, adversaries_of, begin, drive_episode, signed_gaps
 from ..parameters import Value, drawn_parameters, values_at
 from ..spec import Space
 
@@ -36,7 +35,7 @@ SIDEWAYS = 5.0
 dry asphalt give."""
 KEEPS_FREE = 0.2
 """To everybody, or what there was at the start where that was less [m]."""
-LEAST_TIME = 1.0
+MIN_TIME = 1.0
 """To a collision at constant velocities when a manoeuvre ends [s]."""
 
 
@@ -192,7 +191,7 @@ def _end(world: World, manoeuvre: Manoeuvre, wanted: float) -> tuple[float, floa
         left = copy.accumulator.off_road and not was_off
         if copy.accumulator.collisions or left or smallest < wanted:
             return step * copy.context.dt, smallest
-    near = not copy.over and copy.accumulator.ttc < LEAST_TIME
+    near = not copy.over and copy.accumulator.ttc < MIN_TIME
     return (HORIZON if near else math.inf), smallest
 
 
@@ -208,9 +207,9 @@ TIGHTEST = 0.2
 """Curvature of the way of a vehicle, whatever its speed [1/m]: none turns within 5 m."""
 START_GAP = 1.0
 """Free around the ego when the episode begins [m]."""
-FEWEST_DRIVERS = 5
+MIN_DRIVERS = 5
 """A log with fewer that move says nothing about how people drive there."""
-LEAST_SPREAD = np.array([1.0, 0.5, 0.5])
+MIN_SPREAD = np.array([1.0, 0.5, 0.5])
 """Standard deviations are at least these: speed [m/s], accelerations [m/s^2]."""
 ORDINARY = 3.0
 """Standard deviations within which nothing is subtracted."""
@@ -242,10 +241,10 @@ class Manners:
             motion = _motion(points, 0.2)
             if len(motion) and motion[:, 0].max() > 1.0:
                 rows.append(_features(motion))
-        if len(rows) < FEWEST_DRIVERS:
+        if len(rows) < MIN_DRIVERS:
             return cls(None, None)
         found = np.array(rows)
-        return cls(found.mean(axis=0), np.maximum(found.std(axis=0), LEAST_SPREAD))
+        return cls(found.mean(axis=0), np.maximum(found.std(axis=0), MIN_SPREAD))
 
     def distance(self, features: Array) -> float:
         """Mahalanobis distance beyond what is ordinary; 0 where the log says nothing."""
@@ -335,7 +334,7 @@ def _beyond(values: Array, most: float) -> float:
 
 UNAVOIDABLE, REFUSED = -1.0, -200.0
 """Scores of a failure that the reference does not avoid, and of what cannot begin."""
-MOST_STRANGE = 0.5
+MAX_STRANGE = 0.5
 """A collision in a case that is less plausible than this is no finding."""
 SPEED_BIN = 2.0
 """Width of the archive's cells [m/s]."""
@@ -377,7 +376,7 @@ class Evaluation:
     @property
     def is_failure(self) -> bool:
         """Whether the planner was at fault for what could be avoided, in a plausible case."""
-        return self.at_fault and bool(self.avoided) and self.implausibility <= MOST_STRANGE
+        return self.at_fault and bool(self.avoided) and self.implausibility <= MAX_STRANGE
 
 
 class Evaluator:
@@ -421,7 +420,7 @@ class Evaluator:
             # A finding is above 0; what nobody avoids, or nobody does, is not sought.
             if not avoided:
                 score = UNAVOIDABLE - strange
-            elif strange > MOST_STRANGE:
+            elif strange > MAX_STRANGE:
                 score = -strange
             else:
                 score = max(score, 0.01)

@@ -155,7 +155,7 @@ STEP = 0.25
 """Standard deviation that CMA-ES begins with, of a range."""
 STALE = 3
 """Generations without anything better after which it begins elsewhere."""
-START, LEAST_START = 8, 4
+START, MIN_START = 8, 4
 """Spread points in all, and of each space."""
 BATCH = 8
 """Points by the surrogate before spaces are weighed again."""
@@ -163,7 +163,7 @@ OPTIMISM = (2.0, 0.5, 1.0)
 """Standard deviations that are added to what the surrogate expects, by turns."""
 REFIT = 4
 """Points after which the surrogate's length scales are fitted anew."""
-MOST_SEEN = 160
+MAX_SEEN = 160
 """Points that it goes through: the most critical ones, and the latest."""
 UNIFORM, NEAR, AROUND = 600, 60, 6
 """Places that are looked at: anywhere, and around each of so many of the most critical points."""
@@ -260,7 +260,7 @@ def _points(
 def _start(evaluate: Evaluator, budget: SearchBudget) -> Iterator[tuple[int, Point]]:
     """Spread points of every space, spaces by turns."""
     spaces = len(evaluate.spaces)
-    each = max(START // spaces, LEAST_START)
+    each = max(START // spaces, MIN_START)
     clouds = [
         spread("sobol", each, evaluate.dimensions(k), seed=budget.seed) for k in range(spaces)
     ]
@@ -301,10 +301,10 @@ def _guided(
 
 def _telling(seen: Sequence[Evaluation]) -> list[Evaluation]:
     """The most critical ones and the latest, in their order."""
-    if len(seen) <= MOST_SEEN:
+    if len(seen) <= MAX_SEEN:
         return list(seen)
-    ranked = sorted(range(len(seen)), key=lambda k: -seen[k].score)[: MOST_SEEN // 2]
-    return [seen[k] for k in sorted({*ranked, *range(len(seen) - MOST_SEEN // 2, len(seen))})]
+    ranked = sorted(range(len(seen)), key=lambda k: -seen[k].score)[: MAX_SEEN // 2]
+    return [seen[k] for k in sorted({*ranked, *range(len(seen) - MAX_SEEN // 2, len(seen))})]
 
 
 def _compressed(scores: Point) -> Point:

@@ -17,17 +17,15 @@ from real2sim.planners import load_planner, needs_of
 
 from ..._files import atomic_file
 from ...console import CommandError
-from ...policies.plots import film_episode
+from ...policies.page import film_episode
 from ...scene import Scene
 from ...world.recording.recording import first_difference, save_recording
 from ..episode import CameraFeed, Driven, drive_episode, recording_of
 from ..parameters import drawn_parameters
-from ..spec import Space
-from ..storyboard_space import open_scene
+from ..spec import Space, open_scene
 from .evaluation import REFUSED, Evaluation, Evaluator, drive_reference
-from .failure import Failure, boundaries, write_scenario
+from .failure import Failure, boundaries, render_page, write_scenario
 from .optimise import SearchBudget, SearchState, search
-from .page import render_page
 
 # --- Statistics ----------------------------------------------------------------------------------
 

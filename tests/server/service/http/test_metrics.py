@@ -5,7 +5,7 @@ from __future__ import annotations
 from prometheus_client import CollectorRegistry, Histogram
 from prometheus_client.exposition import generate_latest
 
-from real2sim_server.service.http.metrics import FAST_BUCKETS, LoopHistogram
+from real2sim_server.service.http.telemetry import FAST_BUCKETS, LoopHistogram
 
 SECONDS = (0.0, 0.0005, 0.00051, 0.3, 10.0, 11.0)
 

@@ -21,7 +21,7 @@ from real2sim_server.service.http.connections import (
     Connections,
     watch,
 )
-from real2sim_server.service.http.metrics import Metrics
+from real2sim_server.service.http.telemetry import Metrics
 from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.network

@@ -12,7 +12,7 @@ from real2sim_proto.sweeps import SweepRequest
 from real2sim_server.executors import InProcess
 from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.scenarios.openscenario import read_openscenario_text, write_openscenario
-from real2sim_server.service.jobs import command_process
+from real2sim_server.service import drives
 from real2sim_server.service.sweeps import write_spec
 from real2sim_server.sweeps import load_sweep, run_sweep
 from real2sim_server.world.recording.recording import recording_of_bytes
@@ -35,7 +35,7 @@ CUT_IN = {
 @pytest.fixture(autouse=True)
 def _hardly_gives_way(monkeypatch):
     """Beside other work, a sweep that gives way would take minutes."""
-    monkeypatch.setattr(command_process, "NICENESS", 1)
+    monkeypatch.setattr(drives, "NICENESS", 1)
 
 
 def over(client, job: dict) -> dict:

@@ -8,9 +8,14 @@ import urllib.request
 
 import pytest
 
-from real2sim_server.service.objects import object_store, shared_bundles
-from real2sim_server.service.objects.object_store import ObjectStoreError, open_objects
-from real2sim_server.service.objects.shared_bundles import MARK, BundleFolders, SharedBundle
+from real2sim_server.service import shared_objects
+from real2sim_server.service.shared_objects import (
+    MARK,
+    BundleFolders,
+    ObjectStoreError,
+    SharedBundle,
+    open_objects,
+)
 
 CONTENT = bytes(range(256)) * 40
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
@@ -71,7 +76,7 @@ def test_another_url_is_refused(url):
 def test_a_store_that_is_gone_is_told(file, monkeypatch):
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "tests")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "tests")
-    monkeypatch.setattr(object_store, "RETRIES", 0)
+    monkeypatch.setattr(shared_objects, "RETRIES", 0)
     objects = open_objects("s3://bucket?endpoint=http://127.0.0.1:1&region=x")
     with pytest.raises(ObjectStoreError):
         objects.put(file, DIGEST)
@@ -116,7 +121,7 @@ def test_what_was_taken_out_goes_in_the_order_of_its_last_use(tmp_path):
     first, second = (site.bundles.take_out(b) for b in bundles[:2])
     os.utime(first / MARK, (1, 1))
     os.utime(second / MARK, (2, 2))
-    shared_bundles.mark_used(first)
+    shared_objects.mark_used(first)
     third = site.bundles.take_out(bundles[2])
     assert [p.exists() for p in (first, second, third)] == [True, False, True]
 

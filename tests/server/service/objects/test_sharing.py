@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from real2sim_server.service import membership
-from real2sim_server.service.objects.object_store import FolderObjects
+from real2sim_server.service.shared_objects import FolderObjects
 from tests.waiting import LIMIT_S, wait_until
 
 from ..library.test_assets import CUT

@@ -18,7 +18,7 @@ from tests.waiting import wait_until
 from .hands import drag, kept, shown
 
 pytestmark = [pytest.mark.browser, pytest.mark.network]
-LEAST_PSNR = 38.0
+MIN_PSNR = 38.0
 """[dB]; 45 were seen."""
 
 
@@ -92,7 +92,7 @@ def test_the_page_draws_what_the_worker_draws_and_goes_round_where_no_object_is(
     assert drawn(page).shape == exact.shape
     assert exact.std() > 10
     wait_until(
-        lambda: psnr(drawn(page), exact) > LEAST_PSNR,
+        lambda: psnr(drawn(page), exact) > MIN_PSNR,
         lambda: f"the worker's picture: {psnr(drawn(page), exact):.1f} dB",
     )
     before = shown(page, "model.free")

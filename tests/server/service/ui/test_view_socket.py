@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from real2sim_server.service.routes.view import instance_at
+from real2sim_server.service.routes.sockets import instance_at
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ import numpy as np
 
 from real2sim_proto.lanes import SignalKind
 
-from ...geometry.transform import Float
-from ...scene.lane import TRAVELLED, Area, Lane, Road, RoadLane, Signal, StopLine
-from ...scene.lane_graph import LaneGraph
-from ..reader import MapError, damage_named, head_of, integer, number, read_xml
-from .roads import SPEED_UNITS, OpenDriveRoad, SectionLane, read_road
+from ..geometry.transform import Float
+from ..scene.lane import TRAVELLED, Area, Lane, Road, RoadLane, Signal, StopLine
+from ..scene.lane_graph import LaneGraph
+from .opendrive_roads import SPEED_UNITS, OpenDriveRoad, SectionLane, read_road
+from .reader import MapError, damage_named, head_of, integer, number, read_xml
 
 # --- Links ---------------------------------------------------------------------------------------
 

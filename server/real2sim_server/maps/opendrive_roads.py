@@ -13,8 +13,8 @@ from scipy.special import fresnel
 
 from real2sim_proto.lanes import LaneKind
 
-from ...geometry.transform import Float
-from ..reader import MapError, integer, number
+from ..geometry.transform import Float
+from .reader import MapError, integer, number
 
 # --- Plan view -----------------------------------------------------------------------------------
 
@@ -22,7 +22,7 @@ from ..reader import MapError, integer, number
 
 MAX_LENGTH_M = 1e6
 STRAIGHT = 1e-12
-LEAST_BEND = 1e-9
+MIN_BEND = 1e-9
 """A spiral whose heading bends less than this beyond an arc's, times its length, is an arc."""
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 
@@ -144,7 +144,7 @@ def spiral(start: float, end: float, length: float) -> Local:
     integrals.
     """
     change = (end - start) / length
-    if abs(change) * length**3 < LEAST_BEND:
+    if abs(change) * length**3 < MIN_BEND:
         return arc((start + end) / 2)
     scale = math.sqrt(math.pi / abs(change))
     sign = math.copysign(1.0, change)

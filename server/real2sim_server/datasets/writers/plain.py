@@ -1,9 +1,13 @@
-"""Pictures with the labels drawn over them, to be looked at."""
+"""Simple formats: raw labels, pictures with labels drawn over them, WebDataset shards."""
 
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Mapping
+import io
+import json
+import shutil
+import tarfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +22,47 @@ from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip, read_flow
 from ..labels.boxes import EDGES, NEAR
-from .writer import LabelledDrive, objects_of
+from .writer import LabelledDrive, objects_of, write_json
+
+# --- Labels ---------------------------------------------------------------------------------------
+
+
+class LabelsWriter:
+    """Writes each clip as a folder: ``labels.json``, images and points."""
+
+    name = "labels"
+    holds = "all labels as JSON, images as png, points as npy; docs/datasets.md has the fields"
+
+    def write(self, drive: LabelledDrive, folder: Path) -> None:
+        """See :class:`DatasetWriter`."""
+        for clip in drive.clips:
+            shutil.copytree(clip.folder, folder / clip.name)
+        cameras = [
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "K": camera.K.tolist(),
+                "T_vehicle_camera": camera.T_vehicle_camera.tolist(),
+            }
+            for camera in drive.cameras
+        ]
+        content = {
+            "name": drive.name,
+            "period_us": drive.period_us,
+            "ego_size": list(drive.ego_size),
+            "cameras": cameras,
+            "clips": {clip.name: clip.split for clip in drive.clips},
+        }
+        write_json(folder / "dataset.json", content)
+
+
+# --- Pictures -------------------------------------------------------------------------------------
 
 EVERY = 5
-"""Each so many-th frame is drawn."""
+"""Draw every Nth frame."""
 
-QUALITY = 90
+PICTURE_QUALITY = 90
 BACKGROUND = {
     UNLABELED: (0, 0, 0),
     STATIC: (110, 110, 110),
@@ -51,7 +90,7 @@ class PicturesWriter:
                     sheet = labels_sheet(clip, camera, frame)
                     path = folder / clip.name / f"{camera.name}_{frame['index']:06d}.jpg"
                     path.parent.mkdir(parents=True, exist_ok=True)
-                    data = encode_image(sheet, "rgb", "jpeg", quality=QUALITY).data
+                    data = encode_image(sheet, "rgb", "jpeg", quality=PICTURE_QUALITY).data
                     path.write_bytes(data)
 
 
@@ -139,3 +178,63 @@ def _flow(clip: Clip, camera: Camera, index: int, rgb: Image) -> Image:
 def _colour(number: int) -> tuple[int, int, int]:
     red, green, blue = colorsys.hsv_to_rgb(number * 0.61803 % 1.0, 0.75, 1.0)
     return int(red * 255), int(green * 255), int(blue * 255)
+
+
+# --- WebDataset -----------------------------------------------------------------------------------
+
+# Source: the webdataset project. Files of one sample share the name up to the first dot and are
+# stored next to each other.
+
+QUALITY = 95
+
+
+class WebDatasetWriter:
+    """Writes ``<split>-NNNNNN.tar``, a clip each."""
+
+    name = "webdataset"
+    holds = "tar shards: jpg, depth.png, instance.png, semantic.png, flow png and json a sample"
+
+    def write(self, drive: LabelledDrive, folder: Path) -> None:
+        """See :class:`DatasetWriter`. Raises OSError."""
+        numbers: dict[str, int] = {}
+        for clip in drive.clips:
+            number = numbers.get(clip.split, 0)
+            numbers[clip.split] = number + 1
+            path = folder / f"{clip.split}-{number:06d}.tar"
+            with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
+                for frame in clip.frames:
+                    for camera in drive.cameras:
+                        key = f"{clip.name}_{frame['index']:06d}_{camera.name}"
+                        for suffix, data in _sample(clip, camera, frame):
+                            _add(shard, f"{key}.{suffix}", data)
+
+
+def _sample(clip: Clip, camera: Camera, frame: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
+    index = frame["index"]
+    rgb = clip.pixels("rgb", camera.name, index)
+    yield "jpg", encode_image(rgb, "rgb", "jpeg", quality=QUALITY).data
+    for kind in ("depth", "instance", "semantic", "flow_forward", "flow_backward"):
+        path = clip.file(kind, camera.name, index)
+        if path.exists():
+            yield f"{kind}.png", path.read_bytes()
+    objects = objects_of(frame)
+    content: dict[str, Any] = {
+        "clip": clip.name,
+        "split": clip.split,
+        "camera": camera.name,
+        "t_us": frame["t_us"],
+        "K": camera.K.tolist(),
+        "T_vehicle_camera": camera.T_vehicle_camera.tolist(),
+        "T_world_ego": frame["T_world_ego"],
+        "ego_future": frame["ego_future"],
+        "objects": [{**objects[view["object_id"]], **view} for view in frame["views"][camera.name]],
+    }
+    content |= {key: frame[key] for key in ("beside_path", "detections") if key in frame}
+    yield "json", json.dumps(content).encode()
+
+
+def _add(shard: tarfile.TarFile, name: str, data: bytes) -> None:
+    """Without the day, the user or the rights of whoever writes."""
+    member = tarfile.TarInfo(name)
+    member.size, member.mtime, member.mode = len(data), 0, 0o644
+    shard.addfile(member, io.BytesIO(data))
