@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from real2sim_server.cli.command import command
-from real2sim_server.cli.options import JsonFile
+from real2sim_server.cli.common import JsonFile, command
 from real2sim_server.console import CommandError, print_figures, progress, write_json
 
 app = typer.Typer(

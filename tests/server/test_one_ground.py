@@ -14,7 +14,7 @@ from real2sim_proto.base import Pose
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import SetPose
 from real2sim_proto.plans import PoseCommand
-from real2sim_server.cli.ground import ground as ground_command
+from real2sim_server.cli.scene import ground as ground_command
 from real2sim_server.demo.street import unpack_street
 from real2sim_server.edit import ScenarioState, apply_operations
 from real2sim_server.reconstruct import InitialiseOptions

@@ -1,68 +1,25 @@
-"""The worker's part of the ``real2sim`` command: a module for each command, named after it.
+"""The server's part of the ``real2sim`` command.
 
-This package is imported by every ``real2sim --help``, so its modules load nothing heavy: a command
-imports what it needs when it runs.
+Every ``real2sim --help`` imports this package, so its modules load nothing heavy: a command imports
+what it needs when it runs.
 """
 
-from . import (
-    calibrate,
-    demo,
-    doctor,
-    evaluate,
-    evaluate_policy,
-    export,
-    export_dataset,
-    film,
-    fit,
-    ground,
-    import_,
-    log_info,
-    map,
-    reconstruct,
-    render,
-    replay,
-    run,
-    serve,
-    simulate,
-    store,
-    sweep,
-    synth,
-    token,
-    track,
-    train_policy,
-    validate,
-)
-from .command import app
+from . import doctor, drive, export, logs, physics, policies, reconstruct, scene, serve, store
+from .common import app
 
-app.add_typer(token.app, name="token")
+app.add_typer(store.token_app, name="token")
 app.add_typer(store.app, name="store")
 
 __all__ = [
     "app",
-    "calibrate",
-    "demo",
     "doctor",
-    "evaluate",
-    "evaluate_policy",
+    "drive",
     "export",
-    "export_dataset",
-    "film",
-    "fit",
-    "ground",
-    "import_",
-    "log_info",
-    "map",
+    "logs",
+    "physics",
+    "policies",
     "reconstruct",
-    "render",
-    "replay",
-    "run",
+    "scene",
     "serve",
-    "simulate",
     "store",
-    "sweep",
-    "synth",
-    "token",
-    "track",
-    "train_policy",
-    "validate",
 ]

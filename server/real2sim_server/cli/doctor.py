@@ -24,8 +24,7 @@ from ..console import (
     telling_of_compiling,
     write_json,
 )
-from .command import app
-from .options import JsonFile
+from .common import JsonFile, app
 
 if TYPE_CHECKING:
     from ..render._cuda.launcher import Usage

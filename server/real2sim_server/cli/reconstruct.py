@@ -1,11 +1,11 @@
-"""``real2sim reconstruct``: from a driving log to a scene."""
+"""Commands from a log to a scene: reconstruct, evaluate, fit-lidar and fit-uncertainty."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -17,8 +17,7 @@ from ..console import (
     staged_progress,
     write_json,
 )
-from .command import command
-from .options import (
+from .common import (
     JsonFile,
     LogCameras,
     LogEvery,
@@ -28,15 +27,24 @@ from .options import (
     Overwrite,
     RenderBackend,
     RenderDevice,
-    Sequence,
+    SceneBundle,
+    SequenceName,
     chosen_backend,
+    command,
     log_selection,
 )
 
 if TYPE_CHECKING:
+    from ..logs import DrivingLog
     from ..maps import LaneSource
     from ..reconstruct import InitialiseOptions
+    from ..reconstruct.evaluation import Evaluation
+    from ..reconstruct.evaluation.lidar import LidarScore
     from ..reconstruct.training.records import TrainingProgress
+    from ..scene import Scene
+
+
+# --- reconstruct ----------------------------------------------------------------------------------
 
 
 @command("reconstruct")
@@ -70,7 +78,7 @@ def reconstruct(
     cameras: LogCameras = None,
     every: LogEvery = 1,
     log_format: LogFormat = None,
-    sequence: Sequence = None,
+    sequence: SequenceName = None,
     overwrite: Overwrite = False,
     json: JsonFile = None,
 ) -> None:
@@ -135,3 +143,267 @@ def _training_bar(report: Callable[..., None]) -> Callable[[TrainingProgress], N
         report("training", step.iteration, step.iterations, text)
 
     return on_training
+
+
+# --- evaluate -------------------------------------------------------------------------------------
+
+
+@command("evaluate")
+def evaluate(
+    *,
+    scene: SceneBundle,
+    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
+    frames: Annotated[
+        str, typer.Option(help="Frames: held-out, all, or numbers such as 3,7,11.")
+    ] = "held-out",
+    width: Annotated[int | None, typer.Option(min=16, max=8192, help="Image width [px].")] = None,
+    shifts: Annotated[
+        str, typer.Option(help="Metres beside the path, for images where truth is, or roads.")
+    ] = "1,2,3",
+    around: Annotated[
+        bool, typer.Option("--around", help="Also view vehicles from all sides (synthetic logs).")
+    ] = False,
+    lidar: Annotated[
+        bool, typer.Option("--lidar", help="Also simulate LiDAR sweeps and compare them.")
+    ] = False,
+    report: Annotated[
+        Path | None, typer.Option(help="Folder for an HTML report with images.")
+    ] = None,
+    backend: RenderBackend = "auto",
+    device: RenderDevice = None,
+    log_format: LogFormat = None,
+    sequence: SequenceName = None,
+    json: JsonFile = None,
+) -> None:
+    """Compare a scene with its log: images, moving objects, LiDAR depth, rendering speed."""
+    from ..logs.open import open_log
+    from ..reconstruct.evaluation import EvaluateOptions, evaluate_scene, write_report
+    from ..scene.io import load_scene
+
+    options = EvaluateOptions(
+        frames=_parse_frames(frames),
+        width=width,
+        shifts=_parse_shifts(shifts),
+        backend=chosen_backend(backend, device),
+        around=around,
+        lidar=lidar,
+    )
+    loaded, opened = load_scene(scene), open_log(log, format=log_format, sequence=sequence)
+    with staged_progress() as on_progress:
+        result = evaluate_scene(loaded, opened, options=options, on_progress=on_progress)
+    print_figures(f"{scene.name} against {opened.name}", _table(result))
+    if not result.frames_unseen:
+        console.print(
+            "the scene names no held-out frames, so these may have been used to make it",
+            soft_wrap=True,
+        )
+    if result.no_shifted:
+        console.print(result.no_shifted, soft_wrap=True)
+    write_json(json, result.as_json())
+    if report is not None:
+        page = write_report(loaded, opened, result, report, options=options)
+        console.print(f"report: {page}", soft_wrap=True)
+
+
+def _parse_frames(text: str) -> str | tuple[int, ...]:
+    if text in ("held-out", "all"):
+        return text
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise CommandError(
+            f"--frames {text!r}; allowed are Frames: held-out, all, or numbers such as 3,7,11."
+        ) from None
+
+
+def _parse_shifts(text: str) -> tuple[float, ...]:
+    if text == "none":
+        return ()
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise CommandError(
+            f"--shifts {text!r}; allowed are none, or distances in metres such as 1,2,3"
+        ) from None
+
+
+def _table(result: Evaluation) -> dict[str, object]:
+    figures: dict[str, object] = {
+        "frames": ", ".join(map(str, result.frames)),
+        "psnr [dB]": result.psnr,
+        "ssim": result.ssim,
+        "psnr_objects [dB]": result.psnr_objects,
+        "depth_error_m [m]": result.depth_error_m,
+        "depth_error_p90_m [m]": result.depth_error_p90_m,
+        "depth_error_mean_m [m]": result.depth_error_mean_m,
+        "box_error_m [m]": result.box_error_m,
+        "frames_per_second": result.frames_per_second,
+    }
+    for shift in result.shifted:
+        figures[f"psnr from {shift.shift_m:g} m beside [dB]"] = shift.psnr
+    for band in result.lane_band:
+        figures[f"road from {band.shift_m:g} m beside [dB]"] = band.psnr
+        figures["recorded images by the same, on the path [dB]"] = band.images_psnr
+    if result.around is not None:
+        figures |= {
+            "vehicles' seen sides [dB]": result.around.psnr_seen,
+            "vehicles' other sides [dB]": result.around.psnr_unseen,
+            "of these covered": result.around.coverage_unseen,
+        }
+    if result.uncertainty is not None:
+        figures |= {
+            "uncertainty against error, Spearman by pixel": result.uncertainty.spearman,
+            "of squares of 9 pixels": result.uncertainty.spearman_regions,
+            "sparsification (0 best, 1 chance)": result.uncertainty.sparsification,
+            "uncertainty, mean": result.uncertainty.uncertainty,
+            "error, mean": result.uncertainty.error,
+        }
+    if result.lidar is not None:
+        figures |= _lidar_figures(result.lidar)
+    return figures
+
+
+def _lidar_figures(score: LidarScore) -> dict[str, object]:
+    mean = score.mean
+    figures: dict[str, object] = {
+        "lidar against": score.against,
+        "lidar range error, median [m]": mean.median_m,
+        "median squared [m2]": mean.median_squared_m2,
+        "90th percentile [m]": mean.p90_m,
+        "of the expected range, median [m]": mean.expected_m,
+        "chamfer [m2]": mean.chamfer_m2,
+        "chamfer is the": score.chamfer,
+        "F score at 5 cm": mean.f_score,
+        "hit or miss right": mean.hit_miss,
+        "intensity RMSE": mean.intensity_rmse,
+        "drop accuracy": mean.drop_accuracy,
+    }
+    if score.against != "ray-cast truth":
+        figures["residual of the fitted rings [degrees]"] = score.ring_residual_deg
+    return figures
+
+
+# --- fit-lidar, fit-uncertainty -------------------------------------------------------------------
+
+Fitted = tuple["Scene", dict[str, Any]]
+"""The scene with what was fitted, and figures of the fit."""
+
+
+@dataclass(frozen=True)
+class FitFiles:
+    """What is read and written.
+
+    Attributes:
+        scene: bundle.
+        log: folder of the driving log.
+        out: bundle to write; None for the scene itself.
+        log_format, sequence: of the log, where its folder does not tell.
+        json: file for the figures.
+    """
+
+    scene: Path
+    log: Path
+    out: Path | None
+    log_format: str | None
+    sequence: str | None
+    json: Path | None
+
+
+def fit_scene(
+    files: FitFiles, what: str, fit: Callable[[Scene, DrivingLog, Callable[..., None]], Fitted]
+) -> None:
+    """Fit ``what`` of a scene, write the bundle and print the figures."""
+    from ..logs import open_log, same_part
+    from ..scene.io import load_scene, save_scene
+
+    scene = load_scene(files.scene)
+    opened = open_log(files.log, format=files.log_format, sequence=files.sequence)
+    log = same_part(opened, scene.provenance)
+    with staged_progress() as on_progress:
+        made, fitted = fit(scene, log, on_progress)
+    target = files.scene if files.out is None else files.out
+    save_scene(made, target, overwrite=files.out is None)
+    figures = {"scene": str(target), **fitted}
+    print_figures(f"{target.name}, {what}", figures)
+    write_json(files.json, figures)
+
+
+# --- fit-lidar ------------------------------------------------------------------------------------
+
+
+@command("fit-lidar")
+def fit_lidar(
+    *,
+    scene: SceneBundle,
+    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output bundle; default: the scene itself.")
+    ] = None,
+    surfaces: Annotated[
+        Path | None,
+        typer.Option(help="initial.r2s of the training folder, to save time."),
+    ] = None,
+    steps: Annotated[
+        int, typer.Option(min=0, help="Training steps, about one core second each.")
+    ] = 60,
+    log_format: LogFormat = None,
+    sequence: SequenceName = None,
+    json: JsonFile = None,
+) -> None:
+    """Fit LiDAR surfaces and reflectivity of a scene to the recorded sweeps."""
+    from dataclasses import asdict
+
+    from ..reconstruct.lidar import fit_lidar_surfaces
+    from ..scene.io import load_scene
+
+    def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
+        made, report = fit_lidar_surfaces(
+            loaded,
+            opened,
+            surfaces=load_scene(surfaces) if surfaces else None,
+            steps=steps,
+            on_progress=on_progress,
+        )
+        figures = asdict(report)
+        del figures["timing_s"]
+        return made, figures
+
+    fit_scene(FitFiles(scene, log, out, log_format, sequence, json), "surfaces for LiDARs", fit)
+
+
+# --- fit-uncertainty ------------------------------------------------------------------------------
+
+
+@command("fit-uncertainty")
+def fit_uncertainty(
+    *,
+    scene: SceneBundle,
+    log: Annotated[Path, typer.Argument(help="Folder of the scene's driving log.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output bundle; default: the scene itself.")
+    ] = None,
+    views: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Number of images to compare.")
+    ] = 48,
+    backend: RenderBackend = "auto",
+    device: RenderDevice = None,
+    log_format: LogFormat = None,
+    sequence: SequenceName = None,
+    json: JsonFile = None,
+) -> None:
+    """Add uncertainty to a scene, as training does for new scenes."""
+    from dataclasses import asdict
+
+    from ..reconstruct.evaluation.uncertainty import fit_uncertainties
+
+    def fit(loaded: Scene, opened: DrivingLog, on_progress: Callable[..., None]) -> Fitted:
+        made, report = fit_uncertainties(
+            loaded,
+            opened,
+            views=views,
+            backend=chosen_backend(backend, device),
+            on_view=lambda done, total: on_progress("views", done, total),
+        )
+        return made, asdict(report)
+
+    fit_scene(FitFiles(scene, log, out, log_format, sequence, json), "uncertainty", fit)

@@ -1,4 +1,4 @@
-"""``real2sim serve``: start a worker and stay in front."""
+"""Commands that start a worker: serve and demo."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import typer
 from rich.markup import escape
 
 from ..console import LISTENERS, CommandError, errors
-from .command import command
+from .common import command
+
+# --- serve ----------------------------------------------------------------------------------------
 
 
 @command("serve")
@@ -106,3 +108,24 @@ def _said(error: Mapping[str, Any]) -> str:
 
 def _warn(message: str) -> None:
     errors.print(f"[yellow]warning:[/] {escape(message)}", highlight=False, soft_wrap=True)
+
+
+# --- demo -----------------------------------------------------------------------------------------
+
+
+@command("demo")
+def demo(
+    *,
+    out: Annotated[Path, typer.Option("--out", help="Output folder.")] = Path("out/demo"),
+    steps: Annotated[int, typer.Option(min=1, max=10_000)] = 100,
+    from_log: Annotated[
+        bool, typer.Option("--from-log", help="Record and reconstruct the street first.")
+    ] = False,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Keep the worker running afterwards.")
+    ] = False,
+) -> None:
+    """Serve a street, edit it over REST, drive it over WebSocket, and write video and figures."""
+    from ..demo.run import run
+
+    run(out=out, steps=steps, from_log=from_log, leave_serving=serve)

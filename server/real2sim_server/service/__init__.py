@@ -7,7 +7,7 @@ Its parts, lowest first; each imports only those before it, and no file is part 
   and stored answers.
 - ``shared_objects``: bundles and files that workers share, stored by content.
 - ``accounts``: named tokens with roles and limits, and what their holders use.
-- ``preflight``: checks, and a second process that compiles kernels, before anything heavy is loaded.
+- ``preflight``: checks, and a second process that compiles kernels, before heavy imports.
 - ``warm_up``: kernels compiled or loaded before they are needed.
 - ``engine``: the thread that owns the device, and its queue.
 - ``http``: what all replies share: errors, authorisation, idempotency, limits, telemetry and

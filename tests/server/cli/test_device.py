@@ -11,7 +11,7 @@ import torch
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
-from real2sim_server.cli.options import chosen_backend
+from real2sim_server.cli.common import chosen_backend
 from real2sim_server.console import CommandError
 from real2sim_server.reconstruct import ReconstructOptions, reconstruct
 from real2sim_server.render import RenderError, select_backend

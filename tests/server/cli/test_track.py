@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from real2sim_server.cli.track import track
+from real2sim_server.cli.logs import track
 from real2sim_server.logs import open_log
 from real2sim_server.logs.tracking.track import same_object
 from real2sim_server.synthetic import SyntheticConfig, synthesize

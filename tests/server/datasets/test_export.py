@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from real2sim_proto.episode import ResetSpec
-from real2sim_server.cli import export_dataset as command
+from real2sim_server.cli import export as command
 from real2sim_server.console import CommandError
 from real2sim_server.datasets.drive import DatasetError, EpisodeDrive
 from real2sim_server.datasets.export import estimate, export_dataset, work_folder

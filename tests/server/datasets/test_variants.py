@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from real2sim_proto.jobs import DatasetSweep
-from real2sim_server.cli import export_dataset as command
+from real2sim_server.cli import export as command
 from real2sim_server.console import CommandError
 from real2sim_server.datasets.clips import Clip
 from real2sim_server.datasets.drive import DatasetError

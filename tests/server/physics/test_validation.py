@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import typer
 
-from real2sim_server.cli.validate import validate
+from real2sim_server.cli.physics import validate
 from real2sim_server.physics import PhysicsError
 from real2sim_server.physics.validation import CASES, Check, ReferenceCurve
 from real2sim_server.physics.validation import table as table_module

@@ -329,7 +329,7 @@ def test_the_view_socket_is_refused_over_the_limit(start_worker, tokens_file):
 
 
 def test_the_command_prints_a_token_once_that_a_worker_takes(tmp_path, start_worker, capsys):
-    from real2sim_server.cli import token as command
+    from real2sim_server.cli import store as command
 
     path = tmp_path / "tokens.json"
     command.add("alice", file=path, sessions=1)

@@ -1,18 +1,25 @@
-"""``real2sim run``: drive through a scenario file, or a corner case of the gallery."""
+"""Commands that drive without a worker: run, replay, sweep and search."""
 
 from __future__ import annotations
 
 import contextlib
 import json as json_format
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..console import CommandError, console, print_figures, staged_progress, write_json
-from .command import command
-from .options import JsonFile
+from ..console import (
+    CommandError,
+    console,
+    print_figures,
+    staged_progress,
+    told_progress,
+    write_json,
+)
+from .common import Follow, JsonFile, command
 
 if TYPE_CHECKING:
     from real2sim_proto.storyboard import Storyboard
@@ -21,6 +28,10 @@ if TYPE_CHECKING:
     from ..sweeps.episode import Driven
     from ..world.agents import Event
     from ..world.recording.recording import Recording
+    from ..world.recording.replay import Replayer
+
+
+# --- run ------------------------------------------------------------------------------------------
 
 SCRIPTED = "storyboard"
 """The planner's name where the storyboard drives the ego itself."""
@@ -272,3 +283,205 @@ def _print(file: str, figures: dict[str, Any]) -> None:
         for e in figures["events"]
     }
     print_figures(f"{Path(file).name}: {figures['seconds']:.1f} s, {figures['reason']}", rows)
+
+
+# --- replay ---------------------------------------------------------------------------------------
+
+
+@command("replay")
+def replay(
+    *,
+    episode: Annotated[Path, typer.Argument(help="Recording of an episode (.r2e).")],
+    scene: Annotated[
+        Path | None, typer.Option("--scene", help="Scene bundle; simulates the episode again.")
+    ] = None,
+    assets: Annotated[
+        Path | None, typer.Option("--assets", help="Asset library of the scenario.")
+    ] = None,
+    mcap: Annotated[Path | None, typer.Option("--mcap", help="Also write an MCAP file.")] = None,
+    video: Annotated[Path | None, typer.Option("--video", help="Video (MP4) to write.")] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Camera of the video; default: the first.")
+    ] = None,
+    width: Annotated[int, typer.Option(min=64, max=4096, help="Width of the video [px].")] = 640,
+    json: JsonFile = None,
+) -> None:
+    """Score a recorded episode; with its scene, verify and film it."""
+    from ..policies.page import film_episode
+    from ..world.recording.mcap_file import save_mcap
+    from ..world.recording.recording import first_difference, load_recording
+
+    recording = load_recording(episode)
+    figures: dict[str, object] = {
+        "steps": len(recording.instants) - 1,
+        "recorded_metrics": recording.metrics,
+        "scores": [score.fields() for score in recording.rescore()],
+    }
+    if scene is not None:
+        loaded = _load_its_scene(recording, scene)
+        start = _replay_factory(recording, loaded, assets)
+        difference = first_difference(recording, start())
+        figures["bit_identical"] = difference is None
+        figures["first_difference"] = difference
+        if video is not None:
+            film_episode(recording, start(), loaded, video, camera=camera, width=width)
+            console.print(f"wrote {video}")
+    elif video is not None:
+        raise CommandError("--video draws the scene; name its bundle with --scene")
+    if mcap is not None:
+        save_mcap(recording, mcap)
+        console.print(f"wrote {mcap}")
+    _print_scores(recording, figures)
+    write_json(json, figures)
+    if figures.get("bit_identical") is False:
+        raise CommandError(
+            f"the episode comes out differently from step {figures['first_difference']} on; it was "
+            "recorded by another version of this program, or on another device"
+        )
+
+
+def _load_its_scene(recording: Recording, path: Path) -> Scene:
+    from ..scene.io import load_scene
+
+    scene = load_scene(path)
+    if scene.content_hash != recording.scene_hash:
+        raise CommandError(
+            f"the episode ran on a scene with hash {recording.scene_hash[:12]}; {path} has "
+            f"{(scene.content_hash or '')[:12]}"
+        )
+    return scene
+
+
+def _replay_factory(
+    recording: Recording, scene: Scene, assets: Path | None
+) -> Callable[[], Replayer]:
+    """Makes the session as it was before its first entry, as often as wanted."""
+    from ..edit import EditError
+    from ..service.library.assets import AssetLibrary
+    from ..world.recording.recording import RecordingError
+
+    library = AssetLibrary(assets) if assets is not None else None
+
+    def start() -> Replayer:
+        try:
+            return recording.replayer(scene, library.find if library else None)
+        except EditError as error:
+            hint = "name the folder of the worker's asset library with --assets"
+            raise CommandError(f"{error}; {hint}") from error
+        except RecordingError as error:
+            raise CommandError(f"{error} without --scene") from error
+
+    return start
+
+
+def _print_scores(recording: Recording, figures: dict[str, object]) -> None:
+    recorded = {score["name"]: score for score in recording.scores}
+    rows = {}
+    for score in recording.rescore():
+        value = "undefined" if score.value is None else f"{score.value:.4g}"
+        old = recorded.get(score.name, {})
+        same = old.get("version") == score.version and old.get("value") == score.value
+        rows[f"{score.name}@{score.version}"] = value if same else f"{value} (was {old})"
+    if "bit_identical" in figures:
+        rows["bit-identical"] = "yes" if figures["bit_identical"] else "no"
+    print_figures(f"{recording.scene}, {figures['steps']} steps", rows)
+    for score in recording.rescore():
+        if score.cannot_see:
+            console.print(f"[dim]{score.name}: {score.cannot_see}[/dim]")
+
+
+# --- sweep, search --------------------------------------------------------------------------------
+
+
+@command("sweep")
+def sweep(
+    *,
+    spec: Annotated[Path, typer.Argument(help="sweep.yaml or .json, see docs/sweeps.md.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder; an existing sweep resumes.")],
+    scenes: Annotated[
+        Path | None, typer.Option("--scenes", help="Folder of scene bundles.")
+    ] = None,
+    workers: Annotated[
+        int, typer.Option(min=1, max=4096, help="Episodes to drive in parallel.")
+    ] = 1,
+    executor: Annotated[str, typer.Option(help="Run in local processes or on ray.")] = "processes",
+    ray_address: Annotated[
+        str | None, typer.Option(help="Address of a Ray cluster; default: start one.")
+    ] = None,
+    json: JsonFile = None,
+    follow: Follow = False,
+) -> None:
+    """Drive points of a parameter space with planners; renders only what planners need.
+
+    Leaves episodes.parquet, a row an episode, and recordings and scenario files of the worst.
+    Killed, the same command goes on; the table is the same bytes whoever drove, and however often
+    it was killed.
+    """
+    from ..console import write_json
+    from ..executors import ExecutorError, executor_of
+    from ..sweeps import load_sweep, run_sweep
+
+    asked = load_sweep(spec, scenes)
+    try:
+        who = executor_of(executor, workers=workers, address=ray_address)
+        with told_progress(follow=follow) as report:
+            figures = run_sweep(asked, out, who, scenes=scenes, on_progress=report)
+    except ExecutorError as error:
+        raise CommandError(str(error)) from error
+    write_json(json, figures)
+    if not follow:
+        print_figures(f"sweep of {asked.case.name}", figures)
+
+
+# --- search ---------------------------------------------------------------------------------------
+
+
+@command("search")
+def search(
+    *,
+    spaces: Annotated[
+        list[str],
+        typer.Argument(help="Files as for `sweep`, or shipped: cut_in, hard_brake, oncoming, ..."),
+    ],
+    planner: Annotated[str, typer.Option(help="Planner as for `drive`, see docs/policies.md.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder for failures and the report.")],
+    episodes: Annotated[int, typer.Option(min=20, max=100_000)] = 300,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    shrink: Annotated[
+        int, typer.Option(min=0, help="Number of failures to shrink to their boundary.")
+    ] = 3,
+    probability: Annotated[
+        int, typer.Option(min=0, help="Episodes to estimate the failure rate; 0: none.")
+    ] = 0,
+    films: Annotated[int, typer.Option(min=0, help="Number of failures to film.")] = 0,
+    scenes: Annotated[
+        Path | None, typer.Option("--scenes", help="Folder of scene bundles.")
+    ] = None,
+    json: JsonFile = None,
+    follow: Follow = False,
+) -> None:
+    """Find avoidable collisions that are the planner's fault.
+
+    Leaves failures.json, each failure as a case and as a recording, and a page; see docs/sweeps.md.
+    """
+    from ..console import write_json
+    from ..sweeps import load_space
+    from ..sweeps.search.optimise import SearchBudget
+    from ..sweeps.search.run import SearchOptions, run_search
+
+    options = SearchOptions(
+        budget=SearchBudget(episodes=episodes, seed=seed),
+        shrink=shrink,
+        probability=probability,
+        films=films,
+        scenes=scenes,
+    )
+    asked = [load_space(name, scenes) for name in spaces]
+    with told_progress(follow=follow) as report:
+        found = run_search(asked, planner, out, options, on_progress=report)
+    write_json(json, found)
+    if follow:
+        return
+    keys = ("episodes", "first_failure", "at_fault", "avoidable", "cells")
+    print_figures(f"failures of {planner}", {k: found[k] for k in keys})
+    console.print(f"wrote {out / 'failures.html'} and {out / 'failures.json'}")

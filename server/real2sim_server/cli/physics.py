@@ -1,25 +1,32 @@
-"""``real2sim simulate``: physics on the objects of a scene."""
+"""Commands of the physics: simulate, calibrate and validate."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..console import CommandError, console, print_figures, staged_progress, write_json
-from .command import command
-from .options import JsonFile, SceneBundle
+from .._files import atomic_file
+from ..console import CommandError, console, print_figures, progress, staged_progress, write_json
+from .common import JsonFile, SceneBundle, command
 
 if TYPE_CHECKING:
+    from real2sim_proto.jobs import Observations
     from real2sim_proto.operations import PhysicsValues
 
+    from ..physics.validation.table import CaseResult
     from ..scene import Scene
+    from ..simulation.calibration import ObjectCalibration
     from ..simulation.experiments import Experiment
     from ..simulation.playback import PlacedObjects
     from ..simulation.presets import ObjectPhysics
     from ..simulation.result import SimulationResult
+
+
+# --- simulate -------------------------------------------------------------------------------------
 
 
 @command("simulate")
@@ -231,3 +238,197 @@ def _figures(result: SimulationResult) -> dict[str, object]:
         figures[f"{c.object_id} by {c.other}: delta-v [m/s]"] = c.delta_v
         figures[f"{c.object_id} by {c.other}: of it beyond its weight [m/s]"] = c.impact_delta_v
     return figures
+
+
+# --- calibrate ------------------------------------------------------------------------------------
+
+
+@command("calibrate")
+def calibrate(
+    *,
+    scene: SceneBundle,
+    subject: Annotated[str, typer.Option("--object", help="Object to calibrate.")],
+    fit: Annotated[
+        list[str],
+        typer.Option(help="stiffness, yield_stress, viscosity, friction or speed; repeatable."),
+    ],
+    observed: Annotated[
+        Path | None,
+        typer.Option(
+            help="JSON of boxes, points and images, as of the REST job; images may be files beside "
+            "it. Default: the object's own recorded track.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    beside: Annotated[
+        list[str] | None, typer.Option("--with", help="Other objects to simulate; repeatable.")
+    ] = None,
+    physics: Annotated[
+        list[str] | None,
+        typer.Option("--physics", help="Initial values, as for simulate."),
+    ] = None,
+    gravity: Annotated[float | None, typer.Option(min=0, max=100, help="Gravity [m/s^2].")] = None,
+    preset: Annotated[str, typer.Option(help="Preset: paper or vehicle.")] = "vehicle",
+    frame: Annotated[int, typer.Option(min=0, help="Recorded frame to start at.")] = 0,
+    duration: Annotated[
+        float, typer.Option(min=0.01, max=30, help="Duration of the recorded track to use [s].")
+    ] = 1.0,
+    max_particles: Annotated[
+        int, typer.Option(min=100, help="Maximum particles of all bodies.")
+    ] = 20_000,
+    steps: Annotated[int, typer.Option(min=1, max=60, help="Maximum steps of the search.")] = 12,
+    json: JsonFile = None,
+) -> None:
+    """Fit an object's physical parameters to observations.
+
+    Each comes with what it may be wrong by: what observations leave open, and what cells do.
+    """
+    from ..edit.state import ScenarioState
+    from ..scene.io import load_scene
+    from ..simulation.calibration import calibrate_object, observations_of
+
+    given = _read(observed)
+    loaded = load_scene(scene)
+    state = ScenarioState.of(loaded)
+    taking_part = (subject, *(beside or ()))
+    setup = continue_driving(loaded, state, taking_part, frame, preset=preset)
+    options = replace(
+        setup.options,
+        objects=changed(setup, values_of(physics or [])),
+        max_particles=max_particles,
+    )
+    if gravity is not None:
+        options = replace(options, gravity=(0.0, 0.0, -gravity))
+    there = {o.object_id: o for o in state.visible}
+    if subject not in there:
+        raise CommandError(f"no object {subject!r}; there are {', '.join(sorted(there))}")
+    end = options.start_us + round(duration * 1e6)
+    seen = observations_of(given, loaded, there[subject], options.start_us, end)
+    expected = 6 * len(fit) + 2 * steps + 5
+    with staged_progress() as report:
+        found = calibrate_object(
+            loaded,
+            state,
+            options,
+            subject,
+            seen,
+            parameters=fit,
+            steps=steps,
+            on_run=lambda runs: report("simulate", min(runs, expected), expected),
+        )
+    print_figures(f"{subject} of {scene.name}", _calibrated_values(found))
+    write_json(json, found.figures())
+
+
+def _read(path: Path | None) -> Observations:
+    """Observations of a file; images that it names by their files are read."""
+    import base64
+    import json
+
+    from pydantic import ValidationError
+
+    from real2sim_proto.jobs import Observations
+
+    if path is None:
+        return Observations(recorded=True)
+    try:
+        document = json.loads(path.read_text("utf-8"))
+        for image in document.get("images", []):
+            if "file" in image:
+                data = (path.parent / image.pop("file")).read_bytes()
+                image["image"] = base64.b64encode(data).decode("ascii")
+        return Observations.model_validate(document)
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise CommandError(f"{path}: {where}: {first['msg']}") from problem
+    except (OSError, ValueError, AttributeError, TypeError) as problem:
+        raise CommandError(f"{path}: no readable observations: {problem}") from problem
+
+
+def _calibrated_values(found: ObjectCalibration) -> dict[str, object]:
+    fit = found.fit
+    figures: dict[str, object] = {}
+    for name, factor in fit.factors.items():
+        if name in fit.undetermined:
+            figures[name] = "not told by these observations"
+            continue
+        value = f", {found.values[name]:.4g}" if name in found.values else ""
+        figures[name] = f"times {factor:.3f} +- {100 * fit.uncertainty[name]:.1f} %{value}"
+    figures["differences over what is known"] = f"{fit.residual[0]:.3g} to {fit.residual[-1]:.3g}"
+    figures["simulations"] = fit.runs
+    return figures
+
+
+# --- validate -------------------------------------------------------------------------------------
+
+
+@command("validate")
+def validate(
+    *,
+    backend: Annotated[str, typer.Option(help="Solver: cpu or reference.")] = "cpu",
+    cases: Annotated[
+        str | None,
+        typer.Option(
+            help="Comma-separated names, or a group: 'simulation' or 'published'; default: all "
+            "except the published crash figures."
+        ),
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="HTML report to write; default: next to the JSON file.")
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Compare the physics with known solutions; exit code 1 if any fails."""
+    from ..physics.validation.table import as_figures, render_page
+
+    with progress("validating") as report:
+        results = _run(backend, cases, report)
+    figures = as_figures(results, backend)
+    write_json(json, figures)
+    if page is None and json is not None:
+        page = json.with_suffix(".html")
+    if page is not None:
+        with atomic_file(page) as file:
+            file.write(render_page(results, backend=backend).encode())
+    _print_results(results)
+    if page is not None:
+        console.print(f"page: {page}", highlight=False, soft_wrap=True)
+    if not figures["passed"]:
+        raise typer.Exit(1)
+
+
+def _run(backend: str, cases: str | None, report: Callable[[int, int], None]) -> list[CaseResult]:
+    """The cases asked for; ``published`` stands for all of the published crash figures, and
+    ``simulation`` for all of bodies that roll, hand over and hit thin things."""
+    from ..physics.validation import table
+    from ..simulation.experiments.crash_tests import PUBLISHED, THEORY
+
+    names = [*table.CASES, *THEORY]
+    if cases is not None:
+        names = [name.strip() for name in cases.split(",")]
+    for group, members in (("published", PUBLISHED), ("simulation", THEORY)):
+        if group in names:
+            at = names.index(group)
+            names[at : at + 1] = members
+    available = {**table.CASES, **THEORY, **PUBLISHED}
+    return table.run_table(backend=backend, cases=names, available=available, on_progress=report)
+
+
+def _print_results(results: Sequence[CaseResult]) -> None:
+    lines = 0
+    for result in results:
+        for check in result.checks:
+            lines += 1
+            mark = "[green]holds[/]" if check.passed else "[bold red]FAILS[/]"
+            console.print(
+                f"{mark}  {check.name}: {check.measured:.5g}, expected {check.expected:.5g} "
+                f"± {check.tolerance:.2g} {check.unit}".rstrip(),
+                highlight=False,
+                soft_wrap=True,
+            )
+        if result.error:
+            console.print(f"[bold red]FAILS[/]  {result.name}: {result.error}", highlight=False)
+    failed = sum(not r.passed for r in results)
+    console.print(f"{lines} lines of {len(results)} cases; {failed} cases fail", highlight=False)

@@ -1,18 +1,45 @@
-"""Options that several commands share, and the choice of renderer and device."""
+"""The Typer app of the server's commands, and the options that several commands share."""
 
 from __future__ import annotations
 
+import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from ..console import CommandError
+from ..console import CommandError, run_command
 
 if TYPE_CHECKING:
     from ..logs import LogSelection
 
+
+Function = TypeVar("Function", bound=Callable[..., None])
+
+app = typer.Typer(no_args_is_help=True)
+
+
+def command(name: str, *, group: typer.Typer = app) -> Callable[[Function], Function]:
+    """Register a function as the command ``name``; its parameters are the command's options.
+
+    On the command line, errors that a person can mend become one sentence and exit code 1; the
+    function itself is left as it is, and raises them.
+    """
+
+    def register(function: Function) -> Function:
+        @functools.wraps(function)
+        def invoke(**options: Any) -> None:
+            run_command(function, **options)
+
+        group.command(name)(invoke)
+        return function
+
+    return register
+
+
+# --- Options --------------------------------------------------------------------------------------
 
 JsonFile = Annotated[
     Path | None,
@@ -23,7 +50,9 @@ LogFolder = Annotated[Path, typer.Argument(help="Folder of a driving log.")]
 LogFormat = Annotated[
     str | None, typer.Option("--format", help="Format of the log; default: detected.")
 ]
-Sequence = Annotated[str | None, typer.Option(help="Sequence of a data set that holds several.")]
+SequenceName = Annotated[
+    str | None, typer.Option(help="Sequence of a data set that holds several.")
+]
 LogFrames = Annotated[
     str, typer.Option(help="Part of the log as FIRST:STOP such as 50:100 (end-exclusive).")
 ]
