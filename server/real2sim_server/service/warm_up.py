@@ -35,7 +35,7 @@ class KernelWarmUp:
     """Gets the kernels of one worker ready, those first that every session needs.
 
     On the first run a second process compiles beside this one, which then loads what the other left
-    on disk, see :mod:`.first_run`.
+    on disk, see :mod:`.preflight`.
     """
 
     def __init__(self) -> None:

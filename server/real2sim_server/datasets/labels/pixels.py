@@ -54,7 +54,7 @@ much more [m]."""
 
 @func(inline="always")
 def is_surface(body: Any, x: float, y: float, z: float) -> bool:
-    """Whether a place of the world is of a body and not of its shadow, see :mod:`.surface`.
+    """Whether a place of the world is of a body and not of its shadow.
 
     Args:
         body: at least 21 numbers: ``T_object_world`` [3, 4]; half length, width and height; margin
