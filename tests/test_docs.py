@@ -61,7 +61,7 @@ def test_the_newest_release_in_the_changelog_is_the_version() -> None:
     assert f"real2sim=={version}" in server["dependencies"]
     assert f"real2sim-server=={version}" in sdk["optional-dependencies"]["server"]
     heads = re.findall(r"^## (\S+)", (REPOSITORY / "CHANGELOG.md").read_text("utf-8"), re.M)
-    assert heads[:2] == ["Unreleased", version]
+    assert heads[0] == version
 
 
 def test_the_rest_page_has_every_error_code_with_its_status() -> None:

@@ -1,6 +1,6 @@
 """Driving logs: one reader per dataset and the synthetic generator, behind one DrivingLog type.
 
-The generator lives in :mod:`real2sim_server.synthetic` and is not imported here: it compiles kernels.
+The generator is in :mod:`real2sim_server.synthetic`; it compiles kernels, so nothing here imports it.
 """
 
 from .check import LogCheck, check_log
