@@ -65,5 +65,7 @@ def test_a_version_that_cannot_follow_is_refused_before_anything_is_written(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         release.prepare(checkout, version, date(2027, 1, 2))
-    changed = subprocess.run(["git", "status", "--short"], cwd=checkout, capture_output=True)
+    changed = subprocess.run(
+        ["git", "status", "--short"], cwd=checkout, capture_output=True, check=True
+    )
     assert changed.stdout == b""

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ._poses import Matrix
+from ._session_state import Matrix
 
 DRIVER = "egodriver.EgodriverService"
 RENDERER = "nre.grpc.protos.sensorsim.SensorsimService"

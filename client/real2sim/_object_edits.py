@@ -48,7 +48,7 @@ from real2sim_proto.storyboard import Storyboard
 
 from ._calls import checked, instant_us
 from ._handles import Handle, ScenarioState
-from ._poses import pose_between, pose_matrix, quaternion_of
+from ._session_state import pose_between, pose_matrix, quaternion_of
 
 R = TypeVar("R")
 Vector = tuple[float, float, float]

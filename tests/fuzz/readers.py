@@ -320,7 +320,7 @@ def read_pickle(path: Path) -> None:
 
 
 def read_checkpoint(path: Path) -> None:
-    from real2sim_server.reconstruct.imports.torch_file import unpack_torch_file
+    from real2sim_server.reconstruct.imports.checkpoint import unpack_torch_file
 
     unpack_torch_file(str(path), str(path.parent))
 
@@ -397,7 +397,7 @@ def _message(parts: Parts, folder: Path) -> Path:
 
 def _targets() -> list[Target]:
     from real2sim_server.logs import LogError
-    from real2sim_server.reconstruct.imports.torch_file import TorchFileError
+    from real2sim_server.reconstruct.imports.checkpoint import TorchFileError
     from real2sim_server.scenarios import ScenarioError
     from real2sim_server.world.recording.recording import RecordingError
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._poses import Matrix
+from .._session_state import Matrix
 
 WAY_BETWEEN = 50.0
 """An agent keeps points of its route so far apart, and those where its option changes [m]."""

@@ -19,7 +19,7 @@ import numpy as np
 from real2sim_proto.plans import TrajectoryPlan
 
 from .._alpasim import DRIVER, DRIVER_METHODS, GLOBAL_SHUTTER, MAX_MESSAGE_BYTES, Ftheta, messages
-from .._poses import Matrix, quaternion_of
+from .._session_state import Matrix, quaternion_of
 from .follow_route import Comfort, Path, delays_of_poses
 from .peer import (
     Look,

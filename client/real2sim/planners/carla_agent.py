@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.plans import Control
 
-from .._poses import Matrix
+from .._session_state import Matrix
 from ..images import Frame
 from ._carla import Lookup, PinholeView, lookup_of, offer_stand_ins
 from .peer import PeerError, T_ego_camera, rgb_frames

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._poses import Matrix, pose_matrix
+from .._session_state import Matrix, pose_matrix
 from ..errors import Real2SimError
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ import numpy as np
 from real2sim_proto.scenes import CameraInfo, SceneState
 
 from .._alpasim import GLOBAL_SHUTTER, MAX_MESSAGE_BYTES, RENDERER, RENDERER_METHODS, messages
-from .._poses import Matrix, pose_matrix, quaternion_of
+from .._session_state import Matrix, pose_matrix, quaternion_of
 from ..errors import CapacityError, NotFoundError, Real2SimError, UnreachableError
 from ..planners.alpasim import ALPASIM_CAMERAS
 from ..planners.peer import PeerError, cameras_for, looks_of

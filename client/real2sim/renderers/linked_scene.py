@@ -14,7 +14,7 @@ from real2sim_proto.base import Pose
 from real2sim_proto.scenes import SceneInfo
 
 from .._calls import describe
-from .._poses import Matrix, quaternion_of
+from .._session_state import Matrix, quaternion_of
 from ..errors import Real2SimError
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from real2sim_proto.scenes import ObjectInfo
 
 from .._calls import describe
-from .._poses import Matrix, pose_between, pose_matrix
+from .._session_state import Matrix, pose_between, pose_matrix
 from ..errors import NotFoundError, Real2SimError, UnreachableError
 from ..planners.neuroncap import NUSCENES_CAMERAS
 from ..planners.peer import Look, PeerError, cameras_for, looks_of

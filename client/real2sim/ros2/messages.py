@@ -16,7 +16,7 @@ import numpy as np
 
 from real2sim_proto.plans import Control, TrajectoryPlan
 
-from .._poses import Matrix, quaternion_of
+from .._session_state import Matrix, quaternion_of
 from ..errors import Real2SimError
 
 if TYPE_CHECKING:

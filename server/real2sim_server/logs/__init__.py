@@ -1,6 +1,6 @@
 """Driving logs: one reader per dataset and the synthetic generator, behind one DrivingLog type.
 
-The generator is in :mod:`real2sim_server.synthetic`; it compiles kernels, so nothing here imports it.
+The generator is in ``real2sim_server.synthetic``; it compiles kernels, so nothing imports it here.
 """
 
 from .check import LogCheck, check_log

@@ -17,7 +17,7 @@ from real2sim.planners.learned import REACH, PolicyShape, network, shrink, state
 from .._files import atomic_file
 from ..console import CommandError
 from ..datasets.clips import Clip
-from ..datasets.labels.futures import STEP_US
+from ..datasets.labels.boxes import STEP_US
 from ..edit import ScenarioState
 from ..edit.compose import instances_at
 from ..geometry.transform import quaternion_yaw, transform_from

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from real2sim._alpasim import DRIVER, DRIVER_METHODS, Ftheta, messages
-from real2sim._poses import quaternion_of
+from real2sim._session_state import quaternion_of
 from real2sim.planners import load_planner, needs_of
 from real2sim.planners.alpasim import AlpasimDriver
 from real2sim.planners.peer import PeerError

@@ -4,12 +4,10 @@ All of it comes from one pass per camera, from passes of objects alone and from 
 drive has; :data:`HOW` says which label from what.
 """
 
-from .boxes import ObjectBox, boxes_at, projected_box
-from .futures import ego_future, ego_state, futures_at
-from .how import HOW
+from .boxes import ObjectBox, boxes_at, ego_future, ego_state, futures_at, projected_box
 from .images import CameraImages, draw_moment, flow_between
 from .points import SeenPoints, lidar_points, points_in_boxes, seen_points
-from .views import CameraView, ObjectView, views_of
+from .views import HOW, CameraView, ObjectView, views_of
 
 __all__ = [
     "HOW",

@@ -30,8 +30,17 @@ from .accumulate import (
     voxel_levels,
     well_supported,
 )
-from .inpainting import ColourPrior, body_color, fill_from_mirror, fill_from_neighbours, fill_ground
-from .surfels import Surfels, fit_surfels, round_surfels, spread_ground
+from .surfels import (
+    ColourPrior,
+    Surfels,
+    body_color,
+    fill_from_mirror,
+    fill_from_neighbours,
+    fill_ground,
+    fit_surfels,
+    round_surfels,
+    spread_ground,
+)
 from .triangulate import TriangulatedPoints, sweep_planes, triangulate
 from .vehicle_body import (
     VEHICLE_LENGTH,

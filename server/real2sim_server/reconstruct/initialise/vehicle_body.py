@@ -17,8 +17,7 @@ from ...scene import Scene
 from ...synthetic.materials import BODY, PLAIN, WHEEL
 from ...synthetic.vehicles import CARGO_FLOOR, SHAPES, VehicleShape, build_vehicle
 from .accumulate import PointSet
-from .inpainting import GREY, fill_from_mirror, modal_colour
-from .surfels import Surfels
+from .surfels import GREY, Surfels, fill_from_mirror, modal_colour
 from .vehicle_parts import (
     Part,
     brightness,

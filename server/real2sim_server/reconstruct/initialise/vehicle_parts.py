@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...geometry.transform import Float
 from ...scene import SceneObject, Trajectory
 from ...synthetic.vehicles import VehicleShape, roof_heights
-from .inpainting import MIN_OBSERVED, modal_colour
+from .surfels import MIN_OBSERVED, modal_colour
 
 # Shading: one paint is brighter where it faces the sun and the sky.
 #

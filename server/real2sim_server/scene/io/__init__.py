@@ -1,10 +1,18 @@
 """Scenes, assets and splats on disk."""
 
-from .bundle import load_asset, load_scene, save_asset, save_scene
+from .bundle import (
+    StagingError,
+    StagingLimits,
+    load_asset,
+    load_scene,
+    save_asset,
+    save_scene,
+    stage_asset,
+    stage_scene,
+)
 from .export import export_scene
 from .packed import DEMO_SCENE, SHIPPED_STREET, read_packed, write_packed
 from .splats import import_splats, read_splats, write_splats
-from .staging import StagingError, StagingLimits, stage_asset, stage_scene
 from .summary import (
     AssetSummary,
     ObjectSummary,

@@ -235,7 +235,7 @@ MAX_IMPORTS = 8
 class ImportQueue:
     """One import after the other, on a thread that nothing else uses. Belongs to the event loop.
 
-    The reading is done by a process with limits, see :mod:`real2sim_server.scene.io.staging`; one
+    The reading is done by a process with limits, see :mod:`real2sim_server.scene.io.bundle`; one
     at a time, so that these are the limits of all imports together.
     """
 

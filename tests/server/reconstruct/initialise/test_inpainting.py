@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from real2sim_server.reconstruct.initialise.inpainting import (
+from real2sim_server.reconstruct.initialise.surfels import (
     body_color,
     fill_from_neighbours,
     modal_colour,

@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.reconstruct.lidar.ray_loss import (
-    LOGIT,
-    REACH,
-    SHIFT,
-    SIZE,
-    ray_gradients,
-)
+from real2sim_server.reconstruct.lidar.learn import LOGIT, REACH, SHIFT, SIZE, ray_gradients
 
 BEGINS = np.array([0, 3], np.int64)
 MEMBERS = np.array([0, 1, 2], np.int32)
