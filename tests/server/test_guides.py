@@ -75,7 +75,8 @@ def test_readme(
         url = opened.enter_context(running_worker(settings)).url
         monkeypatch.setenv("REAL2SIM_URL", url)
         serve = "real2sim serve --scenes out/scenes "
-        readme.shell("curl", {serve: ": ", "'http://127.0.0.1:8600/v1": f"'{url}/v1"})
+        ours = {serve: f"export REAL2SIM_URL={url}; : ", "'http://127.0.0.1:8600/v1": f"'{url}/v1"}
+        readme.shell("curl", ours)
         assert picture(readme.folder / "frame.jpg").shape[2] == 3
         edit = readme.python("car in my lane")
         place = edit["scenario"].objects["car_6"].position
