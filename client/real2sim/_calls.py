@@ -275,7 +275,7 @@ def parse_image(reply: Reply, modality: str) -> Image:
     codecs = {media_type: codec for codec, media_type in MEDIA_TYPES.items()}
     codec = codecs.get(reply.media_type)
     if codec is None:
-        raise MalformedReplyError(f"the worker sent {reply.media_type!r} where an image was asked")
+        raise MalformedReplyError(f"the worker sent {reply.media_type!r} instead of an image")
     dtype = "uint8" if modality in ("rgb", "semantic") else "uint16"
     shape = encoded_shape(reply.content, codec)
     return Image(data=reply.content, codec=codec, modality=modality, dtype=dtype, shape=shape)

@@ -294,7 +294,7 @@ def poll_delays(job_id: str, timeout: float | None) -> Iterator[float]:
         yield delay
         delay = min(delay * 1.5, MAX_POLL_S)
     raise ReplyTimeoutError(
-        f"end of job {job_id!r}", timeout or 0.0, hint="it goes on; wait again, or cancel it"
+        f"end of job {job_id!r}", timeout or 0.0, hint="the job continues; wait again or cancel it"
     )
 
 

@@ -125,7 +125,7 @@ class ObjectEdits(Handle, Generic[R]):
     def _track(self) -> Track:
         track = self.info.trajectory
         if track is None:
-            raise ValueError(f"the worker has told no trajectory of {self.object_id!r}; refresh()")
+            raise ValueError(f"the trajectory of {self.object_id!r} is not loaded; call refresh()")
         return track
 
     def pose(self, t: float | None = None, *, t_us: int | None = None) -> Pose:

@@ -382,9 +382,9 @@ class SessionBase(Handle):
         expected, revision = request.only_at_revision, self.welcome.revision
         if expected is not None and revision != expected:
             raise ConnectionLostError(
-                f"the connection was lost while {request.awaited} was awaited; the session is at "
+                f"the connection was lost before {request.awaited} arrived; the session is at "
                 f"revision {revision}, so it took effect",
-                hint="the session goes on; look at the next observation",
+                hint="the session continues; read the next observation",
             )
 
     def _timeout_of(self, request: PendingRequest[Any]) -> float:

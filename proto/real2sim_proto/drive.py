@@ -78,7 +78,7 @@ Slot = Annotated[
 def check_asked(*asked: Sequence[object]) -> None:
     """Raises ValueError: nothing is to be shown."""
     if not any(asked):
-        raise ValueError("nothing is asked for; name sensors, lidars or radars")
+        raise ValueError("the request is empty; name sensors, lidars or radars")
 
 
 class Envelope(Model):

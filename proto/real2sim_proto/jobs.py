@@ -270,7 +270,7 @@ class SweptValues(Model):
         if sum(value is not None for value in given) != 1:
             raise ValueError("give exactly one of values, range, uniform and normal")
         if self.uniform is not None and self.uniform[0] > self.uniform[1]:
-            raise ValueError("uniform wants its lower bound first")
+            raise ValueError("the lower bound of uniform must come first")
         return self
 
     @property
@@ -385,11 +385,13 @@ class DatasetRequest(Model):
         if sum(name is not None for name in (self.scenario, self.scene, self.session)) != 1:
             raise ValueError("name exactly one of scenario, scene and session")
         if self.recording is not None and self.scene is None:
-            raise ValueError("a recording wants the scene that it ran on")
+            raise ValueError("a recording needs the scene that it was made in")
         if self.sweep is not None and (self.recording is not None or self.session is not None):
-            raise ValueError("a sweep edits a scene or a scenario; an episode stays as it went")
+            raise ValueError(
+                "a sweep varies a scene or a scenario; a recorded episode cannot change"
+            )
         if self.rig is not None and (self.cameras or self.width or self.lidar):
-            raise ValueError("a rig says all of cameras, width and lidar: leave those out")
+            raise ValueError("a rig replaces cameras, width and lidar: leave those out")
         return self
 
 

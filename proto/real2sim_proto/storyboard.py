@@ -78,7 +78,7 @@ class Entity(Model):
     @model_validator(mode="after")
     def _is_someone(self) -> Entity:
         if (self.kind == "object") != (self.object_id is not None):
-            raise ValueError(f"entity {self.name!r}: object_id goes with kind 'object'")
+            raise ValueError(f"entity {self.name!r}: object_id is only allowed with kind 'object'")
         return self
 
 

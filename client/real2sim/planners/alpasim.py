@@ -230,7 +230,7 @@ class AlpasimDriver:
             raise PeerError(
                 f"the driver at {self.target} has no plan after {self._without_plan} "
                 f"observations: {said}",
-                hint="see which context it needs, and what --dt-us lies between observations",
+                hint="check which context it needs, and the time between observations (--dt-us)",
             )
         delays = delays_of_poses(speed=1.0, horizon=3.0, spacing=0.25)
         path = Path.along(obs.route)

@@ -86,7 +86,7 @@ class _AgentNeeds(Needs):
                 raise PeerError(
                     f"the agent's camera {name!r} looks where the scene's cameras "
                     f"({', '.join(there) or 'none'}) see {coarse.covered:.0%} of its image",
-                    hint="drive a scene with a camera that looks that way, or turn the agent's",
+                    hint="use a scene with a camera facing that direction, or turn the agent's",
                 )
             for camera in coarse.cameras:
                 there_is = there[camera]
@@ -175,7 +175,7 @@ class CarlaAgent:
             kind = sensor.get("type")
             if kind != CAMERA and kind not in OTHER_SENSORS:
                 raise PeerError(
-                    f"the agent's sensor {sensor.get('id')!r} is a {kind!r}, which is not there",
+                    f"the agent's sensor {sensor.get('id')!r} is an unsupported {kind!r}",
                     hint=f"there are {', '.join((CAMERA, *OTHER_SENSORS))}",
                 )
         return sensors

@@ -162,11 +162,13 @@ def _camera_for(
         return wanted
     cameras = ", ".join(there) or "none"
     if name in given:
-        raise PeerError(f"camera {wanted!r}, given for {name!r}, is not there; there: {cameras}")
+        raise PeerError(
+            f"camera {wanted!r}, given for {name!r}, does not exist; available: {cameras}"
+        )
     if name not in known:
         raise PeerError(
-            f"the planner wants camera {name!r}, and nothing says which of {cameras} that is",
-            hint=f"say so: cameras={name}:{next(iter(there), 'CAMERA')}",
+            f"the planner needs camera {name!r}, which matches none of {cameras} by name",
+            hint=f"map it: cameras={name}:{next(iter(there), 'CAMERA')}",
         )
     look = known[name]
 
@@ -176,8 +178,8 @@ def _camera_for(
     near = [camera for camera in there if apart(camera) <= MAX_ANGLE]
     if not near:
         raise PeerError(
-            f"the planner wants camera {name!r}, and none of {cameras} looks that way",
-            hint=f"take another one: cameras={name}:{next(iter(there), 'CAMERA')}",
+            f"the planner needs camera {name!r}, but none of {cameras} faces that direction",
+            hint=f"use another one: cameras={name}:{next(iter(there), 'CAMERA')}",
         )
     return min(near, key=lambda c: (apart(c) + 0.5 * abs(there[c].field - look.field), c))
 

@@ -89,7 +89,7 @@ class Needs:
         missing = [name for name in self.cameras if name not in there]
         if missing or not there:
             raise ValueError(
-                f"the planner wants camera {(missing or ['any'])[0]!r}; the scene has "
+                f"the planner needs camera {(missing or ['any'])[0]!r}; the scene has "
                 f"{', '.join(there) or 'none'}"
             )
         return [

@@ -65,12 +65,12 @@ def run_confined(
     try:
         told = [json.loads(line) for line in lines]
     except (ValueError, RecursionError) as error:
-        raise ConfinedError("the process that read it told no JSON") from error
+        raise ConfinedError("the process that read it returned no JSON") from error
     ended = told[-1]
     if ended["late"] or ended["exit"] == -signal.SIGXCPU:
-        raise ConfinedError(f"took longer than {limits.seconds:g} s, which is allowed")
+        raise ConfinedError(f"exceeded the time limit of {limits.seconds:g} s")
     if len(told) != 2:
-        raise ConfinedError(f"the process that read it ended by {_ending(ended['exit'])}")
+        raise ConfinedError(f"the process that read it ended with {_ending(ended['exit'])}")
     return _value(told[0], limits, errors)
 
 

@@ -185,9 +185,9 @@ def _own_architecture() -> list[str]:
 
     if not torch.cuda.is_available():
         raise CommandError(
-            "torch sees no CUDA device here, so --build-gpu needs to be told what for: "
+            "torch finds no CUDA device, so --build-gpu needs the architecture: "
             "--arch sm_90 for H100 and H200, sm_89 for L4 and RTX 40, sm_86 for RTX 30, sm_80 for "
-            "A100; it may be given several times"
+            "A100; repeat the option for several"
         )
     major, minor = torch.cuda.get_device_capability()
     return [f"sm_{major}{minor}"]

@@ -183,7 +183,7 @@ def changed(setup: Experiment, values: dict[str, PhysicsValues]) -> dict[str, Ob
     unknown = sorted(values.keys() - objects.keys() - {"*"})
     if unknown:
         raise CommandError(
-            f"--physics is given for {unknown[0]!r}, which takes no part; taking part: "
+            f"--physics is given for {unknown[0]!r}, which is not simulated; simulated objects: "
             f"{', '.join(objects)}"
         )
     return {
@@ -202,7 +202,7 @@ def continue_driving(
     from ..simulation.rollout import SimulateOptions
 
     if not objects:
-        raise CommandError("name what to simulate with --object, or take an --experiment")
+        raise CommandError("choose objects with --object, or an --experiment")
     if frame >= len(scene.frame_times_us):
         last = len(scene.frame_times_us) - 1
         raise CommandError(f"--frame {frame}; the scene has frames 0 to {last}")

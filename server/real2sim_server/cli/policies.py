@@ -152,15 +152,17 @@ def _cases(
     from ..policies.suite import DEMO_SUITE, cases_as_recorded, load_suite
 
     if reset is not None and not (scenes or scenarios):
-        raise CommandError("--reset goes with --scene and --scenario; a suite names its own")
+        raise CommandError(
+            "--reset is only allowed with --scene or --scenario; a suite defines its own"
+        )
     if suite is not None:
         if scenes or scenarios:
-            raise CommandError("give scenes and scenarios, or a suite that names its own")
+            raise CommandError("give either scenes and scenarios, or a suite")
         return load_suite(suite)
     if scenes or scenarios:
         return cases_as_recorded(scenes, scenarios, _options(reset))
     if not demo:
-        raise CommandError("name what to drive: --scene, --scenario or --suite")
+        raise CommandError("nothing to drive: give --scene, --scenario or --suite")
     return load_suite(DEMO_SUITE)
 
 

@@ -81,7 +81,7 @@ def cameras_of(values: Mapping[str, Any], rig: CameraRig) -> list[Camera]:
         raise DatasetError(f"rig: {error}") from error
     names = [camera.name for camera in asked]
     if len(set(names)) != len(names):
-        raise DatasetError(f"rig: a camera's name stands for one camera only, not {names}")
+        raise DatasetError(f"rig: camera names must be unique, not {names}")
     return [_camera(camera, rig) for camera in asked]
 
 
@@ -96,7 +96,7 @@ def _camera(asked: RigCamera, rig: CameraRig) -> Camera:
         camera = rig[asked.name]
         return camera if asked.width is None else camera.resized(asked.width)
     if asked.width is None or asked.height is None:
-        raise DatasetError(f"rig: camera {asked.name!r} with hfov_deg wants width and height")
+        raise DatasetError(f"rig: camera {asked.name!r} with hfov_deg needs width and height")
     focal = asked.width / (2 * math.tan(math.radians(asked.hfov_deg) / 2))
     K = np.array([[focal, 0, asked.width / 2], [0, focal, asked.height / 2], [0, 0, 1.0]])
     pose = transform_from(asked.position, (1.0, 0.0, 0.0, 0.0))

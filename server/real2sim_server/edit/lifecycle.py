@@ -100,7 +100,7 @@ def spawn(state: ScenarioState, operation: Spawn) -> AppliedOperation:
     appearance = _appearance(state, operation)
     if operation.pose is None:
         raise invalid_operation(
-            "a place beside the ego's route is known in a running session only",
+            "a position relative to the ego's route is only allowed in a running session",
             hint="give the pose of the box centre",
         )
     start_us = state.clock[0] if operation.start_us is None else operation.start_us

@@ -220,8 +220,9 @@ class Scenario:
         if base_revision is not None and base_revision != self.revision:
             raise EditError(
                 ErrorCode.STALE_REVISION,
-                f"made for revision {base_revision}; the scenario is at {self.revision}",
-                hint=f"read what changed after {base_revision} and send it again",
+                f"the edit was made for revision {base_revision}; the scenario is at "
+                f"{self.revision}",
+                hint=f"read the changes after {base_revision} and send the edit again",
             )
 
     def _entry(

@@ -84,7 +84,9 @@ def align(
     """
     driven = np.asarray(poses, dtype=np.float64).reshape(-1, 3)
     if len(driven) < 5:
-        raise MapError("a map is aligned to what was driven, and nobody drove 10 m in this scene")
+        raise MapError(
+            "a map is aligned to recorded paths, and no vehicle drove 10 m in this scene"
+        )
     if start is not None:
         return _checked(_refined(graph, driven, np.array(start)))
     here = np.zeros(3)
@@ -220,8 +222,8 @@ def _anywhere(graph: LaneGraph, poses: Float) -> Alignment:
         if apart and _cost(other) < _cost(best) + AS_GOOD_M:
             places = " and ".join(f"{f.yaw:.3f},{f.x:.1f},{f.y:.1f}" for f in (best, other))
             raise MapError(
-                f"the map fits what was driven in several places alike, such as "
-                f"(yaw,x,y) {places}; say which with --at"
+                f"the map fits the recorded path equally well in several places, such as "
+                f"(yaw,x,y) {places}; choose one with --at"
             )
     return best
 
@@ -235,6 +237,6 @@ def _checked(fit: Alignment) -> Alignment:
         raise MapError(
             f"the map does not fit: driven poses are {fit.residual:.2f} m from centre lines in the "
             f"median (allowed: {MEDIAN_M} m), {fit.within:.0%} of them inside a lane of their "
-            f"direction (least: {WITHIN:.0%}); give another map, or where it lies with --at"
+            f"direction (minimum: {WITHIN:.0%}); use another map, or give its pose with --at"
         )
     return fit

@@ -60,7 +60,7 @@ def lanes_from_log(log: DrivingLog) -> LaneGraph:
     ways += [_line(t.trajectory.positions - [0, 0, t.size[2] / 2]) for t in tracks]
     driven = [way for way in ways if len(way) * STEP_M >= MIN_LENGTH_M]
     if not driven:
-        raise MapError(f"log {log.name!r}: nobody drives {MIN_LENGTH_M:.0f} m in it")
+        raise MapError(f"log {log.name!r}: no vehicle drives {MIN_LENGTH_M:.0f} m in it")
     points, intensity = _ground_returns(log)
     made = [_marked(line, points, intensity) for line in _gathered(driven)]
     lanes = [

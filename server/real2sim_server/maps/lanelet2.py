@@ -94,7 +94,7 @@ class _Osm:
         for way_id, refs in ways.items():
             for node in refs:
                 if node not in places:
-                    raise MapError(f"{file}: way {way_id} names node {node}, which is not there")
+                    raise MapError(f"{file}: way {way_id} names node {node}, which is missing")
         relations = {}
         for element in related:
             members: dict[str, list[tuple[str, str]]] = defaultdict(list)

@@ -135,9 +135,9 @@ class _Search:
         known: np.ndarray = np.sqrt(np.diag(_covariance(J))) * self._scatter() < MAX_UNCERTAINTY
         if not known.any():
             raise SolverError(
-                f"these observations do not tell {', '.join(self._names)}: whatever they are, the "
-                "simulation is the same within what they are known to; observe what the values "
-                "change (a dent, a bounce, a slide), more often or more exactly"
+                f"these observations do not determine {', '.join(self._names)}: for all values the "
+                "simulation agrees with them within their accuracy; add observations that depend on "
+                "it (a dent, a bounce, a slide), or more accurate ones"
             )
         return known
 

@@ -332,8 +332,8 @@ def _check_optics(optics: LensView, request: RasterRequest) -> None:
     same = same and request.cameras == 1 and np.array_equal(given[1][0], camera.K)
     if not (same and np.allclose(given[0][0], optics.viewmat, atol=1e-9)):
         raise RenderError(
-            f"optics are of one camera, {camera.name!r} of {camera.width}x{camera.height}, whose K "
-            "and viewmat in the middle of the read-out must be those given"
+            f"optics require one camera, {camera.name!r} of {camera.width}x{camera.height}, whose "
+            "K and viewmat at mid-readout equal the given ones"
         )
     for index, instance in enumerate(request.instances):
         twist = instance.twist
@@ -440,7 +440,7 @@ def _check_cloud(cloud: GaussianCloud, name: str) -> None:
         raise RenderError(f"{name}.scales must be linear and >= 0; were logarithms given?")
     low, high = cloud.opacities.detach().aminmax()
     if low < 0 or high > 1:
-        raise RenderError(f"{name}.opacities must lie in [0, 1]; were logits given?")
+        raise RenderError(f"{name}.opacities must be in [0, 1]; are they logits?")
 
 
 def _check_colour(colour: TimeColour, gaussians: int, name: str) -> None:

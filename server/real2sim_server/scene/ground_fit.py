@@ -390,7 +390,7 @@ def find_road_plane(
     candidates = np.flatnonzero(_around(points, boxes))
     if len(candidates) < 3:
         raise SceneError(
-            f"{len(candidates)} of {len(points)} points lie around the {len(boxes)} boxes; "
+            f"{len(candidates)} of {len(points)} points are around the {len(boxes)} boxes; "
             "at least 3 are needed to find the ground"
         )
     normal, offset, inliers = _ransac(points[candidates], seed)

@@ -410,8 +410,8 @@ async def _driven(
     if session.world is None or session.world is before:
         raise ServiceError(
             ErrorCode.JOB_FAILED,
-            f"nobody has driven: {error or 'the planner left before its first observation'}",
-            hint="start it again, or read the log of the planner",
+            f"the planner did not drive: {error or 'it ended before its first observation'}",
+            hint="start it again, or read the planner's log",
         )
     return error
 

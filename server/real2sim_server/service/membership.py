@@ -234,7 +234,7 @@ def _made_before(folder: Path, row: BundleRow) -> bool:
 def _unavailable(what: str, error: ObjectStoreError) -> ServiceError:
     return ServiceError(
         ErrorCode.STORAGE_UNAVAILABLE,
-        f"{what} lies in the store of objects, which does not give it: {error}",
+        f"{what} is in the object store, which failed to return it: {error}",
         hint="send it again after Retry-After seconds",
     )
 

@@ -336,8 +336,8 @@ def _times(times_us: Sequence[int], start_us: int) -> Float:
     times: Float = (np.array(times_us, dtype=np.float64) - start_us) * 1e-6
     if times.min() < 0 or times.max() > MAX_OBSERVED_TIME:
         raise PhysicsError(
-            f"observations reach from {min(times_us)} to {max(times_us)} us; the simulation begins "
-            f"at {start_us} us: give what was seen from then on, for {MAX_OBSERVED_TIME:g} s at "
+            f"observations are from {min(times_us)} to {max(times_us)} us; the simulation begins "
+            f"at {start_us} us: give observations after that, over {MAX_OBSERVED_TIME:g} s at "
             "most"
         )
     return times
@@ -476,7 +476,7 @@ def calibrate_object(
         raise PhysicsError(f"cannot fit {unknown}; allowed are {', '.join(PARAMETERS)}")
     if object_id not in options.objects:
         raise PhysicsError(
-            f"{object_id!r} takes no part; taking part: {', '.join(options.objects)}"
+            f"{object_id!r} is not simulated; simulated objects: {', '.join(options.objects)}"
         )
     if not observations:
         raise PhysicsError("nothing was observed; give boxes, points or images")

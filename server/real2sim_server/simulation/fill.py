@@ -67,7 +67,7 @@ class Filling:
         solid = solid & (heights >= above)
         pieces, count = ndimage.label(solid)
         if count == 0:
-            raise ParticleError(f"nothing of it lies above {above:.2f} m in the object's frame")
+            raise ParticleError(f"it has no matter above {above:.2f} m in the object's frame")
         largest = 1 + int(np.bincount(pieces[pieces > 0])[1:].argmax())
         index = np.argwhere(pieces == largest)
         volumes = np.full(len(index), self.spacing**3)

@@ -116,7 +116,7 @@ def _subjects(
         subject = there[object_id]
         if physics.T_world_object is None and not subject.trajectory.covers(start_us):
             raise PhysicsError(
-                f"object {object_id!r} is not there at {start_us} us; it is from "
+                f"object {object_id!r} does not exist at {start_us} us; it exists from "
                 f"{subject.trajectory.start_us} to {subject.trajectory.end_us} us"
             )
         subjects.append(subject)

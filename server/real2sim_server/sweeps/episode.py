@@ -255,8 +255,8 @@ class CameraFeed:
             return None
         if set(needs.modalities) != {"rgb"}:
             raise ValueError(
-                f"the planner wants {', '.join(needs.modalities)}; sweeps draw rgb alone: drive it "
-                "with evaluate-policy"
+                f"the planner needs {', '.join(needs.modalities)}; sweeps only render rgb: "
+                "drive it with evaluate-policy"
             )
         sensors = needs.sensors(camera_infos(tuple(scene.rig)))
         cameras = (scene.rig[sensor["camera"]] for sensor in sensors)

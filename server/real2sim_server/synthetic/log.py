@@ -90,7 +90,7 @@ class SyntheticLog(DrivingLog):
         if len(vehicles) and max(vehicles) >= len(source.drive.vehicles):
             raise ValueError(
                 f"only vehicles can be placed, tracks 0 to {len(source.drive.vehicles) - 1}; "
-                f"{max(vehicles)} is somebody on foot or on a bicycle"
+                f"{max(vehicles)} is a pedestrian or cyclist"
             )
         return shoot_image(
             source.world,

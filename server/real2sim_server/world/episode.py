@@ -117,7 +117,7 @@ def _clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
     if spec.warmup_us and any(spec.randomization.start.model_dump().values()):
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
-            "a warm-up follows the log, and randomization.start begins beside it",
+            "a warm-up follows the log, but randomization.start moves the start off it",
             hint="leave out one of warmup_us and randomization.start",
         )
     if spec.beyond_log == "end" and spec.horizon is not None and spec.horizon > longest:

@@ -321,8 +321,8 @@ def _mounted_lidar(spec: LidarSpec, dt_us: int) -> MountedLidar:
         raise _refused(f"{what}: a sweep of {duration_us} us; {MAX_SWEEP_US} us at most")
     if period_us < duration_us:
         raise _refused(
-            f"{what}: a sweep takes {duration_us} us and is asked for every {period_us} us",
-            hint=f"give period_us from {duration_us} on, or a higher rate_hz",
+            f"{what}: a sweep takes {duration_us} us, longer than the period of {period_us} us",
+            hint=f"set period_us to at least {duration_us}, or a higher rate_hz",
         )
     return MountedLidar(spec, lidar, period_us)
 

@@ -330,7 +330,8 @@ class World:
         if base_revision is not None and base_revision != self.revision:
             raise EditError(
                 ErrorCode.STALE_REVISION,
-                f"made for revision {base_revision}; the session is at {self.revision}",
+                f"the edit was made for revision {base_revision}; the session is at "
+                f"{self.revision}",
                 hint="look at the objects again and send the edit for the present revision",
             )
         s, t_us = self._path_point.s, self.t_us

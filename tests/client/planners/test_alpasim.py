@@ -264,9 +264,9 @@ def test_cameras_are_named_behind_the_target(driver, infos):
 @pytest.mark.parametrize(
     ("wanted", "suffix", "said"),
     [
-        ("middle", "", "nothing says which of front, left, CAM_BACK"),
-        ("camera_cross_right_120fov", "", "none of front, left looks that way"),
-        ("middle", "?cameras=middle:roof", "camera 'roof', given for 'middle', is not there"),
+        ("middle", "", "matches none of front, left, CAM_BACK"),
+        ("camera_cross_right_120fov", "", "none of front, left faces that direction"),
+        ("middle", "?cameras=middle:roof", "camera 'roof', given for 'middle', does not exist"),
     ],
 )
 def test_a_camera_that_nothing_here_stands_for_is_said(driver, infos, wanted, suffix, said):

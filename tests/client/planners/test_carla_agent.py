@@ -155,7 +155,7 @@ def test_a_camera_that_nothing_sees_is_refused(planner):
 def test_a_sensor_that_is_not_there_is_refused(tmp_path):
     file = tmp_path / "agent.py"
     file.write_text(AGENT.replace("sensor.other.imu", "sensor.lidar.ray_cast"))
-    with pytest.raises(PeerError, match=r"'IMU' is a 'sensor.lidar.ray_cast', which is not there"):
+    with pytest.raises(PeerError, match=r"'IMU' is an unsupported 'sensor.lidar.ray_cast'"):
         CarlaAgent(str(file))
 
 

@@ -185,7 +185,7 @@ def test_a_rig_has_cameras_of_its_own(tiny_drive):
     ("cameras", "message"),
     [
         ([{"name": "rear"}], "the scene has front, left"),
-        ([{"name": "own", "hfov_deg": 90.0}], "wants width and height"),
+        ([{"name": "own", "hfov_deg": 90.0}], "needs width and height"),
         ([{"name": "front"}, {"name": "front"}], "one camera only"),
         ([{"name": "front", "hfov_deg": 300.0}], "hfov_deg"),
     ],

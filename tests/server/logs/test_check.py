@@ -152,7 +152,7 @@ CONTENTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "NaN origin": (not_a_number("origin"), "origin must be finite"),
     "absolute times": (
         absolute_times,
-        "offset_us goes from .* must be relative",
+        "offset_us ranges from .* must be relative",
     ),
 }
 

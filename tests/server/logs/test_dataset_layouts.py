@@ -109,7 +109,7 @@ def test_pickles_with_anything_but_arrays_are_refused_unrun(
     folder, proof = copied("street_gaussians"), tmp_path / "proof"
     evil = np.array({"0": _Evil(proof)}, dtype=object)
     np.savez(folder / "pointcloud.npz", pointcloud=evil)
-    with pytest.raises(LogError, match=r"pointcloud\.npz.*asks for .*, which is no array"):
+    with pytest.raises(LogError, match=r"pointcloud\.npz.*contains .*, which is not an array"):
         open_log(folder).lidar(0)
     assert not proof.exists()
 

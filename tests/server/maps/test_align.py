@@ -59,7 +59,7 @@ def test_a_straight_road_that_fits_anywhere_is_refused():
 
 
 def test_nothing_driven_is_refused():
-    with pytest.raises(MapError, match="nobody drove"):
+    with pytest.raises(MapError, match="no vehicle drove"):
         align(GRAPH, np.zeros((0, 3)))
 
 

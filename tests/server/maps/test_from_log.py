@@ -60,5 +60,5 @@ def test_ways_alone_tell_both_lanes_and_say_how_well(street):
 def test_a_log_in_which_nobody_drives_is_refused_by_name(street):
     still = Trajectory.from_transforms([0, 10_000_000], np.tile(np.eye(4), (2, 1, 1)))
     log = replace(street, source=Sparse(), ego=still, tracks=())
-    with pytest.raises(MapError, match=r"synthetic_1.*nobody drives"):
+    with pytest.raises(MapError, match=r"synthetic_1.*no vehicle drives"):
         lanes_from_log(log)

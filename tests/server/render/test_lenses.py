@@ -257,7 +257,7 @@ def test_training_through_a_lens_is_refused_on_the_cpu(instances):
 def test_optics_of_another_camera_are_refused(instances, change):
     other = replace(camera("brown"), **change)
     optics = LensView(camera("brown"), CameraMotion.still(POSE))
-    with pytest.raises(RenderError, match="optics are of one camera"):
+    with pytest.raises(RenderError, match="optics require one camera"):
         rasterize(
             instances,
             optics.viewmat[None],

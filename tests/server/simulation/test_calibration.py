@@ -154,7 +154,7 @@ def test_what_was_observed_on_half_the_cells_is_found_within_the_uncertainty(sce
 
 
 def test_observations_that_tell_nothing_are_refused(scene, state, truth):
-    with pytest.raises(PhysicsError, match="do not tell yield_stress"):
+    with pytest.raises(PhysicsError, match="do not determine yield_stress"):
         calibrated(scene, state, boxes_of(truth), "yield_stress")
 
 

@@ -33,7 +33,7 @@ def test_a_blind_planner_is_shown_nothing(left_first):
 
 
 def test_modalities_that_sweeps_do_not_draw_are_named(left_first):
-    with pytest.raises(ValueError, match="wants depth; sweeps draw rgb alone"):
+    with pytest.raises(ValueError, match="needs depth; sweeps only render rgb"):
         CameraFeed.of(left_first, Needs(modalities=("depth",)))
 
 

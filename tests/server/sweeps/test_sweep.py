@@ -150,7 +150,7 @@ def test_a_stop_rule_ends_at_the_same_row_whatever_was_driven(alone, scene_folde
     [
         ({"metrics": ["beauty"]}, "no score 'beauty'"),
         ({"rank_by": "beauty"}, "no column"),
-        ({"planners": ["depth_sampling"]}, "sweeps draw rgb alone"),
+        ({"planners": ["depth_sampling"]}, "sweeps only render rgb"),
         ({"planners": ["nobody"]}, "is unknown"),
         ({"case": SWEEP["case"] | {"scene": "nowhere"}}, "no scene 'nowhere'"),
         ({"parameters": {"steps": {"low": 0, "high": 1}}}, "name of a column"),

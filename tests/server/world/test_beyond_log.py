@@ -358,7 +358,7 @@ def test_a_look_that_does_not_exist_is_refused(street):
 
 
 def test_a_scene_without_vehicles_has_nobody_to_look_like(make_world):
-    with pytest.raises(WorldError, match="nobody to look like"):
+    with pytest.raises(WorldError, match="has no appearance"):
         make_world(spec={"agents": {"spawn": SPAWN}})
 
 

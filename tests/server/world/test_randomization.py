@@ -120,7 +120,7 @@ def test_what_is_drawn_is_in_the_first_observation_alone(begun):
 
 
 def test_a_start_is_not_drawn_for_a_warm_up(begun):
-    with pytest.raises(WorldError, match="begins beside it"):
+    with pytest.raises(WorldError, match="moves the start off it"):
         begun(1, START, spec={"warmup_us": 500_000})
 
 

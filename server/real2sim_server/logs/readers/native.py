@@ -320,7 +320,7 @@ def _read_sweep(path: Path) -> LidarSweep:
             )
     if len(points) and np.abs(offset_us.astype(np.float64)).max() > MAX_OFFSET_US:
         raise LogError(
-            f"{path}: offset_us goes from {offset_us.min()} to {offset_us.max()}; it must be "
+            f"{path}: offset_us ranges from {offset_us.min()} to {offset_us.max()}; it must be "
             "relative to the frame's time, in microseconds (the point's time minus the frame's)"
         )
     return LidarSweep(

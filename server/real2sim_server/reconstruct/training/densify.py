@@ -473,7 +473,9 @@ class Strategy:
             ReconstructError: the renderer keeps no screen statistics.
         """
         if output.screen is None:
-            raise ReconstructError("this renderer does not count what it draws; choose another")
+            raise ReconstructError(
+                "this renderer does not report the contributions of Gaussians; choose another"
+            )
 
     def step_post_backward(
         self, gaussians: Gaussians, optimizer: SelectiveAdam, step: TrainingStep

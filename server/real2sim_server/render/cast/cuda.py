@@ -175,7 +175,7 @@ class CudaCaster:
         pairs = int(ends[-1])
         if pairs > MAX_PAIRS:
             raise RenderError(
-                f"a sweep whose Gaussians lie in {pairs} tiles is more than the {MAX_PAIRS} that "
+                f"the sweep has {pairs} pairs of Gaussian and tile, more than the {MAX_PAIRS} that "
                 "can be sorted at once; cast fewer rays in a sweep"
             )
         held.space(sweep, "keys", (pairs,), torch.int64)

@@ -209,7 +209,7 @@ def _level(part: Part) -> None:
 
 def _flat(part: Part, name: str) -> None:
     if name in part.raw.attributes and part.number(name) != 0.0:
-        raise part.error(f"{name} of <{part.tag}> is not supported but as 0: objects stand level")
+        raise part.error(f"{name} of <{part.tag}> must be 0: objects stay level")
 
 
 _POSITIONS: dict[str, Callable[[Positions, Part], Fields]] = {

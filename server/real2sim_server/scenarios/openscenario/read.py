@@ -97,7 +97,7 @@ class Catalogs:
             raise part.error(f"catalogs in {path!r} cannot be read: the file came alone")
         folder = (self._folder / path).resolve()
         if not folder.is_dir():
-            raise part.error(f"there is no folder {path!r} of catalogs beside the scenario")
+            raise part.error(f"no catalog folder {path!r} next to the scenario file")
         files = sorted(folder.glob("*.xosc"))
         if len(files) > MAX_FILES:
             raise part.error(f"folder {path!r} holds more than {MAX_FILES} catalogs")
@@ -531,7 +531,7 @@ class _Reader:
         found = self.catalogs.entry(found, "Environment") if is_named else scoped(found)
         road = found.find("RoadCondition")
         if road is not None and road.number("frictionScaleFactor", 1.0) != 1.0:
-            raise road.error("frictionScaleFactor is not supported but as 1")
+            raise road.error("frictionScaleFactor must be 1")
         _read_all(found.raw)
         self.notes.append(
             f"environment {found.text('name', '')!r}: images show the scene in its own weather and "
@@ -561,7 +561,7 @@ class _Reader:
     def _group(self, part: Part) -> Fields:
         who = part.child("Actors")
         if who.flag("selectTriggeringEntities", False):
-            raise who.error("selectTriggeringEntities is not supported but as false")
+            raise who.error("selectTriggeringEntities must be false")
         maneuvers = list[Fields]()
         for each in part.children("Maneuver", "CatalogReference"):
             is_named = each.tag == "CatalogReference"

@@ -75,7 +75,7 @@ def _check(board: Storyboard) -> None:
         if entity.box is None:
             raise _wordless(f"entity {entity.name!r} has no box; give it one")
     if board.distributions:
-        raise _wordless("distributions stand in a file of their own; leave them out")
+        raise _wordless("distributions belong in a separate file; leave them out")
 
 
 def _wordless(what: str) -> ScenarioError:

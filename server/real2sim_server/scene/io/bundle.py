@@ -205,7 +205,7 @@ def load_lanes(path: str | PathLike[str], content_hash: str) -> LaneGraph | None
 def _document_of(folder: Path, content_hash: str) -> SceneDocument:
     document = read_container(folder, SceneDocument, verify=False)
     if document.content_hash != content_hash:
-        raise BundleError(f"{folder}: another bundle stands here now; read its summary again")
+        raise BundleError(f"{folder}: another bundle has replaced it; read its summary again")
     return document
 
 

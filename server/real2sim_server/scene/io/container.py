@@ -145,7 +145,7 @@ class TensorFile:
         if tuple(tensor.shape) != shape or tensor.dtype != dtype:
             raise BundleError(
                 f"{self.path}: tensor {key!r} is {tensor.dtype} {list(tensor.shape)}, "
-                f"scene.json asks for {dtype} {list(shape)}"
+                f"scene.json requires {dtype} {list(shape)}"
             )
         if self.verify and tensor_hash(tensor) != expected:
             raise BundleError(

@@ -440,7 +440,7 @@ def unpack_lanes(
             source = _ARRAYS[name]
             first = taken[source]
             if type(value) is not int or not 0 <= value <= len(arrays[source]) - first:
-                raise SceneError(f"lanes: {name} of {value!r} entries goes beyond their file")
+                raise SceneError(f"lanes: {name} of {value!r} entries exceeds their file")
             taken[source] += value
             return arrays[source][first : first + value].tolist()
         if isinstance(value, dict):

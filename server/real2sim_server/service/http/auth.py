@@ -207,7 +207,7 @@ def check_token(connection: HTTPConnection) -> None:
     if account is None:
         worker.metrics.auth_failures.labels("http").inc()
         if given is None:
-            raise unauthorized("this worker wants a bearer token")
+            raise unauthorized("this worker requires a bearer token")
         raise unauthorized("the bearer token is not this worker's")
     act_for(connection, account)
 

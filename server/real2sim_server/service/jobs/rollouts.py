@@ -185,8 +185,8 @@ def _with_values(
     if unknown:
         raise ServiceError(
             ErrorCode.UNKNOWN_OBJECT,
-            f"physics is given for {unknown[0]!r}, which takes no part",
-            hint=f"taking part: {', '.join(objects)}; '*' stands for all",
+            f"physics is given for {unknown[0]!r}, which is not simulated",
+            hint=f"simulated objects: {', '.join(objects)}; '*' means all",
         )
     return {
         name: with_values(own, values.get("*"), values.get(name)) for name, own in objects.items()
@@ -351,7 +351,7 @@ def _chosen(
     if not moved:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST,
-            "no object has a velocity or physics of its own, so nothing would be simulated",
+            "no object has a velocity or physics, so there is nothing to simulate",
             hint="name objects, or edit one with set_velocity or set_physics first",
         )
     centres = np.array([o.trajectory.pose(start)[0] for o in moved])
@@ -586,8 +586,8 @@ def _plan(
     if request.object_id not in plan.options.objects:
         raise ServiceError(
             ErrorCode.UNKNOWN_OBJECT,
-            f"{request.object_id!r} takes no part in the simulation",
-            hint=f"taking part: {', '.join(plan.options.objects)}",
+            f"{request.object_id!r} is not part of the simulation",
+            hint=f"simulated objects: {', '.join(plan.options.objects)}",
         )
     [subject] = [o for o in plan.resolved_objects.visible if o.object_id == request.object_id]
     start = plan.options.start_us

@@ -428,7 +428,7 @@ def check_known(scene: Scene, sensors: Iterable[SensorSpec]) -> None:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST,
             f"scene {scene.name!r} has no images {UNCERTAINTY!r}: {WITHOUT}",
-            hint="ask for the other modalities, or for a scene whose has_uncertainties is true",
+            hint="request other modalities, or use a scene whose has_uncertainties is true",
         )
 
 

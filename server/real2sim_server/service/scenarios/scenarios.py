@@ -93,8 +93,8 @@ class Scenarios:
         if revision > len(entries):
             raise ServiceError(
                 ErrorCode.INVALID_REQUEST,
-                f"scenario {scenario_id!r} has {len(entries)} revisions; {revision} is not there",
-                hint="leave revision out to fork what it is now",
+                f"scenario {scenario_id!r} has {len(entries)} revisions; there is no {revision}",
+                hint="leave revision out to fork the current one",
             )
         name = cached.row.name if request.name is None else request.name
         log = [history_entry(e) for e in entries[:revision]]

@@ -106,9 +106,9 @@ class LockStep(Generic[A]):
         if step > self.step:
             raise ServiceError(
                 ErrorCode.BAD_STEP,
-                f"an action for step {step}, which nobody has observed yet; the session is at "
+                f"an action for step {step}, which is in the future; the session is at "
                 f"step {self.step}",
-                hint="put the step of the newest observation into the action",
+                hint="send the step of the newest observation",
             )
         return None
 

@@ -111,8 +111,8 @@ class Segment:
         if not secrets_equal(secret.hex(), self._secret.hex()):
             raise ServiceError(
                 ErrorCode.INVALID_REQUEST,
-                "the secret is not the one in the shared memory of this connection's welcome",
-                hint="the 32 bytes behind the first 16 of the file are meant; go on without it",
+                "the secret does not match the shared memory of this connection's welcome",
+                hint="send bytes 16 to 47 of the file, or continue without shared memory",
             )
         self.attached = True
         self._remove_name()

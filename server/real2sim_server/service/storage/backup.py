@@ -186,7 +186,7 @@ def _unpacked(file: Path, beside: Path) -> Iterator[Path]:
                 f"real2sim {info.made_by}"
             )
         if not (folder / DATABASE).is_file() or _sha256(folder / DATABASE) != info.sha256:
-            raise BackupError(f"{str(file)!r} is damaged: its store is not what it was")
+            raise BackupError(f"{str(file)!r} is damaged: the hash of its store differs")
         yield folder
 
 

@@ -393,7 +393,7 @@ def check_version(found: int) -> None:
         return
     if found < 1:
         raise StoreError(
-            "the store was made before the first release, whose schema is new; move it away, or "
+            "the store was made before the first release and cannot be read; move it away, or "
             "give another REAL2SIM_STORE_URL"
         )
     raise StoreError(

@@ -125,8 +125,8 @@ class FilmPlan:
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise PhysicsError(
-                f"{folder / FILE}: no readable plan of a film ({error}); `real2sim simulate` "
-                "leaves one beside each result"
+                f"{folder / FILE}: no readable film plan ({error}); `real2sim simulate` "
+                "writes one next to each result"
             ) from error
 
 

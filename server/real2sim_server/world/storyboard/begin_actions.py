@@ -182,8 +182,8 @@ def _where(actor: EntityState, at: Beginning, what: str) -> RoadPoint:
     if here is None:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
-            f"{actor.name!r} is beside all lanes and cannot begin a {what}",
-            hint="let it begin on a lane; storyboard.roads says how many there are",
+            f"{actor.name!r} is on no lane and cannot begin a {what}",
+            hint="place it on a lane; storyboard.roads gives their number",
         )
     return here
 

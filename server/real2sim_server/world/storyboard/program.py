@@ -152,8 +152,8 @@ def _in_order(entries: Sequence[InitAction]) -> tuple[InitAction, ...]:
             names = " and ".join(repr(e) for e in dict.fromkeys(e.entity for e in waiting))
             raise WorldError(
                 ErrorCode.INVALID_REQUEST,
-                f"{names} are placed relative to each other at the start",
-                hint="give one of them a place or speed of its own in the storyboard's init",
+                f"{names} have initial positions relative to each other",
+                hint="give one of them an absolute position or speed in the storyboard's init",
             )
         waiting.remove(ready)
         done.append(ready)

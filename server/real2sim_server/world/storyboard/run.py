@@ -245,7 +245,7 @@ def _look(entity: Entity, state: ScenarioState, size: Vector) -> ObjectState:
     if not candidates:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
-            f"entity {entity.name!r} has nobody to look like: the scene has no object",
+            f"entity {entity.name!r} has no appearance: the scene has no object to copy",
             hint="name an asset of the library in `asset_id`",
         )
     group = next((g for g in ALIKE if entity.category in g), frozenset({entity.category}))
@@ -505,8 +505,8 @@ def begin_storyboard(
     if spec.beyond_log == "loop":
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
-            "a storyboard goes on in one direction, and beyond_log 'loop' puts the ego back",
-            hint="let beyond_log be 'extend' or 'end'",
+            "a storyboard runs once, but beyond_log 'loop' returns the ego to the start",
+            hint="set beyond_log to 'extend' or 'end'",
         )
     if spec.warmup_us:
         raise WorldError(

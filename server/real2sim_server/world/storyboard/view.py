@@ -494,8 +494,8 @@ class PositionResolver:
         if here is None:
             raise WorldError(
                 ErrorCode.INVALID_REQUEST,
-                f"a position is relative to the lane of {entity!r}, which is beside all lanes",
-                hint="put it onto a lane, or give the position in the world",
+                f"a position is relative to the lane of {entity!r}, which is on no lane",
+                hint="place it on a lane, or give a world position",
             )
         return here, 1.0 if math.cos(actor.h - here.h) >= 0.0 else -1.0
 

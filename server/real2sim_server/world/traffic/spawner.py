@@ -274,8 +274,8 @@ def _looks(spec: SpawnSpec, state: ScenarioState) -> tuple[ObjectState, ...]:
     if not vehicles:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
-            "agents.spawn has nobody to look like: the scene has no vehicle",
-            hint="insert one, or name objects in agents.spawn.looks",
+            "agents.spawn has no appearance: the scene has no vehicle to copy",
+            hint="insert a vehicle, or name objects in agents.spawn.looks",
         )
     moving = tuple(o for o in vehicles if o.trajectory.moves)
     return moving or vehicles

@@ -199,5 +199,5 @@ def test_without_a_method_the_set_stays_as_it_is():
 def test_a_renderer_without_screen_statistics_is_refused():
     output = SimpleNamespace(screen=None)
     for method in STRATEGIES:
-        with pytest.raises(ReconstructError, match="does not count what it draws"):
+        with pytest.raises(ReconstructError, match="does not report the contributions"):
             strategy_of(replace(OPTIONS, method=method)).step_pre_backward(output)

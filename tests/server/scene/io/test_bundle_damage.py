@@ -126,7 +126,7 @@ def test_counts_that_do_not_fit_the_tensors_are_refused(bundle):
     content = content_of(bundle)
     content["background"]["gaussians"] = 10**15
     rehash(bundle, content)
-    with pytest.raises(BundleError, match=r"scene.json asks for torch.float32 \[1000000000000000"):
+    with pytest.raises(BundleError, match=r"scene.json requires torch.float32 \[1000000000000000"):
         load_scene(bundle)
 
 

@@ -38,7 +38,7 @@ def test_what_observations_do_not_tell_at_all_fails_with_what_to_observe(client,
     body = asked(parameters=["yield_stress"])
     job = finished(client, client.post(f"{scenario}/calibrate", json=body))
     assert job["state"] == "failed"
-    assert "do not tell yield_stress" in job["error"]["detail"]
+    assert "do not determine yield_stress" in job["error"]["detail"]
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_values_of_the_papers_table_can_be_asked_for_and_posts_of_any_shape_are_
 @pytest.mark.parametrize(
     ("asked", "code", "words"),
     [
-        ({"physics": {"post": {"mass": 3}}}, "UNKNOWN_OBJECT", "takes no part"),
+        ({"physics": {"post": {"mass": 3}}}, "UNKNOWN_OBJECT", "is not simulated"),
         ({"physics": {"*": {"young": 0}}}, "INVALID_REQUEST", "greater than 0"),
         ({"physics": {"*": {"mass": 1, "density": 1}}}, "INVALID_REQUEST", "not both"),
         ({"speed": 3}, "INVALID_REQUEST", "speed is of an experiment"),

@@ -115,7 +115,7 @@ def test_a_drive_that_nobody_has_begun_can_be_cancelled_and_ends_with_its_sessio
         site.call("DELETE", info)
         done = ended(site, job)
         assert done["state"] == "failed"
-        assert "nobody has driven" in done["error"]["detail"]
+        assert "the planner did not drive" in done["error"]["detail"]
 
 
 def test_a_fork_of_an_earlier_step_goes_on_from_there_as_the_first_did(site):

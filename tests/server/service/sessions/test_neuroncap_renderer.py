@@ -173,8 +173,13 @@ def test_raw_images_are_saved_tensors_in_base64(serve, site, tiny_scene):
         ("/render_image", {}, 422, "pose"),
         ("/render_image", {"pose": [[1.0] * 4] * 4}, 422, "no rigid transform"),
         ("/render_image", {"image_format": "webp"}, 422, "image_format"),
-        ("/render_image", {"camera_name": "CAM_BACK"}, 422, "none of front, left looks that way"),
-        ("/render_image", {"camera_name": "roof"}, 422, "nothing says which"),
+        (
+            "/render_image",
+            {"camera_name": "CAM_BACK"},
+            422,
+            "none of front, left faces that direction",
+        ),
+        ("/render_image", {"camera_name": "roof"}, 422, "matches none of"),
         (
             "/update_actors",
             [{"uuid": "x", "timestamps": [0], "poses": [np.eye(4).tolist()]}],
@@ -204,7 +209,7 @@ def test_what_cannot_be_served_is_refused_and_the_rest_goes_on(
 
 
 def test_a_link_that_names_no_camera_of_the_scene_is_refused_at_once(serve):
-    with pytest.raises(PeerError, match="camera 'roof', given for 'CAM_FRONT', is not there"):
+    with pytest.raises(PeerError, match="camera 'roof', given for 'CAM_FRONT', does not exist"):
         serve(cameras={"CAM_FRONT": "roof"})
 
 

@@ -246,7 +246,7 @@ class _Function:
             if variable not in self._arguments:
                 self._local.add(variable)
             return variable, held
-        raise self._refused(self._node, f"so many kinds of {name}")
+        raise self._refused(self._node, f"this number of kinds of {name}")
 
     def _both(self, node: ast.AST, one: Kind, other: Kind) -> Kind:
         """A kind that holds values of either."""
