@@ -136,8 +136,8 @@ class _Search:
         if not known.any():
             raise SolverError(
                 f"these observations do not determine {', '.join(self._names)}: for all values the "
-                "simulation agrees with them within their accuracy; add observations that depend on "
-                "it (a dent, a bounce, a slide), or more accurate ones"
+                "simulation agrees with them within their accuracy; add observations that depend "
+                "on it (a dent, a bounce, a slide), or more accurate ones"
             )
         return known
 

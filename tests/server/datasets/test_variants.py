@@ -186,7 +186,7 @@ def test_a_rig_has_cameras_of_its_own(tiny_drive):
     [
         ([{"name": "rear"}], "the scene has front, left"),
         ([{"name": "own", "hfov_deg": 90.0}], "needs width and height"),
-        ([{"name": "front"}, {"name": "front"}], "one camera only"),
+        ([{"name": "front"}, {"name": "front"}], "must be unique"),
         ([{"name": "front", "hfov_deg": 300.0}], "hfov_deg"),
     ],
 )
