@@ -95,7 +95,7 @@ def test_an_end_without_a_word_is_an_error(call):
 
 @pytest.mark.parametrize("function", ["sleep", "burn"])
 def test_what_takes_too_long_is_ended(call, function):
-    with pytest.raises(ConfinedError, match=r"longer than 0\.5 s"):
+    with pytest.raises(ConfinedError, match=r"time limit of 0\.5 s"):
         call(function, limits=Limits(seconds=0.5))
 
 
