@@ -66,8 +66,8 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
 
 # --- Strides -------------------------------------------------------------------------------------
 
-# Pedestrians who left their recorded trajectories (led by a driver or a storyboard, or hit) walk
-# with strides that follow from their motion.
+# Pedestrians off their recorded trajectories (moved by a driver or a storyboard, or hit) walk with
+# strides computed from their motion.
 
 LED = 1e-3
 """A pedestrian this close to the recorded trajectory [m], also in the entries of the rotation,
@@ -80,12 +80,12 @@ Walker = tuple[int, ObjectState, Figure]
 
 @dataclass(frozen=True, eq=False)
 class Strides:
-    """Strides of people at one instant; a part of a world, so replayed and forked with it.
+    """Strides of pedestrians at one instant; part of the world, so replayed and forked with it.
 
     Attributes:
-        made: by object id, of those whom no trajectory leads.
-        objects: of the world, in their order.
-        walkers: row, object and figure of those among them that are people.
+        made: strides by object id, of pedestrians off their trajectories.
+        objects: objects of the world, in order.
+        walkers: row, object and figure of the pedestrians among them.
     """
 
     made: Mapping[str, Stride] = field(default_factory=dict)

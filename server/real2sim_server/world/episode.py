@@ -385,8 +385,8 @@ class EpisodeRoute:
 
 # --- Randomization -------------------------------------------------------------------------------
 
-# Every value has a name, such as ``start.lateral`` or ``agents.car_3.headway``, under which it is
-# sampled (see :class:`.common.Draws`) and reported.
+# Every value is sampled (see :class:`.common.Draws`) and reported under a name, such as
+# ``start.lateral`` or ``agents.car_3.headway``.
 
 START_ATTEMPTS = 16
 """Attempts to sample a start outside every object before the recorded one is used."""
@@ -400,14 +400,14 @@ def randomized_start(
     *,
     is_free: Callable[[Motion], bool],
 ) -> tuple[Motion, dict[str, float]]:
-    """The motion at the start of an episode, and the values sampled for it by name.
+    """The ego motion at the start of an episode, and the sampled values by name.
 
     Args:
-        recorded: the ego in the log at that time.
+        recorded: recorded ego motion at that time.
         path: the recorded drive.
-        spec: ranges.
-        draws: of the episode.
-        is_free: whether a motion touches no object.
+        spec: sampling ranges.
+        draws: random numbers of the episode.
+        is_free: whether the ego in a given motion touches no object.
     """
     widths = {f"start.{name}": width for name, width in spec.model_dump().items() if width}
     if not widths:
@@ -443,8 +443,8 @@ class RandomizedIdm:
     """Parameters of IDM drivers, sampled for each object.
 
     Attributes:
-        spec: widths of the factors.
-        draws: of the episode.
+        spec: ranges of the factors.
+        draws: random numbers of the episode.
     """
 
     spec: TrafficRandomization
