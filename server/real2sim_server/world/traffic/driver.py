@@ -208,11 +208,13 @@ def pose_on_path(
 
 
 def pose_put_back(pose: AgentPose, route: LoggedPath, way: float) -> AgentPose:
-    """The pose ``way`` metres back along a route: beside it and turned against it as before; its
-    height is left as it is."""
+    """The pose moved ``way`` metres back along a route, with the same offset and relative heading.
+
+    The height is unchanged.
+    """
     x, y, z = pose.position
     near = route.nearest(x, y)
-    # Beyond the ends of the route it goes straight on, where the nearest point is the end.
+    # The route continues straight beyond its ends, but the nearest point there is the end itself.
     beyond = (x - near.position[0]) * math.cos(near.yaw)
     beyond += (y - near.position[1]) * math.sin(near.yaw)
     px, py, _, yaw = route.at(near.s + beyond - way)
