@@ -319,12 +319,12 @@ def sprung_side_by_side(
 
 
 def tilted(T_world_vehicle: Float, attitude: BodyAttitude, ego: EgoSpec) -> Float:
-    """``T_world_body`` [4, 4] of the body over a vehicle that stands level on the ground."""
+    """``T_world_body`` [4, 4] of the sprung body of a vehicle that is level on the ground."""
     if attitude == LEVEL or ego.suspension is None:
         return T_world_vehicle
     cos_p, sin_p = math.cos(attitude.pitch), math.sin(attitude.pitch)
     cos_r, sin_r = math.cos(attitude.roll), math.sin(attitude.roll)
-    # Of one flat tuple: nested lists take twice as long.
+    # A flat tuple: nested lists take twice as long.
     T_vehicle_body = np.array(
         (
             *(cos_p, sin_p * sin_r, sin_p * cos_r, 0.0),

@@ -91,7 +91,7 @@ def _dynamics(dynamics: Dynamics, at: Beginning) -> Dynamics:
 
 
 def _freed(actor: EntityState) -> EntityState:
-    """Remove the timing of the entity's trajectory; it continues along it at its own speed."""
+    """Replace a timed trajectory by its path, along which the entity keeps its own speed."""
     if actor.trajectory is None or actor.trajectory.timing is None:
         return actor
     course = actor.trajectory.course
@@ -306,9 +306,9 @@ def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> Enti
 
 
 def _is_beside(place: Place, route: Way) -> bool:
-    """Whether a place is one to drive a route from."""
+    """Whether a place is near enough to a route, and roughly along it, to start driving it."""
     near = route.path.nearest(place.x, place.y)
-    # Headings of a route turn between its places, which may be far apart: its points tell more.
+    # Use points of the route: its headings change between places that may be far apart.
     (x0, y0, *_), (x1, y1, *_) = (route.path.at(near.s + ds) for ds in (-0.5, 0.5))
     turn = math.remainder(math.atan2(y1 - y0, x1 - x0) - place.h, math.tau)
     away = math.dist((place.x, place.y), near.position[:2])

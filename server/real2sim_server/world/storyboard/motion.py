@@ -245,14 +245,14 @@ class KeepDistance:
     leading: bool
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
-        """``h`` seconds on, as fast as the limits let it be there and stay."""
+        """The motion after ``h`` seconds, as fast as the limits allow without overshoot."""
         other = view.entities[self.action.entity]
         ahead = ahead_on_way(actor, other.x, other.y, view.network)
         error = ahead - self._wanted(actor, other)
         closing = error + other.speed * h
         limits = self.action.limits
         if limits.acceleration is None and limits.deceleration is None:
-            # As fast as it takes: there at the end of the step.
+            # Unlimited: reach the target at the end of the step.
             most = math.inf if limits.speed is None else float(limits.speed)
             way = min(max(closing, 0.0), most * h)
             speed = min(other.speed, most) if abs(way - closing) < DONE else way / h
@@ -281,10 +281,10 @@ class KeepDistance:
 
 
 def _approach(speed: float, other: float, error: float, h: float, limits: SpeedLimits) -> float:
-    """Speed after ``h`` seconds of who is to close ``error`` metres to someone with a speed."""
+    """Speed after ``h`` seconds that closes a gap ``error`` [m] to another entity."""
     gain = float(limits.acceleration) if limits.acceleration is not None else 10.0
     loss = float(limits.deceleration) if limits.deceleration is not None else 10.0
-    # The difference that the other limit can still take back in time; linear when nearly there.
+    # The speed difference that the opposite limit can still remove in time; linear near the target.
     back = loss if error > 0 else gain
     excess = min(math.sqrt(2.0 * 0.8 * back * abs(error)), abs(error) * 2.0)
     wanted = max(other + math.copysign(excess, error), 0.0)
@@ -368,7 +368,7 @@ class Synchronize:
         """Constant acceleration to arrive in time."""
         rate = 2 * (d - v * time) / time**2
         if v + rate * time < 0.0:
-            # It would have to come back: it stops at its place and waits.
+            # It would overshoot and return: it stops at its target instead.
             return -v * v / (2 * max(d, DONE))
         return rate
 

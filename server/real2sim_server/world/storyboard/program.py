@@ -140,13 +140,16 @@ _SPEEDING = frozenset({"speed", "speed_profile"})
 
 
 def _in_order(entries: Sequence[InitAction]) -> tuple[InitAction, ...]:
-    """In the order of the file, but after what they refer to: a place relative to an entity comes
-    after that entity's place, a speed relative to another's after that speed."""
+    """Init actions in the order of the file, but after those that they depend on.
+
+    A position relative to an entity comes after that entity's position, a relative speed after the
+    speed that it refers to.
+    """
     waiting, done = list(entries), list[InitAction]()
     while waiting:
         ready = next((e for k, e in enumerate(waiting) if _is_ready(e, waiting, k)), None)
         if ready is None:
-            # Who keeps a distance to somebody need not wait for them.
+            # Keeping a distance does not depend on the speed of the other entity.
             ready = next((e for e in waiting if e.action.kind not in PLACING | _SPEEDING), None)
         if ready is None:
             names = " and ".join(repr(e) for e in dict.fromkeys(e.entity for e in waiting))
