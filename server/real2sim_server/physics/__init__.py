@@ -1,4 +1,4 @@
-"""Gaussians with mass: particles, materials, colliders, contact and the solver."""
+"""Physics of Gaussians: particles, materials, colliders, contact and the MPM solver."""
 
 from .body import Body, Particles, ball_particles, box_particles
 from .calibration import Calibration, calibrate

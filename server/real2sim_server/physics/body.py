@@ -25,10 +25,10 @@ class Particles:
         positions: [N, 3] float64 [m].
         volumes: [N] float64 rest volumes [m^3], > 0.
         masses: [N] float64 [kg], > 0.
-        source: [N] int64, index of the Gaussian a particle stands for, -1 for interior fill.
+        source: [N] int64, index of the Gaussian of each particle, -1 for interior fill.
 
     Raises:
-        ParticleError: no particles, shapes that do not fit, values not finite or not positive.
+        ParticleError: no particles, mismatched shapes, values that are not finite or not positive.
     """
 
     positions: Float
@@ -69,9 +69,9 @@ class Particles:
 
     @property
     def inertia(self) -> Float:
-        """[3, 3] inertia about the centre of mass [kg m^2]; each particle counts as a small cube.
+        """[3, 3] inertia about the centre of mass [kg m^2]; each particle is a small cube.
 
-        The cubes' own inertia m V^(2/3) / 6 makes a lattice of particles exact for a box.
+        With the cubes' own inertia m V^(2/3) / 6, a lattice of particles is exact for a box.
         """
         r = self.positions - self.centre_of_mass
         second = np.einsum("n,ni,nj->ij", self.masses, r, r)
@@ -87,7 +87,7 @@ class Particles:
         return replace(self, positions=apply_transform(matrix, self.positions))
 
     def take(self, index: NDArray[Any]) -> Particles:
-        """The particles of ``index``: indices in any order, or a mask [N]."""
+        """A subset of the particles; ``index``: indices in any order, or a mask [N]."""
         return Particles(
             self.positions[index], self.volumes[index], self.masses[index], self.source[index]
         )
@@ -99,10 +99,10 @@ class Particles:
         return replace(self, masses=self.masses * (mass / self.masses.sum()))
 
     def with_centre_height(self, height: float) -> Particles:
-        """The particles with mass moved between layers, so that the centre of mass has that z [m].
+        """The particles with mass redistributed for a centre of mass at z = ``height`` [m].
 
-        Each layer weighs by exp(-k z) times what it did: lower parts become denser, none empty. A
-        height outside of the particles is held to what leaves every layer a tenth of a percent.
+        The mass of each layer is scaled by exp(-k z), so lower layers become denser. For heights
+        out of range, every layer keeps at least a tenth of a percent.
         """
         z = self.positions[:, 2] - self.centre_of_mass[2]
         most = np.log(1e3) / max(float(np.ptp(z)), 1e-9)
@@ -124,11 +124,11 @@ def box_particles(size: ArrayLike, *, spacing: float, density: float) -> Particl
 
     Args:
         size: [3] edge lengths [m].
-        spacing: wanted distance of particles [m]; it is fitted so that the box is filled.
+        spacing: approximate particle spacing [m]; adjusted to fill the box.
         density: mass per volume [kg/m^3].
 
     Raises:
-        ParticleError: for sizes, spacing or density that are not positive.
+        ParticleError: if size, spacing or density is not positive.
     """
     edges = np.asarray(size, dtype=np.float64)
     if edges.shape != (3,) or not (edges > 0).all() or not spacing > 0 or not density > 0:
@@ -146,7 +146,7 @@ def ball_particles(radius: float, *, spacing: float, density: float) -> Particle
     """A ball centred on the origin, cut from a cubic lattice; volumes sum to the ball's.
 
     Raises:
-        ParticleError: for a radius, spacing or density that is not positive.
+        ParticleError: if radius, spacing or density is not positive.
     """
     if not (radius > 0 and spacing > 0 and density > 0):
         raise ParticleError(
@@ -176,24 +176,24 @@ class Body:
     """A deformable body in the world frame.
 
     Attributes:
-        name: unique among the bodies of a solver.
-        particles: placed in the world.
-        material: one material, or several that ``regions`` chooses from.
-        regions: [N] int, which material a particle is of; all of the first when not given.
-        velocity: [3] of the centre of mass [m/s].
+        name: unique name in a solver.
+        particles: particles, world frame.
+        material: one material, or several that ``regions`` selects from.
+        regions: [N] int, material index of each particle; the first material if not given.
+        velocity: [3] velocity of the centre of mass [m/s].
         angular_velocity: [3] about the centre of mass [rad/s].
-        friction: Coulomb coefficient of its surface, >= 0; between two bodies the geometric mean
-            of both holds, at a collider the collider's where it has one.
+        friction: Coulomb coefficient of its surface, >= 0. Between two bodies, the geometric mean
+            applies; at a collider, the collider's coefficient if it has one.
         particle_velocities: [N, 3] [m/s], instead of a rigid motion.
-        particle_gradients: [N, 3, 3] velocity gradients [1/s]; those of the rigid motion when not
+        particle_gradients: [N, 3, 3] velocity gradients [1/s]; those of the rigid motion if not
             given.
-        history: [N] plastic memory, as ``BodyState.history`` gave it; none when not given.
-        deformation: [N, 3, 3] initial F_elastic; identity when not given.
-        total_deformation: [N, 3, 3] initial F_total, of an already dented body; ``deformation``
-            when not given.
+        history: [N] plastic memory, as in ``BodyState.history``; none if not given.
+        deformation: [N, 3, 3] initial F_elastic; identity if not given.
+        total_deformation: [N, 3, 3] initial F_total of an already dented body; ``deformation`` if
+            not given.
 
     Raises:
-        ParticleError, MaterialError: for shapes and values that do not fit.
+        ParticleError, MaterialError: for invalid shapes and values.
     """
 
     name: str
@@ -273,7 +273,7 @@ class Body:
 
     @property
     def velocities(self) -> Float:
-        """[N, 3] of its particles at the start [m/s]."""
+        """[N, 3] initial particle velocities [m/s]."""
         if self.particle_velocities is not None:
             return self.particle_velocities
         r = self.particles.positions - self.particles.centre_of_mass
@@ -281,7 +281,7 @@ class Body:
 
     @property
     def gradients(self) -> Float:
-        """[N, 3, 3] velocity gradients of its particles at the start [1/s]."""
+        """[N, 3, 3] initial velocity gradients of its particles [1/s]."""
         if self.particle_gradients is not None:
             return self.particle_gradients
         x, y, z = np.asarray(self.angular_velocity)
@@ -290,7 +290,7 @@ class Body:
 
 
 def _determinants(matrices: Float) -> Float:
-    """[N] of [N, 3, 3], without factorising each."""
+    """[N] determinants of [N, 3, 3], without factorisation."""
     x, y, z = (matrices[:, row].T for row in range(3))
     found: Float = (
         x[0] * (y[1] * z[2] - y[2] * z[1])

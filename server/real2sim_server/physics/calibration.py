@@ -1,4 +1,4 @@
-"""Materials and motion from observations, by least squares through the differentiable solver."""
+"""Calibration of materials and motion by least squares through the differentiable solver."""
 
 from __future__ import annotations
 
@@ -43,15 +43,14 @@ class Calibration:
     """The result of a calibration.
 
     Attributes:
-        factors: by parameter, on the value the solver was given.
-        uncertainty: by parameter, what one factor may be wrong by, as a fraction: when observations
-            are wrong by ``residual[-1]``, and by ``discretisation``; infinite for what they say
-            nothing about.
-        discretisation: by parameter, the part of it that is due to cells: how far the result moves
-            on coarser ones, continued to none (Richardson 1911, first order).
-        residual: root mean square distance to what was observed [m], at the start and after each
-            step that was kept; it never rises.
-        rejected: steps that were taken back since they raised the residual.
+        factors: by parameter, relative to the initial value of the solver.
+        uncertainty: by parameter, relative uncertainty of the factor, from an observation error of
+            ``residual[-1]`` and from ``discretisation``; infinite for undetermined parameters.
+        discretisation: by parameter, the part due to the cell size: the change of the result on
+            coarser cells, extrapolated to zero (Richardson 1911, first order).
+        residual: RMS distance to the observations [m], at the start and after each accepted step;
+            never increases.
+        rejected: number of rejected steps, which would have increased the residual.
     """
 
     factors: dict[str, float]
@@ -72,20 +71,20 @@ def calibrate(
 ) -> Calibration:
     """Fit factors so that a body's particles go where they were observed.
 
-    A step that raises the residual is taken back and tried shorter (Levenberg 1944, Marquardt
-    1963). Contact comes a substep sooner or later as parameters change, so that paths are stairs
-    with slopes on them: where no step along the slope helps, slopes are taken over several stairs.
+    A step that increases the residual is rejected and shortened (Levenberg 1944, Marquardt 1963).
+    Contacts start a substep earlier or later as parameters change, so trajectories are piecewise
+    smooth with jumps. If no step along the gradient helps, secants over several jumps are used.
 
     Args:
-        solver: at its start, with initial values; its state is not changed.
+        solver: solver at its start, with initial values; its state is not changed.
         observed: [T, N, 3] positions after ``every``, 2 ``every``, ... substeps [m].
-        parameters: names out of PARAMETERS.
-        dt: substep [s], small enough for all that is tried.
+        parameters: names from PARAMETERS.
+        dt: substep [s], stable for all tried values.
         every: substeps between observations.
-        steps: tried at most, rejected ones included.
+        steps: maximum number of steps, including rejected ones.
 
     Raises:
-        SolverError: for names or shapes that do not fit, or initial values that already diverge.
+        SolverError: for invalid names or shapes, or initial values that diverge.
     """
     names = tuple(dict.fromkeys(parameters))
     target = _checked(solver, observed, names)
@@ -128,7 +127,7 @@ def _discretisation(
     dt: float,
     every: int,
 ) -> dict[str, float]:
-    """Distance of the logarithms to those on cells of size zero, from coarser cells."""
+    """Distance of the logarithms to those at cell size zero, from coarser cells."""
     scale = _scale(J)
     scaled = J / scale
     inverse = torch.linalg.pinv(scaled) / scale[:, None]
@@ -158,12 +157,12 @@ def _checked(solver: Solver, observed: Float, names: Sequence[str]) -> Tensor:
 
 
 def _size(off: Tensor) -> float:
-    """Root mean square; NaN compares as no improvement."""
+    """RMS; NaN compares as no improvement."""
     return float(off.square().mean().sqrt())
 
 
 def _step(J: Tensor, off: Tensor, damping: float) -> Tensor:
-    """One damped step of the logarithms, in units in which every parameter weighs the same."""
+    """One damped step of the logarithms, with scaled parameters."""
     scale = _scale(J)
     scaled = J / scale
     normal = scaled.T @ scaled + damping * torch.eye(len(scale), dtype=J.dtype)

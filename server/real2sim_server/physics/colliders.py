@@ -24,12 +24,12 @@ class Collider:
     """Base class of colliders.
 
     Attributes:
-        name: unique among the colliders of a solver.
-        friction: Coulomb coefficient, >= 0; None takes the body's; infinity sticks.
-        separable: whether bodies may lift off; False holds whatever has touched.
+        name: unique name in a solver.
+        friction: Coulomb coefficient, >= 0; None uses the body's; infinity sticks.
+        separable: whether bodies may lift off; if False, contacts are permanent.
 
     Raises:
-        ColliderError: for values that make no sense.
+        ColliderError: for invalid values.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Collider:
         self._check()
 
     def _check(self) -> None:
-        """Check what a subclass adds."""
+        """Validate the fields of a subclass."""
 
     @property
     def moving(self) -> bool:
@@ -63,7 +63,7 @@ class Collider:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plane(Collider):
-    """A half-space; bodies stay on the side the normal points to.
+    """A half-space; bodies stay on the side of the normal.
 
     Attributes:
         point: [3] on the plane [m].
@@ -87,7 +87,7 @@ class Solid(Collider):
     """A closed shape, at rest or in rigid motion. The field named POSE is its pose.
 
     Attributes:
-        velocity: [3] of the origin of its frame [m/s].
+        velocity: [3] velocity of the origin of its frame [m/s].
         angular_velocity: [3] about that origin, world axes [rad/s].
     """
 
@@ -106,13 +106,13 @@ class Solid(Collider):
 
     @property
     def pose(self) -> Float:
-        """[4, 4] its frame to the world."""
+        """[4, 4] transform from its frame to the world."""
         pose: Float = getattr(self, self.POSE)
         return pose
 
     @property
     def bounds(self) -> tuple[Float, Float]:
-        """Lowest and highest corner [3] of the box about it in its own frame [m]."""
+        """Lowest and highest corner [3] of its bounding box, own frame [m]."""
         raise NotImplementedError
 
     @property
@@ -135,17 +135,17 @@ class Solid(Collider):
         return float(np.linalg.norm(self.velocity)) + reach * spin
 
     def velocity_at(self, point: Float) -> Float:
-        """Velocity [3] of its material at a point [3] of the world [m/s]."""
+        """Velocity [3] of its material at a world point [3] [m/s]."""
         turning = np.cross(np.asarray(self.angular_velocity), point - self.pose[:3, 3])
         velocity: Float = np.asarray(self.velocity) + turning
         return velocity
 
     def at_rest(self) -> Self:
-        """The same, where it is, standing still."""
+        """The solid at its current pose, at rest."""
         return replace(self, velocity=np.zeros(3), angular_velocity=np.zeros(3))
 
     def after(self, duration: float) -> Self:
-        """The solid ``duration`` [s] later, moved at its velocities."""
+        """The solid moved at its velocities for ``duration`` [s]."""
         if not self.moving:
             return self
         pose = np.array(self.pose)
@@ -185,7 +185,7 @@ class Box(Solid):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cylinder(Solid):
-    """A solid round post or drum with flat ends, about the z axis of its frame.
+    """A solid cylinder along the z axis of its frame.
 
     Attributes:
         T_world_cylinder: [4, 4] pose; origin at the centre.
@@ -217,7 +217,7 @@ class Capsule(Solid):
     Attributes:
         T_world_capsule: [4, 4] pose; origin at the middle of the line.
         radius: [m], > 0.
-        length: of the line, without the round ends [m], >= 0.
+        length: length of the line, without the round ends [m], >= 0.
     """
 
     POSE: ClassVar[str] = "T_world_capsule"
@@ -240,14 +240,14 @@ class Capsule(Solid):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HeightField(Collider):
-    """Ground given by heights on a regular grid; particles below it are pushed up.
+    """Ground as heights on a regular grid; particles below it are pushed up.
 
-    Outside the grid the nearest rim height holds.
+    Outside the grid the nearest border height applies.
 
     Attributes:
         heights: [X, Y] float64 [m], X and Y >= 2.
         origin: [2] (x, y) of ``heights[0, 0]`` [m].
-        spacing: distance of samples [m], > 0.
+        spacing: sample spacing [m], > 0.
     """
 
     heights: NDArray[np.float64]
@@ -293,9 +293,9 @@ def _rotation(rotation_vector: Float) -> Float:
 
 # Colliders made of triangles.
 #
-# The sign of a distance comes from pseudonormals of the nearest face, edge or vertex (Baerentzen
-# and Aanaes 2005), which is exact for closed meshes. A bounding volume tree in one array finds
-# triangles: a query skips everything inside a box that is too far away.
+# The sign of a distance comes from the pseudonormal of the nearest face, edge or vertex (Baerentzen
+# and Aanaes 2005), which is exact for closed meshes. Queries use a bounding volume tree in one
+# array and skip boxes that are too far away.
 
 TRIANGLES_MAX = 20_000
 FLAT = 1e-10
@@ -306,19 +306,19 @@ _SIDES = ((0, 1), (1, 2), (2, 0))
 
 @dataclass(frozen=True, eq=False)
 class TriangleSurface:
-    """Checked triangles, ready for queries; many colliders may share them.
+    """Validated triangles with a search tree; may be shared by many colliders.
 
     Attributes:
-        vertices: [V, 3] [m]; those at the same place become one.
-        triangles: [T, 3] indices of vertices, counter-clockwise seen from outside. A closed mesh
-            that is inside out as a whole is turned.
-        thickness: of a sheet that is not closed [m]; None for a closed mesh.
-        packed: as kernels read it, see ``contact.collider_distance``.
-        corners: [T, 3, 3] of the triangles [m].
+        vertices: [V, 3] [m]; duplicates are merged.
+        triangles: [T, 3] vertex indices, counter-clockwise seen from outside. A closed mesh with
+            inverted orientation is flipped.
+        thickness: thickness of an open sheet [m]; None for a closed mesh.
+        packed: kernel form, see ``contact.collider_distance``.
+        corners: [T, 3, 3] corners of the triangles [m].
         normals: [T, 7, 3] pseudonormals: face, edges 01, 12, 20, corners.
 
     Raises:
-        ColliderError: with the first triangle or the number of edges that are not as they must be.
+        ColliderError: with the first invalid triangle or the number of invalid edges.
     """
 
     vertices: ArrayLike
@@ -353,12 +353,12 @@ class TriangleSurface:
 
     @property
     def nodes(self) -> int:
-        """Of the tree of boxes."""
+        """Number of nodes of the tree."""
         return 2 * len(self.corners) - 1
 
     @property
     def bounds(self) -> tuple[Float, Float]:
-        """Lowest and highest corner [3] of the box about it [m]."""
+        """Lowest and highest corner [3] of its bounding box [m]."""
         around = 0.0 if self.thickness is None else self.thickness / 2
         points = self.corners.reshape(-1, 3)
         return points.min(axis=0) - around, points.max(axis=0) + around
@@ -370,7 +370,7 @@ class TriangleMesh(Solid):
 
     Attributes:
         T_world_mesh: [4, 4] pose.
-        surface: in the mesh's own frame.
+        surface: triangles, mesh frame.
     """
 
     POSE: ClassVar[str] = "T_world_mesh"
@@ -384,7 +384,7 @@ class TriangleMesh(Solid):
 
     @property
     def thickness(self) -> float:
-        """0: how thin parts of it are is not known."""
+        """0, because the thickness of its parts is unknown."""
         return 0.0
 
 
@@ -426,7 +426,7 @@ def _require_area(corners: Float) -> None:
 
 
 def _areas(corners: Float) -> Float:
-    """[T, 3] normals of triangles as long as twice their area."""
+    """[T, 3] normals of triangles, with a length of twice their area."""
     doubled: Float = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return doubled
 
@@ -446,7 +446,7 @@ def _closed(vertices: Float, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
             f"from {vertices[a].tolist()} to {vertices[b].tolist()}; close it, or give the "
             "thickness of a sheet"
         )
-    # Of two triangles that face the same way one runs along their edge forwards, one backwards.
+    # Consistently oriented neighbours traverse their common edge in opposite directions.
     forwards = np.bincount(index, weights=edges[:, 0] < edges[:, 1], minlength=len(uses))
     if (forwards != 1).any():
         raise ColliderError(
@@ -477,7 +477,7 @@ def _pseudonormals(vertices: Float, triangles: NDArray[np.int64]) -> Float:
         np.add.at(at_vertices, triangles[:, k], angle[:, None] * faces)
     normals[:, 1:4] = at_edges[index].reshape(3, -1, 3).transpose(1, 0, 2)
     normals[:, 4:] = at_vertices[triangles]
-    # Two faces of a folded sheet may cancel each other.
+    # The normals of two faces of a folded sheet may cancel.
     lengths = np.linalg.norm(normals, axis=2, keepdims=True)
     return np.where(lengths > 1e-9, normals / np.maximum(lengths, 1e-9), faces[:, None])
 
@@ -488,9 +488,9 @@ def _unit(vectors: Float) -> Float:
 
 
 def _tree(corners: Float) -> Float:
-    """Boxes about triangles, halved along their longest edge down to one triangle each.
+    """Bounding volume tree, split along the longest edge down to one triangle per leaf.
 
-    Each is low (3), high (3), the box that follows all that is within it, and its triangle or -1.
+    Each row is low (3), high (3), the next row after its subtree, and its triangle or -1.
     """
     low, high = corners.min(axis=1), corners.max(axis=1)
     centres = (low + high) / 2

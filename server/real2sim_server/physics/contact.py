@@ -1,9 +1,9 @@
-"""Contact of bodies with colliders and with each other, one set of functions for every device.
+"""Contact of bodies with colliders and with each other; functions shared by all devices.
 
-Colliders are packed rows, with one distance function for all shapes. Nodes of the grid stop most of
-a body but may all miss a collider that is thin against the cells. Such a collider also holds each
-particle: the kernel follows the particle's path through the substep to the first touch and removes
-the velocity that would carry it further in, wherever the grid lies.
+Colliders are packed rows with one distance function for all shapes. Contact acts on grid nodes,
+which may all miss a collider that is thin compared with the cells. Thin colliders therefore also
+act on particles: the kernel follows a particle's path through the substep to the first touch and
+removes the velocity that would move it further inside, independently of the grid.
 """
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.

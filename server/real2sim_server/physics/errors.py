@@ -3,8 +3,8 @@
 PhysicsError
 ├── MaterialError    a material parameter outside its range, or an unknown constitutive law
 ├── ParticleError    particles that cannot be simulated: empty, massless, not finite, too many
-├── ColliderError    a collider that makes no sense
-├── SolverError      a setting of the solver that is not allowed, or a backend not usable here
+├── ColliderError    an invalid collider
+├── SolverError      an invalid solver option, or an unusable backend
 └── UnstableError    the simulation diverged and smaller steps did not help
 """
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 
 class PhysicsError(Exception):
-    """Something about a simulation is not as it must be. The message says what, and what to do."""
+    """Base class of physics errors. The message names the problem and suggests a fix."""
 
 
 class MaterialError(PhysicsError, ValueError):
@@ -24,11 +24,11 @@ class ParticleError(PhysicsError, ValueError):
 
 
 class ColliderError(PhysicsError, ValueError):
-    """A collider that makes no sense."""
+    """An invalid collider."""
 
 
 class SolverError(PhysicsError, ValueError):
-    """A setting of the solver that is not allowed, or a backend that is not usable here."""
+    """An invalid solver option, or an unusable backend."""
 
 
 class UnstableError(PhysicsError, RuntimeError):

@@ -1,10 +1,10 @@
-"""Fit what a simulation is given by running it: factors by least squares, viscosity by rebound.
+"""Fitting of simulation inputs: factors by least squares, viscosity by rebound tests.
 
-Simulations are not smooth: contact comes a substep earlier or later. So slopes are differences over
-a span that is wide against such steps, and the search follows Levenberg and Marquardt. The
-uncertainty of a result has two parts: what the observations leave open, and what the cells cause.
-The latter is how far the result moves when coarser cells explain the same observations,
-extrapolated to cells of size zero (Richardson 1911, first order).
+Simulations are not smooth, because contacts start a substep earlier or later. Derivatives are
+therefore differences over a span that is wide compared with such jumps, and the search follows
+Levenberg and Marquardt. The uncertainty of a result has two parts: observation error and
+discretisation error. The latter is the change of the result on coarser cells, extrapolated to cell
+size zero (Richardson 1911, first order).
 """
 
 from __future__ import annotations
@@ -50,14 +50,13 @@ class Fit:
     """The result of a fit.
 
     Attributes:
-        factors: by parameter; 1 for what observations do not tell.
-        uncertainty: by parameter, standard deviation of one factor as a fraction: of what follows,
-            the root of the sum of squares; infinite for what observations do not tell.
-        observation: the part that observations leave open.
-        discretisation: the part that is due to cells.
-        residual: root mean square of the differences over what each is known to, at the start and
-            after each step that was kept.
-        runs: of the simulation.
+        factors: by parameter; 1 if the observations do not determine it.
+        uncertainty: by parameter, relative standard deviation of the factor: the root of the sum of
+            squares of the next two; infinite if the observations do not determine it.
+        observation: part due to observation errors.
+        discretisation: part due to the cell size.
+        residual: RMS of the normalised residuals, at the start and after each accepted step.
+        runs: number of simulations.
     """
 
     factors: dict[str, float]
@@ -77,18 +76,18 @@ def fit(residuals: Residuals, parameters: Sequence[str], *, steps: int = 12) -> 
     """Find the factors that best explain the observations.
 
     Args:
-        residuals: simulates and compares.
-        parameters: names.
-        steps: tried at most.
+        residuals: function that simulates and compares.
+        parameters: names of the parameters.
+        steps: maximum number of steps.
 
     Raises:
-        SolverError: when the first run diverges, or the observations determine no parameter.
+        SolverError: if the first run diverges, or the observations determine no parameter.
     """
     search = _Search(residuals, tuple(dict.fromkeys(parameters)))
     known = search.determined(search.slopes(SPANS[0]))
     search.keep(known)
     search.descend(steps)
-    # The end of the search may leave some undetermined; the others are then fitted without them.
+    # If some parameters turn out to be undetermined, the others are fitted without them.
     for _ in parameters:
         known = search.determined(search.slopes(SPANS[-1]))
         if known.all():
@@ -212,13 +211,13 @@ class _Search:
 
 
 def continued(moved: Mapping[float, Float]) -> Float:
-    """[K] distance of a result to that on cells of size zero, from its change on coarser cells.
+    """[K] distance of a result to that at cell size zero, from its change on coarser cells.
 
-    Of first order, by least squares over all of these: a body that lies differently on the grid
-    moves it as well, and from one alone that would count several times.
+    First order, by least squares over several cell sizes, because the position of a body on the
+    grid also affects the result.
 
     Args:
-        moved: [K] by size of cells against the usual.
+        moved: [K] changes by relative cell size.
     """
     over = np.array([coarser - 1 for coarser in moved])
     slope = over @ np.abs(np.stack(list(moved.values()))) / float(over @ over)
@@ -251,9 +250,9 @@ def _size(off: Float) -> float:
 # zeta = eta omega / 2 (lambda + 2 mu). That is the first guess; impacts of the body itself refine
 # it.
 #
-# The rebound depends on where the wall lies between the grid's nodes: an elastic block of six cells
-# keeps 0.64 of its speed on a wall through nodes and 0.88 on one just below them. So the impacts
-# use the wall that the body is meant for, where it is given.
+# The rebound depends on the position of the wall between grid nodes: an elastic block of six cells
+# keeps 0.64 of its speed on a wall through nodes and 0.88 on one just below them. The test impacts
+# therefore use the actual wall if it is given.
 
 TOLERANCE = 0.015
 """A fit stops when achieved and requested are this near."""
@@ -268,10 +267,10 @@ class RestitutionFit:
     Attributes:
         body: the body with the fitted viscosity in all its materials.
         requested, achieved: coefficient of restitution against a rigid wall.
-        elastic: what the body does without added viscosity; no more can be reached.
-        viscosity: added to the materials [Pa s].
-        speed: of the test impacts [m/s].
-        impacts: how many were made.
+        elastic: restitution without added viscosity, the maximum.
+        viscosity: viscosity added to the materials [Pa s].
+        speed: speed of the test impacts [m/s].
+        impacts: number of test impacts.
     """
 
     body: Body
@@ -296,16 +295,16 @@ def fit_restitution(
     """Fit viscosity so that ``body`` bounces off a rigid wall with ``requested``.
 
     Args:
-        body: its velocity and place do not matter.
+        body: the body; its velocity and position are ignored.
         requested: coefficient of restitution, in [0, 1].
-        speed: approach of the test impacts [m/s]; restitution depends on it.
-        normal: [3] out of the wall, where no ``wall`` is given; it then lies just below the body.
-        wall: the one the body will hit; the body is put in front of it.
-        collider: what acts in place of the wall, whose face ``wall`` then is; at rest.
-        options: of the solver the body is meant for; cells and precision matter.
+        speed: approach speed of the test impacts [m/s]; restitution depends on it.
+        normal: [3] outward normal of a wall just below the body, if no ``wall`` is given.
+        wall: the wall that the body will hit; the body is placed in front of it.
+        collider: collider at rest to use instead of the wall; ``wall`` is its face.
+        options: options of the target solver; cell size and precision matter.
 
     Returns:
-        The fit; ``achieved`` falls short of ``requested`` where the body cannot bounce so well.
+        The fit; ``achieved`` is below ``requested`` if the body cannot rebound that well.
 
     Raises:
         SolverError: for a request outside [0, 1] or a speed that is not positive.
@@ -353,8 +352,8 @@ def impact(
 ) -> float:
     """Coefficient of restitution of one impact on a rigid wall, without gravity.
 
-    Arguments are those of :func:`fit_restitution`. Separation over approach speed of the centre
-    of mass; 0 when it does not come off again.
+    Arguments as in :func:`fit_restitution`. Separation over approach speed of the centre of mass;
+    0 if the body does not separate again.
     """
     if not (math.isfinite(speed) and speed > 0):
         raise SolverError(f"speed of an impact must be positive [m/s], not {speed!r}")

@@ -1,9 +1,9 @@
-"""What bodies are made of: frozen, checked records in SI units, found by name.
+"""Materials: frozen, validated records in SI units, registered by name.
 
-A material names its constitutive law and says which numbers go into it. New materials register
-themselves with :func:`register_material`. The laws' functions are in :mod:`.stress`, compiled, and
-in plain torch in ``backends.reference_laws``. Both choose by the code of a law, so a new law is a
-record here, a branch in each of the two, and columns of a material's row.
+A material names its constitutive law and provides its parameters. Register new materials with
+:func:`register_material`. Constitutive laws are implemented twice: compiled in :mod:`.stress` and
+in plain torch in ``backends.reference_laws``. Both dispatch on the code of a law. To add a law, add
+a record here, a branch in both implementations, and columns of a material's row.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from . import stress
 from .errors import MaterialError
 from .stress import LAMBDA, LAW, MATERIAL_ROW, MU, PLASTIC, VISCOSITY, A
 
-# Constitutive laws: the name, the code and what each keeps of a particle.
+# Constitutive laws: name, code and per-particle memory.
 
 
 @dataclass(frozen=True)
 class ConstitutiveLaw:
-    """How stress follows from deformation.
+    """A constitutive law.
 
     Attributes:
-        name: of the law.
-        code: what kernels know it by, column LAW of a material's row.
-        plastic: whether it flows, so that F_elastic and F_total part ways and history is kept.
-        parameters: what the columns A, B and C hold, at most three.
+        name: name of the law.
+        code: code in kernels, column LAW of a material's row.
+        plastic: whether it flows, so that F_elastic and F_total differ and history is stored.
+        parameters: parameters in the columns A, B and C, at most three.
     """
 
     name: str
@@ -75,10 +75,10 @@ CONSTITUTIVE_LAWS = {
 
 
 def require_known(law: object, owner: str) -> ConstitutiveLaw:
-    """Return the law if kernels know it.
+    """Return ``law`` if it is a known constitutive law.
 
     Raises:
-        MaterialError: for anything else, with what is allowed.
+        MaterialError: for anything else, with the allowed laws.
     """
     if not isinstance(law, ConstitutiveLaw) or CONSTITUTIVE_LAWS.get(law.code) != law:
         name = law.name if isinstance(law, ConstitutiveLaw) else law
@@ -92,7 +92,7 @@ def law_of_code(code: float) -> ConstitutiveLaw:
     """The law with this code.
 
     Raises:
-        MaterialError: when there is none, with what is allowed.
+        MaterialError: for an unknown code, with the allowed laws.
     """
     law = CONSTITUTIVE_LAWS.get(int(code)) if code == int(code) else None
     if law is None:
@@ -101,23 +101,23 @@ def law_of_code(code: float) -> ConstitutiveLaw:
 
 
 def allowed_laws() -> str:
-    """Names of all laws for messages."""
+    """Names of all laws, for error messages."""
     return ", ".join(law.name for law in CONSTITUTIVE_LAWS.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """Material of a body: elastic constants, and those that a subclass adds.
+    """Material of a body: elastic constants, and parameters of subclasses.
 
     Attributes:
-        constitutive_law: of the class; says which function gives the stress and what is kept.
+        constitutive_law: constitutive law of the class.
         young: Young's modulus E [Pa], > 0.
         poisson: Poisson's ratio nu, in (-1, 0.5).
-        density: mass per rest volume [kg/m^3], > 0; used where an object's mass is not given.
+        density: mass per rest volume [kg/m^3], > 0; used if an object's mass is not given.
         viscosity: Kelvin-Voigt eta [Pa s], >= 0.
 
     Raises:
-        MaterialError: for a value outside its range, or a law that kernels do not know.
+        MaterialError: for a value out of range, or an unknown law.
     """
 
     constitutive_law: ClassVar[ConstitutiveLaw]
@@ -164,19 +164,19 @@ class Material:
 
     @property
     def plastic(self) -> bool:
-        """Whether it keeps dents, so that F_elastic and F_total part ways."""
+        """Whether it deforms plastically, so that F_elastic and F_total differ."""
         return self.constitutive_law.plastic
 
     @property
     def strength(self) -> float:
-        """Stress at which pressure from one side makes it yield [Pa]; infinite: never."""
+        """Uniaxial compressive yield stress [Pa]; infinite if it never yields."""
         return math.inf
 
     def row(self) -> NDArray[np.float64]:
-        """The record as kernels read it: [MATERIAL_ROW] float64, see ``stress.MATERIAL_ROW``.
+        """The kernel form: [MATERIAL_ROW] float64, see ``stress.MATERIAL_ROW``.
 
         Raises:
-            MaterialError: when there are not as many law parameters as the law has.
+            MaterialError: if the number of parameters does not match the law.
         """
         law, parameters = self.constitutive_law, self.law_parameters()
         if len(parameters) != len(law.parameters):
@@ -191,11 +191,11 @@ class Material:
         return row
 
     def law_parameters(self) -> tuple[float, ...]:
-        """What the law needs besides elastic constants, in the order of its ``parameters``."""
+        """Parameters of the law besides elastic constants, in the order of its ``parameters``."""
         return ()
 
     def _check(self) -> None:
-        """Check the parameters that a subclass adds."""
+        """Validate the parameters of a subclass."""
 
     def _number(self, name: str) -> float:
         value = getattr(self, name)
@@ -221,11 +221,11 @@ def register_material(name: str, **typical: float) -> Callable[[_Kind], _Kind]:
     """Decorator that registers a material under a name.
 
     Args:
-        name: unique among all materials.
-        typical: parameters of what the name stands for, where they are not the class's defaults.
+        name: unique name.
+        typical: parameters of the named material that differ from the defaults of the class.
 
     Raises:
-        MaterialError: for a name that is taken.
+        MaterialError: if the name is taken.
     """
 
     def register(kind: _Kind) -> _Kind:
@@ -241,8 +241,8 @@ def named_material(name: str, **values: float) -> Material:
     """The material registered under a name, with the given values replaced.
 
     Raises:
-        MaterialError: for a name nobody registered, with what is allowed; for a value that the
-            material does not have, or outside its range.
+        MaterialError: for an unknown name, with the allowed ones; for a value that the material
+            does not have, or out of range.
     """
     if name not in MATERIALS:
         raise MaterialError(f"unknown material {name!r}; allowed are {', '.join(MATERIALS)}")
@@ -273,7 +273,7 @@ class FixedCorotated(Material):
 @register_material("rigid")
 @dataclass(frozen=True, kw_only=True)
 class NearRigid(Material):
-    """Fixed corotated and stiff: bends by less than can be seen, at the cost of small steps."""
+    """Stiff fixed corotated elasticity: no visible deformation, at the cost of small time steps."""
 
     constitutive_law: ClassVar[ConstitutiveLaw] = FIXED_COROTATED
 
@@ -293,7 +293,7 @@ class NeoHookean(Material):
     constitutive_law: ClassVar[ConstitutiveLaw] = NEO_HOOKEAN
 
 
-# Materials that keep dents: they flow, pack or come apart.
+# Plastic materials: they flow, pack or break.
 
 
 @register_material("metal", young=2e8, density=300.0, yield_stress=4e6, hardening=2e7)
@@ -301,7 +301,7 @@ class NeoHookean(Material):
 class Metal(Material):
     """Hencky elasticity with von Mises yield and linear hardening: keeps dents.
 
-    The named one is a car body's sheet metal smeared over its volume.
+    The registered material is a car body's sheet metal, averaged over its volume.
 
     Attributes:
         yield_stress: uniaxial yield stress [Pa], > 0.
@@ -331,8 +331,8 @@ class Foam(Material):
     """Hencky elasticity with viscoplastic flow (Yue et al. 2015).
 
     Attributes:
-        yield_stress: below this it is elastic [Pa], > 0.
-        plastic_viscosity: how slowly it flows above [Pa s], >= 0.
+        yield_stress: elastic limit [Pa], > 0.
+        plastic_viscosity: viscosity of plastic flow [Pa s], >= 0.
     """
 
     constitutive_law: ClassVar[ConstitutiveLaw] = VISCOPLASTIC
@@ -355,7 +355,7 @@ class Foam(Material):
 @register_material("sand")
 @dataclass(frozen=True, kw_only=True)
 class Sand(Material):
-    """Drucker-Prager without cohesion (Klar et al. 2016): heaps, flows, never pulls.
+    """Drucker-Prager without cohesion (Klar et al. 2016): heaps and flows, without tension.
 
     Attributes:
         friction_angle: internal friction [rad], in (0, pi/2).
@@ -416,10 +416,10 @@ class Snow(Material):
 
 @dataclass(frozen=True, kw_only=True)
 class Structure(Snow):
-    """Thin-walled structure that folds: packs as snow does, and unfolds as easily as paper.
+    """Thin-walled structure that folds: packs like snow and unfolds without resistance.
 
-    Up to the length that it had it resists no pull, so that what is springy beside it straightens
-    it again; beyond that it holds up to ``critical_stretch``.
+    Up to its original length it does not resist tension, so neighbouring elastic material can
+    straighten it. Beyond that it holds up to ``critical_stretch``.
     """
 
     constitutive_law: ClassVar[ConstitutiveLaw] = CRUSH

@@ -1,4 +1,4 @@
-"""From bodies to a checked model, and the Protocol of the backends that solve it."""
+"""Construction of a validated model from bodies, and the Protocol of solver backends."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class ParticleArrays:
         positions: [N, 3] [m].
         velocities: [N, 3] [m/s].
         gradients: [N, 3, 3] APIC velocity gradient [1/s].
-        F_elastic: [N, 3, 3], drives stress.
-        F_total: [N, 3, 3], drives what is seen.
+        F_elastic: [N, 3, 3], determines stress.
+        F_total: [N, 3, 3], determines the visible deformation.
         history: [N] plastic memory, see ``stress.stress_update``.
     """
 
@@ -53,7 +53,7 @@ class ParticleArrays:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A checked simulation, ready for a backend.
+    """A validated simulation model for a backend.
 
     Attributes:
         start: particles at the start.
@@ -61,13 +61,13 @@ class Model:
         material: [N] int64, row of ``table``.
         body: [N] int64, increasing.
         table: [K, MATERIAL_ROW] float64, ``Material.row``.
-        friction: [B] float64, of the bodies' surfaces.
+        friction: [B] float64, friction coefficients of the bodies' surfaces.
         dx: cell size of the grid [m].
         gravity: [3] [m/s^2].
-        dtype: float32 or float64, precision of the state where the backend has a choice.
+        dtype: float32 or float64, precision of the state if the backend supports both.
 
     Raises:
-        MaterialError: for a law in ``table`` that there is not.
+        MaterialError: for an unknown law in ``table``.
     """
 
     start: ParticleArrays
@@ -87,7 +87,7 @@ class Model:
 
     @property
     def plastic(self) -> NDArray[np.bool_]:
-        """[N] which particles keep F_total and history of their own."""
+        """[N] whether particles have separate F_total and history."""
         flags: NDArray[np.bool_] = self.table[self.material, stress.PLASTIC] > 0
         return flags
 
@@ -125,25 +125,25 @@ class Measure:
 
     @property
     def finite(self) -> bool:
-        """Whether no particle has left the numbers."""
+        """Whether all values are finite."""
         sums = (self.centre.sum(), self.kinetic.sum(), self.elastic.sum())
         bounds = (self.max_speed, self.max_wave_speed, self.min_volume_ratio)
         return bool(np.isfinite([*sums, *bounds]).all())
 
 
 class Simulation(Protocol):
-    """A model in motion on one backend."""
+    """A running simulation on one backend."""
 
     def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
-        """Make ``steps`` substeps of ``dt`` [s]; moving colliders start where they are given."""
+        """Make ``steps`` substeps of ``dt`` [s]; moving colliders start at their given poses."""
         ...
 
     def measure(self) -> Measure:
-        """Sums and bounds of the present state."""
+        """Sums and bounds of the current state."""
         ...
 
     def particles(self) -> ParticleArrays:
-        """A copy of the present state, in the order of the model."""
+        """A copy of the current state, in the order of the model."""
         ...
 
     def contacts(self) -> tuple[Float, Float]:
@@ -154,31 +154,31 @@ class Simulation(Protocol):
         ...
 
     def save(self) -> Any:
-        """The present state, bit by bit."""
+        """The complete current state."""
         ...
 
     def restore(self, saved: Any) -> None:
-        """Go back to a saved state."""
+        """Restore a saved state."""
         ...
 
 
 class SolverBackend(Protocol):
-    """One way to compute; all members agree within the precision they work in."""
+    """A solver implementation; all backends agree within their precision."""
 
     name: str
 
     def start(self, model: Model, colliders: Sequence[Collider]) -> Simulation:
-        """Load a model. Number and type of colliders stay the same."""
+        """Load a model. The number and types of colliders must not change later."""
         ...
 
 
 def is_thin(collider: Collider, dx: float) -> bool:
-    """Whether too few nodes of a grid of ``dx`` [m] lie in a collider to stop a body."""
+    """Whether a collider contains too few nodes of a grid of ``dx`` [m] to stop a body."""
     return isinstance(collider, Solid) and collider.thickness < THIN_CELLS * dx
 
 
 def pack_colliders(colliders: Sequence[Collider], dx: float) -> tuple[Float, Float]:
-    """Rows [K, COLLIDER_ROW], and numbers [H] of height fields and meshes, as kernels read them."""
+    """Colliders in kernel form: rows [K, COLLIDER_ROW], data [H] of height fields and meshes."""
     rows = np.zeros((len(colliders), collider_rows.COLLIDER_ROW))
     heights: list[Float] = []
     stored = 0
@@ -242,11 +242,11 @@ BYTES_PER_PARTICLE = {"single": 900, "double": 1400}
 def build_model(
     bodies: Sequence[Body], *, dx: float | None, gravity: ArrayLike, precision: str
 ) -> Model:
-    """One model of all bodies.
+    """Build one model of all bodies.
 
     Raises:
-        SolverError: for settings that are not allowed.
-        ParticleError: when there are more particles than memory, or too sparse ones.
+        SolverError: for invalid options.
+        ParticleError: for more particles than fit in memory, or too sparse ones.
     """
     if not 0 < len(bodies) <= BODIES_MAX:
         raise SolverError(f"a solver takes 1 to {BODIES_MAX} bodies, not {len(bodies)}")
@@ -272,10 +272,10 @@ def build_model(
 
 
 def check_memory(particles: int, precision: str) -> None:
-    """Refuse a model that would not fit in memory, before any allocation.
+    """Check that a model fits in memory, before any allocation.
 
     Raises:
-        ParticleError: with what is needed and what there is.
+        ParticleError: if not, with the required and the available memory.
     """
     needed, free = particles * BYTES_PER_PARTICLE[precision], available_memory()
     if needed > 0.8 * free:

@@ -1,4 +1,4 @@
-"""Scalar and tuple functions that the kernels of every backend use, and their decorators."""
+"""Scalar and tuple functions shared by the kernels of all backends, and their decorators."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ TINY = F32(1e-30)
 def square_root(x: Any) -> Any:
     """Square root of a number that is not negative.
 
-    In kernels an instruction of the processor, which loops over lanes become vector code with;
-    ``math.sqrt`` calls the C library for the sake of negative numbers.
+    Compiles to a processor instruction, so loops over lanes can be vectorised; ``math.sqrt`` calls
+    the C library to handle negative numbers.
     """
     return math.sqrt(x)
 

@@ -1,4 +1,4 @@
-"""The solver: time, an adaptive time step, and substeps taken back when they diverged."""
+"""The solver: time integration with an adaptive time step and rollback of diverged substeps."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class SolverOptions:
     """Options of a solver.
 
     Attributes:
-        dx: cell size [m]; None takes twice the spacing of the coarsest body's particles.
+        dx: cell size [m]; None for twice the particle spacing of the coarsest body.
         gravity: [3] [m/s^2].
         backend: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``.
         precision: ``single`` or ``double`` state; the reference is always double.
         cfl: fraction of a cell that the fastest wave may cross in a substep, in (0, 0.9].
         dt_max: longest substep [s].
-        substeps_max: a single ``step`` that would need more substeps is refused.
+        substeps_max: maximum number of substeps of a single ``step``; raises beyond.
     """
 
     dx: float | None = None
@@ -63,8 +63,8 @@ class BodyState:
     Attributes:
         positions, velocities: [N, 3] [m], [m/s].
         gradients: [N, 3, 3] velocity gradient [1/s].
-        F_elastic: [N, 3, 3], what stress comes from.
-        F_total: [N, 3, 3], all deformation since the start: covariances become F S F^T.
+        F_elastic: [N, 3, 3], determines stress.
+        F_total: [N, 3, 3], total deformation since the start: covariances become F S F^T.
         history: [N] plastic memory.
         mass: [kg].
         centre: [3] centre of mass [m].
@@ -98,10 +98,10 @@ class ContactTotals:
 
     Attributes:
         body, other: names.
-        impulse: [3] on ``body`` [N s]; over its mass this is its delta-v.
-        moment: [3] of the impulse about the world origin [N m s].
+        impulse: [3] impulse on ``body`` [N s]; divide by its mass for its delta-v.
+        moment: [3] moment of the impulse about the world origin [N m s].
         friction_work: energy dissipated by friction [J]; between bodies each side counts half.
-        work: energy the other gave to ``body`` by pushing it [J]; negative where it was braked.
+        work: work of ``other`` on ``body`` [J]; negative if it brakes ``body``.
     """
 
     body: str
@@ -117,10 +117,10 @@ class Energies:
     """Sums over all bodies [J].
 
     Attributes:
-        kinetic, elastic, gravity: present energy; gravity is 0 at the world origin.
-        friction_heat: dissipated by friction since the start.
-        collider_work: done on bodies by moving colliders since the start.
-        dissipated: lost since the start to viscous and plastic flow, inelastic contact and the
+        kinetic, elastic, gravity: current energies; gravity is 0 at the world origin.
+        friction_heat: energy dissipated by friction since the start.
+        collider_work: work of moving colliders on bodies since the start.
+        dissipated: energy lost since the start by viscous and plastic flow, inelastic contact and
             transfers between particles and grid.
     """
 
@@ -142,10 +142,10 @@ class StepReport:
     """Report of a step.
 
     Attributes:
-        substeps: made and kept.
+        substeps: number of accepted substeps.
         dt: last substep [s].
-        rollbacks: blocks of substeps that were taken back.
-        reasons: why, one for each rollback.
+        rollbacks: number of rolled back blocks of substeps.
+        reasons: reason of each rollback.
     """
 
     substeps: int = 0
@@ -155,15 +155,15 @@ class StepReport:
 
 
 class Solver:
-    """Bodies and colliders in motion: MLS-MPM with APIC on a sparse grid.
+    """Solver for bodies and colliders: MLS-MPM with APIC on a sparse grid.
 
     Args:
-        bodies: at least one, with unique names.
-        colliders: with unique names.
-        options: how to compute.
+        bodies: at least one body, with unique names.
+        colliders: colliders with unique names.
+        options: solver options.
 
     Raises:
-        SolverError, ParticleError: for what cannot be simulated, with the reason.
+        SolverError, ParticleError: if the input cannot be simulated, with the reason.
     """
 
     def __init__(
@@ -196,17 +196,17 @@ class Solver:
 
     @property
     def colliders(self) -> tuple[Collider, ...]:
-        """Colliders in their present poses."""
+        """Colliders in their current poses."""
         return tuple(self._colliders)
 
     def step(self, duration: float) -> StepReport:
         """Advance by ``duration`` [s], in as many substeps as needed.
 
         Raises:
-            SolverError: for a duration that is not positive or needs too many substeps.
-            ParticleError: when particles leave the reach of the grid.
-            UnstableError: when it diverges and smaller substeps do not help. After any error the
-                solver stands at the last good state.
+            SolverError: if the duration is not positive or needs too many substeps.
+            ParticleError: if particles leave the reach of the grid.
+            UnstableError: if it diverges and smaller substeps do not help. After any error the
+                solver is at its last valid state.
         """
         if not (math.isfinite(duration) and duration > 0):
             raise SolverError(f"duration of a step must be positive [s], not {duration!r}")
@@ -230,9 +230,9 @@ class Solver:
         return report
 
     def time_step(self) -> float:
-        """Longest stable substep now [s]: waves, motion, viscosity, and ``dt_scale``.
+        """Current longest stable substep [s], from waves, motion, viscosity and ``dt_scale``.
 
-        What moves relative to a collider must not cross more of a cell than what moves past nodes.
+        The CFL limit also applies to motion relative to colliders.
         """
         m, o = self._measure, self.options
         speed = m.max_wave_speed + m.max_speed
@@ -243,7 +243,7 @@ class Solver:
         """State of the body with this name.
 
         Raises:
-            SolverError: when there is none.
+            SolverError: for an unknown name.
         """
         return self.states()[self._index(name)]
 
@@ -274,7 +274,7 @@ class Solver:
 
     @property
     def measure(self) -> Measure:
-        """Sums and bounds of the present state."""
+        """Sums and bounds of the current state."""
         return self._measure
 
     def particles(self) -> ParticleArrays:
@@ -283,7 +283,7 @@ class Solver:
 
     @property
     def contacts(self) -> list[ContactTotals]:
-        """All contacts since the start, one entry for each body and other."""
+        """Contact totals since the start, one entry per body and other."""
         by_collider, by_body = self.simulation.contacts()
         names = [b.name for b in self.bodies]
         found = []
@@ -297,7 +297,7 @@ class Solver:
         return found
 
     def energies(self) -> Energies:
-        """The energy balance: what there is, and where the rest went."""
+        """The energy balance: current energies and losses since the start."""
         m = self._measure
         heat, work = self._contact_energies()
         now = self._mechanical(m)
@@ -311,7 +311,7 @@ class Solver:
         )
 
     def snapshot(self) -> Any:
-        """The present state, bit by bit; for :meth:`restore` of this solver only."""
+        """The complete current state; for :meth:`restore` of this solver only."""
         return (
             self.simulation.save(),
             list(self._colliders),
@@ -321,13 +321,13 @@ class Solver:
         )
 
     def restore(self, snapshot: Any) -> None:
-        """Go back to a snapshot; from there on everything is as it was, to the bit."""
+        """Restore a snapshot; the simulation continues bitwise identically from there."""
         saved, colliders, self.time, self._dt_scale, self._measure = snapshot
         self._colliders = list(colliders)
         self.simulation.restore(saved)
 
     def _attempt(self, count: int, report: StepReport) -> bool:
-        """Make ``count`` substeps; take them back and halve the step if they went wrong."""
+        """Make ``count`` substeps; on instability, roll them back and halve the step."""
         before, saved = self._measure, self.simulation.save()
         work_before = self._contact_energies()[1]
         try:
@@ -365,14 +365,14 @@ class Solver:
         return ""
 
     def _instability(self, before: Measure, work: float) -> str:
-        """Description of the present state's instability; empty where it is stable."""
+        """Description of the instability of the current state; empty if stable."""
         m = self._measure
         if not m.finite:
             return "positions, velocities or stresses are not finite"
         rise = self._mechanical(m) - self._mechanical(before) - max(work, 0.0)
         live = float((before.kinetic + before.elastic).sum()) + abs(work)
         g = float(np.linalg.norm(self.model.gravity))
-        # Sums of single-precision particles waver by this much when hardly anything moves.
+        # Rounding noise of single-precision sums when hardly anything moves.
         noise = float(m.mass.sum()) * (1e-4 * g * self.dx + 1e-8)
         if rise > ENERGY_SLACK * live + noise:
             return f"energy rose by {rise:.3g} J from {live:.3g} J without cause"

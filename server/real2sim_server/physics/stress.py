@@ -1,8 +1,8 @@
 """Stress and return mapping of one particle.
 
-``stress_update`` is the one entry: it takes the trial elastic deformation gradient and gives the
-elastic part that is left after plastic flow, the Kirchhoff stress tau, the stored energy per rest
-volume and the history variable. Formulas: reference in :mod:`.materials` at each class.
+``stress_update`` is the entry point: it maps a trial elastic deformation gradient to the elastic
+part after plastic flow, the Kirchhoff stress tau, the stored energy per rest volume and the history
+variable. See the classes in :mod:`.materials` for references.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .numerics import (
     times_transposed,
 )
 
-# A material as kernels read it: one row of numbers.
+# A material in kernel form: one row of numbers.
 
 COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW, CRUSH = range(7)
 """Codes of constitutive laws in column LAW; see ``materials.CONSTITUTIVE_LAWS``."""
@@ -54,8 +54,8 @@ def stress_update(F: Any, history: Any, row: Any, dt: Any) -> Any:
     Args:
         F: trial deformation gradient, nine numbers.
         history: plastic memory; hardening [Pa], volume correction, or plastic volume ratio.
-        row: the material, a row with the columns above.
-        dt: time since the last call [s]; 0 leaves rate-dependent flow out.
+        row: material row with the columns above.
+        dt: time since the last call [s]; 0 disables rate-dependent flow.
     """
     law = row[LAW]
     if law == COROTATED:
@@ -138,7 +138,7 @@ def neo_hookean_at(F: Any, log_volume: Any, mu: Any, lam: Any) -> Any:
 def hencky(stretch: Any, history: Any, row: Any, dt: Any) -> Any:
     """Hencky's law with the flow rule of the row's law, in principal stretches.
 
-    tau = 2 mu e + lambda tr(e), e = ln(stretch). A law that is none of them gives NaN.
+    tau = 2 mu e + lambda tr(e), e = ln(stretch). Unknown laws give NaN.
     """
     mu, lam = row[MU], row[LAMBDA]
     e = (math.log(stretch[0]), math.log(stretch[1]), math.log(stretch[2]))
@@ -263,7 +263,7 @@ def snow(stretch: Any, history: Any, row: Any) -> Any:
 
 @device_function
 def snow_bounds(history: Any, row: Any) -> Any:
-    """Between which principal stretches snow and structure are elastic."""
+    """Elastic range of the principal stretches of snow and structure."""
     high = ONE + row[B]
     if row[LAW] == CRUSH and history < ZERO:
         high = ONE + max(SLACK, row[B] * (ONE + UNFOLDED * history))
@@ -272,13 +272,13 @@ def snow_bounds(history: Any, row: Any) -> Any:
 
 @device_function
 def snow_hardening(history: Any, row: Any) -> Any:
-    """Factor on the moduli of snow and structure, from what plastic flow has left."""
+    """Hardening factor on the moduli of snow and structure, from the plastic volume ratio."""
     return math.exp(min(max(row[C] * (ONE - math.exp(history)), -THREE), THREE))
 
 
 @device_function
 def wave_hardening(history: Any, row: Any) -> Any:
-    """By how much plastic flow has stiffened a particle; its waves run so much faster, squared."""
+    """Stiffening of a particle by plastic flow: the factor on its squared wave speed."""
     if not SNOW <= row[LAW] <= CRUSH:
         return 1.0
     hardening = row[C] * (1.0 - math.exp(float(history)))

@@ -1,4 +1,4 @@
-"""From Gaussians to pictures: one rasterize() call, three backends."""
+"""Rendering of Gaussians to images: one rasterize() call with several backends."""
 
 from .backend import Backend
 from .frame import Frame, RigView, draws_together, render_cameras, render_rigs, warm_up

@@ -1,4 +1,4 @@
-"""The interface of rasterizer backends: requests, results, and what several backends share."""
+"""The interface of rasterizer backends: requests, results and shared helpers."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ CLAMP_MARGIN = 0.3
 
 @dataclass(frozen=True, eq=False)
 class RasterRequest:
-    """A checked rasterize() call.
+    """A validated rasterize() call.
 
     Attributes:
-        instances: what is drawn; order breaks ties of depth.
+        instances: instances to draw; list order breaks depth ties.
         viewmats: [C, 4, 4] float64 torch, ``T_camera_world``.
         Ks: [C, 3, 3] float64 torch [px].
         width, height: size of all images [px].
-        sky: what is seen behind everything, or None for ``options.background``.
-        options: the rest.
-        optics: lens, shutter and motion of the only camera, whose viewmat is that of the middle of
-            the read-out; None for pinholes.
-        between: called between pieces of the work, each of some 10 ms, on the calling thread. It
-            may rasterize something else with the same backend. None: the work is done in one go.
+        sky: sky behind everything, or None for ``options.background``.
+        options: all other options.
+        optics: lens, shutter and motion of a single camera, whose viewmat is that of the middle of
+            the read-out; None for pinhole cameras.
+        between: callback between pieces of work of about 10 ms each, on the calling thread. It may
+            rasterize with the same backend. If None, the work is not interrupted.
     """
 
     instances: tuple[Instance, ...]
@@ -72,7 +72,7 @@ class RasterRequest:
 
 
 def needs_gradients(request: RasterRequest) -> bool:
-    """Whether the pictures must carry gradients to anything in the request."""
+    """Whether images must carry gradients to any input of the request."""
     if not torch.is_grad_enabled():
         return False
     tensors: list[object] = [request.viewmats, request.sky.faces if request.sky else None]
@@ -83,19 +83,19 @@ def needs_gradients(request: RasterRequest) -> bool:
 
 
 def is_reduced(request: RasterRequest) -> bool:
-    """Whether a backend that can merge Gaussians does so for this request."""
+    """Whether a backend with levels of detail merges Gaussians for this request."""
     small = request.width * request.height <= SMALL_IMAGE_PIXELS
     plain = request.optics is None
     return plain and request.options.detail == "auto" and small and not needs_gradients(request)
 
 
 def class_behind(request: RasterRequest) -> int:
-    """Class of pixels in which nothing takes half of the light."""
+    """Semantic class of pixels with an opacity below one half."""
     return UNLABELED if request.sky is None else SKY
 
 
 def with_colours(request: RasterRequest) -> RasterRequest:
-    """The request with colours that change over time put into the clouds."""
+    """The request with time-dependent colours evaluated and stored in the clouds."""
     instances = tuple(
         i if i.colour is None else replace(i, cloud=i.colour.at(i.cloud, i.t_us), colour=None)
         for i in request.instances
@@ -104,45 +104,49 @@ def with_colours(request: RasterRequest) -> RasterRequest:
 
 
 class Backend(Protocol):
-    """One way to rasterize. All members give the same pictures within 1/255.
+    """A rasterizer. All backends give the same images within 1/255.
 
-    A member that draws lenses and rolling shutters has ``draws_lenses = True``.
+    Backends that support lenses and rolling shutters set ``draws_lenses = True``.
     """
 
     name: str
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
-        """Draw the request. Images lie on the device the backend works on."""
+        """Draw the request. Images are on the backend's device."""
         ...
 
     def warm_up(self) -> None:
-        """Compile or load whatever the first call would otherwise wait for."""
+        """Compile or load everything that the first call needs."""
         ...
 
 
 @runtime_checkable
 class BatchBackend(Protocol):
-    """A Backend that draws the small images of many requests in one go."""
+    """A Backend that draws the small images of many requests in one call."""
 
     def rasterize_batch(self, requests: Sequence[RasterRequest]) -> RenderOutput:
-        """All images of ``requests``, which are of one size, one sky and the same options, and for
-        each of which :func:`is_reduced` holds; the same bits as one by one."""
+        """All images of ``requests``; bitwise equal to separate calls.
+
+        Requests must share size, sky and options, and satisfy :func:`is_reduced`.
+        """
         ...
 
     def rasterize_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
-        """All images of ``worlds``, by world and then by camera; sizes, sky and options are those
-        of ``like``, for which :func:`is_reduced` holds. The same bits as one by one."""
+        """All images of ``worlds``, by world, then by camera; bitwise equal to separate calls.
+
+        Size, sky and options are those of ``like``, which must satisfy :func:`is_reduced`.
+        """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class StartedFrames:
-    """Images on their way to the host.
+    """Images that are being copied to the host.
 
     Attributes:
-        images: [C, H, W, ...] by modality of each request, on the host; whole once ``ready`` has
-            returned.
-        ready: waits for them; on any thread, any number of times.
+        images: [C, H, W, ...] by modality of each request, on the host; complete once ``ready``
+            has returned.
+        ready: waits for the images; thread-safe, can be called repeatedly.
     """
 
     images: list[dict[str, NDArray[Any]]]
@@ -151,36 +155,36 @@ class StartedFrames:
 
 @runtime_checkable
 class FrameBackend(Protocol):
-    """A Backend that draws images of several sizes in one go, as they leave the renderer."""
+    """A Backend that draws final images of several sizes in one call."""
 
     @property
     def modalities(self) -> frozenset[str]:
-        """Those of which :meth:`frames` makes images."""
+        """Modalities that :meth:`frames` supports."""
         ...
 
     def frames(
         self, requests: Sequence[RasterRequest], modalities: Sequence[str]
     ) -> list[dict[str, NDArray[Any]]]:
-        """Images [C, H, W, ...] by modality of each request, on the host and for the caller to
-        keep; what the modality's ``pixels`` makes of :meth:`Backend.rasterize`, within one level
-        of a byte."""
+        """Images [C, H, W, ...] by modality of each request, on the host, owned by the caller.
+
+        Equal to the modality's ``pixels`` of :meth:`Backend.rasterize` within one byte level.
+        """
         ...
 
     def start_frames(
         self, requests: Sequence[RasterRequest], modalities: Sequence[str]
     ) -> StartedFrames:
-        """As :meth:`frames`, but returns when they are drawn: the next ones are drawn while they
-        are copied."""
+        """Like :meth:`frames`, but returns before the copy to the host is complete."""
         ...
 
 
 def draws_lens(backend: Backend) -> bool:
-    """Whether ``backend`` draws lenses and rolling shutters."""
+    """Whether ``backend`` supports lenses and rolling shutters."""
     return bool(getattr(backend, "draws_lenses", False))
 
 
 def no_lens(backend: Backend, camera: Camera) -> str:
-    """Why ``backend`` does not draw a camera, and what to do."""
+    """Message why ``backend`` cannot draw a camera, with a suggestion."""
     kind = "pinhole" if camera.lens is None else camera.lens.model
     return (
         f"the backend {backend.name!r} draws pinhole cameras with a global shutter, not camera "
@@ -190,26 +194,26 @@ def no_lens(backend: Backend, camera: Camera) -> str:
 
 
 def check_optics(backend: Backend, request: RasterRequest) -> None:
-    """Raises RenderError where ``backend`` cannot draw the request's lens or shutter."""
+    """Raise RenderError if ``backend`` cannot draw the request's lens or shutter."""
     if request.optics is not None and not draws_lens(backend):
         raise RenderError(no_lens(backend, request.optics.camera))
 
 
 def device_of(backend: Backend) -> torch.device:
-    """Where the images of ``backend`` lie, and where its inputs are best kept."""
+    """Device of the images of ``backend``, and the preferred device of its inputs."""
     device: torch.device = getattr(backend, "device", torch.device("cpu"))
     return device
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where I instances stand before C cameras; float64, so that only the result is rounded.
+    """Poses of I instances relative to C cameras; float64, so that only the result is rounded.
 
     Attributes:
-        linear: [C, I, 3, 3] maps cloud coordinates to the camera frame, scale included.
-        offset: [C, I, 3] position of the clouds' origins in the camera frame [m].
-        camera_position: [C, I, 3] camera centre in the instance's unscaled frame [m]; colours
-            are seen along ``scale * mean - camera_position``.
+        linear: [C, I, 3, 3] maps cloud coordinates to the camera frame, including scale.
+        offset: [C, I, 3] origins of the clouds, camera frame [m].
+        camera_position: [C, I, 3] camera centre in the instance's unscaled frame [m]; the view
+            direction of a colour is ``scale * mean - camera_position``.
         scale: [I, 3].
     """
 
@@ -269,12 +273,12 @@ def empty_statistics(
 
 
 def screen_scale(request: RasterRequest) -> tuple[float, float]:
-    """Factors on gradients by x and y [px]; see ScreenStatistics."""
+    """Scale factors of gradients by x and y [px]; see ScreenStatistics."""
     return request.cameras * request.width / 2, request.cameras * request.height / 2
 
 
 class ScreenTracker:
-    """Fills ScreenStatistics for the reference."""
+    """Collects ScreenStatistics for the reference backend."""
 
     def __init__(self, request: RasterRequest) -> None:
         self.statistics = empty_statistics(request)
@@ -284,7 +288,7 @@ class ScreenTracker:
     def watch(
         self, camera: int, owners: Tensor, means2d: Tensor, extents: Tensor
     ) -> ScreenWatch | None:
-        """Note the radii of V splats of one camera and listen for the gradients of their centres.
+        """Record the radii of V splats of one camera and hook the gradients of their centres.
 
         Args:
             camera: index of the camera.
@@ -320,7 +324,7 @@ class ScreenWatch:
         self.absolute = torch.zeros(count, 2, dtype=torch.float64)
 
     def gather(self, index: Tensor, dx: Tensor, dy: Tensor) -> None:
-        """Listen to offsets [M, pixels] from the splats ``index`` [M] to the pixels of a tile."""
+        """Hook offsets [M, pixels] from the splats ``index`` [M] to the pixels of a tile."""
         for axis, offsets in enumerate((dx, dy)):
             if offsets.requires_grad:
                 offsets.register_hook(functools.partial(self._add, axis, index))
@@ -329,26 +333,26 @@ class ScreenWatch:
         self.absolute[:, axis].index_add_(0, index, gradient.abs().sum(1).double())
 
 
-# Warm-up: small requests that together use every path of a backend
+# Warm-up: small requests that together cover every path of a backend
 
 MANY = 5_000
 """More Gaussians than a backend treats as one block."""
 
 
 def warm_up_requests() -> Iterator[RasterRequest]:
-    """One request for each combination that could be compiled on its own."""
+    """One request for each separately compiled combination."""
     yield from picture_requests()
     yield from small_requests()
 
 
 def picture_requests() -> Iterator[RasterRequest]:
-    """Those of a scene's first picture, which shows clouds of many Gaussians."""
+    """Requests that cover the first image of a scene, with clouds of many Gaussians."""
     for labels in (False, True):
         yield _request(_cloud(MANY), labels=labels)
 
 
 def small_requests() -> Iterator[RasterRequest]:
-    """Those of clouds of few Gaussians, and of small images, for which Gaussians are merged."""
+    """Requests that cover clouds of few Gaussians, and small images with merged Gaussians."""
     details: tuple[Detail, ...] = ("full", "auto")
     for detail in details:
         yield _request(_cloud(2), _cloud(MANY), labels=True, detail=detail)
@@ -374,7 +378,7 @@ def _request(
 
 
 def _cloud(count: int) -> GaussianCloud:
-    """A cloud of this many Gaussians, at two places in front of the camera."""
+    """A cloud of ``count`` Gaussians, at two positions in front of the camera."""
     two = GaussianCloud(
         means=torch.tensor([[0.0, 0, 2], [0, 0, 3]]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),

@@ -55,13 +55,13 @@ _skies: WeakKeyDictionary[Sky, Sky] = WeakKeyDictionary()
 
 
 def uncertainty_request(request: RasterRequest) -> RasterRequest:
-    """The pass whose image's channels are the uncertainty, in [0, 1].
+    """The pass whose image channels are the uncertainty, in [0, 1].
 
-    What has no uncertainties (an inserted asset, a shadow that an edit has made) counts as UNSEEN,
-    and so does what is behind everything where there is no sky.
+    Instances without uncertainties (inserted assets, shadows of edits) count as UNSEEN, and so does
+    the background without a sky.
 
     Raises:
-        RenderError: nothing of what is drawn has any.
+        RenderError: no instance has uncertainties.
     """
     if all(instance.cloud.uncertainties is None for instance in request.instances):
         raise RenderError(WITHOUT)
@@ -81,7 +81,7 @@ def uncertainty_request(request: RasterRequest) -> RasterRequest:
 
 
 def shown_as_colour(instance: Instance) -> Instance:
-    """The instance with uncertainties in place of its colours."""
+    """The instance with uncertainties instead of colours."""
     found = _clouds.get(instance.cloud)
     if found is None:
         cloud = instance.cloud.with_uncertainties()
@@ -92,7 +92,7 @@ def shown_as_colour(instance: Instance) -> Instance:
 
 
 def uncertainty_picture(uncertainty: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """RGB [H, W, 3] of an image [H, W] for people: from black (0) to pale yellow (UNSEEN)."""
+    """RGB visualisation [H, W, 3] of an image [H, W]: black (0) to pale yellow (UNSEEN)."""
     import cv2
 
     levels = np.rint(np.clip(uncertainty / UNSEEN, 0, 1) * 255).astype(np.uint8)
@@ -118,7 +118,7 @@ ROUNDING_KERNELS = 2
 
 
 def at_once() -> None:
-    """For images that are whole: nothing has to be waited for."""
+    """A ``ready`` function for images that are already complete."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,15 +126,15 @@ class Frame:
     """The images of one camera.
 
     Attributes:
-        camera: its name.
+        camera: name of the camera.
         images: by modality: ``rgb`` [H, W, 3] uint8, ``depth`` [H, W] float32 along the camera z
             axis [m], 0 where alpha is below 0.5, ``instance`` [H, W] uint16 ids, 0 is background,
             ``median_depth`` [H, W] float32 [m], 0 where alpha is below 0.5, ``semantic`` [H, W]
             uint8, see SEMANTIC_CLASSES, ``uncertainty`` [H, W] float32, expected absolute error
-            of a colour, of 1.
+            of a colour in [0, 1].
         T_world_camera: [4, 4] float64, OpenCV camera frame to world.
         timing_ms: by stage; cameras drawn together share their time equally.
-        ready: returns when the images are whole; nobody has to ask but who asked not to wait.
+        ready: waits until the images are complete; only needed if rendering did not wait.
     """
 
     camera: str
@@ -145,31 +145,31 @@ class Frame:
 
     @property
     def rgb(self) -> NDArray[np.uint8]:
-        """The colour image. Raises KeyError where it was not requested."""
+        """The colour image. Raises KeyError if it was not requested."""
         return self.images["rgb"]
 
     @property
     def depth(self) -> NDArray[np.float32] | None:
-        """The depth image; None when not requested."""
+        """The depth image; None if not requested."""
         return self.images.get("depth")
 
     @property
     def instance(self) -> NDArray[np.uint16] | None:
-        """The instance image; None when not requested."""
+        """The instance image; None if not requested."""
         return self.images.get("instance")
 
 
 @dataclass(frozen=True, eq=False)
 class RigView:
-    """The cameras of a vehicle and the scene before them.
+    """The cameras of a vehicle and the scene that they see.
 
     Attributes:
-        instances: what is in its world.
-        cameras: on the vehicle.
+        instances: instances of its world.
+        cameras: cameras on the vehicle.
         T_world_vehicle: [4, 4] pose of the vehicle, in the middle of a read-out.
-        sky: behind everything.
-        twist: [6] of the vehicle, velocity [m/s] of its origin and angular velocity [rad/s] in the
-            world, for cameras with a rolling shutter; None: it stands.
+        sky: sky behind everything.
+        twist: [6] velocity of the vehicle's origin [m/s] and angular velocity [rad/s], world frame,
+            for cameras with a rolling shutter; None if stationary.
     """
 
     instances: Sequence[Instance]
@@ -191,24 +191,25 @@ def render_cameras(
     between: Callable[[], object] | None = None,
     twist: NDArray[np.float64] | None = None,
 ) -> list[Frame]:
-    """Frames of ``cameras`` in their order; cameras of one size are drawn in one call,
-    and all in one where the backend can.
+    """Render the frames of ``cameras``, in order.
+
+    Cameras of one size are drawn in one call, and all cameras in one if the backend supports it.
 
     Args:
-        instances: what is in the world, see rasterize().
-        cameras: on the vehicle.
+        instances: instances of the world, see rasterize().
+        cameras: cameras on the vehicle.
         T_world_vehicle: [4, 4] pose of the vehicle.
-        sky: behind everything.
-        options: of the pass.
-        modalities: images that the frames have, and with them the switches of ``options``; None
-            for rgb and what those switches say.
-        backend: draws.
-        between: called between pieces of the work, see RasterRequest.
-        twist: of the vehicle, see RigView.
+        sky: sky behind everything.
+        options: options of the pass.
+        modalities: images of the frames; sets the switches of ``options``. None for rgb and the
+            images selected by these switches.
+        backend: renderer backend.
+        between: callback between pieces of work, see RasterRequest.
+        twist: twist of the vehicle, see RigView.
 
     Raises:
-        RenderError: as rasterize(); also for a vehicle pose that is not rigid, and for a modality
-            that nobody has registered.
+        RenderError: as rasterize(); also for a vehicle pose that is not rigid, and for an unknown
+            modality.
     """
     view = RigView(instances, cameras, T_world_vehicle, sky, twist)
     return render_rigs(
@@ -225,16 +226,17 @@ def render_rigs(
     between: Callable[[], object] | None = None,
     waits: bool = True,
 ) -> list[list[Frame]]:
-    """Frames of several vehicles, as :func:`render_cameras` gives each; all are drawn in one call
-    where the backend can, see :func:`draws_together`.
+    """Render frames of several vehicles, equal to :func:`render_cameras` of each.
+
+    All are drawn in one call if the backend supports it, see :func:`draws_together`.
 
     Args:
-        views: what the cameras of each vehicle look at.
-        options, modalities, backend, between: as of :func:`render_cameras`.
-        waits: until images are whole; else each is once its frame's ``ready`` has returned.
+        views: cameras and scene of each vehicle.
+        options, modalities, backend, between: see :func:`render_cameras`.
+        waits: whether to wait until images are complete; else call ``ready`` of each frame.
 
     Raises:
-        RenderError: as :func:`render_cameras`, for any of them; nothing is drawn then.
+        RenderError: as :func:`render_cameras`, for any of them; nothing is drawn.
     """
     if modalities is None:
         modalities = modalities_drawn(options)
@@ -256,15 +258,18 @@ def render_rigs(
 
 
 def draws_together(backend: Backend, modalities: Iterable[str]) -> bool:
-    """Whether images of these modalities are drawn in one go, whatever is in them and of any size;
-    small ones of one size may be by other backends too, see BatchBackend."""
+    """Whether ``backend`` draws images of these modalities in one call, for any content and size.
+
+    Other backends may still batch small images of one size, see BatchBackend.
+    """
     return isinstance(backend, FrameBackend) and backend.modalities.issuperset(modalities)
 
 
 def warm_up(backend: str | Backend = "auto") -> None:
-    """Compile or load everything a first frame would wait for, which takes half a minute the first
-    time; for small images and clouds of few Gaussians there is
-    :func:`~.select.warm_up_small_images`."""
+    """Compile or load everything that a first frame needs; takes half a minute the first time.
+
+    For small images and clouds of few Gaussians see :func:`~.select.warm_up_small_images`.
+    """
     made.expect(ROUNDING_KERNELS)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
     chosen.warm_up()
@@ -273,7 +278,7 @@ def warm_up(backend: str | Backend = "auto") -> None:
 
 
 def classes_of(instances: Sequence[Instance]) -> NDArray[np.uint8]:
-    """Classes [65536] by instance id, of the first that has it."""
+    """Classes [65536] by instance id; the first instance with an id determines its class."""
     classes = np.full(MAX_INSTANCE_ID + 1, UNLABELED, np.uint8)
     for instance in reversed(instances):
         classes[instance.instance_id] = instance.semantic
@@ -281,7 +286,7 @@ def classes_of(instances: Sequence[Instance]) -> NDArray[np.uint8]:
 
 
 def alike(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Indices of pinholes of one size each, and of every other camera by itself."""
+    """Groups of camera indices: pinhole cameras by size, every other camera separately."""
     groups: dict[tuple[int, ...], list[int]] = {}
     for index, camera in enumerate(cameras):
         own = () if camera.is_pinhole else (index,)
@@ -336,7 +341,7 @@ def _vehicle_pose(given: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Images [C, H, W, ...] by modality, milliseconds by stage, and what waits for the images."""
+    """Images [C, H, W, ...] by modality, milliseconds by stage, and the ``ready`` function."""
 
     images: Mapping[str, NDArray[Any]]
     timing_ms: Mapping[str, float]
@@ -346,7 +351,7 @@ class _Drawn:
 def _drawn(
     requests: Sequence[RasterRequest], modalities: Sequence[str], backend: Backend
 ) -> Iterator[_Drawn]:
-    """The output of each request; uncertainty takes a pass of its own."""
+    """The output of each request; uncertainty needs a separate pass."""
     if UNCERTAINTY not in modalities:
         yield from _drawn_in_colour(requests, modalities, backend)
         return
@@ -379,14 +384,13 @@ def _drawn_in_colour(
             seen = replace(output, classes=classes, behind=behind)
         images = {name: modality_of(name).pixels(seen) for name in modalities}
         if request.optics is not None and "semantic" in images:
-            # Where the lens sees nothing there is no sky, either.
+            # Pixels outside the lens show no sky.
             images["semantic"][0][tables_of(request.optics.camera).blind] = UNLABELED
         yield _Drawn(images, seen.timing_ms)
 
 
 def _rasterized(requests: Sequence[RasterRequest], backend: Backend) -> Iterator[RenderOutput]:
-    """Outputs of requests in their order; small images alike are drawn in one go where the backend
-    can, the same bits as one by one."""
+    """Outputs of requests, in order; compatible small images are batched with equal results."""
     if not isinstance(backend, BatchBackend):
         yield from map(backend.rasterize, requests)
         return
@@ -407,7 +411,7 @@ def _rasterized(requests: Sequence[RasterRequest], backend: Backend) -> Iterator
 def _taken_apart(
     output: RenderOutput, cameras: Sequence[int], numbers: Sequence[int]
 ) -> Iterator[tuple[int, RenderOutput]]:
-    """Outputs of requests that were drawn in one go, by their numbers."""
+    """Outputs of requests that were drawn in one call, by index."""
     first = 0
     for number, count in zip(numbers, cameras, strict=True):
         part = slice(first, first + count)
@@ -448,22 +452,24 @@ EVERYTHING = RasterOptions(median_depth=True)
 
 
 def refuse_lenses(backend: Backend, cameras: Sequence[Camera]) -> None:
-    """Raises RenderError where ``backend`` cannot draw one of the cameras."""
+    """Raise RenderError if ``backend`` cannot draw one of the cameras."""
     for camera in cameras:
         if not camera.is_pinhole and not draws_lens(backend):
             raise RenderError(no_lens(backend, camera))
 
 
 def kernels_of_lenses_on_disk() -> bool:
-    """Whether an earlier run left what :func:`warm_up_lenses` compiles longest."""
+    """Whether the disk cache has the slowest kernels of :func:`warm_up_lenses`."""
     from ._cpu.ray_project import project_rays  # Imported only where it is needed.
 
     return is_on_disk(project_rays)
 
 
 def warm_up_lenses(backend: str | Backend = "auto") -> None:
-    """Compile or load everything that a first frame through a lens or a rolling shutter would wait
-    for; takes half a minute the first time."""
+    """Compile or load everything for frames with lenses or rolling shutters.
+
+    Takes half a minute the first time.
+    """
     chosen = select_backend(backend) if isinstance(backend, str) else backend
     cloud = GaussianCloud(
         means=torch.tensor([[0.0, 0.0, 3.0], [0.2, 0.1, 0.4]]),
@@ -481,7 +487,7 @@ def warm_up_lenses(backend: str | Backend = "auto") -> None:
         )
 
 
-# Labels: colours, depth and object of each pixel in one walk, also of objects as if alone
+# Labels: colour, depth and object of each pixel in one pass, also for objects without occluders
 
 FRONT = 0.2
 """Transmittance at which the front of a pixel lies, of what labels show."""
@@ -489,7 +495,7 @@ FRONT = 0.2
 
 @runtime_checkable
 class LabelBackend(Protocol):
-    """A Backend that finds labels while it draws colours."""
+    """A Backend that computes labels in the colour pass."""
 
     def label(
         self,
@@ -499,25 +505,26 @@ class LabelBackend(Protocol):
         level: float,
         along_rays: bool = True,
     ) -> list[LabelOutput]:
-        """Picture and labels of each camera.
+        """Image and labels of each camera.
 
         Args:
-            request: without optics.
-            windows: of objects, one each, by camera.
-            level: transmittance at which the front of a pixel lies, the Gaussian that brings it
-                there or below; at most a half, which counts where it is not reached.
-            along_rays: whether depth is where a pixel's ray meets its front most, or the depth of
-                the front's centre.
+            request: request without optics.
+            windows: one window per object, by camera.
+            level: transmittance that defines the front of a pixel: the Gaussian at which it first
+                falls to this value or below. At most one half, which is used if ``level`` is not
+                reached.
+            along_rays: whether depth is at the maximum response along the pixel's ray; else it is
+                the depth of the Gaussian's centre.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledFrame:
-    """One camera's picture and labels, see LabelOutput.
+    """Image and labels of one camera, see LabelOutput.
 
     Attributes:
-        rgb: [H, W, 3] uint8, the bytes of a picture alone.
+        rgb: [H, W, 3] uint8, bitwise equal to an image without labels.
         depth: [H, W] float32 [m].
         instance: [H, W] uint16.
         alone: depths [h, w] float32 by window.
@@ -532,7 +539,7 @@ class LabelledFrame:
 
 
 def labels_while_drawing(backend: Backend, cameras: Sequence[Camera]) -> bool:
-    """Whether :func:`label_cameras` can do it: others draw a pass for each label."""
+    """Whether :func:`label_cameras` is supported; otherwise each label needs its own pass."""
     return isinstance(backend, LabelBackend) and all(camera.is_pinhole for camera in cameras)
 
 
@@ -545,15 +552,15 @@ def label_cameras(
     sky: Sky | None,
     backend: LabelBackend,
 ) -> list[LabelledFrame]:
-    """Pictures and labels of ``cameras`` in their order.
+    """Render images and labels of ``cameras``, in order.
 
     Args:
-        instances: what is in the world, see rasterize().
-        cameras: pinholes on the vehicle.
+        instances: instances of the world, see rasterize().
+        cameras: pinhole cameras on the vehicle.
         T_world_vehicle: [4, 4] pose of the vehicle.
-        windows: of objects that are also asked for alone, by camera.
-        sky: behind everything.
-        backend: draws.
+        windows: windows of objects to label without occluders, by camera.
+        sky: sky behind everything.
+        backend: renderer backend.
 
     Raises:
         RenderError: as rasterize().

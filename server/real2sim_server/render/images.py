@@ -1,7 +1,7 @@
-"""From rendered arrays to files and bytes: camera effects, quantization, encoding.
+"""Camera effects, quantization and encoding of rendered images.
 
-Effects work on linear light: sRGB display values are linearised first and encoded again afterwards.
-The functions are pure and run on any thread.
+Effects work on linear light: sRGB values are linearised before and encoded afterwards. All
+functions are pure and thread-safe.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 
 def turbo_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """By libjpeg-turbo on this thread, 4:4:4."""
+    """Encode with libjpeg-turbo on this thread, 4:4:4."""
     import simplejpeg
 
     encoded: bytes = simplejpeg.encode_jpeg(image, quality, "RGB", "444")
@@ -50,10 +50,10 @@ def turbo_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
 
 
 class NvjpegEncoder:
-    """Jpegs 4:4:4 by nvJPEG. An image that it cannot encode is encoded by libjpeg-turbo.
+    """JPEG encoder (4:4:4) with nvJPEG; falls back to libjpeg-turbo for images that it rejects.
 
-    Each thread has an encoder of its own, and with it a CUDA stream: encoders of nvImageCodec
-    are not for several threads at once.
+    Each thread has its own encoder and CUDA stream, because nvImageCodec encoders are not
+    thread-safe.
 
     Args:
         device: number of the GPU, or CPU_ONLY.
@@ -81,10 +81,10 @@ class NvjpegEncoder:
             return turbo_jpeg(image, quality)
 
     def encode(self, image: NDArray[np.uint8], quality: int) -> bytes:
-        """By nvJPEG alone.
+        """Encode with nvJPEG only.
 
         Raises:
-            RenderError: it could not.
+            RenderError: encoding failed.
         """
         codec = self._codec
         params = codec.EncodeParams(
@@ -106,17 +106,16 @@ class NvjpegEncoder:
     def _encoder(self) -> Any:
         own: Any = getattr(self._own, "encoder", None)
         if own is None:
-            # One thread of its own: the encoders of several images are several threads already.
+            # One internal thread: images are already encoded on several threads.
             own = self._codec.Encoder(device_id=self._device, max_num_cpu_threads=1)
             self._own.encoder = own
         return own
 
 
 def jpeg_encoder_for(device: torch.device) -> tuple[JpegEncoder, str]:
-    """What encodes images that were drawn on ``device``, and why.
+    """The JPEG encoder for images drawn on ``device``, and the reason for the choice.
 
-    nvJPEG on a GPU, where it is installed and gives back a sample as it was; libjpeg-turbo
-    everywhere else.
+    nvJPEG on a GPU if it is installed and reproduces a sample; otherwise libjpeg-turbo.
     """
     if device.type != "cuda":
         return turbo_jpeg, "libjpeg-turbo: images are drawn on the CPU"
@@ -133,7 +132,7 @@ def jpeg_encoder_for(device: torch.device) -> tuple[JpegEncoder, str]:
 
 
 def disproof(encoder: NvjpegEncoder) -> str | None:
-    """What is wrong with the jpeg of a sample; None where its colours are right."""
+    """Error of the encoder on a sample image; None if its colours are correct."""
     import simplejpeg
 
     rows, columns = np.mgrid[0:48, 0:64].astype(np.uint8)
@@ -161,14 +160,14 @@ and one filter for all rows (Paeth's) pictures take two thirds of the time, and 
 
 @dataclass(frozen=True, eq=False)
 class EncodedImage:
-    """Bytes of one image and what is needed to read them.
+    """Bytes of one image, with the metadata to decode them.
 
     Attributes:
-        data: the bytes; of codec ``raw`` the array in C order, little-endian.
+        data: the bytes; for codec ``raw`` the array in C order, little-endian.
         codec: ``raw``, ``jpeg`` or ``png``.
-        dtype: of the decoded array: ``uint8``, ``uint16`` or ``float32``. Depth as ``uint16``
+        dtype: dtype of the decoded array: ``uint8``, ``uint16`` or ``float32``. Depth as ``uint16``
             is in steps of DEPTH_PNG_UNIT, uncertainty in steps of UNCERTAINTY_PNG_UNIT.
-        shape: of the decoded array.
+        shape: shape of the decoded array.
     """
 
     data: bytes
@@ -180,11 +179,10 @@ class EncodedImage:
 def encode_rgb(
     image: NDArray[np.uint8], codec: str, *, quality: int = 90, jpeg: JpegEncoder = turbo_jpeg
 ) -> bytes:
-    """RGB [H, W, 3] uint8 as raw bytes, jpeg (4:4:4, no loss beyond ``quality``) or png.
+    """Encode RGB [H, W, 3] uint8 as raw bytes, jpeg (4:4:4) or png.
 
     Raises:
-        RenderError: another codec, an image of another dtype or shape, or a quality outside 1 to
-            100.
+        RenderError: unsupported codec, wrong dtype or shape, or a quality outside 1 to 100.
     """
     _check_codec("rgb", codec, RGB_CODECS)
     _check_array("rgb", image, np.uint8, 3)
@@ -199,10 +197,10 @@ def encode_rgb(
 
 
 def encode_depth(depth: NDArray[np.float32], codec: str, *, name: str = "depth") -> bytes:
-    """Depth [H, W] float32 [m] as raw float32, or 16-bit png in steps of DEPTH_PNG_UNIT.
+    """Encode depth [H, W] float32 [m] as raw float32, or 16-bit png in steps of DEPTH_PNG_UNIT.
 
-    In a png a hit is never 0, and everything beyond the range has the largest level. Messages call
-    the image ``name``.
+    In a png, a hit is at least 1 and values beyond the range have the largest level. ``name`` is
+    used in error messages.
     """
     _check_codec(name, codec, EXACT_CODECS)
     _check_array(name, depth, np.float32, 2)
@@ -213,8 +211,10 @@ def encode_depth(depth: NDArray[np.float32], codec: str, *, name: str = "depth")
 
 
 def encode_uncertainty(image: NDArray[np.float32], codec: str) -> bytes:
-    """Uncertainty [H, W] float32 in [0, 1] as raw float32, or 16-bit png in steps of
-    UNCERTAINTY_PNG_UNIT."""
+    """Encode uncertainty [H, W] float32 in [0, 1] as raw float32 or 16-bit png.
+
+    The png is in steps of UNCERTAINTY_PNG_UNIT.
+    """
     _check_codec("uncertainty", codec, EXACT_CODECS)
     _check_array("uncertainty", image, np.float32, 2)
     if codec == "raw":
@@ -223,21 +223,21 @@ def encode_uncertainty(image: NDArray[np.float32], codec: str) -> bytes:
 
 
 def encode_instance(instance: NDArray[np.uint16], codec: str) -> bytes:
-    """Instance ids [H, W] uint16 as raw uint16 or 16-bit png."""
+    """Encode instance ids [H, W] uint16 as raw uint16 or 16-bit png."""
     return encode_lossless(instance, codec, name="instance", dtype=np.dtype("<u2"))
 
 
 def encode_lossless(image: NDArray[Any], codec: str, *, name: str, dtype: np.dtype[Any]) -> bytes:
-    """An image [H, W] of uint8 or uint16 as raw values, little-endian, or as png.
+    """Encode an image [H, W] of uint8 or uint16 as raw values, little-endian, or as png.
 
     Args:
-        image: of ``dtype``.
+        image: image of ``dtype``.
         codec: ``raw`` or ``png``.
-        name: of the modality, for messages.
-        dtype: of a pixel.
+        name: name of the modality, for error messages.
+        dtype: pixel dtype.
 
     Raises:
-        RenderError: another codec, or an image of another dtype or shape.
+        RenderError: unsupported codec, or wrong dtype or shape.
     """
     _check_codec(name, codec, EXACT_CODECS)
     _check_array(name, image, dtype, 2)
@@ -285,11 +285,11 @@ PIECE = 1 << 21
 def to_uint8(rgb: Tensor, *, between: Callable[[], object] | None = None) -> NDArray[np.uint8]:
     """RGB [..., H, W, 3] float32 as uint8: clamped to [0, 1], halves rounded up, NaN to 0.
 
-    Images on a GPU are rounded there and brought over as bytes.
+    Images on a GPU are rounded there and copied as bytes.
 
     Args:
-        rgb: of any number of images.
-        between: called between pieces of the work.
+        rgb: any number of images.
+        between: callback between pieces of work.
     """
     if rgb.device.type != "cpu":
         rounded = (rgb.nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).byte()
@@ -305,8 +305,10 @@ def to_uint8(rgb: Tensor, *, between: Callable[[], object] | None = None) -> NDA
 def solid_depth(
     depth: Tensor, alpha: Tensor, *, between: Callable[[], object] | None = None
 ) -> NDArray[np.float32]:
-    """Depth [..., H, W] float32 [m], 0 where ``alpha`` is below SOLID_ALPHA; ``between`` is called
-    between pieces of the work."""
+    """Depth [..., H, W] float32 [m], 0 where ``alpha`` is below SOLID_ALPHA.
+
+    ``between``: callback between pieces of work.
+    """
     if depth.device.type != "cpu":
         return _on_host(depth.where(alpha >= SOLID_ALPHA, 0.0))
     values = np.ascontiguousarray(depth.detach().numpy())
@@ -319,7 +321,7 @@ def solid_depth(
 
 
 def _on_host(image: Tensor) -> NDArray[Any]:
-    """By memory that a GPU writes to without help, several times as fast as any other."""
+    """Copy to the host through pinned memory, which is several times faster."""
     if image.device.type != "cuda":
         return image.cpu().numpy()
     held = torch.empty(image.shape, dtype=image.dtype, pin_memory=True)
@@ -327,7 +329,7 @@ def _on_host(image: Tensor) -> NDArray[Any]:
 
 
 def _pieces(length: int, between: Callable[[], object] | None) -> Iterator[slice]:
-    """All of it, or what is done between two calls of ``between``."""
+    """One slice of everything, or one slice per call of ``between``."""
     if between is None:
         yield slice(None)
         return
@@ -357,10 +359,10 @@ def _keep_solid(
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an RGB image uint8 [H, W, 3] as PNG; folders on the way are made.
+    """Write an RGB image uint8 [H, W, 3] as PNG; creates missing folders.
 
     Raises:
-        RenderError: the image has another shape or dtype.
+        RenderError: wrong shape or dtype.
         OSError: the file cannot be written.
     """
     data = encode_rgb(image, "png")
@@ -381,13 +383,13 @@ STEPS = 1 << 14
 def with_effects(
     rgb: NDArray[np.uint8], effects: CameraEffects, camera: str, t_us: int
 ) -> NDArray[np.uint8]:
-    """An image [H, W, 3] as the camera gives it; motion blur has been drawn already.
+    """Apply camera effects to an image [H, W, 3]; motion blur is already rendered.
 
     Args:
-        rgb: as drawn.
-        effects: of the camera.
-        camera: its name; noise differs between cameras and instants.
-        t_us: instant [us].
+        rgb: rendered image.
+        effects: effects of the camera.
+        camera: name of the camera; noise differs between cameras and instants.
+        t_us: time [us].
     """
     light = to_light(rgb)
     if effects.vignetting is not None:
@@ -408,7 +410,7 @@ def to_light(rgb: NDArray[np.uint8]) -> Light:
 
 
 def to_display(light: Light, tone_curve: tuple[float, ...] | None = None) -> NDArray[np.uint8]:
-    """Display values of linear light, cut at black and white."""
+    """Display values of linear light, clamped to black and white."""
     index = np.clip(light * (STEPS - 1) + 0.5, 0, STEPS - 1).astype(np.uint16)
     levels: NDArray[np.uint8] = _levels_of_light(tone_curve)[index]
     return levels
@@ -441,7 +443,7 @@ def _falloff(size: tuple[int, int], numbers: tuple[float, float, float]) -> Ligh
 
 
 def _noise(light: Light, noise: NoiseSpec, camera: str, t_us: int) -> Light:
-    """Of a generator that counts: the same on any thread, whatever was drawn before."""
+    """Add noise from a counter-based generator: independent of thread and earlier draws."""
     key = np.array([noise.seed, zlib.crc32(camera.encode())], np.uint64)
     counter = np.array([0, 0, 0, t_us & (2**64 - 1)], np.uint64)
     generator = np.random.Generator(np.random.Philox(key=key, counter=counter))

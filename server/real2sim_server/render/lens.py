@@ -1,8 +1,8 @@
-"""Rays of a camera with a lens or a rolling shutter, the way back, and the ground class.
+"""Rays and projection of cameras with a lens or a rolling shutter, and the ground class.
 
-Blending needs the ray of every pixel; finding the pixels that a Gaussian may touch needs the way
-back for any direction, even those outside the lens. Both are tables, so no renderer depends on a
-lens model.
+Blending needs the ray of every pixel. Finding the pixels that a Gaussian may touch needs the
+projection of any direction, even outside the lens. Both are tables, so renderers do not depend on
+lens models.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ STEP = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class LensView:
-    """A camera with a lens or a rolling shutter, where it is while an image is read out.
+    """A camera with a lens or a rolling shutter, and its motion during a read-out.
 
     Attributes:
-        camera: draws; its own pose on a vehicle is not looked at.
-        motion: of the camera in the world.
+        camera: the camera; its pose on the vehicle is ignored.
+        motion: motion of the camera in the world.
     """
 
     camera: Camera
@@ -47,7 +47,7 @@ class LensView:
 
     @property
     def seconds(self) -> float:
-        """How long an image is read out."""
+        """Read-out time of an image [s]."""
         return self.camera.shutter.readout_us * 1e-6
 
     @property
@@ -57,12 +57,12 @@ class LensView:
 
     @functools.cached_property
     def middle(self) -> Float:
-        """``T_world_camera`` [4, 4] then."""
+        """``T_world_camera`` [4, 4] in the middle of the read-out."""
         return self.motion.middle()
 
     @functools.cached_property
     def moves(self) -> bool:
-        """Whether rays start from different places, or look from different turns."""
+        """Whether the pose of the camera changes during the read-out."""
         return self.camera.shutter.rolls
 
     def lines(self) -> Float:
@@ -71,7 +71,7 @@ class LensView:
 
     @functools.cached_property
     def shift(self) -> Float:
-        """[3] way of the camera over the read-out, in its frame in the middle [m]."""
+        """[3] displacement of the camera over the read-out, in its frame in the middle [m]."""
         way: Float = self.motion.end[:3, 3] - self.motion.start[:3, 3]
         return way @ self.middle[:3, :3]
 
@@ -91,8 +91,10 @@ class LensView:
         return axis / (2 * sine) * angle if sine > 1e-12 else axis / 2
 
     def rays(self) -> NDArray[np.float32]:
-        """[H, W, 3] directions in the camera's frame in the middle of the read-out, of any length;
-        0 where the lens sees nothing."""
+        """[H, W, 3] ray directions, camera frame in the middle of the read-out; not normalised.
+
+        0 outside the lens.
+        """
         table = tables_of(self.camera).rays
         turn = self.turn
         if not self.moves or not turn.any():
@@ -110,18 +112,18 @@ class LensView:
 
 @dataclass(frozen=True, eq=False)
 class LensTables:
-    """What is known of a camera whatever it looks at.
+    """Scene-independent tables of a camera.
 
     Attributes:
-        rays: [H, W, 3] float32 unit directions of pixel centres; 0 where the lens sees nothing.
-        blind: [H, W] bool, where that is so.
-        directory: [6, CELLS + 1, CELLS + 1, NODE] float32, position x, y [px], its derivatives
-            x_u, x_v, y_u, y_v, how much these change around it relative to them [a unit of u, v]
-            and how far positions between nodes may be off [px], at the nodes of the faces of a cube
-            of directions; face 2 k + (s < 0) has component k largest, of sign s, and u, v are the
-            next two over its magnitude.
-        slack, bend: the most that the directory says of these on the image.
-        reach: largest angle from the axis of a pixel [rad].
+        rays: [H, W, 3] float32 unit directions of pixel centres; 0 outside the lens.
+        blind: [H, W] bool, pixels outside the lens.
+        directory: [6, CELLS + 1, CELLS + 1, NODE] float32, at the nodes of the faces of a cube of
+            directions: position x, y [px], its derivatives x_u, x_v, y_u, y_v, their relative
+            change nearby [per unit of u, v], and the maximum interpolation error [px]. Face
+            2 k + (s < 0) has component k largest, with sign s; u, v are the next two components
+            over its magnitude.
+        slack, bend: maxima of the last two values over the image.
+        reach: largest angle of a pixel from the axis [rad].
     """
 
     rays: NDArray[np.float32]
@@ -134,7 +136,7 @@ class LensTables:
 
 @weak_cache
 def tables_of(camera: Camera) -> LensTables:
-    """Tables of a camera; made once, in a fifth of a second."""
+    """Tables of a camera, cached; takes a fifth of a second."""
     width, height = camera.width, camera.height
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays, seen = camera.unproject(np.stack([x, y], -1))
@@ -147,12 +149,13 @@ def tables_of(camera: Camera) -> LensTables:
 
 
 def continued(camera: Camera, reach: float) -> Callable[[Float], Float]:
-    """Image positions [..., 2] of any directions [..., 3]: beyond what the lens sees, or BEYOND the
-    image, they go on straight as they did at that edge.
+    """Image positions [..., 2] of any directions [..., 3].
+
+    Outside the lens, or BEYOND the image, positions are extrapolated linearly from that edge.
 
     Args:
-        camera: with its lens.
-        reach: of LensTables [rad].
+        camera: camera with its lens.
+        reach: ``reach`` of LensTables [rad].
     """
     own = np.pi if camera.lens is None else camera.lens.reach
     if camera.lens is None or camera.lens.perspective:
@@ -167,7 +170,7 @@ def continued(camera: Camera, reach: float) -> Callable[[Float], Float]:
         length = np.hypot(directions[..., 0], directions[..., 1])
         angle = np.arctan2(length, directions[..., 2])
         across = directions[..., :2] / np.where(length > 0, length, 1.0)[..., None]
-        # Straight behind any way out will do.
+        # Straight behind the camera, any direction will do.
         across = np.where((length > 0)[..., None], across, [1.0, 0.0])
         found = at(np.minimum(angle, last), across)
         edge = np.full_like(angle, last)
@@ -206,8 +209,10 @@ def _directory(
 def _precision(
     camera: Camera, position: Callable[[Float], Float], known: Float
 ) -> tuple[Float, Float]:
-    """How much slopes change over each cell [6, CELLS, CELLS] and how far interpolated positions
-    may be off [px], from the middles of cells; beside the image at most as much as on it."""
+    """Relative slope change over each cell [6, CELLS, CELLS], and interpolation error [px].
+
+    Estimated at cell centres; outside the image limited to the maximum inside.
+    """
     middle = (np.arange(CELLS) + 0.5) * (2 / CELLS) - 1
     u, v = np.meshgrid(middle, middle, indexing="ij")
     corners = [known[:, i : i + CELLS, j : j + CELLS] for i in (0, 1) for j in (0, 1)]
@@ -240,7 +245,7 @@ TOLERANCE = 0.15
 def back_projected(
     depth: NDArray[np.float32], K: Float, T_world_camera: Float
 ) -> NDArray[np.float32]:
-    """Points [H, W, 3] of the world [m] at a depth image [H, W] along the camera's z axis [m]."""
+    """World points [H, W, 3] [m] of a depth image [H, W] along the camera's z axis [m]."""
     height, width = depth.shape
     x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
     y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
@@ -258,14 +263,14 @@ def with_ground(
     T_world_camera: Float,
     ground: Ground,
 ) -> NDArray[np.uint8]:
-    """A semantic image [H, W] in which the ground has its own class, for any camera or lens.
+    """The semantic image [H, W] with a separate ground class, for any camera or lens.
 
     Args:
-        semantic: [H, W], in which the ground is ``static``.
-        depth: [H, W] median depth of the same pass, as the camera's lens has it [m].
-        camera: that looks.
+        semantic: [H, W], with the ground as ``static``.
+        depth: [H, W] median depth of the same pass, as defined by the camera's lens [m].
+        camera: the camera.
         T_world_camera: [4, 4], in the middle of a read-out.
-        ground: of the scene.
+        ground: ground of the scene.
     """
     found = semantic.copy()
     rows, columns = np.nonzero((semantic == STATIC) & (depth > 0))
@@ -278,7 +283,7 @@ def with_ground(
 
 
 def _rays(camera: Camera, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Of pixels, [P, 3] in the camera's frame, to where its depth images have depth 1."""
+    """Rays of pixels [P, 3], camera frame, scaled to unit depth."""
     if camera.is_pinhole:
         K = camera.K
         x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]

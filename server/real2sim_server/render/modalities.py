@@ -1,4 +1,4 @@
-"""Sensor modalities: the images that a camera produces, and their registry."""
+"""Camera modalities (image types) and their registry."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ SWITCHES = ("depth", "instance", "median_depth")
 
 @dataclass(frozen=True, eq=False)
 class SensorModality:
-    """One kind of image of a camera, from the rasterizer's output to bytes.
+    """An image type of a camera, from the rasterizer output to bytes.
 
     Attributes:
-        name: as sensors ask for it.
-        dtype: of a raw pixel; little-endian.
+        name: name in sensor requests.
+        dtype: dtype of a raw pixel; little-endian.
         channels: trailing shape of an image: ``(3,)`` is [H, W, 3], ``()`` is [H, W].
-        codecs: that it can be encoded with; ``jpeg`` becomes ``png`` where it is not among them.
-        pixels: images [C, H, W, *channels] of a pass, of ``dtype``.
-        encode: bytes of an image by codec and quality; raises RenderError for an image of another
+        codecs: supported codecs; an unsupported ``jpeg`` becomes ``png``.
+        pixels: function that returns images [C, H, W, *channels] of ``dtype`` from a pass.
+        encode: function that encodes an image by codec and quality; raises RenderError for a wrong
             dtype or shape.
-        switch: field of RasterOptions without which the pass does not draw it; None for none.
-        encoded_dtypes: dtype of the decoded array by codec, where it is not ``dtype``.
+        switch: field of RasterOptions that enables it, or None.
+        encoded_dtypes: dtype of the decoded array by codec, if it differs from ``dtype``.
     """
 
     name: str
@@ -68,11 +68,11 @@ _registry: dict[str, SensorModality] = {}
 
 
 def register(modality: SensorModality) -> SensorModality:
-    """Make a modality known under its name.
+    """Register a modality under its name.
 
     Raises:
-        ValueError: the name is taken, or ``raw`` and ``png`` are not among the codecs, or the
-            rasterizer has no such switch.
+        ValueError: the name is taken, ``raw`` or ``png`` is missing in the codecs, or the switch is
+            unknown.
     """
     if modality.name in _registry:
         raise ValueError(f"there is a modality {modality.name!r} already")
@@ -85,7 +85,7 @@ def register(modality: SensorModality) -> SensorModality:
 
 
 def unregister(name: str) -> None:
-    """Forget a modality, for tests that register one."""
+    """Remove a modality; for tests."""
     del _registry[name]
 
 
@@ -104,7 +104,7 @@ def modality_of(name: str) -> SensorModality:
 
 
 def options_for(names: Iterable[str], options: RasterOptions) -> RasterOptions:
-    """``options`` with the switches of a pass that draws these modalities."""
+    """``options`` with the switches of these modalities set."""
     wanted = {modality_of(name).switch for name in names}
     return replace(
         options,
@@ -115,7 +115,7 @@ def options_for(names: Iterable[str], options: RasterOptions) -> RasterOptions:
 
 
 def modalities_drawn(options: RasterOptions) -> tuple[str, ...]:
-    """``rgb``, and what the switches of a pass add to it."""
+    """``rgb`` and the modalities enabled by the switches of ``options``."""
     return ("rgb", *(switch for switch in SWITCHES if getattr(options, switch)))
 
 
@@ -127,19 +127,18 @@ def encode_image(
     quality: int = 90,
     jpeg: JpegEncoder = turbo_jpeg,
 ) -> EncodedImage:
-    """Encode an image of a modality; lossless ones become png where jpeg is requested.
+    """Encode an image of a modality; lossless modalities use png if jpeg is requested.
 
     Args:
-        image: as the modality has it: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` or
-            ``median_depth`` [m], [H, W] uint16 ``instance``, [H, W] uint8 ``semantic``, or [H, W]
-            float32 ``uncertainty``.
-        modality: name of a registered one.
+        image: [H, W, 3] uint8 ``rgb``, [H, W] float32 ``depth`` or ``median_depth`` [m], [H, W]
+            uint16 ``instance``, [H, W] uint8 ``semantic``, or [H, W] float32 ``uncertainty``.
+        modality: name of a registered modality.
         codec: ``raw``, ``jpeg`` or ``png``.
-        quality: of jpeg, 1 to 100.
-        jpeg: makes the bytes of a jpeg.
+        quality: jpeg quality, 1 to 100.
+        jpeg: jpeg encoder.
 
     Raises:
-        RenderError: unknown modality or codec, or an image of another kind.
+        RenderError: unknown modality or codec, or an image that does not match the modality.
     """
     kind = modality_of(modality)
     if codec == "jpeg" and codec not in kind.codecs:
@@ -229,8 +228,8 @@ INSTANCE = register(
 )
 
 
-# Depth of the Gaussian at half of the light [m]; 0 without one. The expected depth is a mean over a
-# pixel and lies between two surfaces at the edge of one; this is the depth of one of them.
+# Depth of the Gaussian at which half of the light is absorbed [m]; 0 without one. At edges, the
+# expected depth is a mean between two surfaces; the median depth is that of one of them.
 
 
 def _median_depth_pixels(output: RenderOutput) -> NDArray[np.float32]:
@@ -267,7 +266,7 @@ def _semantic_pixels(output: RenderOutput) -> NDArray[np.uint8]:
     if output.instance is None or output.classes is None:
         raise RenderError("the pass has drawn no classes")
     found: NDArray[np.uint8] = output.classes[output.instance.cpu().numpy()]
-    # Alpha reaches one half where a Gaussian takes half of the light, and there alone.
+    # Equivalent to a Gaussian at which half of the light is absorbed.
     found[(output.alpha < SOLID_ALPHA).cpu().numpy()] = output.behind
     return found
 
@@ -289,7 +288,7 @@ SEMANTIC = register(
 )
 
 
-# Expected error of a colour in [0, 1] as a mean of its channels, in every pixel, the sky included
+# Expected colour error in [0, 1], mean over the channels, for every pixel including the sky
 
 
 def _uncertainty_pixels(output: RenderOutput) -> NDArray[np.float32]:

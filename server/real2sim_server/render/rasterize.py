@@ -1,4 +1,4 @@
-"""The one call that turns Gaussians into pictures."""
+"""Rasterization of Gaussians: the rasterize() call and its batched variants."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class View:
     """One image of a batch.
 
     Attributes:
-        instances: what is in its world.
+        instances: instances of its world.
         viewmat: [4, 4] ``T_camera_world``.
         K: [3, 3] intrinsics [px].
     """
@@ -77,20 +77,20 @@ def rasterize(
             z forward).
         Ks: [C, 3, 3] intrinsics [px], without skew.
         width, height: size of all C images [px].
-        sky: behind everything, in place of ``options.background``.
-        options: planes, blur, mode and which images are made.
+        sky: sky behind everything, instead of ``options.background``.
+        options: planes, blur, mode and selection of images.
         backend: ``auto``, ``cpu``, ``cuda``, ``nvrtc``, ``reference``, or a Backend.
-        check_values: False for callers that make new clouds for every call, which would be checked
-            each time, and answer for their values themselves.
-        between: called between pieces of the work, see RasterRequest.
-        optics: lens, shutter and motion of the one camera given; its viewmat is
-            ``optics.viewmat``, its K and size those of the optics' camera. Gaussians are not
-            projected affinely then: each pixel's ray takes their response where it is largest along
-            it (Moenne-Loccoz et al. 2024), and depths are ranges where the camera says so.
+        check_values: False to skip the validation of cloud values, for callers that create new
+            clouds in every call.
+        between: callback between pieces of work, see RasterRequest.
+        optics: lens, shutter and motion of a single camera; pass its ``optics.viewmat`` and the K
+            and size of its camera. Gaussians are not projected affinely then: the response is
+            evaluated at its maximum along each pixel's ray (Moenne-Loccoz et al. 2024), and depths
+            are ranges if the camera defines them so.
 
     Raises:
-        RenderError: for anything that is not as said above, and for optics that the backend cannot
-            draw; nothing is drawn then.
+        RenderError: for invalid arguments and for optics that the backend cannot draw; nothing is
+            drawn.
     """
     request = checked_request(
         instances,
@@ -120,7 +120,7 @@ def checked_request(
     between: Callable[[], object] | None = None,
     optics: LensView | None = None,
 ) -> RasterRequest:
-    """What a backend may trust: the arguments of :func:`rasterize`, ``size`` is width and height.
+    """Validate the arguments of :func:`rasterize` for a backend; ``size`` is (width, height).
 
     Raises:
         RenderError: as :func:`rasterize`.
@@ -149,21 +149,20 @@ def rasterize_batch(
     options: RasterOptions = SMALL_IMAGES,
     backend: str | Backend = "auto",
 ) -> RenderOutput:
-    """Draw the images of many worlds in one call: those of ``views`` in their order.
+    """Draw the images of many worlds in one call, in the order of ``views``.
 
-    Small images are shared between cores, each drawn on one of them, where the backend can; what
-    an image shows depends on its own view alone, so each is the one that :func:`rasterize` gives,
-    bit for bit. Images carry no gradients.
+    Backends that support it draw small images in parallel, each on one core. Every image is bitwise
+    equal to that of :func:`rasterize`. Images carry no gradients.
 
     Args:
-        views: at least one; instances and camera of each image.
-        width, height: of all images [px].
-        sky: behind everything.
-        options: of all images; by default small ones are drawn from merged Gaussians.
-        backend: as in :func:`rasterize`.
+        views: instances and camera of each image; at least one.
+        width, height: size of all images [px].
+        sky: sky behind everything.
+        options: options of all images; by default small ones are drawn from merged Gaussians.
+        backend: see :func:`rasterize`.
 
     Raises:
-        RenderError: as :func:`rasterize`, and for no views at all.
+        RenderError: as :func:`rasterize`, and for an empty list of views.
     """
     if not views:
         raise RenderError("rasterize_batch() needs at least one view")
@@ -204,15 +203,15 @@ def rasterize_worlds(
     options: RasterOptions = SMALL_IMAGES,
     backend: str | Backend = "auto",
 ) -> RenderOutput:
-    """Draw many worlds of the same things: [W C] images, by world and then by camera.
+    """Draw many worlds made of the same things: [W C] images, by world, then by camera.
 
-    They are the images that :func:`rasterize_batch` gives of the same views, bit for bit. What is
-    prepared for small images takes time by thing and not by image, where the backend can.
+    The images are bitwise equal to those of :func:`rasterize_batch`. Backends that support it
+    prepare small images once per thing instead of once per image.
 
     Args:
-        worlds: at least one, with one camera at least.
-        width, height: of all images [px].
-        sky, options, backend: as in :func:`rasterize_batch`.
+        worlds: at least one world and one camera.
+        width, height: size of all images [px].
+        sky, options, backend: see :func:`rasterize_batch`.
 
     Raises:
         RenderError: as :func:`rasterize_batch`.
@@ -236,7 +235,7 @@ def rasterize_worlds(
 
 
 def views_of(worlds: WorldViews) -> list[View]:
-    """Each image of ``worlds`` by itself."""
+    """A View for each image of ``worlds``."""
     views = []
     for w, viewmats in enumerate(worlds.viewmats):
         t_us = int(worlds.times_us[w])
@@ -249,7 +248,7 @@ def views_of(worlds: WorldViews) -> list[View]:
 
 
 def _check_worlds(worlds: WorldViews, like: RasterRequest) -> None:
-    """The things and the cameras as any request; of poses those that are shown."""
+    """Validate things and cameras like any request, and the poses of shown things."""
     _check_request(like, check_values=True)
     viewmats = _float64(worlds.viewmats.reshape(-1, 4, 4), "viewmats", (4, 4))
     _check_cameras(
@@ -264,7 +263,7 @@ def _check_worlds(worlds: WorldViews, like: RasterRequest) -> None:
 
 
 def _joined(outputs: Sequence[RenderOutput]) -> RenderOutput:
-    """Images of several calls as those of one."""
+    """Join the images of several calls."""
     timing: dict[str, float] = {}
     for output in outputs:
         for stage, milliseconds in output.timing_ms.items():
@@ -323,7 +322,7 @@ def _check_cameras(request: RasterRequest) -> None:
 
 
 def _check_optics(optics: LensView, request: RasterRequest) -> None:
-    """One camera, and the same in both."""
+    """Check that there is one camera, consistent with the optics."""
     camera = optics.camera
     for name, pose in (("start", optics.motion.start), ("end", optics.motion.end)):
         _check_rigid(pose, f"optics.motion.{name}")
@@ -354,9 +353,9 @@ def _check_rigid(matrix: np.ndarray, name: str) -> None:
 
 
 def _check_poses(instances: Sequence[Instance], *, trusted: bool) -> None:
-    """Poses of all instances at once, since there may be many; a bad one is then looked for.
+    """Validate the poses of all instances at once; search for the invalid one on failure.
 
-    Poses that a trusted caller has made on another device are not waited for.
+    Skips poses of trusted callers on another device, to avoid waiting for it.
     """
     poses = {
         f"instances[{index}].T_world_object": _values(instance.T_world_object)
@@ -425,7 +424,7 @@ def _is_scale(scale: tuple[float, float, float]) -> bool:
 
 
 def _check_cloud(cloud: GaussianCloud, name: str) -> None:
-    """Values of a cloud; once for each cloud, since clouds are immutable."""
+    """Validate the values of a cloud; cached, because clouds are immutable."""
     for part in ("means", "quats", "scales", "opacities", "sh"):
         values = getattr(cloud, part).detach()
         if torch.isfinite(values.sum()):
@@ -444,7 +443,7 @@ def _check_cloud(cloud: GaussianCloud, name: str) -> None:
 
 
 def _check_colour(colour: TimeColour, gaussians: int, name: str) -> None:
-    """A colour and its cloud; its values once, since colours are immutable."""
+    """Validate a colour against its cloud; value checks are cached: colours are immutable."""
     rows = len(colour.coefficients)
     if rows != gaussians:
         raise RenderError(f"{name} has {rows} rows for a cloud of {gaussians} Gaussians")

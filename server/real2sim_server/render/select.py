@@ -1,7 +1,7 @@
-"""Selection of a backend, logged with its reason, and levels of detail prepared for it.
+"""Selection of a backend, and preparation of levels of detail.
 
-Small images are drawn from levels of detail; without preparation, the first small image of a cloud
-makes its levels and waits for them.
+Small images are drawn from levels of detail. Without preparation, the first small image of a cloud
+waits until its levels are built.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class BackendStatus:
     """Whether a backend can be used here.
 
     Attributes:
-        name: by which it is selected.
+        name: name of the backend.
         usable: whether select_backend() would return it.
-        reason: why, or why not.
-        remedy: what to do to make it usable; empty when it is.
+        reason: why it is usable, or not.
+        remedy: how to make it usable; empty if it is.
     """
 
     name: str
@@ -45,9 +45,9 @@ class RegisteredBackend:
     """A backend that can be selected by name.
 
     Attributes:
-        status: whether it can be used here; imports and starts nothing that takes long.
-        make: the backend; called once, and only where it is usable.
-        preference: ``auto`` takes the usable backend with the largest; 0 is never taken so.
+        status: function that returns whether it can be used here; must be fast.
+        make: function that creates the backend; called once, and only if it is usable.
+        preference: ``auto`` selects the usable backend with the highest value; 0 is never selected.
     """
 
     status: Callable[[], BackendStatus]
@@ -56,10 +56,10 @@ class RegisteredBackend:
 
 
 def register_backend(backend: RegisteredBackend) -> None:
-    """Add a backend from outside of the package.
+    """Register a third-party backend.
 
     Raises:
-        ValueError: its name is taken.
+        ValueError: the name is taken.
     """
     name = backend.status().name
     if name in BACKENDS or name == "auto":
@@ -69,14 +69,14 @@ def register_backend(backend: RegisteredBackend) -> None:
 
 @functools.cache
 def select_backend(name: str = "auto") -> Backend:
-    """The one backend of that name, made on first use.
+    """Return the backend with a name, created on first use.
 
     Args:
-        name: of a registered backend (``cpu``, ``cuda``, ``nvrtc``, ``reference``), or ``auto``:
-            cuda where it is usable, else cpu.
+        name: name of a registered backend (``cpu``, ``cuda``, ``nvrtc``, ``reference``), or
+            ``auto``: cuda if usable, else cpu.
 
     Raises:
-        RenderError: unknown, or not usable here; the message says what to do.
+        RenderError: unknown or unusable backend; the message suggests a fix.
     """
     if name == "auto":
         return select_backend(_preferred())
@@ -98,9 +98,9 @@ def _by_preference() -> list[RegisteredBackend]:
 
 
 def _preferred() -> str:
-    """Name of the best usable backend; says in the log why the best one of all is not.
+    """Name of the best usable backend; logs why a preferred one is not usable.
 
-    A warning where there is a GPU: who has one expects that it is used.
+    Logs a warning if there is a GPU, because users expect it to be used.
     """
     statuses = [backend.status() for backend in _by_preference() if backend.preference]
     chosen = next((status for status in statuses if status.usable), statuses[-1])
@@ -169,7 +169,7 @@ def _make_reference() -> Backend:
 BACKENDS: dict[str, RegisteredBackend] = {
     "cuda": RegisteredBackend(_cuda_status, _make_cuda, preference=2),
     "cpu": RegisteredBackend(_cpu_status, _make_cpu, preference=1),
-    # Not taken by itself: it draws without gradients, so training could not go on with it.
+    # Never selected by ``auto``: it has no gradients, so it cannot be used for training.
     "nvrtc": RegisteredBackend(_nvrtc_status, _make_nvrtc),
     "reference": RegisteredBackend(
         lambda: BackendStatus("reference", True, "plain torch, slow"), _make_reference
@@ -188,15 +188,17 @@ SMALL_IMAGE_KERNELS = 5
 
 
 def kernels_of_small_images_on_disk() -> bool:
-    """Whether an earlier run left what :func:`warm_up_small_images` compiles longest."""
+    """Whether the disk cache has the slowest kernels of :func:`warm_up_small_images`."""
     from ._cpu.small_images import draw_images
 
     return is_on_disk(draw_images)
 
 
 def warm_up_small_images(backend: str | Backend = "auto") -> None:
-    """Compile or load everything that a first small image would wait for, and a first image of a
-    cloud of few Gaussians; takes a minute the first time."""
+    """Compile or load everything for small images and clouds of few Gaussians.
+
+    Takes a minute the first time.
+    """
     made.expect(SMALL_IMAGE_KERNELS)
     chosen = select_backend(backend) if isinstance(backend, str) else backend
     for request in small_requests():
@@ -221,13 +223,13 @@ def without_levels(things: Iterable[Instance]) -> list[Instance]:
 
 
 def make_levels(things: Iterable[Instance]) -> None:
-    """Make the levels of all things: about a second for a million Gaussians. On any thread."""
+    """Build the levels of all things: about a second per million Gaussians. Thread-safe."""
     for thing in without_levels(things):
         hierarchy_of(thing.cloud, thing.colour)
 
 
 def levels_estimate(things: Iterable[Instance]) -> int:
-    """Memory that the levels of ``things`` will take [bytes], each cloud counted once."""
+    """Estimated memory of the levels of ``things`` [bytes], counting each cloud once."""
     clouds = {(id(t.cloud), id(t.colour)): t for t in things}
     sizes = (
         t.cloud.nbytes + (t.colour.nbytes if t.colour is not None else 0) for t in clouds.values()
@@ -236,12 +238,12 @@ def levels_estimate(things: Iterable[Instance]) -> int:
 
 
 def levels_bytes() -> int:
-    """Memory that the levels of all clouds take that are alive [bytes]."""
+    """Memory of the levels of all live clouds [bytes]."""
     return held_bytes()
 
 
 def scene_levels_bytes(scene: Scene) -> int:
-    """Memory that the levels of a scene's own clouds take [bytes], which leaves with the scene."""
+    """Memory of the levels of a scene's own clouds [bytes], released with the scene."""
     clouds = [(scene.background, None), *((o.cloud, o.colour) for o in scene.objects.values())]
     known = {known_hierarchy(cloud, colour) for cloud, colour in clouds}
     return sum(hierarchy.nbytes for hierarchy in known if hierarchy is not None)

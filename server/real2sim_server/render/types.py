@@ -1,4 +1,4 @@
-"""Input and output of rasterize()."""
+"""Inputs and outputs of rasterize()."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALL_IMAGE_PIXELS = 128 * 128
 
 
 class RenderError(ValueError):
-    """A render request that cannot be answered; the message says what is allowed."""
+    """An invalid render request; the message names the allowed values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,16 +32,16 @@ class Instance:
     Attributes:
         cloud: Gaussians in their own frame.
         T_world_object: [4, 4] rigid transform, float64; None for the identity (background). A
-            tensor (float32 or float64) that requires grad gets the gradient of the pose.
+            tensor (float32 or float64) that requires grad receives the gradient of the pose.
         instance_id: value in instance images, 0 (background) to 65535.
-        scale: [3] multiplies the cloud about its own origin along its own axes.
+        scale: [3] scales the cloud about its origin along its own axes.
         covars: [N, 3, 3] float32, covariances in the cloud's frame that replace quats and scales
             (deformed clouds), or None.
-        colour: how the cloud's colours change over time, or None.
-        t_us: instant at which ``colour`` is taken [us].
-        semantic: value in semantic images; instances of one ``instance_id`` have one.
-        twist: [6] float64, velocity [m/s] of its origin and angular velocity [rad/s] in the world,
-            for cameras with a rolling shutter; None: it stands.
+        colour: time-dependent colours of the cloud, or None.
+        t_us: time at which ``colour`` is evaluated [us].
+        semantic: value in semantic images; the same for all instances of an ``instance_id``.
+        twist: [6] float64, velocity of its origin [m/s] and angular velocity [rad/s], world frame,
+            for cameras with a rolling shutter; None if stationary.
     """
 
     cloud: GaussianCloud
@@ -57,13 +57,13 @@ class Instance:
 
 @dataclass(frozen=True, eq=False)
 class WorldViews:
-    """What C cameras see in W worlds that are made of the same K things.
+    """C cameras in W worlds that are made of the same K things.
 
     Attributes:
-        things: K of them; where they stand and their instants are said below.
+        things: K instances; their own poses and times are ignored.
         poses: [W, K, 4, 4] float64, ``T_world_object``.
-        shown: [W, K] bool, which of them are there.
-        times_us: [W] int64, instants at which their colours are taken [us].
+        shown: [W, K] bool, whether each thing is present.
+        times_us: [W] int64, times at which colours are evaluated [us].
         viewmats: [W, C, 4, 4] float64, ``T_camera_world``.
         Ks: [C, 3, 3] float64 [px].
     """
@@ -81,20 +81,20 @@ class RasterOptions:
     """Options of rasterize(), named after gsplat.rasterization.
 
     Attributes:
-        near_plane, far_plane: Gaussians whose centre depth is outside are dropped [m].
+        near_plane, far_plane: depth range of Gaussian centres; others are dropped [m].
         eps2d: added to the diagonal of projected covariances [px^2].
-        radius_clip: Gaussians whose extent on screen is not larger are dropped [px].
+        radius_clip: Gaussians with at most this extent on screen are dropped [px].
         rasterize_mode: ``classic``, or ``antialiased`` (opacity compensated for ``eps2d``).
-        background: RGB in [0, 1] behind everything where there is no sky.
-        depth, instance: whether these images are made besides RGB and alpha.
-        median_depth: whether that image is made, see RenderOutput.
-        track_screen: whether ScreenStatistics are gathered, which densification reads; only in
-            passes that carry gradients.
-        detail: ``full``: every Gaussian that an image shows is drawn; ``auto``: images of at most
-            SMALL_IMAGE_PIXELS are drawn from Gaussians merged to about two pixels, antialiased and
-            with the blur of a pixel alone, in a fraction of the time and nearer to a large image
-            scaled down; larger ones, and all on backends that merge nothing, as with ``full``,
-            bit for bit.
+        background: RGB in [0, 1] behind everything, if there is no sky.
+        depth, instance: whether to draw these images in addition to RGB and alpha.
+        median_depth: whether to draw that image, see RenderOutput.
+        track_screen: whether to collect ScreenStatistics for densification; only in passes that
+            carry gradients.
+        detail: ``full``: draw every visible Gaussian. ``auto``: draw images of at most
+            SMALL_IMAGE_PIXELS from Gaussians merged to about two pixels, antialiased and with the
+            blur of one pixel. That is much faster and closer to a downscaled large image. Larger
+            images, and all images on backends without levels of detail, are bitwise equal to
+            ``full``.
     """
 
     near_plane: float = 0.01
@@ -112,23 +112,23 @@ class RasterOptions:
 
 @dataclass(frozen=True, eq=False)
 class ScreenStatistics:
-    """How the Gaussians of each instance showed on the images, in the order of the instances.
+    """Screen-space statistics of the Gaussians of each instance, in the order of the instances.
 
     Attributes:
-        radii: [C, N] float32 each, half the longer side of the box about what is drawn [px],
-            rounded up; 0 where a Gaussian was not drawn.
-        gradients: [N, 2] float32 each, zero until backward fills them in: sums over cameras of
-            the norm of the loss gradient by the centre on the image. Column 0 takes the gradient
-            itself, column 1 the sum over pixels of its absolute value (absgrad, Ye et al. 2024).
-            Before the norm x is multiplied by C width / 2 and y by C height / 2, as gsplat's
-            DefaultStrategy does, so that its thresholds hold. A second backward adds to them.
+        radii: [C, N] float32 each, half the longer side of the screen bounding box [px], rounded
+            up; 0 if a Gaussian was not drawn.
+        gradients: [N, 2] float32 each, zero until backward: sums over cameras of the norm of the
+            loss gradient by the screen position. Column 0 uses the gradient itself, column 1 the
+            sum over pixels of its absolute value (absgrad, Ye et al. 2024). Before the norm, x is
+            multiplied by C width / 2 and y by C height / 2 as in gsplat's DefaultStrategy, so that
+            its thresholds apply. A second backward adds to them.
     """
 
     radii: tuple[Tensor, ...]
     gradients: tuple[Tensor, ...]
 
     def first(self, count: int) -> ScreenStatistics:
-        """Of the first instances alone."""
+        """Statistics of the first ``count`` instances."""
         return ScreenStatistics(self.radii[:count], self.gradients[:count])
 
 
@@ -140,17 +140,17 @@ class RenderOutput:
         rgb: [C, H, W, 3] float32, blended over sky or background, not clamped above 1.
         alpha: [C, H, W] float32 in [0, 1], accumulated opacity.
         depth: [C, H, W] float32, expected depth along the camera z axis [m], that is
-            sum(w z) / sum(w); 0 where alpha is 0. None when not asked for.
+            sum(w z) / sum(w); 0 where alpha is 0. None if not requested.
         instance: [C, H, W] uint16, instance_id of the Gaussian at which transmittance first falls
-            to 0.5 or below; 0 where it never does. None when not asked for.
-        median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 where there is none, and
-            without gradients. None when not asked for.
-        uncertainty: [C, H, W] float32, see :mod:`.frame`; None where not requested.
-        classes: [65536] uint8, of ``instance`` by id; None where not requested.
-        behind: class of a pixel at which transmittance stays above 0.5.
+            to 0.5 or below; 0 where it never does. None if not requested.
+        median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 where there is none. Has no
+            gradients. None if not requested.
+        uncertainty: [C, H, W] float32, see :mod:`.frame`; None if not requested.
+        classes: [65536] uint8, class by instance id; None if not requested.
+        behind: class of pixels whose transmittance stays above 0.5.
         timing_ms: milliseconds by stage (``project``, ``sort``, ``blend``, ``sky`` ...).
-        screen: sizes and gradients on the image; None when not asked for or without gradients.
-        between: of the request; for what is done with large images afterwards.
+        screen: screen-space statistics; None if not requested or without gradients.
+        between: callback of the request, for later processing of large images.
     """
 
     rgb: Tensor
@@ -179,7 +179,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Window:
-    """Pixels [top:bottom, left:right] of an image in which an object is also requested alone."""
+    """Pixels [top:bottom, left:right] in which an object is also labelled without occluders."""
 
     instance_id: int
     left: int
@@ -190,14 +190,14 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class LabelOutput:
-    """One camera's picture and labels.
+    """Image and labels of one camera.
 
     Attributes:
-        rgb: [H, W, 3] float32, as of RenderOutput.
-        depth: [H, W] float32 along the camera's z axis, of each pixel's front [m], 0 for none.
-        instance: [H, W] uint16, object of the front; 0 also where there is none.
-        alone: by window, depths [h, w] float32 of the object's own fronts, whatever hides it.
-        timing_ms: by stage.
+        rgb: [H, W, 3] float32, as in RenderOutput.
+        depth: [H, W] float32 depth of each pixel's front along the camera's z axis [m], 0 without.
+        instance: [H, W] uint16, instance id of the front; 0 for background or without front.
+        alone: by window, depths [h, w] float32 of the object's own fronts, ignoring occluders.
+        timing_ms: milliseconds by stage.
     """
 
     rgb: Tensor
@@ -207,7 +207,7 @@ class LabelOutput:
     timing_ms: dict[str, float] = field(default_factory=dict)
 
 
-# Results cached for as long as an immutable object lives
+# Results cached for the lifetime of an immutable object
 
 Source = TypeVar("Source")
 Made = TypeVar("Made")

@@ -1,7 +1,7 @@
-"""Videos as files: WebM with VP8, which every browser plays, and MP4 with MPEG-4 Part 2.
+"""Video files: WebM with VP8, which every browser plays, and MP4 with MPEG-4 Part 2.
 
-Both encoders come with OpenCV. VP8 takes 80 ns a pixel, often longer than the picture took to
-render; so frames are encoded on a thread of their own, in the order they came.
+Both encoders come with OpenCV. VP8 takes 80 ns per pixel, often longer than rendering, so frames
+are encoded on a separate thread, in order.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class VideoError(OSError):
 
 
 class VideoFile:
-    """A video of frames of one size; the file is there, whole, once it is closed.
+    """A video of frames of one size; the file is complete once it is closed.
 
     Args:
-        path: of the file, ``.webm`` or ``.mp4``.
-        frames_per_second: its rate.
+        path: path of the file, ``.webm`` or ``.mp4``.
+        frames_per_second: frame rate.
 
     Raises:
-        VideoError: another suffix.
+        VideoError: unsupported suffix.
     """
 
     def __init__(self, path: Path, frames_per_second: float) -> None:
@@ -50,8 +50,8 @@ class VideoFile:
             raise VideoError(f"{path}: videos end in {' or '.join(FOURCC_BY_SUFFIX)}")
         self._path = path
         self._rate = frames_per_second
-        # OpenCV knows no four-character code for VP8 in WebM and complains of each on standard
-        # error. WebM is Matroska under another name, so that name is written afterwards.
+        # OpenCV has no four-character code for VP8 in WebM and prints a warning for each one. WebM
+        # is a form of Matroska, so the document type is changed afterwards.
         container = ".mkv" if path.suffix == ".webm" else path.suffix
         self._temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{container}")
         self._writer: Any = None
@@ -61,7 +61,7 @@ class VideoFile:
     def add(self, frame: NDArray[np.uint8]) -> None:
         """Append an RGB frame uint8 [H, W, 3]; odd sizes lose their last row or column.
 
-        The frame may be changed afterwards; it is encoded later.
+        The frame may be modified afterwards.
 
         Raises:
             VideoError: OpenCV cannot write the video.
@@ -76,10 +76,10 @@ class VideoFile:
             self._waiting.popleft().result()
 
     def close(self) -> None:
-        """Finish the file; without a frame there is none. Raises what encoding a frame raised.
+        """Finish the file; without frames, no file is created. Re-raises encoding errors.
 
         Raises:
-            OSError: the system refused to write some of it.
+            OSError: a write failed.
         """
         try:
             while self._waiting:
@@ -95,7 +95,7 @@ class VideoFile:
             raise
 
     def discard(self) -> None:
-        """Leave no file."""
+        """Stop and delete the file."""
         for frame in self._waiting:
             frame.cancel()
         self._finish()
@@ -113,7 +113,7 @@ class VideoFile:
         return writer
 
     def _finish(self) -> bool:
-        """End the thread and the encoder; whether there is a file."""
+        """End the thread and the encoder; return whether there is a file."""
         self._encoder.shutdown(wait=True)
         writer, self._writer = self._writer, None
         if writer is not None:
@@ -123,7 +123,7 @@ class VideoFile:
 
 @contextmanager
 def video_file(path: Path, *, frames_per_second: float) -> Iterator[VideoFile]:
-    """A video that is there, whole, when the block ends, and is not where it fails.
+    """A video that is complete when the block ends, and deleted if the block fails.
 
     Raises:
         VideoError: OpenCV cannot write the video.
@@ -141,11 +141,11 @@ def video_file(path: Path, *, frames_per_second: float) -> Iterator[VideoFile]:
 def _check_whole(file: Path) -> None:
     """Check that OpenCV wrote the whole file.
 
-    OpenCV reports no failed writes. FFmpeg, which writes for it, stops at the first one, and writes
+    OpenCV does not report failed writes. FFmpeg, its writer, stops at the first failure and writes
     the length of the contents last.
 
     Raises:
-        OSError: the file is incomplete; with the system's reason, or EIO if it takes writes again.
+        OSError: the file is incomplete; with the system's reason, or EIO if writes work again.
     """
     with file.open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
@@ -157,14 +157,14 @@ def _check_whole(file: Path) -> None:
 
 
 def _raise_write_error(file: Path) -> None:
-    """Raise the system's reason for refusing writes to a file, if it still refuses them."""
+    """Raise the system's error for writes to a file, if they still fail."""
     with file.open("ab", buffering=0) as opened:
         opened.write(b"\0")
         os.fsync(opened.fileno())
 
 
 def _end_of_matroska(opened: BinaryIO) -> int | None:
-    """Where the segment ends that holds all of the video (RFC 9559, 5.1)."""
+    """End of the segment that holds the video (RFC 9559, 5.1)."""
     header = opened.read(256)
     at = header.find(MATROSKA_SEGMENT)
     start = at + len(MATROSKA_SEGMENT) + 8
@@ -175,7 +175,7 @@ def _end_of_matroska(opened: BinaryIO) -> int | None:
 
 
 def _end_of_mp4(opened: BinaryIO) -> int | None:
-    """Where the last box ends, if it is the index of the video (ISO/IEC 14496-12, 4.2)."""
+    """End of the last box, if it is the index of the video (ISO/IEC 14496-12, 4.2)."""
     at, kind = 0, b""
     while len(header := opened.read(16)) >= 8:
         size, kind = int.from_bytes(header[:4], "big"), header[4:8]

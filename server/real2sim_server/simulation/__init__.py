@@ -1,4 +1,4 @@
-"""Bodies of a scene in time: rigid, deforming, at rest."""
+"""Simulation of a scene's objects as rigid, deforming and resting bodies."""
 
 from .fill import Filling, fill_object
 from .playback import Playback

@@ -1,9 +1,9 @@
-"""Colliders of a scene: its ground, and upright boxes around the obstacles of its background.
+"""Colliders of a scene: its ground, and upright boxes around background obstacles.
 
-Solid cells are the closed loop's (``scene.ground``). Adjacent cells form one obstacle. Its
-Gaussians are split along their length until a box seen from above fits each part: one for a pole,
-one for each side of a house, several for a curved hedge. The recording saw only one side of a wall,
-so boxes grow away from the recorded path.
+Occupied cells are those of the closed loop (``scene.ground``). Adjacent cells form one obstacle.
+Its Gaussians are split lengthwise until a rectangle in the plane fits each part: one for a pole,
+one per side of a house, several for a curved hedge. The recording shows only one side of a wall,
+so boxes extend away from the recorded path.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Cleared:
     size: Float
 
     def holds(self, points: Float) -> NDArray[np.bool_]:
-        """Whether points [N, 2] are inside, seen from above."""
+        """Whether points [N, 2] are inside the box, in the plane."""
         back = invert_transform(self.T_world_box)
         level = np.column_stack([points, np.full(len(points), self.T_world_box[2, 3])])
         local = level @ back[:3, :3].T + back[:3, 3]
@@ -76,7 +76,7 @@ class Cleared:
 
 @dataclass(frozen=True, eq=False)
 class _Rectangle:
-    """Seen from above: centre [2], unit vector along it [2], full length and width [m]."""
+    """A rectangle in the plane: centre [2], unit vector along it [2], length and width [m]."""
 
     centre: Float
     along: Float
@@ -99,12 +99,12 @@ class _Rectangle:
 
 
 def background_colliders(scene: Scene, cleared: Sequence[Cleared], *, within: float) -> list[Box]:
-    """Boxes around the obstacles of a scene's background, ``background.0`` and so on.
+    """Boxes around background obstacles, named ``background.0`` and so on.
 
     Args:
-        scene: whose background, ground and recorded way.
-        cleared: places of the objects that take part, as they start; at least one.
-        within: distance from these at which something still counts [m].
+        scene: scene with background, ground and recorded path.
+        cleared: initial boxes of the simulated objects; at least one.
+        within: maximum distance of obstacles from these boxes [m].
     """
     way = RecordedPath.of(scene.ego)
     cells = occupied_cells(scene.background, scene.ground, way)
@@ -140,7 +140,7 @@ def described(boxes: Sequence[Box]) -> list[dict[str, object]]:
 
 
 def _connected(points: Float, cells: OccupiedCells) -> Iterator[Float]:
-    """Points [K, 2] of each group of cells that touch, if only at a corner."""
+    """Points [K, 2] of each 8-connected group of cells."""
     from scipy import ndimage
 
     if not len(points):
@@ -159,7 +159,7 @@ def _connected(points: Float, cells: OccupiedCells) -> Iterator[Float]:
 def _fitted(
     points: Float, cells: OccupiedCells, cleared: Sequence[Cleared]
 ) -> Iterator[_Rectangle]:
-    """Rectangles that cover points [K, 2] of one obstacle, split where one does not fit."""
+    """Rectangles that cover points [K, 2] of one obstacle, split until they fit."""
     rectangle = _around(points)
     grid = rectangle.grid(OBSTACLE_CELL / 2)
     blocked = any(c.holds(grid).any() for c in cleared)
@@ -189,7 +189,7 @@ def _around(points: Float) -> _Rectangle:
     frame = np.stack([along, [-along[1], along[0]]])
     local = (points - middle) @ frame.T
     low, high = local.min(axis=0), local.max(axis=0)
-    # Parts of one wall must meet; across it stray ones make nothing broader.
+    # Cover the full length so that parts of a wall meet; trim outliers across it.
     low[0], high[0] = low[0] - BEYOND, high[0] + BEYOND
     low[1], high[1] = np.quantile(local[:, 1], [TRIM, 1 - TRIM])
     length, width = np.maximum(high - low, NARROW).tolist()
@@ -197,8 +197,10 @@ def _around(points: Float) -> _Rectangle:
 
 
 def _seen_side(rectangle: _Rectangle, way: RecordedPath, cleared: Sequence[Cleared]) -> _Rectangle:
-    """What is long and thin is made thicker, away from the recorded way and where nothing starts; a
-    pole stays as it is."""
+    """Thicken a long, thin rectangle away from the recorded path and from ``cleared`` boxes.
+
+    Poles stay as they are.
+    """
     missing = DEPTH - rectangle.width
     if missing <= 0 or rectangle.length < 2 * DEPTH:
         return rectangle
@@ -211,7 +213,7 @@ def _seen_side(rectangle: _Rectangle, way: RecordedPath, cleared: Sequence[Clear
 
 
 def _high_points(background: GaussianCloud, ground: Ground, near: Sequence[_Rectangle]) -> Float:
-    """[K, 3] x, y and height above the ground of what is opaque above what a car is tall [m]."""
+    """[K, 3] x, y and height above ground [m] of opaque Gaussians above the height of a car."""
     if not near:
         return np.zeros((0, 3))
     means = background.means.cpu().numpy().astype(np.float64)
@@ -227,7 +229,7 @@ def _high_points(background: GaussianCloud, ground: Ground, near: Sequence[_Rect
 
 
 def _upright(name: str, rectangle: _Rectangle, ground: Ground, high: Float) -> Box:
-    """The box over a rectangle, as tall as the points above it."""
+    """The box over a rectangle, up to the highest points above it."""
     local = (high[:, :2] - rectangle.centre) @ np.stack([rectangle.along, rectangle.across]).T
     reach = np.array([rectangle.length, rectangle.width]) / 2 + OBSTACLE_CELL / 2
     above = high[np.all(np.abs(local) < reach, axis=1), 2]
@@ -252,19 +254,19 @@ MARGIN = 40.0
 def ground_collider(
     ground: Ground, places: Float, *, offset: float = 0.0, friction: float | None = None
 ) -> HeightField:
-    """The cells of a scene's ground around given places: the same surface, bit for bit.
+    """The scene's ground around given positions as a collider; bitwise the same surface.
 
     Args:
-        ground: of the scene.
-        places: [N, 2] what the collider is for, N >= 1, world [m].
-        offset: by which it is raised [m].
-        friction: of the collider; None for that of the bodies.
+        ground: ground of the scene.
+        places: [N, 2] positions to cover, N >= 1, world frame [m].
+        offset: height offset [m].
+        friction: friction coefficient; None for that of the bodies.
     """
     last = np.array(ground.heights.shape) - 1
     low, high = places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN
     first = np.floor((low - ground.first_centre) / ground.cell).astype(np.int64)
     end = np.ceil((high - ground.first_centre) / ground.cell).astype(np.int64)
-    # At least two samples each way, also where the places are beside the grid.
+    # At least two samples per axis, even for positions outside the grid.
     i, j = np.clip(first, 0, last - 1).tolist()
     m, n = np.clip(end, [i + 1, j + 1], last).tolist()
     return HeightField(

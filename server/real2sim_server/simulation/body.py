@@ -1,7 +1,7 @@
-"""One object of a scene as a body: rigid while alone, deforming in contact, asleep at rest.
+"""A scene object as a body: rigid when free, deforming in contact, asleep at rest.
 
-The body owns its state: what it is now, for how long it has been so, and how it changes over.
-A simulator gives orders (activate, rigidify, put to sleep) and reads.
+The body owns its state, its timers and the transitions between modes. The simulator triggers the
+transitions (activate, rigidify, put to sleep) and reads the state.
 """
 
 from __future__ import annotations
@@ -88,18 +88,18 @@ class DeformableBody:
 
     Args:
         name: object id.
-        particles: at rest, object frame.
+        particles: particles at rest, object frame.
         materials, regions: see :class:`~..physics.body.Body`.
-        friction: of its surface.
-        cell: of the solver's grid [m].
-        T_world_object: [4, 4] at the start.
-        velocity: [3] of the centre of mass [m/s].
+        friction: friction coefficient of its surface.
+        cell: cell size of the solver grid [m].
+        T_world_object: [4, 4] initial pose.
+        velocity: [3] initial velocity of the centre of mass [m/s].
         angular_velocity: [3] world axes [rad/s].
-        tyres: when it stands on wheels.
-        shape: what earlier deformation has left; None for none.
+        tyres: tyres of a body on wheels, or None.
+        shape: shape after earlier deformation, or None.
 
     Attributes:
-        acceleration: [3] of the centre of mass in the last step of deforming; zero else [m/s^2].
+        acceleration: [3] of the centre of mass in the last deforming step; else zero [m/s^2].
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class DeformableBody:
 
     @property
     def T_world_object(self) -> Float:
-        """[4, 4] pose; while deforming, the rigid pose nearest to all its particles."""
+        """[4, 4] pose; while deforming, the best-fitting rigid pose of all its particles."""
         if self.state is not None:
             return self._nearest_pose(self.state).copy()
         pose = np.eye(4)
@@ -172,7 +172,7 @@ class DeformableBody:
         return pose
 
     def _nearest_pose(self, state: BodyState) -> Float:
-        """[4, 4] see above; not to be written to."""
+        """[4, 4] best-fitting rigid pose; read-only."""
         if self._pose_of is not state:
             rotation = best_rotation(self.rest.positions, state.positions, self.rest.masses)
             self._pose_of, self._pose = state, np.eye(4)
@@ -188,11 +188,11 @@ class DeformableBody:
         return (self.state.positions - pose[:3, 3]) @ pose[:3, :3]
 
     def hull_points(self) -> Float:
-        """[K, 3] its outermost particles, in the world [m]: what meets a half-space."""
+        """[K, 3] its outermost particles, world frame [m]; used against half-spaces."""
         return self._world(self._hull, 0)
 
     def shell_points(self) -> Float:
-        """[K, 3] all particles with nothing beside them, in the world [m]."""
+        """[K, 3] all surface particles, world frame [m]."""
         return self._world(self._shell, 1)
 
     def _world(self, which: NDArray[np.int64], kind: int) -> Float:
@@ -205,7 +205,7 @@ class DeformableBody:
         return placed
 
     def box(self) -> tuple[Float, Float]:
-        """Pose [4, 4] and size [3] of the box around its present shape."""
+        """Pose [4, 4] and size [3] of the box around its current shape."""
         kept = self.shape if self.state is None else self.state
         if self._bounds_of is not kept:
             local, half = self.local_positions(), self.spacing / 2
@@ -217,7 +217,7 @@ class DeformableBody:
         return pose, size.copy()
 
     def gap_to(self, other: DeformableBody) -> float:
-        """A lower bound of the distance between the boxes of two bodies [m]; below 0 inside."""
+        """A lower bound of the distance between the boxes of two bodies [m]; negative inside."""
         apart = float(np.linalg.norm(self.motion.centre - other.motion.centre))
         apart -= self.reach + other.reach + CORNER * (self.spacing + other.spacing)
         if apart > NEAR_MAX:
@@ -225,16 +225,15 @@ class DeformableBody:
         return -float(box_penetration(*self.box(), *other.box()))
 
     def gap_to_colliders(self, colliders: Sequence[Collider]) -> tuple[float, float]:
-        """Distance [m] to the nearest collider, and the speed of approach there [m/s].
+        """Distance [m] to the nearest collider, and the closing speed there [m/s].
 
-        Solids further away than NEAR_MAX are infinitely far.
+        Infinite for solids beyond NEAR_MAX.
         """
         gap, approach, _ = self._closest(colliders, within=NEAR_MAX, ahead=0.0)
         return gap, approach
 
     def meets(self, colliders: Sequence[Collider], *, within: float, ahead: float) -> bool:
-        """Whether it and a collider approach each other and will be ``within`` [m] of each other in
-        the time ``ahead`` [s]."""
+        """Whether a collider is approaching and will be ``within`` [m] in time ``ahead`` [s]."""
         return self._closest(colliders, within=within, ahead=ahead)[2]
 
     def _closest(
@@ -242,7 +241,7 @@ class DeformableBody:
     ) -> tuple[float, float, bool]:
         """See ``rigid.closest``.
 
-        Outermost particles are what meets ground; a solid may meet any place of a flat side.
+        Ground contact uses the outermost particles; a solid may touch any point of a flat side.
         """
         smooth = [c for c in colliders if not isinstance(c, Solid)]
         hull = np.inf, 0.0, False
@@ -257,7 +256,7 @@ class DeformableBody:
         return gap, approach, hull[2] or shell[2]
 
     def _within_reach(self, solids: Sequence[Solid], within: float, ahead: float) -> list[Solid]:
-        """Those so near the box about the body that their surfaces must be compared."""
+        """Solids so near the box of the body that their surfaces must be compared."""
         gaps, speeds = solid_gaps(*self.box(), solids)
         m = self.motion
         speed = float(np.linalg.norm(m.velocity))
@@ -267,7 +266,7 @@ class DeformableBody:
 
     @property
     def _local_centre(self) -> Float:
-        """[3] its centre of mass in its own frame while it keeps its shape [m]."""
+        """[3] its centre of mass in its own frame, in its current shape [m]."""
         if self._centre_of is not self.shape:
             self._centre_of = self.shape
             self._centre: Float = self.rest.masses @ self.shape.positions / self.rest.mass
@@ -275,7 +274,7 @@ class DeformableBody:
 
     @property
     def reach(self) -> float:
-        """Of a ball about its centre of mass that holds the body [m]."""
+        """Radius of its bounding sphere around the centre of mass [m]."""
         positions = self.shape.positions if self.state is None else self.state.positions
         if self._radius_of is not positions:
             centre = self.rest.masses @ positions / self.rest.mass
@@ -284,7 +283,7 @@ class DeformableBody:
         return self._radius_m
 
     def solver_body(self) -> Body:
-        """The body as it is now, for a solver; velocity and turning are the motion's."""
+        """The current body for a solver, with the velocities of its rigid motion."""
         if self.state is not None:
             s = self.state
             return self._solver_body(s.positions, s.velocities, s.gradients, s)
@@ -324,7 +323,7 @@ class DeformableBody:
 
     @property
     def kinetic_energy(self) -> float:
-        """Energy of its motion [J]."""
+        """Kinetic energy [J]."""
         if self.state is None:
             return self.motion.kinetic
         turning = self.motion.angular_velocity
@@ -338,15 +337,15 @@ class DeformableBody:
     def advance_rigid(
         self, duration: float, gravity: Float, road: Sequence[Collider]
     ) -> TyreReaction | None:
-        """Fall, roll, slide for ``duration`` [s].
+        """Advance the rigid motion (falling, rolling, sliding) by ``duration`` [s].
 
         Args:
             duration: [s].
             gravity: [3] [m/s^2].
-            road: colliders that carry tyres.
+            road: colliders that support tyres.
 
         Returns:
-            What the road did; nothing without tyres.
+            Reaction of the road; None without tyres.
         """
         steps = math.ceil(duration / RIGID_STEP - 1e-6)
         dt = duration / steps
@@ -381,23 +380,22 @@ class DeformableBody:
         return None if self.tyres is None else TyreReaction(impulse, friction_work)
 
     def note_standing(self, duration: float) -> None:
-        """Count how long a rigid body has hardly moved while something carries it; it has moved for
-        ``duration`` [s]."""
+        """Add ``duration`` [s] to the time for which a supported rigid body has hardly moved."""
         m = self.motion
         slow = np.linalg.norm(m.velocity) + np.linalg.norm(m.angular_velocity) < SLEEP_SPEED / 2
         self._settle_time = self._stood + duration if slow else 0.0
 
     def activate(self) -> None:
-        """Start to deform; the next ``solver_body`` goes into a solver."""
+        """Switch to deforming mode; the next ``solver_body`` is for a solver."""
         self.mode = BodyMode.DEFORMING
         self._velocity_before = self.motion.velocity
         self._deforming_time = self._settle_time = self._sleep_time = 0.0
 
     def update_from_solver(self, state: BodyState) -> None:
-        """Take over the solver's state of this body; the motion becomes its rigid part.
+        """Take over the solver state of this body; its rigid part becomes the motion.
 
-        On the grid a body turns as if its particles were wider than they are, so that angular
-        momentum is kept here: what has acted is what it has changed by there.
+        On the grid, particles have extra rotational inertia. The body therefore tracks angular
+        momentum itself and applies the change seen on the grid.
         """
         spin = self.motion.angular_momentum + state.angular_momentum - self._carried
         self._carried = state.angular_momentum
@@ -414,18 +412,18 @@ class DeformableBody:
         )
 
     def _on_grid(self, motion: RigidMotion) -> Float:
-        """[3] angular momentum that particles have on the grid when they move so."""
+        """[3] angular momentum of the particles on the grid for a rigid motion."""
         return motion.angular_momentum + self._added_inertia * motion.angular_velocity
 
     @property
     def lag(self) -> Float:
-        """[3] by how much slower it turns on the grid than its angular momentum says [rad/s]."""
+        """[3] deficit of its angular velocity on the grid against its angular momentum [rad/s]."""
         m = self.motion
         inertia = m.world_inertia + self._added_inertia * np.eye(3)
         return np.asarray(np.linalg.solve(inertia, self._on_grid(m) - self._carried), np.float64)
 
     def catch_up(self) -> None:
-        """Let particles turn as fast as its angular momentum says; a solver must start anew."""
+        """Set the particles' rotation to its angular momentum; the solver must restart."""
         self._change(np.zeros(3), self.lag)
         self._carried = self._on_grid(self.motion)
 
@@ -433,8 +431,8 @@ class DeformableBody:
         """Apply the road's forces to the wheels while deforming, as on a rigid body.
 
         Returns:
-            What the road did, or None when no wheel carries; else a solver must start anew from
-            this body.
+            Reaction of the road, or None if no wheel carries load. If not None, the solver must
+            restart from this body.
         """
         if self.tyres is None:
             return None
@@ -445,7 +443,7 @@ class DeformableBody:
         return reaction
 
     def apply_impulse(self, after: RigidMotion) -> None:
-        """Give all particles the rigid change of velocity from the present motion to ``after``."""
+        """Apply the rigid velocity change from the current motion to ``after`` to all particles."""
         assert self.state is not None
         m = self.motion
         self._change(after.velocity - m.velocity, after.angular_velocity - m.angular_velocity)
@@ -456,7 +454,7 @@ class DeformableBody:
         self.motion = after
 
     def _change(self, velocity: Float, turning: Float) -> None:
-        """Add a rigid motion to that of all particles: [3] of the centre [m/s], and [3] [rad/s]."""
+        """Add a rigid motion to all particles: [3] of the centre [m/s], and [3] [rad/s]."""
         assert self.state is not None
         s, spin = self.state, cross_matrix(turning)
         self.state = replace(
@@ -466,24 +464,24 @@ class DeformableBody:
         )
 
     def brake_after_hit(self, fraction: float) -> None:
-        """Lock the wheels, once and for all, as far as ``fraction`` of their grip says."""
+        """Brake the wheels permanently, with ``fraction`` of their grip."""
         assert self.tyres is not None
         self.hit = True
         self.tyres = self.tyres.braked(fraction)
 
     def residual_speed(self) -> float:
-        """Root mean square speed of particles against the rigid part of their motion [m/s]."""
+        """RMS speed of particles relative to the rigid motion [m/s]."""
         assert self.state is not None
         s, m = self.state, self.motion
         rigid = m.velocity + np.cross(m.angular_velocity, s.positions - s.centre)
         return float(np.sqrt(self.rest.masses @ ((s.velocities - rigid) ** 2).sum(axis=1) / m.mass))
 
     def update_timers(self, duration: float) -> None:
-        """Add ``duration`` [s] to its times of deforming, being settled and being slow."""
+        """Add ``duration`` [s] to the timers for deforming, settled and slow."""
         speed = float(np.linalg.norm(self.motion.velocity))
         turning = float(np.linalg.norm(self.motion.angular_velocity))
         settled = self.residual_speed() < max(SETTLED_SPEED, SETTLED_FRACTION * speed)
-        # In the middle of an impact a stiff body hardly deforms either.
+        # A stiff body hardly deforms even in the middle of an impact.
         self.acceleration = (self.motion.velocity - self._velocity_before) / duration
         self._velocity_before = self.motion.velocity
         settled = settled and float(np.linalg.norm(self.acceleration)) < JOLT
@@ -499,16 +497,16 @@ class DeformableBody:
 
     @property
     def may_rigidify(self) -> bool:
-        """Whether it has deformed and has been settled long enough."""
+        """Whether it has been deforming and settled for long enough."""
         return self._settle_time >= SETTLE_TIME and self._deforming_time >= 2 * SETTLE_TIME
 
     @property
     def may_sleep(self) -> bool:
-        """Whether it has also been nearly still long enough."""
+        """Whether it has also been nearly still for long enough."""
         return self.may_rigidify and self._sleep_time > SLEEP_TIME
 
     def rigidify(self) -> None:
-        """Become rigid in the present shape, with the same momentum and angular momentum."""
+        """Become rigid in the current shape, conserving momentum and angular momentum."""
         assert self.state is not None
         pose, s = self.T_world_object, self.state
         back = pose[:3, :3].T
@@ -528,16 +526,16 @@ class DeformableBody:
 
     @property
     def has_parked(self) -> bool:
-        """Whether a rigid body has been still long enough to be put to sleep."""
+        """Whether a rigid body has been still for long enough to sleep."""
         return self._settle_time > WHEELS_SLEEP_TIME
 
     def put_to_sleep(self, supports: Sequence[str] = ()) -> None:
-        """Stand still until a body comes near or its support moves.
+        """Put the body to sleep until another one approaches or its support moves.
 
         A deforming body becomes rigid first.
 
         Args:
-            supports: names of what it rests on.
+            supports: names of the bodies or colliders that it rests on.
         """
         self.supports = frozenset(supports)
         if self.state is not None:
@@ -546,7 +544,7 @@ class DeformableBody:
         self.motion = replace(self.motion, velocity=np.zeros(3), angular_velocity=np.zeros(3))
 
     def wake(self) -> None:
-        """Let the body move again."""
+        """Wake the body."""
         self.mode = BodyMode.RIGID
 
     def push(self, impulse: Float, moment: Float) -> None:
@@ -554,7 +552,7 @@ class DeformableBody:
 
         Args:
             impulse: [3] [N s].
-            moment: [3] of it about the world origin [N m s].
+            moment: [3] moment of the impulse about the world origin [N m s].
         """
         m = self.motion
         turn = np.linalg.solve(m.world_inertia, moment - np.cross(m.centre, impulse))
@@ -576,7 +574,7 @@ def _undeformed(particles: Particles) -> DeformedShape:
 
 
 def _shell(positions: Float, spacing: float) -> NDArray[np.int64]:
-    """Indices of particles that have no neighbour on one of their six sides."""
+    """Indices of particles without a neighbour on at least one of their six sides."""
     from scipy.spatial import cKDTree
 
     neighbours = cKDTree(positions).query_ball_point(
@@ -587,7 +585,7 @@ def _shell(positions: Float, spacing: float) -> NDArray[np.int64]:
 
 
 def _hull(positions: Float) -> NDArray[np.int64]:
-    """Indices of the outermost particles along evenly spread directions."""
+    """Indices of the outermost particles along evenly distributed directions."""
     k = np.arange(SURFACE_POINTS) + 0.5
     z = 1 - 2 * k / SURFACE_POINTS
     radius, angle = np.sqrt(1 - z * z), np.pi * (1 + 5**0.5) * k

@@ -1,8 +1,8 @@
-"""Parts of vehicles that break or come loose, their fragments, and the underside of a rollover.
+"""Breakable vehicle parts, their fragments, and the underside shown in a rollover.
 
-A part's place on the vehicle's box identifies it. ECE R48 puts headlamps 0.5 to 1.2 m above the
-road and within 0.4 m of the outline, so heights are in metres; glass begins at the belt line and
-ends below the roof's edge.
+Parts are identified by their position in the vehicle's box. ECE R48 requires headlamps 0.5 to 1.2 m
+above the road and within 0.4 m of the outline, so heights are in metres. Glass extends from the
+belt line to just below the edge of the roof.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ class Part:
     """A part of a vehicle.
 
     Attributes:
-        name: unique on a vehicle.
-        kind: what it does when it breaks.
-        low, high: corners of its box in the vehicle's frame [m].
-        outward: [3] where it faces.
+        name: unique name on the vehicle.
+        kind: kind of breakage.
+        low, high: corners of its box, vehicle frame [m].
+        outward: [3] outward direction.
     """
 
     name: str
@@ -63,20 +63,20 @@ class Part:
     outward: tuple[float, float, float]
 
     def holds(self, points: Float, margin: float = 0.0) -> NDArray[np.bool_]:
-        """[N] whether points [N, 3] are within its box, which is ``margin`` [m] larger."""
+        """[N] whether points [N, 3] are in its box, enlarged by ``margin`` [m]."""
         low, high = np.array(self.low) - margin, np.array(self.high) + margin
         inside: NDArray[np.bool_] = np.all((points > low) & (points < high), axis=1)
         return inside
 
     @property
     def middle(self) -> Float:
-        """[3] of its box [m]."""
+        """[3] centre of its box [m]."""
         middle: Float = np.array([self.low, self.high]).mean(axis=0)
         return middle
 
 
 def parts_of(category: str, size: Sequence[float]) -> tuple[Part, ...]:
-    """Parts of a vehicle of ``size`` (length, width, height) [m]; other objects have none."""
+    """Parts of a vehicle of ``size`` (length, width, height) [m]; empty for other objects."""
     if category not in VEHICLES:
         return ()
     return (*_end(size, ahead=True), *_end(size, ahead=False), *_glass(size))
@@ -139,7 +139,7 @@ def _glass(size: Sequence[float]) -> list[Part]:
     if not tall:
         low, high = (back[0], -inner, belt), (back[1], inner, top)
         found.append(Part("rear window", "pane", low, high, (-0.8, 0.0, 0.6)))
-    # Side windows end at the pillar before the front door, which a crushed front does not reach.
+    # Side windows end at the A-pillar, which a crushed front does not reach.
     along = (x[0] - 0.15 * length, x[0] + 0.1 * length) if tall else (-0.36 * length, 0.18 * length)
     for side, name in ((1.0, "left"), (-1.0, "right")):
         y = (inner, half) if side > 0 else (-half, -inner)
@@ -166,12 +166,12 @@ class Breakage:
     """A broken part.
 
     Attributes:
-        object_id, part, kind: which one.
-        time_s: when, since the start [s].
-        position: [3] of the middle of the part in the world [m].
-        velocity: [3] of that place then [m/s].
-        outward: [3] where the part faced, world.
-        severity: how far the limit was passed by the end of it, at least 1.
+        object_id, part, kind: vehicle, part and kind of breakage.
+        time_s: time since the start [s].
+        position: [3] centre of the part, world frame [m].
+        velocity: [3] velocity of that point [m/s].
+        outward: [3] outward direction of the part, world frame.
+        severity: final strain over the limit, at least 1.
     """
 
     object_id: str
@@ -189,7 +189,7 @@ class Breakage:
 
     @classmethod
     def of_record(cls, record: dict[str, Any]) -> Breakage:
-        """Read the result of :meth:`record`. Raises TypeError for other members."""
+        """Inverse of :meth:`record`. Raises TypeError for unknown fields."""
         members: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in record.items()
         }
@@ -197,12 +197,12 @@ class Breakage:
 
 
 class BreakageLog:
-    """Follows the parts of one vehicle through the frames of a crash.
+    """Tracks the parts of one vehicle over the frames of a crash.
 
     Args:
-        category, size: of the vehicle; things that are no vehicles have no parts.
+        category, size: category and size of the vehicle; other objects have no parts.
         rest: [N, 3] particles at rest, object frame [m].
-        spacing: of the particles [m].
+        spacing: particle spacing [m].
     """
 
     def __init__(
@@ -220,7 +220,7 @@ class BreakageLog:
     def follow(self, displacements: Float) -> list[Part]:
         """Parts that break in a frame in which particles are displaced [N, 3] [m] from rest."""
         new = []
-        # Most of a vehicle keeps its shape, and parts are broken against that.
+        # Displacements are relative to the undeformed majority of the vehicle.
         moved = displacements - np.median(displacements, axis=0)
         for part, near in self._carried:
             passed = _strain(part, moved[near]) / LIMITS[part.kind]
@@ -237,7 +237,7 @@ class BreakageLog:
         return twin
 
     def place(self, part: Part, displacements: Float) -> Float:
-        """[3] where the middle of a part is, object frame [m]."""
+        """[3] current centre of a part, object frame [m]."""
         near = next(n for p, n in self._carried if p.name == part.name)
         place: Float = part.middle + displacements[near].mean(axis=0)
         return place
@@ -250,8 +250,8 @@ def _strain(part: Part, moved: Float) -> float:
     return float(np.quantile(-(moved @ np.array(part.outward)), OUTER))
 
 
-# Fragments fly, bounce, slide and stay on the road. Their paths are closed formulas of time, so any
-# instant can be shown alone and always looks the same.
+# Fragments fly, bounce, slide and come to rest on the road. Their paths are closed-form functions
+# of time, so every instant can be rendered independently and is deterministic.
 
 Heights = Callable[[Float], Float]
 """[K, 2] or [K, 3] places -> [K] height of the ground [m]."""
@@ -268,15 +268,15 @@ SH_0 = 0.28209479177387814
 
 @dataclass(frozen=True)
 class _Shards:
-    """Fragments of a kind of part.
+    """Fragment parameters of a kind of part.
 
     Attributes:
-        count: how many.
-        size: from and to, half length [m]; glass is crumbs, bumpers are pieces.
-        width, thickness: half of these as fractions of half the length.
-        speed: of leaving [m/s], out and to the sides.
-        spread: [m] standard deviation of where they leave from, around the part's middle.
-        colours: that they have in turn.
+        count: number of fragments.
+        size: range of half lengths [m]; glass is crumbs, bumpers are pieces.
+        width, thickness: half width and half thickness as fractions of the half length.
+        speed: initial speed outwards and sideways [m/s].
+        spread: standard deviation of the start positions around the centre of the part [m].
+        colours: colours, used in turn.
     """
 
     count: int
@@ -302,12 +302,12 @@ SHARDS: dict[Kind, _Shards] = {
 def fragment_cloud(
     broken: Sequence[Breakage], time_s: float, heights: Heights
 ) -> GaussianCloud | None:
-    """All fragments at ``time_s`` [s], in the world; None while there are none.
+    """All fragments at ``time_s`` [s], world frame; None if there are none.
 
     Args:
-        broken: parts that broke.
-        time_s: on the clock of the breakages.
-        heights: of the ground.
+        broken: broken parts.
+        time_s: time on the clock of the breakages.
+        heights: ground heights.
     """
     clouds = [
         _cloud(breakage, time_s - breakage.time_s, heights)
@@ -342,7 +342,7 @@ def _cloud(breakage: Breakage, age: float, heights: Heights) -> GaussianCloud:
 def _leaving(
     breakage: Breakage, shards: _Shards, n: int, random: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Start and velocity, [n, 3] each: along, across and above the part's facing direction."""
+    """Start and velocity, [n, 3] each, relative to the outward direction of the part."""
     outward = np.array(breakage.outward)
     outward[2] = 0.0
     outward /= max(float(np.linalg.norm(outward)), 1e-9)
@@ -352,7 +352,7 @@ def _leaving(
     sides = (along, wide, high) if shards is not SHARDS["pane"] else (wide, along, high)
     start = np.array(breakage.position) + (random.normal(size=(n, 3)) * sides) @ axes
     scatter = random.normal(size=(n, 3)) * [0.6, 1.0, 0.6] + [0.35, 0.0, 0.7]
-    # What is broken harder is thrown farther.
+    # Higher severity throws fragments farther.
     speed = shards.speed * np.sqrt(min(breakage.severity, 4.0))
     return start, np.array(breakage.velocity) + speed * scatter @ axes
 
@@ -360,7 +360,7 @@ def _leaving(
 def _fallen(
     start: Float, velocity: Float, thin: Float, age: float, heights: Heights
 ) -> tuple[Float, Float]:
-    """Positions [n, 3] at an age [s], and the time each has tumbled [n]."""
+    """Positions [n, 3] at an age [s], and the tumbling time of each fragment [n]."""
     above = np.maximum(start[:, 2] - heights(start[:, :2]) - thin, 0.0)
     level, up = velocity[:, :2].copy(), velocity[:, 2].copy()
     left, place = np.full(len(start), age), start[:, :2].copy()
@@ -414,8 +414,8 @@ def _tensor(values: NDArray[np.float64]) -> torch.Tensor:
 
 # The underside of a vehicle that turns over.
 #
-# No recording shows it. Training fits the blurred contact shadow where wheels meet the road; turned
-# upwards it would be a ragged plate above the wheels.
+# Recordings do not show it. Training fits the contact shadow between wheels and road instead, which
+# would look like a ragged plate on an overturned vehicle.
 
 SHADOW, SILLS = 0.1, 0.3
 """What is below sills and reaches so far down is shadow or tyre: heights over the road [m]."""
@@ -436,10 +436,10 @@ AXLE, PIPE = 0.09, 0.06
 
 
 def with_underside(cloud: GaussianCloud, size: Sequence[float]) -> GaussianCloud:
-    """A vehicle with a floor instead of its shadow.
+    """Replace the contact shadow of a vehicle by a floor.
 
     Args:
-        cloud: its Gaussians at rest, object frame.
+        cloud: Gaussians of the vehicle at rest, object frame.
         size: (length, width, height) [m].
     """
     points = cloud.means.detach().cpu().numpy().astype(np.float64)

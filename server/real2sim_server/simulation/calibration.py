@@ -1,7 +1,7 @@
-"""Fit an object's materials and motion to observations: tracked boxes, marked points, images.
+"""Calibration of an object's materials and motion from tracked boxes, marked points and images.
 
-Each observation returns its differences to a simulation divided by its standard deviation, so that
-observations of several kinds combine.
+Each observation returns its residuals divided by their standard deviation, so observations of
+different kinds can be combined.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ IMAGE_WIDTH = 96
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """A simulation as observations compare with it.
+    """A simulation to compare with observations.
 
     Attributes:
-        scene, state: what was simulated.
-        subject: the object that was observed.
-        result: with a frame at each instant that anybody observed.
+        scene, state: the simulated scene and scenario state.
+        subject: the observed object.
+        result: simulation result with a frame at every observation time.
     """
 
     scene: Scene
@@ -62,7 +62,7 @@ class Simulated:
         return [int(np.abs(self.result.times_s - t).argmin()) for t in times_s]
 
     def displacements(self, frame: int) -> Float:
-        """[N, 3] of particles, object frame [m]."""
+        """[N, 3] particle displacements, object frame [m]."""
         moved = self.own.displacements(frame)
         return np.zeros(self.own.rest.shape) if moved is None else moved.astype(np.float64)
 
@@ -76,7 +76,7 @@ class Observation(Protocol):
         ...
 
     def differences(self, simulated: Simulated) -> Float:
-        """[M] simulated minus observed, divided by the standard deviation."""
+        """[M] residuals, simulated minus observed, divided by the standard deviation."""
         ...
 
 
@@ -86,13 +86,13 @@ class BoxTrack:
 
     Attributes:
         times_s: [T] since the start of the simulation [s].
-        positions: [T, 3] of box centres, world [m].
-        quaternions: [T, 4] wxyz; None where only places are known.
-        sizes: [T, 3] of the boxes, which shorten when an object is crushed [m]; None: as it was.
-        position_sigma, heading_sigma, size_sigma: what they are known to [m], [rad], [m].
+        positions: [T, 3] box centres, world frame [m].
+        quaternions: [T, 4] wxyz; None if only positions are known.
+        sizes: [T, 3] box sizes [m], which shrink when an object is crushed; None if unchanged.
+        position_sigma, heading_sigma, size_sigma: standard deviations [m], [rad], [m].
 
     Raises:
-        PhysicsError: for shapes that do not fit, values that are not finite or times that are none.
+        PhysicsError: for mismatched shapes, values that are not finite, or invalid times.
     """
 
     times_s: Float
@@ -140,13 +140,13 @@ class MarkedPoints:
     """Tracked points on an object, such as stickers or corners of lamps.
 
     Attributes:
-        places: [P, 3] where they are on the object before anything happens, object frame [m].
+        places: [P, 3] points on the undeformed object, object frame [m].
         times_s: [T] since the start of the simulation [s].
-        positions: [T, P, 3] where they were seen, world [m]; NaN where they were not.
-        sigma: what places are known to [m].
+        positions: [T, P, 3] observed positions, world frame [m]; NaN if not observed.
+        sigma: standard deviation of positions [m].
 
     Raises:
-        PhysicsError: for shapes that do not fit, or when no point was seen.
+        PhysicsError: for mismatched shapes, or if no point was observed.
     """
 
     places: Float
@@ -183,13 +183,13 @@ class ObservedImages:
 
     Attributes:
         times_s: [T] since the start of the simulation [s].
-        cameras: [T] each of the size of its image.
-        T_world_vehicle: [T, 4, 4] what the cameras are on.
-        images: [T] of [H, W, 3] uint8.
-        sigma: what a pixel is known to, as a fraction of white.
+        cameras: [T] cameras, each with the size of its image.
+        T_world_vehicle: [T, 4, 4] poses of the vehicle with the cameras.
+        images: [T] images [H, W, 3] uint8.
+        sigma: standard deviation of a pixel, as a fraction of white.
 
     Raises:
-        PhysicsError: for images that are not as large as their cameras.
+        PhysicsError: if an image and its camera differ in size.
     """
 
     times_s: Float
@@ -237,7 +237,7 @@ def small(camera: Camera, image: NDArray[np.uint8]) -> tuple[Camera, NDArray[np.
     """A camera and its image at IMAGE_WIDTH or below.
 
     Raises:
-        PhysicsError: for an image of other proportions than the camera's.
+        PhysicsError: if the aspect ratios of image and camera differ.
     """
     import cv2
 
@@ -256,7 +256,7 @@ def recorded_track(trajectory: Trajectory, start_us: int, end_us: int) -> BoxTra
     """The tracked boxes after ``start_us`` up to ``end_us`` [us].
 
     Raises:
-        PhysicsError: when there is none in that time.
+        PhysicsError: if there is no box in that interval.
     """
     times = np.asarray(trajectory.times_us)
     own = np.flatnonzero((times > start_us) & (times <= end_us))
@@ -302,16 +302,17 @@ MAX_OBSERVED_TIME = 30.0
 def observations_of(
     given: Requested, scene: Scene, subject: PlacedObject, start_us: int, end_us: int
 ) -> list[Observation]:
-    """Observations, in seconds from the start.
+    """Convert requested observations, with times in seconds from the start.
 
     Args:
-        given: as a request has it.
-        scene: whose cameras took images.
-        subject: that was observed.
-        start_us, end_us: of the simulation [us]; recorded boxes are taken up to the end.
+        given: observations of a request.
+        scene: scene with the cameras of the images.
+        subject: the observed object.
+        start_us, end_us: start and end of the simulation [us]; recorded boxes are used up to the
+            end.
 
     Raises:
-        PhysicsError: for times before the start or far beyond it, and images that cannot be read.
+        PhysicsError: for times before the start or far beyond it, and unreadable images.
     """
     found: list[Observation] = []
     if given.recorded:
@@ -411,10 +412,10 @@ class ObjectCalibration:
     """The result of a calibration.
 
     Attributes:
-        fit: factors, what they may be wrong by, residuals.
-        values: by parameter that is told, the value that the factor makes: Young's modulus and
-            yield stress [Pa] and viscosity [Pa s] of one material, friction, speed [m/s].
-        cell: of the grid that it was found on [m].
+        fit: factors, their uncertainties and residuals.
+        values: fitted values of the determined parameters: Young's modulus and yield stress [Pa],
+            viscosity [Pa s] of a single material, friction, speed [m/s].
+        cell: cell size of the grid [m].
     """
 
     fit: Fit
@@ -422,7 +423,7 @@ class ObjectCalibration:
     cell: float
 
     def figures(self) -> dict[str, Any]:
-        """As JSON values; None for factors that observations do not determine."""
+        """As JSON values; None for factors that the observations do not determine."""
         found = self.fit
 
         def finite(values: Mapping[str, float]) -> dict[str, float | None]:
@@ -458,18 +459,17 @@ def calibrate_object(
     """Fit factors so that the simulation matches the observations.
 
     Args:
-        scene, state, options: what is simulated, with initial values; its duration follows from
-            the observations.
-        object_id: of the object whose values are fitted.
-        observations: of it; all of them together.
-        parameters: names out of PARAMETERS.
-        steps: of the search at most.
-        on_run: told how many simulations were made, after each.
-        cancelled: asked before each step of a simulation.
+        scene, state, options: simulation with initial values; its duration follows from the
+            observations.
+        object_id: id of the object to calibrate.
+        observations: observations of it, used together.
+        parameters: names from PARAMETERS.
+        steps: maximum number of search steps.
+        on_run: called with the number of simulations after each one.
+        cancelled: polled before each simulation step.
 
     Raises:
-        PhysicsError: for what cannot be simulated, unknown names, and observations that tell
-            nothing.
+        PhysicsError: for invalid simulations, unknown names, and observations without information.
     """
     unknown = [name for name in parameters if name not in PARAMETERS]
     if unknown or not parameters:
@@ -502,7 +502,7 @@ class CalibrationCancelled(Exception):
 
 
 class _Trials:
-    """Simulations from the same start with other values."""
+    """Simulations from the same start with varying values."""
 
     def __init__(
         self,
@@ -525,7 +525,7 @@ class _Trials:
         self.cancelled: Callable[[], bool] | None = None
 
     def differences(self, factors: Mapping[str, float], coarser: float) -> Float:
-        """Differences of all observations, concatenated."""
+        """Residuals of all observations, concatenated."""
         bodies = [copy.copy(b) for b in self._bodies(coarser)]
         [body] = [b for b in bodies if b.name == self._object_id]
         apply_factors(body, factors)
@@ -536,7 +536,7 @@ class _Trials:
         return np.concatenate([o.differences(seen) for o in self._observations])
 
     def body(self) -> DeformableBody:
-        """The object at the start, with its given values."""
+        """The object at the start, with its initial values."""
         [body] = [b for b in self._bodies(1.0) if b.name == self._object_id]
         return body
 

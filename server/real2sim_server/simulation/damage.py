@@ -1,7 +1,7 @@
-"""Damaged vehicles as they are drawn: their Gaussians moved, folded, lit and broken.
+"""Rendering of damaged vehicles: moves, folds, shades and breaks their Gaussians.
 
-Particles report how far each place moved; this module derives how sheet metal looks. The same code
-serves simulated rollouts, REST and the closed loop.
+Particles give the displacement field; this module derives the appearance of the sheet metal.
+Rollouts, the REST API and the closed loop use the same code.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from .embedding import Deformed, Embedding, deform_cloud, replaced_rows
 
 # Crumpled sheet: flat facets between sharp ridges, in an irregular pattern.
 #
-# Sheet neither stretches nor bends in two directions at once, so a dent bends it along lines. Its
-# height above the smooth surface is linear in each facet. Facets are where the skin cuts the
-# tetrahedra of a lattice tilted in the vehicle, which needs no coordinates on the skin.
+# Sheet metal neither stretches nor bends in two directions at once, so a dent bends it along lines.
+# Its height above the smooth surface is linear in each facet. Facets are the intersections of the
+# skin with the tetrahedra of a tilted lattice, so no surface coordinates are needed.
 
 CELLS = (0.5, 0.22)
 """Sizes of facets and of the dents in them [m]."""
@@ -54,8 +54,7 @@ def crumple(points: Float, seed: int) -> tuple[Float, Float]:
 
 
 def scrapes(points: Float, seed: int) -> Float:
-    """[G, 2] how much of the paint at points [G, 3] [m] is scraped off, and how much is smeared
-    with what scraped it, where sheet is pushed in as deep as can be; from 0 to 1."""
+    """[G, 2] fractions of paint scraped off and smeared at points [G, 3] [m], at maximum depth."""
     random = np.random.default_rng(seed + 1)
     found = np.zeros((len(points), 2))
     for k, least in enumerate(SCRAPED_FROM):
@@ -66,8 +65,10 @@ def scrapes(points: Float, seed: int) -> Float:
 
 
 def _piecewise(places: Float, corners: Float) -> tuple[Float, Float]:
-    """[G] values and [G, 3] slopes at places [G, 3] of a lattice of unit cells, linear in each of
-    the six tetrahedra of a cell between values at its ``corners`` [T, T, T]."""
+    """[G] values and [G, 3] gradients at points [G, 3] of a lattice of unit cells.
+
+    Linear in each of the six tetrahedra of a cell, from its values at ``corners`` [T, T, T].
+    """
     corner = np.floor(places).astype(np.int64)
     inside = places - corner
     order = np.argsort(-inside, axis=1, kind="stable")
@@ -91,13 +92,13 @@ def _piecewise(places: Float, corners: Float) -> tuple[Float, Float]:
     return values, slopes
 
 
-# Sheet metal under compression: it keeps its length and buckles out of plane.
+# Sheet metal under compression keeps its length and buckles out of plane.
 #
-# Particles are a tenth of a metre apart and only give a place's shortening. Sheet shortened by a
+# Particles are a tenth of a metre apart and only give the local shortening. A sheet shortened by a
 # fraction 1 - s folds: with folds every ``wavelength`` of its own length and flat flanks, a chord
 # of s per unit length gives flanks at the angle acos(s) and an amplitude of wavelength / 4 sqrt(1 -
-# s^2). Flanks keep their length, so their Gaussians leave no gaps, and they turn, so that light
-# falls on them as on folds. A bonnet has one fold, at half its length, by design.
+# s^2). Flanks keep their length, so their Gaussians leave no gaps, and they rotate, so that they
+# are shaded like folds. A bonnet has one fold at half its length, by design.
 
 WAVELENGTHS = (0.36, 0.17)
 """Of folds and of the creases between them, along the sheet [m]."""
@@ -146,12 +147,12 @@ OCCLUDED = 0.4
 
 @dataclass(frozen=True, eq=False)
 class FoldedSheet:
-    """Positions and looks of points on a sheet.
+    """Geometry and appearance of points on a sheet.
 
     Attributes:
         deformed: positions, F and rotation of each point.
-        light: [G] light on it against what fell on it before.
-        scraped: [G, 2] how much of the paint is gone, and how much is smeared; 0 to 1.
+        light: [G] light relative to the undeformed sheet.
+        scraped: [G, 2] fractions of paint scraped off and smeared, 0 to 1.
     """
 
     deformed: Deformed
@@ -163,12 +164,12 @@ class Sheet:
     """The skin of a vehicle.
 
     Args:
-        points: [G, 3] in the vehicle's frame [m].
-        rest: [N, 3] particles at rest in the same frame [m].
-        spacing: of the particles [m].
+        points: [G, 3] vehicle frame [m].
+        rest: [N, 3] particles at rest, same frame [m].
+        spacing: particle spacing [m].
         size: (length, width, height) of the vehicle [m].
-        smooth: [G] points that never fold, as wheels and glass.
-        seed: of where folds are.
+        smooth: [G] points that never fold, such as wheels and glass.
+        seed: seed of the fold positions.
     """
 
     def __init__(
@@ -196,7 +197,7 @@ class Sheet:
         self._hinge = np.clip((place[:, 0] - 1 + BONNET_BEHIND) / BONNET_BEHIND, 0.0, 1.0)
 
     def shortening(self, F: Float) -> Float:
-        """[G, 3] fraction by which sheet is shortened along the vehicle's axes."""
+        """[G, 3] relative shortening of the sheet along the vehicle axes."""
         shorter: Float = np.clip(1 - np.linalg.norm(F, axis=1) - ELASTIC, 0.0, STEEPEST)
         return shorter
 
@@ -204,9 +205,9 @@ class Sheet:
         """The sheet on a body.
 
         Args:
-            body: how R points move with the particles around them.
-            most: [R, 3] their largest shortening so far, of this instant too.
-            rows: [R] which points; all of a bonnet or none.
+            body: deformation of R points.
+            most: [R, 3] their largest shortening so far, including this instant.
+            rows: [R] indices of the points; include all points of a bonnet or none.
         """
         at_rest, foldable = self.normals[rows], self._foldable[rows]
         shortened = np.maximum(self.shortening(body.F), KEPT * most) * foldable[:, None]
@@ -246,13 +247,13 @@ class Sheet:
         return FoldedSheet(Deformed(positions, F, tilt @ body.rotations), light, scraped)
 
     def _pressed(self, body: Deformed, rows: NDArray[np.int64]) -> Float:
-        """[R] how far points were pushed in, from 0 to 1 (the greatest visible depth)."""
+        """[R] relative depth by which points are pushed in, 0 to 1 (maximum visible depth)."""
         depth = -((body.positions - self._points[rows]) * self.normals[rows]).sum(axis=1)
         pressed: Float = np.clip((depth - DENT[0]) / (DENT[1] - DENT[0]), 0.0, 1.0)
         return pressed
 
     def _bonnet_rise(self, shortened: Float, rows: NDArray[np.int64]) -> tuple[Float, Float]:
-        """[R] height by which the bonnet is raised, [R] and its slope."""
+        """[R] height by which the bonnet is raised, and [R] its slope."""
         raised, slope = np.zeros(len(shortened)), np.zeros(len(shortened))
         bonnet = self.bonnet[rows]
         if not bonnet.any():
@@ -280,7 +281,7 @@ def _outward(points: Float, rest: Float, spacing: float) -> tuple[Float, Float]:
 
 
 def _phases(points: Float, seed: int) -> Float:
-    """[3, 2, G] phases of folds and creases along each axis; they wander with the other axes."""
+    """[3, 2, G] phases of folds and creases along each axis; they vary along the other axes."""
     random = np.random.default_rng(seed)
     shifts = random.uniform(0, 2 * np.pi, (3, len(WAVELENGTHS), 3))
     phases = np.zeros((3, len(WAVELENGTHS), len(points)))
@@ -304,7 +305,7 @@ def _triangle(phase: Float) -> tuple[Float, Float]:
 
 
 def _lengthened(F: Float, shortened: Float) -> Float:
-    """F with the length back that folding takes up."""
+    """F with the length restored that folding takes up."""
     factors = 1 / np.maximum(1 - shortened, 1 - STEEPEST)
     longer: Float = F * factors[:, None, :]
     return longer
@@ -323,7 +324,7 @@ def _faces(F: Float, normals: Float) -> Float:
 
 
 def _between(first: Float, second: Float) -> Float:
-    """[G, 3, 3] smallest rotations that turn unit vectors ``first`` [G, 3] to ``second``."""
+    """[G, 3, 3] smallest rotations from unit vectors ``first`` [G, 3] to ``second``."""
     axis = np.cross(first, second)
     cosine = np.clip((first * second).sum(axis=1), -0.99, 1.0)
     cross = np.zeros((len(first), 3, 3))
@@ -336,9 +337,8 @@ def _between(first: Float, second: Float) -> Float:
 def _lit_from(normals: Float) -> Float:
     """[G, 3] direction of the light on surfaces with unit ``normals`` [G, 3] at rest.
 
-    What a surface shows at rest is how it was lit when it was seen, whichever side that was. So
-    light comes from above and beside each surface, never along it: however it is turned, it gets
-    lighter or darker.
+    The recorded colours include the original lighting. Light therefore comes from obliquely above
+    each surface, so that every rotation makes it lighter or darker.
     """
     x, y = normals[:, 0], normals[:, 1]
     beside = np.stack([x - y, x + y, np.zeros(len(x))], axis=1) * np.sqrt(0.5)
@@ -403,9 +403,9 @@ class DamagedVehicle:
     Args:
         cloud: its Gaussians at rest, object frame.
         rest: [N, 3] particles at rest, object frame [m].
-        spacing: of the particles [m].
-        category, size: of the object.
-        object_id: by which folds differ from vehicle to vehicle.
+        spacing: particle spacing [m].
+        category, size: category and size of the object.
+        object_id: id of the object; seeds the fold pattern.
     """
 
     def __init__(
@@ -446,8 +446,10 @@ class DamagedVehicle:
         )
 
     def shortening(self, displacements: Float) -> Float:
-        """[G, 3] by what fraction the sheet at each Gaussian is shorter along the vehicle's axes,
-        with particles displaced [N, 3] [m]; the largest so far goes into :meth:`cloud`."""
+        """[G, 3] relative shortening of the sheet at each Gaussian along the vehicle axes.
+
+        For particle displacements [N, 3] [m]. Pass the maximum so far to :meth:`cloud`.
+        """
         shorter = np.zeros((len(self._points), 3))
         rows = np.flatnonzero(self._embedding.near(_moved(displacements)))
         shorter[rows] = self._sheet.shortening(self._embedding.gradients(displacements, rows))
@@ -456,19 +458,19 @@ class DamagedVehicle:
     def cloud(
         self, displacements: Float, most: Float, broken: Mapping[str, float]
     ) -> GaussianCloud:
-        """The drawn Gaussians; those that nothing moved stay unchanged, bit for bit.
+        """The damaged Gaussians; undisplaced ones are bitwise unchanged.
 
         Args:
-            displacements: [N, 3] of its particles from rest [m].
+            displacements: [N, 3] particle displacements from rest [m].
             most: [G, 3] largest shortening so far.
-            broken: names of parts that have broken, and how long ago [s].
+            broken: names of broken parts, and the time since then [s].
         """
         changed = self._embedding.near(_moved(displacements)) | (most > 0).any(axis=1)
         if (changed & self._sheet.bonnet).any():
             changed |= self._sheet.bonnet
         rows = np.flatnonzero(changed)
         body = self._embedding.follow(displacements, rows)
-        # Only what differs from how the vehicle as a whole has moved is seen as damage.
+        # Only motion relative to the vehicle as a whole is damage.
         turn, shift = _carried(self._rest, displacements)
         folded = self._sheet.fold(_without(body, turn, shift), most[rows], rows)
         index = torch.from_numpy(rows).to(self._cloud.device)
@@ -490,7 +492,7 @@ class DamagedVehicle:
         return _split(replace(moved, means=means, sh=sh), rows, body.F)
 
     def _rows_of(self, part: Part) -> NDArray[np.int64]:
-        """Gaussians of a part: all at its place, without the paint around it."""
+        """Gaussians of a part: all in its box, without the surrounding paint."""
         inside = part.holds(self._points)
         if part.kind == "pane" and part.outward[1]:
             inside |= self._leaning(part)
@@ -509,7 +511,7 @@ class DamagedVehicle:
         return np.flatnonzero(inside)
 
     def _leaning(self, part: Part) -> NDArray[np.bool_]:
-        """[G] what belongs to side windows, which lean inwards further up, between the screens."""
+        """[G] whether Gaussians belong to side windows, which lean inwards between the screens."""
         low, high = np.array(part.low), np.array(part.high)
         inwards = LEANING * self._size[1]
         low[1], high[1] = (low[1] - inwards, high[1]) if low[1] > 0 else (low[1], high[1] + inwards)
@@ -519,7 +521,7 @@ class DamagedVehicle:
         return replace(part, low=tuple(low), high=tuple(high)).holds(self._points)
 
     def _painted(self) -> NDArray[np.bool_]:
-        """[G] whether a Gaussian is neither glass nor below the sills; all where none is left."""
+        """[G] whether a Gaussian is neither glass nor below the sills; all if none remains."""
         height = self._points[:, 2] / self._size[2] + 0.5
         painted: NDArray[np.bool_] = height > SILLS
         for part in self._parts.values():
@@ -528,7 +530,7 @@ class DamagedVehicle:
         return painted if painted.any() else np.ones(len(painted), dtype=bool)
 
     def _drooped(self, name: str, means: torch.Tensor, age: float) -> torch.Tensor:
-        """A bumper that hangs by one end; which one differs from vehicle to vehicle."""
+        """A bumper hanging by one end, which varies between vehicles."""
         rows = self._rows[name]
         if not len(rows):
             return means
@@ -541,7 +543,7 @@ class DamagedVehicle:
         sunk = np.minimum(sunk, places[:, 2] + self._size[2] / 2 - CLEARANCE)
         sunk = np.maximum(sunk, 0.0)
         places[:, 2] -= sunk
-        # It comes off forwards as well, where it is loose.
+        # The loose end also moves forwards.
         places[:, 0] += np.sign(places[:, 0].mean()) * LOOSE * sunk
         moved = means.clone()
         moved[rows] = torch.from_numpy(places.astype(np.float32)).to(means.device)
@@ -574,8 +576,7 @@ def _moved(displacements: Float) -> NDArray[np.bool_]:
 
 
 def _carried(rest: Float, displacements: Float) -> tuple[Float, Float]:
-    """Turn [3, 3] and shift [3] of most of a body's particles [N, 3]; what is crushed has little
-    weight."""
+    """Robust rotation [3, 3] and translation [3] of particles [N, 3]; crushed ones weigh little."""
     places = rest + displacements
     weights = np.ones(len(rest))
     for _ in range(CARRIED_ROUNDS):
@@ -591,12 +592,12 @@ def _carried(rest: Float, displacements: Float) -> tuple[Float, Float]:
 
 
 def _without(body: Deformed, turn: Float, shift: Float) -> Deformed:
-    """A body's points before it was turned and shifted."""
+    """Points of a body without the rigid motion ``turn`` and ``shift``."""
     return Deformed((body.positions - shift) @ turn, turn.T @ body.F, turn.T @ body.rotations)
 
 
 def _with(body: Deformed, turn: Float, shift: Float) -> Deformed:
-    """A body's points after it was turned and shifted."""
+    """Points of a body with the rigid motion ``turn`` and ``shift``."""
     return Deformed(body.positions @ turn.T + shift, turn @ body.F, turn @ body.rotations)
 
 
@@ -620,8 +621,10 @@ def _scraped(sh: torch.Tensor, rows: torch.Tensor, scraped: Float) -> torch.Tens
 
 
 def _split(cloud: GaussianCloud, changed: NDArray[np.int64], F: Float) -> GaussianCloud:
-    """The cloud with those Gaussians split in two that were stretched far, so that none is a needle
-    and nothing opens between them; F [R, 3, 3] is of those that were ``changed`` [R]."""
+    """The cloud with strongly stretched Gaussians split in two, to avoid needles and gaps.
+
+    F [R, 3, 3] belongs to the ``changed`` Gaussians [R].
+    """
     stretch = np.linalg.norm(F, axis=1).max(axis=1)
     rows = torch.from_numpy(changed[stretch > SPLIT]).to(cloud.device)
     if not len(rows):

@@ -1,7 +1,7 @@
-"""The recording vehicle as an object of its scene: visible and deformable.
+"""The recording vehicle as a visible, deformable object of its scene.
 
-No recording shows it, so Gaussians cover a plain car of its size: bonnet, cabin with dark glass,
-wheels. Its box stands on the recorded path, measured from the rear axle.
+Recordings do not show it, so it is a generic car of its size made of Gaussians: bonnet, cabin with
+dark glass, wheels. Its box follows the recorded rear axle.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class WithEgo:
 
 
 def with_ego(scene: Scene, state: PlacedObjects) -> tuple[Scene, PlacedObjects]:
-    """A scene and its objects including the ego; unchanged where an object has its id."""
+    """A scene and its objects including the ego; unchanged if an object already has its id."""
     if any(o.object_id == EGO for o in state.visible):
         return scene, state
     trajectory = _boxes(scene.ego, scene.ego_size)
@@ -72,7 +72,7 @@ def with_ego(scene: Scene, state: PlacedObjects) -> tuple[Scene, PlacedObjects]:
 
 
 def _boxes(ego: Trajectory, size: tuple[float, float, float]) -> Trajectory:
-    """Poses of the ego's box from those of its rear axle on the ground."""
+    """Poses of the ego's box, from those of its rear axle on the ground."""
     ahead = np.array([size[0] / 2 - REAR_OVERHANG, 0.0, size[2] / 2])
     shift = quaternion_to_matrix(ego.quaternions) @ ahead
     return Trajectory(ego.times_us, ego.positions + shift, ego.quaternions)
@@ -80,7 +80,7 @@ def _boxes(ego: Trajectory, size: tuple[float, float, float]) -> Trajectory:
 
 @lru_cache(maxsize=4)
 def ego_cloud(size: tuple[float, float, float]) -> GaussianCloud:
-    """Gaussians over the surface of a plain car of this size [m], in the frame of its box."""
+    """Surface Gaussians of a generic car of this size [m], box frame."""
     length, _, height = size
     along = _ticks(length)
     top = height * np.interp(along / length, ROOFLINE[:, 0], ROOFLINE[:, 1])
@@ -104,7 +104,7 @@ def ego_cloud(size: tuple[float, float, float]) -> GaussianCloud:
 
 
 def _ticks(extent: float) -> Float:
-    """Evenly spaced places from 0 to an extent, ends included [m]."""
+    """Evenly spaced positions from 0 to an extent, ends included [m]."""
     return np.linspace(0.0, extent, max(round(extent / STEP), 2) + 1)
 
 

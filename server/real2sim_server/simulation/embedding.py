@@ -1,8 +1,8 @@
-"""Gaussians in a body of moving particles: each follows the particles around it.
+"""Embedding of Gaussians in a body of particles: each Gaussian follows the particles around it.
 
-A Gaussian's map is the weighted least-squares affine fit to the motion of its nearest particles
-(moving least squares). The fit is linear in particle displacements, so its coefficients are found
-once. Any affine motion of the particles is reproduced exactly.
+The map of a Gaussian is the weighted least-squares affine fit to the motion of its nearest
+particles (moving least squares). The fit is linear in particle displacements, so its coefficients
+are computed once. It reproduces affine motions of the particles exactly.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Embedding:
         weights /= weights.sum(axis=1, keepdims=True)
         self._index: NDArray[np.int64] = index
         self._weights = weights
-        # Products of stacks of small matrices: einsum takes several times as long.
+        # Batched products of small matrices: einsum is several times slower.
         centre = (weights[:, None] @ rest[index])[:, 0]
         r = rest[index] - centre[:, None]
         weighted = weights[:, :, None] * r
@@ -68,7 +68,7 @@ class Embedding:
         self._slopes = weighted @ inverse
         self._centre = centre
         self._offset = points - centre
-        # Far from all particles only rotation is trusted.
+        # Far from all particles, only use the rotation.
         beyond = np.linalg.norm(self._offset, axis=1) / spacing
         self._trust = np.clip(2.5 - beyond, 0, 1)[:, None, None]
 
@@ -78,8 +78,7 @@ class Embedding:
         return found
 
     def gradients(self, displacements: Float, rows: NDArray[np.int64]) -> Float:
-        """[R, 3, 3] F of some points, without bounds on their stretch; a fraction of the cost of
-        :meth:`follow`."""
+        """[R, 3, 3] F of some points, without stretch limits; much faster than :meth:`follow`."""
         u = np.asarray(displacements, dtype=np.float64)[self._index[rows]]
         trust = self._trust[rows]
         F: Float = np.eye(3) + trust * (u.transpose(0, 2, 1) @ self._slopes[rows])
@@ -89,8 +88,8 @@ class Embedding:
         """Positions of the points under particle displacements [N, 3] [m].
 
         Args:
-            displacements: of all particles.
-            rows: points that are asked for; all by default.
+            displacements: displacements of all particles.
+            rows: indices of the points; all by default.
         """
         if rows is not None:
             return self._of(rows).follow(displacements)
@@ -114,10 +113,10 @@ class Embedding:
 
 
 def deform_cloud(cloud: GaussianCloud, deformed: Deformed) -> GaussianCloud:
-    """The Gaussians moved: mean, covariance F S F^T, colours turned by the rotation part of F.
+    """The deformed Gaussians: mean, covariance F S F^T, colours rotated by the rotation part of F.
 
-    Opacities and uncertainties stay. Covariances are decomposed into unit quaternions and scales
-    again.
+    Opacities and uncertainties are unchanged. Covariances are decomposed into unit quaternions and
+    scales again.
     """
     axes = quaternion_to_matrix(cloud.quats.detach().cpu().numpy())
     scales = cloud.scales.detach().cpu().numpy().astype(np.float64)
@@ -133,8 +132,10 @@ def deform_cloud(cloud: GaussianCloud, deformed: Deformed) -> GaussianCloud:
 
 
 def replaced_rows(cloud: GaussianCloud, rows: torch.Tensor, part: GaussianCloud) -> GaussianCloud:
-    """The cloud with other Gaussians ``part`` in ``rows`` [P] int64; opacities and uncertainties
-    stay."""
+    """The cloud with ``rows`` [P] int64 replaced by ``part``.
+
+    Opacities and uncertainties are unchanged.
+    """
 
     def replaced(name: str) -> torch.Tensor:
         values: torch.Tensor = getattr(cloud, name).detach().clone()
@@ -159,7 +160,7 @@ def _tensor(values: Float, like: GaussianCloud) -> torch.Tensor:
 
 
 def _turned(cloud: GaussianCloud, rotations: Float) -> torch.Tensor:
-    """Harmonics of each Gaussian turned by its own rotation."""
+    """Spherical harmonics of each Gaussian, rotated by its own rotation."""
     degree = cloud.sh_degree
     turned = np.abs(rotations - np.eye(3)).max(axis=(1, 2)) > TURNED
     if degree == 0 or not turned.any():

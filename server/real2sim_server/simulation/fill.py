@@ -1,8 +1,8 @@
-"""Particles from an object's Gaussians, with a filled interior.
+"""Conversion of an object's Gaussians to particles with a filled interior.
 
-Voxels covered by Gaussians are the shell. Voxels reachable from outside along an axis without
-crossing the shell are outside, the rest is inside. Where the recording hardly saw a side, typically
-the underside, the opposite side or the tracked box closes it.
+Voxels covered by Gaussians form the shell. Voxels reachable from outside along an axis without
+crossing the shell are outside; all others are inside. Sides that the recording hardly shows
+(typically the underside) are closed by the opposite side or the tracked box.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Filling:
-    """The filling of a body, for inspection before the simulation.
+    """A filled body, for inspection before the simulation.
 
     Attributes:
-        particles: Gaussians and interior, in the object's frame.
+        particles: Gaussians and interior, object frame.
         shell, inside: [X, Y, Z] voxels.
         origin: [3] corner of voxel (0, 0, 0) [m].
         spacing: edge of a voxel [m].
@@ -56,11 +56,11 @@ class Filling:
     def lattice(self, *, above: float = -np.inf) -> Particles:
         """One particle at the centre of each voxel of the largest connected piece.
 
-        Even particles make a smoother solid than Gaussians do, and fewer of them; Gaussians then
-        follow by :class:`~.embedding.Embedding`. Masses sum to those of ``particles``.
+        A regular lattice makes a smoother solid than Gaussians, with fewer particles; the Gaussians
+        follow it by :class:`~.embedding.Embedding`. The total mass is that of ``particles``.
 
         Args:
-            above: voxels with centres below this height in the object's frame are left out [m].
+            above: omit voxels with centres below this height, object frame [m].
         """
         solid = self.shell | self.inside
         heights = self.origin[2] + (np.arange(solid.shape[2]) + 0.5) * self.spacing
@@ -84,17 +84,17 @@ def fill_object(
     mass: float | None = None,
     category: str = "",
 ) -> Filling:
-    """Turn an object into particles whose masses sum to its mass.
+    """Convert an object to particles whose masses sum to its mass.
 
-    A voxel's volume is shared by the Gaussians in it; a voxel without any gets one particle at
-    its centre.
+    The Gaussians in a voxel share its volume; a voxel without Gaussians gets one particle at its
+    centre.
 
     Args:
-        cloud: Gaussians in the object's frame, origin at the box centre.
+        cloud: Gaussians, object frame with its origin at the box centre.
         size: (length, width, height) of the box [m].
         spacing: edge of a voxel [m]; about half a grid cell gives 8 particles per cell.
-        mass: of the object [kg]; the category's default when not given.
-        category: class of the object, for the default mass.
+        mass: mass of the object [kg]; default of its category if not given.
+        category: category of the object, for the default mass.
 
     Raises:
         ParticleError: for an object without solid Gaussians, a spacing that is not positive or too
@@ -118,7 +118,7 @@ def fill_object(
 
 
 def _solid_gaussians(cloud: GaussianCloud, size: Float) -> NDArray[np.int64]:
-    """Indices of the Gaussians that belong to the object."""
+    """Indices of the Gaussians that belong to the solid object."""
     means = cloud.means.detach().cpu().numpy().astype(np.float64)
     solid = cloud.opacities.detach().cpu().numpy() >= OPACITY_MIN
     slack = np.minimum(size * BOX_SLACK, BOX_SLACK_MAX)
@@ -150,7 +150,7 @@ def _covered_points(cloud: GaussianCloud, index: NDArray[np.int64], spacing: flo
 
 @dataclass(frozen=True)
 class _Side:
-    """A side of the box: how deep below it a surface still counts as that side's own."""
+    """A side of the box, with the maximum depth of its surface below it."""
 
     axis: int
     sign: int
@@ -172,11 +172,11 @@ SIDES = (
 def _inside(
     shell: Mask, size: Float, origin: Float, spacing: float
 ) -> tuple[Mask, tuple[str, ...]]:
-    """Voxels out of straight reach from outside, and the sides that the box closed.
+    """Voxels not reachable from outside along an axis, and the sides closed by the box.
 
-    From each side everything before the first surface is carved away. Holes in what a side shows
-    are closed from around them; a side hardly seen takes the depths of the side across where that
-    was seen (things on a street are alike left and right), or the face of the box.
+    Everything in front of the first surface is carved away from each side. Holes in a visible side
+    are filled from their surroundings. A hardly visible side uses the depths of the opposite side
+    if that is visible (street objects are roughly symmetric), else the face of the box.
     """
     solid = np.ones(shell.shape, dtype=bool)
     sealed = []
@@ -201,12 +201,12 @@ def _facing(mask: Mask, side: _Side) -> Mask:
 
 
 def len_along(mask: Mask, side: _Side) -> int:
-    """Voxels across the box, from that side to the one across."""
+    """Number of voxels from that side of the box to the opposite one."""
     return int(mask.shape[side.axis])
 
 
 def _depth(shell: Mask, side: _Side) -> tuple[NDArray[np.int64], bool]:
-    """Layers [A, B] before the first surface, all of them beside the silhouette; was it seen."""
+    """Layers [A, B] before the first surface (all outside the silhouette); whether it is seen."""
     along = _facing(shell, side)
     hit = along.any(axis=0)
     silhouette = ndimage.binary_closing(np.pad(hit, 4), iterations=4)[4:-4, 4:-4]
@@ -224,7 +224,7 @@ def _depth(shell: Mask, side: _Side) -> tuple[NDArray[np.int64], bool]:
 def _particles(
     cloud: GaussianCloud, index: NDArray[np.int64], solid: Mask, origin: Float, spacing: float
 ) -> Particles:
-    """Gaussians in solid voxels, and one particle for each solid voxel without any."""
+    """Gaussians in solid voxels, and one particle for each solid voxel without Gaussians."""
     means = cloud.means.detach().cpu().numpy()[index].astype(np.float64)
     voxel = np.floor((means - origin) / spacing).astype(int)
     voxel = np.clip(voxel, 0, np.array(solid.shape) - 1)

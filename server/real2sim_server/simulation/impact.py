@@ -1,8 +1,8 @@
-"""A single impact of two bodies: they deform while in contact and stay dented.
+"""A single impact of two bodies with permanent deformation.
 
-The closed loop has rigid bodies and instantaneous impacts; this module computes how an impact
-changes their shapes. It ignores road, gravity and wheels: over the tenth of a second of a crash
-they change velocities by a twentieth of the crash's effect.
+The closed loop has rigid bodies; this module computes how an impact changes their shapes. It
+ignores road, gravity and wheels: over the tenth of a second of a crash, their effect on velocities
+is about a twentieth of that of the crash.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class CrashBody:
     """A body before or after an impact, in its own frame.
 
     Attributes:
-        rest: particles as they were before anything happened, object frame.
+        rest: undeformed particles, object frame.
         materials, regions: see :class:`~.body.Body`.
-        friction: of its surface.
-        spacing: of the particles [m].
-        shape: what earlier impacts have left; None for none.
+        friction: friction coefficient of its surface.
+        spacing: particle spacing [m].
+        shape: shape after earlier impacts, or None.
     """
 
     rest: Particles
@@ -77,9 +77,9 @@ class ImpactBody:
     """A body before an impact.
 
     Attributes:
-        body: what it is.
+        body: the body.
         T_world_object: [4, 4].
-        velocity: [3] of its centre of mass [m/s].
+        velocity: [3] velocity of its centre of mass [m/s].
         yaw_rate: about the world's z axis [rad/s].
     """
 
@@ -99,11 +99,11 @@ class ImpactResult:
     """The effect of an impact on one body.
 
     Attributes:
-        body: as it is afterwards.
-        displacements: [F, N, 3] float32 of particles from rest, object frame [m]; every
-            ``FRAME_S`` from first contact on, the last one for good.
-        delta_v: [3] change of the velocity of its centre of mass [m/s].
-        depth: how far particles were moved by this impact at most [m].
+        body: the body after the impact.
+        displacements: [F, N, 3] float32 particle displacements from rest, object frame [m]; every
+            ``FRAME_S`` from first contact; the last one is permanent.
+        delta_v: [3] velocity change of its centre of mass [m/s].
+        depth: maximum particle displacement by this impact [m].
     """
 
     body: CrashBody
@@ -121,11 +121,11 @@ def object_body(
     """An object of a scene, filled with particles.
 
     Args:
-        cloud: its Gaussians in its own frame, origin at the box centre.
+        cloud: its Gaussians, object frame with its origin at the box centre.
         size: (length, width, height) of the box [m].
-        category: of the object; vehicles get crumple zones.
+        category: category of the object; vehicles get crumple zones.
         mass: [kg].
-        friction: of its surface.
+        friction: friction coefficient of its surface.
 
     Raises:
         ParticleError: as ``fill_object``.
@@ -141,9 +141,9 @@ def object_body(
 def vehicle_body(
     size: Sequence[float], *, mass: float, friction: float, spacing: float | None = None
 ) -> CrashBody:
-    """A vehicle known only by its box: bonnet, cabin and boot of a plain car.
+    """A generic car with bonnet, cabin and boot, from its box alone.
 
-    Origin of its frame: the centre of the box. ``spacing``: of particles [m].
+    The origin of its frame is the box centre. ``spacing``: particle spacing [m].
     """
     spacing = _spacing(size) if spacing is None else spacing
     block = box_particles(tuple(size), spacing=spacing, density=1.0)
@@ -171,21 +171,20 @@ def simulate_impact(
 ) -> tuple[ImpactResult, ImpactResult | None] | None:
     """Simulate a body's impact on another body or a rigid obstacle.
 
-    They are moved along their ways until they are just not in contact. Momentum of both together
-    stays; what they exchange is left to the solver.
+    Moves both along their velocities to just before contact, then solves the impact. Conserves
+    total momentum.
 
     Args:
-        first, second: about where they meet, with velocities from before they do.
+        first, second: bodies near the contact, with their velocities before it.
 
     Returns:
-        What became of both; None for a collider, and None for everything where they miss.
+        Results of both; None for a collider; None instead of both if they miss.
     """
     return ImpactSimulation(first, second).results()
 
 
 class ImpactSimulation:
-    """An impact, solved no further than somebody asks: images a tenth of a second later need the
-    shapes of a tenth of a second."""
+    """An impact solved incrementally, only as far as frames are requested."""
 
     def __init__(self, first: ImpactBody, second: ImpactBody | Box) -> None:
         """See :func:`simulate_impact`."""
@@ -212,11 +211,12 @@ class ImpactSimulation:
         self._steps = _collide(self._bodies, colliders, along, self._frames)
 
     def displacements(self, role: int, count: int) -> list[Float]:
-        """The first ``count`` frames of a body, see :class:`ImpactResult`; fewer where it is over
-        before, none where the bodies miss.
+        """The first ``count`` frames of a body, see :class:`ImpactResult`.
+
+        Fewer if the impact ends earlier; none if the bodies miss.
 
         Raises:
-            PhysicsError: the solver could not go on; what it had found until then stays.
+            PhysicsError: the solver failed; earlier frames remain available.
         """
         while self._steps is not None and len(self._frames[role]) < count:
             self._go_on()
@@ -253,7 +253,7 @@ def _mean_velocity(impact_bodies: Sequence[ImpactBody]) -> Float:
 def _free_path(
     first: ImpactBody, second: ImpactBody | Box, along: Float, cell: float
 ) -> float | None:
-    """How far ``first`` can go [m] until contact; None where it misses."""
+    """Distance [m] that ``first`` can move until contact; None if it misses."""
     side = np.cross([0.0, 0.0, 1.0], along)
     across = np.stack([side / np.linalg.norm(side), np.cross(along, side)])
     own = first.positions
@@ -270,7 +270,7 @@ def _free_path(
 
 
 def _outermost(places: Float, depths: Float, cell: float, choose: Any) -> dict[Any, float]:
-    """Of all points whose place across falls into one square of the grid, the outermost."""
+    """The outermost point in each square of a grid across the direction of motion."""
     found: dict[tuple[int, int], float] = {}
     for (i, j), depth in zip(np.floor(places / cell).astype(int).tolist(), depths, strict=True):
         found[i, j] = float(choose(found.get((i, j), depth), depth))
@@ -278,7 +278,7 @@ def _outermost(places: Float, depths: Float, cell: float, choose: Any) -> dict[A
 
 
 def _surface(box: Box, like: Float, cell: float) -> Float:
-    """[N, 3] points of a box in the world, near ``like`` in height."""
+    """[N, 3] points of a box, world frame, in the height range of ``like``."""
     pose, size = np.asarray(box.T_world_box), np.asarray(box.size)
     steps = [np.arange(-s / 2, s / 2 + cell / 4, cell / 2) for s in size]
     grid = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -311,8 +311,7 @@ def _collide(
     along: Float,
     histories: list[list[Float]],
 ) -> Iterator[None]:
-    """Step until they have parted, frame by frame; adds displacements of each body's particles to
-    its history."""
+    """Step until the bodies have separated; append each frame's particle displacements."""
     options = SolverOptions(dx=bodies[0].cell, gravity=(0.0, 0.0, 0.0), backend="cpu", cfl=CFL)
     solver = Solver([b.solver_body() for b in bodies], colliders, options)
     first = last = _closing(solver, along)
@@ -345,7 +344,7 @@ def _record_displacements(
     for body, state, history in zip(bodies, solver.states(), histories, strict=True):
         body.update_from_solver(state)
         moved = body.local_positions() - body.rest.positions
-        # Most of a body keeps its shape: that part is what its pose is the pose of.
+        # The pose is that of the undeformed majority of the body.
         history.append(moved - np.median(moved, axis=0))
 
 

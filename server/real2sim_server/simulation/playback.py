@@ -1,4 +1,4 @@
-"""Frames of a simulation as the renderer draws them."""
+"""Conversion of simulation frames to instances for the renderer."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ class PlacedObjects(Protocol):
 
 
 class Playback:
-    """A simulation's result in its scene.
+    """Playback of a simulation result in its scene.
 
     Args:
-        scene: holds the Gaussians.
-        state: the scenario's objects, the ones that were simulated.
-        result: of ``simulate`` on both.
+        scene: scene with the Gaussians.
+        state: scenario state that was simulated.
+        result: result of ``simulate`` on both.
 
     Raises:
-        PhysicsError: when the result has objects that the state has not.
+        PhysicsError: if the result has objects that the state lacks.
     """
 
     def __init__(self, scene: Scene, state: PlacedObjects, result: SimulationResult) -> None:
@@ -85,14 +85,14 @@ class Playback:
         self._damaged: dict[str, _Damaged] = {}
 
     def instances(self, frame: int, *, without: Collection[str] = ()) -> list[Instance]:
-        """The background, then simulated objects at ``frame``, other objects as recorded.
+        """The background, simulated objects at ``frame``, and other objects as recorded.
 
         Args:
-            frame: of the result.
-            without: ids of objects that are left out.
+            frame: frame of the result.
+            without: ids of objects to omit.
 
         Raises:
-            PhysicsError: for a frame that there is not.
+            PhysicsError: for a frame out of range.
         """
         if not 0 <= frame < self.result.frames:
             raise PhysicsError(f"frame {frame}; there are 0 to {self.result.frames - 1}")
@@ -112,7 +112,7 @@ class Playback:
         return instances + self._fragments(frame, without)
 
     def _fragments(self, frame: int, without: Collection[str]) -> list[Instance]:
-        """Fragments of vehicles at that time, with their ids."""
+        """Fragments of vehicles at that time, with the ids of the vehicles."""
         time_s, found = float(self.result.times_s[frame]), []
         for subject in self.state.visible:
             broken = self._breakages.get(subject.object_id)
@@ -153,7 +153,7 @@ class Playback:
         return _placed(kept[1], pose, subject)
 
     def _damage(self, subject: PlacedObject) -> _Damaged | None:
-        """Visible damage of a vehicle; None where breakages were not recorded."""
+        """Visible damage of a vehicle; None if breakages were not recorded."""
         if self.result.breakages is None or subject.category not in VEHICLES:
             return None
         key = subject.object_id
@@ -184,7 +184,7 @@ class Playback:
         return replace(cloud, means=cloud.means + shift)
 
     def _cloud(self, subject: PlacedObject) -> GaussianCloud:
-        """At rest, in the colours of the start: deforming light is not recorded anywhere."""
+        """Gaussians at rest, in the colours at the start."""
         key = subject.object_id
         if key not in self._clouds:
             source = self.scene.object(subject.source_id)
@@ -223,13 +223,13 @@ class _Damaged:
         self._most: Float | None = None
 
     def state(self, row: int, time_s: float) -> Hashable:
-        """The look depends on this state alone; a loose bumper keeps moving for a while."""
+        """A key that determines the appearance; changes while a loose bumper moves."""
         ages = [time_s - b.time_s for b in self._broken if b.time_s <= time_s]
         loose = [round(min(age, HANGING), 6) for age in ages]
         return row, tuple(loose)
 
     def cloud(self, shown: int, time_s: float) -> GaussianCloud:
-        """What is drawn of it in the shape ``shown``, ``time_s`` [s] after the start."""
+        """Its Gaussians in the shape ``shown``, ``time_s`` [s] after the start."""
         if self._most is None or self._upto > shown:
             self._upto, self._most = 0, None
         for row in range(self._upto, shown + 1):
@@ -253,7 +253,7 @@ def _placed(
 
 
 def _in_wheels(means: NDArray[np.float32], wheels: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[G, W] which Gaussians belong to which wheel, by undersides [W, 3] in the same frame."""
+    """[G, W] whether Gaussians belong to each wheel; undersides [W, 3], same frame."""
     offset = means[:, None] - (wheels + np.array([0, 0, WHEEL_RADIUS], dtype=np.float32))
     in_disc = np.hypot(offset[..., 0], offset[..., 2]) < WHEEL_RADIUS + 0.02
     inside: NDArray[np.bool_] = in_disc & (np.abs(offset[..., 1]) < WHEEL_HALF_WIDTH)

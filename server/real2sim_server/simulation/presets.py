@@ -1,5 +1,4 @@
-"""Materials of objects: the paper's soft bodies, vehicles with crumple zones, and values over
-them."""
+"""Material presets: the paper's soft bodies, vehicles with crumple zones, and overrides."""
 
 from __future__ import annotations
 
@@ -25,23 +24,23 @@ Build = tuple[Sequence[Material], NDArray[np.int64], Particles]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ObjectPhysics:
-    """What is known of one object; None takes the preset's or the recording's value.
+    """Physical values of one object; None uses the preset's or the recorded value.
 
     Attributes:
         mass: [kg].
-        density: of what it is filled with [kg/m^3], where ``mass`` is not given.
-        material: of the whole object, instead of the preset's regions.
+        density: density of the filled object [kg/m^3], if ``mass`` is None.
+        material: material of the whole object, instead of the preset's regions.
         friction: Coulomb coefficient of its surface.
-        restitution: wanted rebound from a rigid wall, reached by added viscosity.
-        velocity: [3] at the start, world [m/s]; the recorded one when None.
-        angular_velocity: [3] at the start, world [rad/s].
-        T_world_object: [4, 4] where it starts; where the recording has it when None.
-        brake: fraction of the wheels' grip that is braked, 0 to 1; when None, standing vehicles are
-            braked, moving ones roll until they are hit.
-        grid: cells along twice its longest edge, as the paper counts them; the preset's when None.
+        restitution: coefficient of restitution on a rigid wall, reached by added viscosity.
+        velocity: [3] initial velocity, world frame [m/s]; None for the recorded one.
+        angular_velocity: [3] initial angular velocity, world axes [rad/s].
+        T_world_object: [4, 4] initial pose; None for the recorded one.
+        brake: braked fraction of the wheels' grip, 0 to 1; if None, stationary vehicles are braked
+            and moving ones roll until they are hit.
+        grid: number of cells along twice its longest edge, as in the paper; None for the preset's.
 
     Raises:
-        PhysicsError: for a value out of its range.
+        PhysicsError: for a value out of range.
     """
 
     mass: float | None = None
@@ -77,21 +76,21 @@ class ObjectPhysics:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """A rule that turns objects into bodies.
+    """Rules for converting objects to bodies.
 
     Attributes:
         name: ``paper`` or ``vehicle``.
-        spacing: of particles [m]; cells are twice as large.
-        vehicle_spacing: the same where only vehicles take part: zones of a vehicle are so large
-            that they fold alike on coarser cells.
-        cfl: fraction of a cell that waves may cross in a substep; what is damped is as stable with
-            longer substeps as elastic bodies are with shorter ones.
-        friction: of surfaces against each other and the ground.
+        spacing: particle spacing [m]; cells are twice as large.
+        vehicle_spacing: the same if only vehicles take part; their crumple zones are large enough
+            for coarser cells.
+        cfl: fraction of a cell that waves may cross in a substep; damped materials allow longer
+            substeps than elastic ones.
+        friction: friction coefficient between surfaces and on the ground.
         wheels: whether vehicles stand on tyres.
-        clearance: height under vehicles on tyres that is wheels, not body [m].
-        by_density: whether mass is the material's density times volume, not kilograms per class.
-        build: (category, particles in the object's frame, their spacing) -> materials, index of
-            the material of each particle, and the particles with their masses.
+        clearance: height of the wheels below the body of vehicles on tyres [m].
+        by_density: whether mass is density times volume instead of the default of the category.
+        build: ``build(category, particles, spacing)``, returns materials, the material index of
+            each particle, and the particles with their masses; object frame.
     """
 
     name: str
@@ -106,7 +105,7 @@ class Preset:
 
 
 def _paper(category: str, particles: Particles, spacing: float) -> Build:
-    """Table II of the paper: E 2e6 Pa, nu 0.4, rho 200 kg/m^3, fixed corotated, all through."""
+    """Table II of the paper: homogeneous, fixed corotated, E 2e6 Pa, nu 0.4, rho 200 kg/m^3."""
     soft = FixedCorotated(young=2e6, poisson=0.4, density=200.0)
     return (soft,), np.zeros(len(particles), dtype=np.int64), particles
 
@@ -149,19 +148,18 @@ def preset_of(name: str) -> Preset:
     """The preset with this name.
 
     Raises:
-        PhysicsError: when there is none.
+        PhysicsError: for an unknown name.
     """
     if name not in PRESETS:
         raise PhysicsError(f"unknown preset {name!r}; allowed are {', '.join(PRESETS)}")
     return PRESETS[name]
 
 
-# An object's physical values from edits, requests and commands, over known defaults.
+# Overrides of an object's physical values by edits, requests and commands.
 
 
 def with_values(own: ObjectPhysics, *given: PhysicsValues | None) -> ObjectPhysics:
-    """What is known of an object, with the values that are given in place of those; later ones go
-    before earlier ones.
+    """The physical values of an object with overrides; later ones take precedence.
 
     Raises:
         MaterialError: for a value that the material does not have.
@@ -185,7 +183,7 @@ def with_values(own: ObjectPhysics, *given: PhysicsValues | None) -> ObjectPhysi
 
 
 def _material(fields: dict[str, Any]) -> Material | None:
-    """The one material that values ask for; None where they leave that to the category."""
+    """The single material of the values; None if the category determines the materials."""
     values = {n: fields[n] for n in ("young", "poisson", "density", "yield_stress") if n in fields}
     name = fields.get("material")
     if name is None and values.keys() <= {"density"}:

@@ -1,8 +1,8 @@
-"""Restitution of simulated bodies: fitted before an impact, and enforced when the bodies part.
+"""Restitution of simulated bodies: fitted before an impact, enforced at separation.
 
-The rebound of a body on a grid depends on where the surface lies between nodes and how it is
-turned: an elastic block keeps 0.6 to 0.9 of its speed. So the fit follows the body to the first
-collider it meets, and finds the viscosity by test impacts right there.
+The rebound of a body on a grid depends on the position and orientation of the surface relative to
+the nodes: an elastic block keeps 0.6 to 0.9 of its speed. The fit therefore follows the body to its
+first contact with a collider and determines the viscosity by test impacts at that place.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from .rigid import RigidMotion, clearance
 
 # The end of an impact between bodies with a given restitution.
 #
-# Surfaces on a grid meet node by node, without rebound, and the loss depends on where nodes lie. So
-# an impact is followed from its first to its last impulse. What is missing from Newton's
-# restitution at the contact is one more impulse when the bodies part: along the normal, through the
-# centre of the earlier impulses, and on both sides, so that momentum and angular momentum are
-# conserved. With a restitution of at most 1 it never returns more energy than the impact took.
+# Surfaces on a grid collide node by node, without rebound, and the loss depends on node positions.
+# Each impact is therefore tracked from its first to its last impulse. The deficit to Newton's
+# restitution is applied as one more impulse at separation: along the normal, through the centre of
+# the earlier impulses, and on both sides, so that momentum and angular momentum are conserved. With
+# a restitution of at most 1, it never returns more energy than the impact took.
 #
-# Simultaneous impacts that share a body form one chain, as where the first of three touching bodies
-# is struck. They are resolved one after the other, the fastest approach first, so the last of equal
-# bodies leaves with the momentum of the first. A wave passes from one elastic body to the next as
-# through one piece, so the impact leaves its vibration once, not at every face.
+# Simultaneous impacts that share a body form a chain, for example when the first of three touching
+# bodies is struck. They are resolved one after the other, fastest approach first, so the last of
+# equal bodies leaves with the momentum of the first. A wave passes through touching elastic bodies
+# as through one piece, so vibration losses occur once, not at every face.
 
 QUIET = 2
 """An impact is over after so many steps without an impulse."""
@@ -58,11 +58,11 @@ class Bounce:
     """One impact of a body with a given restitution.
 
     Attributes:
-        body, other: who, on what.
-        time_s: when they parted.
-        speed: of approach along the normal [m/s].
-        grid: separation over approach speed as the grid left it.
-        achieved: as it is now.
+        body, other: the body, and the body or collider that it hit.
+        time_s: time of separation [s].
+        speed: approach speed along the normal [m/s].
+        grid: restitution on the grid, before the correction.
+        achieved: restitution after the correction.
     """
 
     body: str
@@ -78,10 +78,10 @@ class Correction:
     """The correction to one body at the end of an impact.
 
     Attributes:
-        body: that gets it.
-        other: name of what gave it.
+        body: body that receives the impulse.
+        other: name of the body or collider on the other side.
         impulse: [3] [N s].
-        after: motion of the body with it.
+        after: motion of the body after it.
     """
 
     body: DeformableBody
@@ -92,8 +92,8 @@ class Correction:
 
 @dataclass(eq=False)
 class _Impact:
-    """An impact under way: motions before it, and impulse and moment on the body so far; for how
-    long, and for how many steps nothing has acted."""
+    """An ongoing impact: motions before it, impulse and moment on the body so far, its duration,
+    and the number of steps without impulse."""
 
     before: tuple[RigidMotion, ...]
     impulse: Float = field(default_factory=lambda: np.zeros(3))
@@ -107,13 +107,13 @@ class _Meeting:
     """One impact of a finished chain.
 
     Attributes:
-        sides: the body, and the other where that is one.
-        other: what it has hit.
-        point, normal: where [m], and the unit normal towards the body.
-        requested: restitution.
-        still: speed along the normal of what is no body, when it began and now [m/s].
-        hands_on: of none of its sides anything was requested, so that waves pass between them
-            without loss where they touched before the chain began.
+        sides: the body, and the other body, if any.
+        other: name of the body or collider that was hit.
+        point, normal: contact point [m], and unit normal towards the body.
+        requested: requested restitution.
+        still: speed of a collider along the normal, at the start and now [m/s].
+        hands_on: whether no side has a requested restitution; waves then pass without loss between
+            sides that touched before the chain began.
     """
 
     sides: tuple[DeformableBody, ...]
@@ -125,7 +125,7 @@ class _Meeting:
     hands_on: bool
 
     def apart(self, motions: Mapping[str, RigidMotion]) -> float:
-        """Speed at which the sides part, or the body from what does not move [m/s]."""
+        """Separation speed of the sides, or of the body from a collider [m/s]."""
         speeds = [float(self._velocity(motions[s.name], s) @ self.normal) for s in self.sides]
         return speeds[0] - sum(speeds[1:])
 
@@ -136,11 +136,11 @@ class _Meeting:
 
     @property
     def ease(self) -> float:
-        """Speed at which the sides part by one N s between them [1/kg]."""
+        """Change of the separation speed per impulse between the sides [1/kg]."""
         return sum(_ease(s.motion, self.point - s.motion.centre, self.normal) for s in self.sides)
 
     def pushed(self, motions: dict[str, RigidMotion], impulse: float) -> None:
-        """Change motions by an impulse [N s] between the sides, turning about the present place."""
+        """Change motions by an impulse [N s] between the sides at the contact point."""
         for sign, side in zip((1.0, -1.0), self.sides, strict=False):
             now = motions[side.name]
             lever = self.point - side.motion.centre
@@ -157,7 +157,7 @@ class Bounces:
     """Impacts of bodies with a requested restitution or without damping, step by step.
 
     Attributes:
-        log: those that are over.
+        log: finished impacts.
     """
 
     def __init__(self) -> None:
@@ -171,7 +171,7 @@ class Bounces:
         return [{k: _rounded(v) for k, v in m.items() if k != "body"} for m in members]
 
     def start_solver(self) -> None:
-        """A new solver counts impulses from zero."""
+        """Reset the impulse counters for a new solver."""
         self._totals = {}
 
     def forget(self, body: DeformableBody) -> None:
@@ -188,14 +188,14 @@ class Bounces:
     ) -> Iterator[Correction]:
         """Advance by one solver step; returns the corrections of finished impacts.
 
-        Each is to take effect before the next is asked for.
+        Apply each correction before requesting the next.
 
         Args:
-            contacts: of the solver, since its start.
-            bodies: in the solver, as they are now.
-            colliders: as they are now.
+            contacts: contacts of the solver since its start.
+            bodies: current bodies in the solver.
+            colliders: current colliders.
             before: motions of the bodies before the step.
-            step: time now and length of the step [s], and gravity [m/s^2].
+            step: current time and length of the step [s], and gravity [m/s^2].
         """
         wanted = {b.name: b for b in bodies if _restitution(b) is not None}
         walls = {c.name: c for c in colliders}
@@ -256,7 +256,7 @@ class Bounces:
         walls: Mapping[str, Collider],
         step: tuple[float, float, Float],
     ) -> Iterator[Correction]:
-        """The impulses with which bodies of a chain and what they hit part as requested."""
+        """The impulses that give a finished chain its requested restitutions."""
         meetings: list[_Meeting] = []
         before: dict[str, RigidMotion] = {}
         for pair, impact in chain.items():
@@ -275,7 +275,7 @@ class Bounces:
         if max(approaches) < SLOWEST or (len(meetings) == 1 and speeds[0] <= 0):
             return
         give = np.array([m.apart(after) - m.still[0] for m in meetings]) - speeds
-        # What is at least so elastic on the grid stays as it has it.
+        # Impacts that are already elastic enough on the grid remain unchanged.
         given = [not m.hands_on for m in meetings]
         if any(given):
             give = np.where(given, give, np.maximum(give, 0.0))
@@ -323,7 +323,7 @@ def _meeting(
 
 
 def _restitution(body: DeformableBody) -> float | None:
-    """What was requested of a body, or what one has that nothing damps; None for what else is."""
+    """The requested restitution of a body, or that of an undamped body; else None."""
     if body.rebound is not None:
         return body.rebound.requested
     return ELASTIC if body.is_undamped else None
@@ -332,9 +332,11 @@ def _restitution(body: DeformableBody) -> float | None:
 def _one_after_the_other(
     meetings: Sequence[_Meeting], before: Mapping[str, RigidMotion]
 ) -> tuple[list[float], dict[str, RigidMotion]]:
-    """Fastest approach of each impact of a chain [m/s], and motions in the end, by Newton's
-    restitution at the fastest approach until there is none. Elastic bodies that did not come nearer
-    to each other when the chain began touched."""
+    """Fastest approach of each impact of a chain [m/s], and the final motions.
+
+    Applies Newton's restitution to the fastest approach until no sides approach. Elastic bodies
+    that were not approaching when the chain began were touching.
+    """
     motions = dict(before)
     fastest = [0.0] * len(meetings)
     first = [m.still[0] - m.apart(motions) for m in meetings]
@@ -354,14 +356,14 @@ def _one_after_the_other(
 
 
 def _kinetic(motions: Mapping[str, RigidMotion]) -> float:
-    """Energy of bodies in motion [J]."""
+    """Kinetic energy [J]."""
     return sum(m.kinetic for m in motions.values())
 
 
 def _corrections(
     meetings: Sequence[_Meeting], now: Mapping[str, RigidMotion], give: Float
 ) -> Iterator[Correction]:
-    """Impulses that change the speeds at which sides part by ``give`` [m/s]."""
+    """Impulses that change the separation speeds by ``give`` [m/s]."""
     response = np.zeros((len(meetings), len(meetings)))
     for k, m in enumerate(meetings):
         pushed = dict(now)
@@ -385,7 +387,7 @@ def _centre(impact: _Impact, near: Float) -> Float:
 
 
 def _ease(motion: RigidMotion, lever: Float, normal: Float) -> float:
-    """Change of speed along the normal by one N s along it at a lever [1/kg]."""
+    """Change of the normal speed per normal impulse at a lever arm [1/kg]."""
     turn = np.cross(lever, normal)
     return 1.0 / motion.mass + float(turn @ np.linalg.solve(motion.world_inertia, turn))
 
@@ -415,11 +417,11 @@ class FirstTouch:
     """A body's first contact with a collider on its path.
 
     Attributes:
-        motion: of the body then.
-        collider: as it is then, brought to rest.
-        point: on its surface [m].
-        normal: out of it there.
-        speed: of approach along the normal [m/s].
+        motion: motion of the body at that time.
+        collider: the collider at that time, brought to rest.
+        point: point on its surface [m].
+        normal: outward normal there.
+        speed: approach speed along the normal [m/s].
     """
 
     motion: RigidMotion
@@ -435,10 +437,10 @@ def fit_rebound(
     """Add the viscosity with which a body rebounds from its first collider as ``requested``.
 
     Args:
-        body: at its start; its materials change.
+        body: body at its start; its materials are modified.
         requested: coefficient of restitution.
-        colliders: that its surface may meet.
-        gravity: [3] on its way there [m/s^2].
+        colliders: colliders that it may hit.
+        gravity: [3] gravity on its path to the collider [m/s^2].
     """
     touch = first_touch(body, colliders, gravity)
     trial = copy.copy(body)
@@ -477,8 +479,8 @@ def first_touch(
     """The first collider on a body's path, flying or rolling straight; None without one.
 
     Args:
-        body: at its start.
-        colliders: as they are then.
+        body: body at its start.
+        colliders: colliders at that time.
         gravity: [3] [m/s^2].
     """
     motion, now = body.motion, list(colliders)
@@ -511,7 +513,7 @@ def first_touch(
 
 
 def _is_far(solid: Solid, centre: Float, reach: float) -> bool:
-    """Whether a solid is further from a point than ``reach`` [m] and a body's surface."""
+    """Whether a solid is further than twice ``reach`` [m] from a point."""
     low, high = solid.bounds
     extent = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
     away = float(np.linalg.norm(solid.pose[:3, 3] - centre))
@@ -519,7 +521,7 @@ def _is_far(solid: Solid, centre: Float, reach: float) -> bool:
 
 
 def _still(body: DeformableBody) -> Any:
-    """The body at its place for the solver; the velocities are those of the test impact."""
+    """The body for the solver, at its place; the test impact sets the velocities."""
     return replace(body.solver_body(), particle_velocities=None, particle_gradients=None)
 
 

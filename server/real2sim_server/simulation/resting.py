@@ -1,10 +1,9 @@
-"""Resting contact: rigid contacts that persist from step to step, and stability at rest.
+"""Resting contact: persistent rigid contacts, and stability at rest.
 
-On a grid, bodies that lie on each other sink a little with every step and never stop. Once they no
-longer deform they become rigid, and forces at their contact points keep them apart: never
-attractive, with Coulomb friction, and such that no point goes deeper than when the contact began
-(sequential impulses; Catto 2005). Each step starts from the forces of the last. An approach faster
-than GENTLE_THRESHOLD is an impact and deforms.
+On a grid, stacked bodies keep sinking into each other. Once they no longer deform, they become
+rigid, and contact forces separate them: repulsive, with Coulomb friction, and preventing deeper
+penetration than at the start of the contact (sequential impulses; Catto 2005). Each step is warm
+started from the previous one. An approach faster than GENTLE_THRESHOLD is an impact and deforms.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from ..physics.colliders import Collider
 from .body import BodyMode, DeformableBody
 from .rigid import RigidMotion, clearance, rotation_of
 
-# Stability at rest: forces of the contacts against gravity.
+# Stability at rest: contact forces against gravity.
 #
 
 GAP_CELLS = 0.15
@@ -45,7 +44,7 @@ class Contacts:
         other: name of the collider or body.
         points: [K, 3] [m].
         normals: [K, 3] towards the body, unit.
-        friction: most friction over normal force in a direction [3] along the surface.
+        friction: maximum friction over normal force in a direction [3] along the surface.
     """
 
     other: str
@@ -61,14 +60,14 @@ def supports_of(
     others: Iterable[DeformableBody],
     gravity: Float,
 ) -> tuple[str, ...] | None:
-    """Names of a resting body's supports, or None where it would not stay.
+    """Names of the supports of a resting body, or None if it is not stable.
 
     Args:
-        body: as it is now.
-        colliders: that touch its surface.
-        road: those that carry tyres.
-        others: bodies at rest that may carry it.
-        gravity: [3] [m/s^2]; without any, nothing has to hold it.
+        body: the body.
+        colliders: colliders that touch its surface.
+        road: colliders that support tyres.
+        others: resting bodies that may support it.
+        gravity: [3] [m/s^2]; without gravity, no support is needed.
     """
     if not np.any(gravity):
         return ()
@@ -81,7 +80,7 @@ def supports_of(
 
 
 def _wheel_contacts(body: DeformableBody, road: Sequence[Collider]) -> Iterable[Contacts]:
-    """Wheels that carry; locked along their way as far as brakes hold."""
+    """Contacts of loaded wheels; brakes limit the friction along the rolling direction."""
     if body.tyres is None or not road:
         return
     tyres, pose = body.tyres, body.T_world_object
@@ -111,7 +110,7 @@ def collider_contacts(body: DeformableBody, colliders: Sequence[Collider]) -> It
 
 
 def body_contacts(body: DeformableBody, others: Iterable[DeformableBody]) -> list[Contacts]:
-    """Contacts with another body's particles; the normal is the mean direction from them."""
+    """Contacts with particles of other bodies; the normal is the mean direction from them."""
     from scipy.spatial import cKDTree
 
     contacts: list[Contacts] = []
@@ -136,7 +135,7 @@ def body_contacts(body: DeformableBody, others: Iterable[DeformableBody]) -> lis
 
 
 def _by_normal(name: str, points: Float, normals: Float, mu: float) -> Iterable[Contacts]:
-    """Contacts grouped by similar normals, the outermost points of each."""
+    """Contacts grouped by similar normals, with the outermost points of each group."""
     if not len(points):
         return
     _, group = np.unique(np.round(4 * normals), axis=0, return_inverse=True)
@@ -154,7 +153,7 @@ def _outermost(points: Float, normal: Float) -> Float:
 
 
 def tangents(normal: Float, pull: Float) -> tuple[Float, Float]:
-    """Two unit vectors along the surface: against ``pull``, and across it."""
+    """Two unit tangents of the surface: against ``pull``, and perpendicular to it."""
     along = (pull @ normal) * normal - pull
     length = float(np.linalg.norm(along))
     if length < 1e-6 * float(np.linalg.norm(pull)):
@@ -165,7 +164,7 @@ def tangents(normal: Float, pull: Float) -> tuple[Float, Float]:
 
 
 def _balanced(body: DeformableBody, contacts: Sequence[Contacts], gravity: Float) -> bool:
-    """Whether forces within all friction cones hold the weight, without a moment."""
+    """Whether forces within the friction cones balance weight and moments."""
     from scipy.optimize import nnls
 
     if not contacts:
@@ -213,14 +212,14 @@ class ContactPoint:
     """One contact point of a body.
 
     Attributes:
-        body: that is carried.
-        other: what carries it.
-        local: [3] the point, body frame [m].
-        there, normal: [3] where it touches another body and the unit normal towards this one, in
-            the frame of the other [m]; of colliders they are looked up.
-        rest: gap at which it carries [m].
+        body: the supported body.
+        other: the supporting body or collider.
+        local: [3] contact point, body frame [m].
+        there, normal: [3] contact point and unit normal towards this body, in the frame of the
+            other body [m]; computed on demand for colliders.
+        rest: gap at which it carries load [m].
         friction: Coulomb coefficient.
-        impulse: [3] of the last step: along the normal and two tangents [N s].
+        impulse: [3] impulse of the last step along the normal and two tangents [N s].
     """
 
     body: DeformableBody
@@ -233,7 +232,7 @@ class ContactPoint:
     impulse: Float = field(default_factory=lambda: np.zeros(3))
 
     def place(self) -> tuple[Float, Float, float, float]:
-        """Where it is [m], the normal, the gap beyond ``rest`` and how far it has slid [m]."""
+        """Position [m], normal, gap beyond ``rest`` [m] and sliding distance [m]."""
         own = _into(self.body.T_world_object, self.local)
         if not isinstance(self.other, DeformableBody):
             distance, normals = clearance(self.other, own[None])
@@ -250,9 +249,9 @@ class Reaction:
     """The effect of a contact in one step.
 
     Attributes:
-        body, other: on whom, by whom.
-        impulse: [3] on the body, world [N s].
-        heat: dissipated by friction, half of it on each side of two bodies [J].
+        body, other: the affected body, and the other body or collider.
+        impulse: [3] impulse on the body, world frame [N s].
+        heat: energy dissipated by friction, half of it on each of two bodies [J].
     """
 
     body: str
@@ -268,7 +267,7 @@ class RestingContacts:
         self._touches: dict[Pair, list[ContactPoint]] = {}
 
     def holds(self, body: DeformableBody, other: str) -> bool:
-        """Whether a body and another, or a collider, touch here."""
+        """Whether there is a contact between a body and another body or collider."""
         return (body.name, other) in self._touches or (other, body.name) in self._touches
 
     def partners(self, body: DeformableBody) -> set[str]:
@@ -296,11 +295,11 @@ class RestingContacts:
         colliders: Sequence[Collider],
         others: Iterable[DeformableBody],
     ) -> bool | None:
-        """Add a body with gentle contact; returns whether it is gentle, None without contact.
+        """Add a body if its contacts are gentle; return whether they are, None without contact.
 
         Args:
-            body: that keeps its shape.
-            colliders: at rest, that touch its surface.
+            body: rigid body.
+            colliders: colliders at rest that touch its surface.
             others: bodies that it may touch.
         """
         found: list[tuple[Pair, list[ContactPoint]]] = []
@@ -316,15 +315,15 @@ class RestingContacts:
         return True if self.partners(body) else None
 
     def end(self, body: DeformableBody) -> None:
-        """Forget all contacts of a body: from now on the grid or nothing holds it."""
+        """Remove all contacts of a body."""
         self._touches = {p: t for p, t in self._touches.items() if body.name not in p}
 
     def solve(self, duration: float, starts: Mapping[str, Float]) -> list[Reaction]:
         """Apply contacts to bodies that have moved freely; returns their reactions.
 
         Args:
-            duration: for how long they have [s].
-            starts: [3] by name, where centres of mass were before that [m].
+            duration: duration of the free motion [s].
+            starts: [3] centres of mass before it, by name [m].
         """
         self._look_again()
         touches = [t for own in self._touches.values() for t in own]
@@ -346,7 +345,7 @@ class RestingContacts:
         for _ in range(SWEEPS):
             for row in rows:
                 row.relax()
-        # Bodies that part are not shifted: angular momentum goes with where velocities are.
+        # Separating bodies are not shifted, which would change the angular momentum.
         deep = [row for row in rows if row.is_deep and row.carries]
         for _ in range(PUSH_SWEEPS):
             for row in deep:
@@ -357,8 +356,7 @@ class RestingContacts:
         return [reaction for row in rows for reaction in row.reactions()]
 
     def _look_again(self) -> None:
-        """Find pairs anew whose points have slid or opened; forget those that are apart, and those
-        that strike."""
+        """Update pairs whose points have slid or opened; remove separated pairs and impacts."""
         for pair, touches in list(self._touches.items()):
             body, other = touches[0].body, touches[0].other
             reach = DRIFT * body.spacing
@@ -372,7 +370,7 @@ class RestingContacts:
             for touch in known:
                 nearest = min(touches, key=lambda t: float(np.abs(t.local - touch.local).sum()))
                 touch.impulse = nearest.impulse * (len(touches) / len(known))
-            # What falls over strikes with its far edge: that is an impact.
+            # A body that tips over strikes with its far edge, which is an impact.
             if known and all(_closing(t) <= GENTLE_THRESHOLD for t in known):
                 self._touches[pair] = known
             else:
@@ -391,7 +389,7 @@ def touches_any(
 def _on_collider(
     body: DeformableBody, collider: Collider, *, rest: float | None = None
 ) -> list[ContactPoint]:
-    """Where a body touches a collider; it carries as deep as it lies, or at ``rest`` [m]."""
+    """Contact points with a collider, with the current gap as rest gap, or ``rest`` [m]."""
     touches = []
     for contacts in collider_contacts(body, [collider]):
         distance, _ = clearance(collider, contacts.points)
@@ -404,7 +402,7 @@ def _on_collider(
 
 
 def _on_body(body: DeformableBody, other: DeformableBody) -> list[ContactPoint]:
-    """Where a body touches another; it carries as they lie."""
+    """Contact points with another body, with the current gap as rest gap."""
     turn = other.T_world_object[:3, :3]
     touches = []
     for contacts in body_contacts(body, [other]):
@@ -424,7 +422,7 @@ def _local(body: DeformableBody, point: Float) -> Float:
 
 
 def _closing(touch: ContactPoint) -> float:
-    """Speed at which the point and what carries it approach each other [m/s]."""
+    """Closing speed of the point and its support [m/s]."""
     own, normal, _, _ = touch.place()
     velocity = touch.body.motion.velocity_at(own)
     if isinstance(touch.other, DeformableBody):
@@ -433,9 +431,9 @@ def _closing(touch: ContactPoint) -> float:
 
 
 def _strikes(touch: ContactPoint) -> bool:
-    """Whether this is an impact: too fast for rigid contact, or in the midst of being stopped.
+    """Whether this is an impact: too fast for rigid contact, or still being stopped.
 
-    Bodies that carry each other jolt each other as they settle, so that only colliders stop.
+    The latter only applies to colliders, because stacked bodies jolt each other as they settle.
     """
     if _closing(touch) > GENTLE_THRESHOLD or isinstance(touch.other, DeformableBody):
         return _closing(touch) > GENTLE_THRESHOLD
@@ -447,10 +445,10 @@ class _Step:
     """One step in which contacts act.
 
     Attributes:
-        before: motions by name, as bodies have moved freely.
-        speeds: [6] linear and angular by name, to be changed [m/s], [rad/s].
-        went: [6] at which they have moved on the whole.
-        shifts: [6] at which they are shifted beyond that, to be changed.
+        before: motions after free motion, by name.
+        speeds: [6] linear and angular velocities by name, updated [m/s], [rad/s].
+        went: [6] mean velocities of the free motion.
+        shifts: [6] additional position correction velocities, updated.
         duration: [s].
     """
 
@@ -493,16 +491,16 @@ class _Row:
 
     @property
     def carries(self) -> bool:
-        """Whether the point transmits a pushing force."""
+        """Whether the point transmits a repulsive force."""
         return float(self.touch.impulse[0]) > 0
 
     @property
     def is_deep(self) -> bool:
-        """Whether the point lies deeper than it carries."""
+        """Whether the point is deeper than its rest gap."""
         return self._lift > 0
 
     def lift(self) -> None:
-        """Shift bodies, at a speed that is not kept, so that the point comes out."""
+        """Shift bodies to resolve the penetration, without changing their velocities."""
         rising = sum(
             float(jacobian[0] @ shift)
             for (_, jacobian, _), shift in zip(self._sides, self._shifts, strict=True)
@@ -518,7 +516,7 @@ class _Row:
             np.add(speed, impulse @ change, out=speed)
 
     def reactions(self) -> list[Reaction]:
-        """Its reaction, once all contacts have converged."""
+        """Reactions of the point, after all contacts have converged."""
         touch, slip = self.touch, np.zeros(3)
         for own, jacobian, _ in self._sides:
             slip += jacobian @ own
@@ -532,7 +530,7 @@ class _Row:
         ]
 
     def relax(self) -> None:
-        """The impulse that this contact needs at the current velocities."""
+        """Update the impulse of this contact for the current velocities."""
         speed = np.zeros(3)
         for own, jacobian, _ in self._sides:
             speed += jacobian @ own
@@ -548,7 +546,7 @@ class _Row:
 
 
 def _corrected(motion: RigidMotion, speed: Float, moved: Float) -> RigidMotion:
-    """The body moved and turned by ``moved`` [6] [m], [rad], and going on at ``speed`` [6]."""
+    """The body moved by ``moved`` [6] [m], [rad], with velocities ``speed`` [6]."""
     return replace(
         motion,
         rotation=rotation_of(moved[3:]) @ motion.rotation,

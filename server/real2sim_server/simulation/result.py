@@ -1,4 +1,4 @@
-"""Results of a simulation: poses, shapes, contacts, energies; compact on disk."""
+"""Simulation results: poses, shapes, contacts and energies, with a compact file format."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class ObjectResult:
     """One object over F frames.
 
     Attributes:
-        object_id: in the scenario.
+        object_id: id in the scenario.
         mass: [kg].
-        spacing: of its particles [m].
+        spacing: particle spacing [m].
         rest: [N, 3] float32, particles at rest, object frame [m].
         positions, quaternions: [F, 3] float64 [m], [F, 4] wxyz: ``T_world_object``.
-        velocities, angular_velocities: [F, 3] of the centre of mass, world [m/s], [rad/s].
+        velocities, angular_velocities: [F, 3] of the centre of mass, world frame [m/s], [rad/s].
         modes: [F] uint8, value of ``body.BodyMode``.
-        shape_index: [F] int32, row of ``shapes`` that holds at a frame; -1 for undeformed.
-        shapes: [S, N, 3] float16, displacements of particles in the object's frame [m].
+        shape_index: [F] int32, row of ``shapes`` at each frame; -1 if undeformed.
+        shapes: [S, N, 3] float16, particle displacements, object frame [m].
         wheels: [W, 3] float32 undersides of its wheels, object frame [m]; W is 4 or 0.
-        wheel_lifts: [F, W] float32, how far each wheel was pushed up into its arch [m].
+        wheel_lifts: [F, W] float32, spring compression of each wheel [m].
     """
 
     object_id: str
@@ -60,7 +60,7 @@ class ObjectResult:
         return transform_from(self.positions[frame], self.quaternions[frame])
 
     def displacements(self, frame: int) -> NDArray[np.float16] | None:
-        """[N, 3] [m] at a frame; None while undeformed."""
+        """[N, 3] particle displacements at a frame [m]; None if undeformed."""
         row = int(self.shape_index[frame])
         return None if row < 0 else self.shapes[row]
 
@@ -70,13 +70,13 @@ class ContactRecord:
     """The total effect of another object or a collider on an object.
 
     Attributes:
-        object_id, other: who, by whom or what.
-        impulse: [3] on the object [N s].
-        delta_v: length of the impulse over the object's mass [m/s].
-        impact_delta_v: the same without what has only carried the object's weight while they
-            touched; of results written before it was known the whole [m/s].
-        first_s, last_s: when the impulse began and ceased to change [s].
-        heat: dissipated by friction [J].
+        object_id, other: the object, and the other object or collider.
+        impulse: [3] impulse on the object [N s].
+        delta_v: magnitude of the impulse over the object's mass [m/s].
+        impact_delta_v: the same without the impulse that supports the object's weight [m/s]; equals
+            ``delta_v`` in results of older versions.
+        first_s, last_s: first and last time at which the impulse changed [s].
+        heat: energy dissipated by friction [J].
     """
 
     object_id: str
@@ -94,13 +94,13 @@ class Rebound:
     """A body's requested rebound, and the rebound reached in test impacts.
 
     Attributes:
-        requested: separation over approach speed.
-        achieved: the same in test impacts; what really happened is in a Bounce each.
-        elastic: without added viscosity; no more can be reached.
-        other: name of what it was fitted on; None where the body will meet nothing, and a wall
-            across its way stood for it.
-        speed: of the impacts [m/s].
-        viscosity: added [Pa s].
+        requested: requested coefficient of restitution.
+        achieved: restitution in test impacts; for the simulated impacts see Bounce.
+        elastic: restitution without added viscosity, the maximum.
+        other: name of the collider used for the fit; None if the body hits nothing, so that a wall
+            across its path was used.
+        speed: speed of the test impacts [m/s].
+        viscosity: added viscosity [Pa s].
     """
 
     requested: float
@@ -117,21 +117,21 @@ class Rebound:
 
 @dataclass(frozen=True, eq=False)
 class SimulationResult:
-    """A rollout.
+    """The result of a rollout.
 
     Attributes:
         objects: simulated objects by id.
-        times_s: [F] since the start [s].
+        times_s: [F] time since the start [s].
         start_us: scene time of the start [us].
         energies: [F, 6] [J], columns ENERGIES.
-        contacts: at the end.
-        impulses: [F, C, 3] of each contact up to each frame [N s].
-        stopped: ``done`` or ``cancelled``; then there are the frames made until then.
-        figures: preset, gravity, cells, steps, rollbacks, and ``restitution``: of each object that
-            was given one, the members of a Rebound and its ``bounces``; with ``background`` the
-            boxes that stood for it (JSON values only).
-        breakages: parts of vehicles that broke; None where nobody looked (the ``paper`` preset,
-            and results from before that was done), and bodies are then drawn as smooth as they are.
+        contacts: contacts at the end.
+        impulses: [F, C, 3] accumulated impulse of each contact at each frame [N s].
+        stopped: ``done`` or ``cancelled``; a cancelled result has the frames up to then.
+        figures: preset, gravity, cells, steps and rollbacks; ``restitution`` with the fields of a
+            Rebound and its ``bounces`` for each object with a requested restitution; and with
+            ``background`` the boxes of the background (JSON values only).
+        breakages: broken vehicle parts; None if they were not computed (``paper`` preset and
+            results of older versions), in which case bodies are drawn smooth.
     """
 
     objects: Mapping[str, ObjectResult]
@@ -176,10 +176,10 @@ class SimulationResult:
 
     @classmethod
     def load(cls, path: Path) -> SimulationResult:
-        """Read what :meth:`save` wrote.
+        """Read a folder written by :meth:`save`.
 
         Raises:
-            PhysicsError: missing, or no simulation of this version.
+            PhysicsError: missing folder, or no simulation of this version.
         """
         try:
             document = json.loads((path / "simulation.json").read_text())

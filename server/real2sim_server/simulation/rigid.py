@@ -1,4 +1,4 @@
-"""Rigid motion, its two handovers to and from deformation, and distances to colliders."""
+"""Rigid motion, conversion to and from deforming bodies, and distances to colliders."""
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.
 # ruff: noqa: PLR0917
@@ -78,11 +78,11 @@ class RigidMotion:
         return float(self.mass * self.velocity @ self.velocity + turning) / 2
 
     def velocity_at(self, point: Float) -> Float:
-        """[3] of the body at a point of the world [m/s]."""
+        """[3] velocity of the body at a world point [m/s]."""
         return self.velocity + np.cross(self.angular_velocity, point - self.centre)
 
     def with_impulse(self, impulse: Float, point: Float) -> RigidMotion:
-        """After an impulse [3] [N s] at a point [3] of the world."""
+        """The motion after an impulse [3] [N s] at a world point [3]."""
         turn = np.cross(point - self.centre, impulse)
         return replace(
             self,
@@ -91,17 +91,17 @@ class RigidMotion:
         )
 
     def with_gravity(self, duration: float, gravity: Float) -> RigidMotion:
-        """With the velocity that gravity [3] adds in ``duration`` [s], not yet moved."""
+        """The motion with the velocity change by gravity [3] in ``duration`` [s], not yet moved."""
         return replace(self, velocity=self.velocity + duration * gravity)
 
     def advanced(self, duration: float) -> RigidMotion:
-        """``duration`` [s] later at these velocities; angular momentum stays.
+        """The motion ``duration`` [s] later; conserves angular momentum.
 
-        After :meth:`with_gravity` this is symplectic Euler, like the solver's.
+        After :meth:`with_gravity` this is symplectic Euler, like the solver.
         """
         momentum = self.angular_momentum
         turned = rotation_of(duration * self.angular_velocity) @ self.rotation
-        # Rounding must not add up to a skewed frame.
+        # Prevents accumulated rounding from skewing the rotation.
         left, _, right = np.linalg.svd(turned)
         moved = replace(self, rotation=left @ right, centre=self.centre + duration * self.velocity)
         turning = np.linalg.solve(moved.world_inertia, momentum).astype(np.float64, copy=False)
@@ -109,7 +109,7 @@ class RigidMotion:
 
 
 def inertia_about(centre: Float, positions: Float, masses: Float, volumes: Float) -> Float:
-    """[3, 3] inertia of particles about ``centre`` [kg m^2]; each counts as a small cube.
+    """[3, 3] inertia of particles about ``centre`` [kg m^2]; each particle is a small cube.
 
     Args:
         centre: [3] [m].
@@ -126,19 +126,19 @@ def added_inertia(masses: Float, volumes: Float, *, cell: float) -> float:
     """Inertia that the grid adds to particles about any axis [kg m^2].
 
     A particle's velocity gradient carries angular momentum m dx^2/4 axial(C), which is m dx^2/2
-    times its turning (Jiang et al. 2015, APIC), as if it were a ball that wide.
+    times its angular velocity (Jiang et al. 2015, APIC).
 
     Args:
         masses, volumes: [N] [kg], [m^3].
-        cell: dx of the solver's grid [m].
+        cell: cell size dx of the solver grid [m].
     """
     return float(masses.sum()) * cell**2 / 2 - float(masses @ np.cbrt(volumes) ** 2) / 6
 
 
 def best_rotation(rest: Float, now: Float, masses: Float) -> Float:
-    """[3, 3] mass-weighted rotation that takes ``rest`` [N, 3] nearest to ``now`` (Kabsch 1976).
+    """[3, 3] mass-weighted best-fit rotation from ``rest`` [N, 3] to ``now`` (Kabsch 1976).
 
-    Both about their own centres of mass.
+    Both sets are taken about their own centres of mass.
     """
     a = rest - masses @ rest / masses.sum()
     b = now - masses @ now / masses.sum()
@@ -153,7 +153,7 @@ def best_rotation(rest: Float, now: Float, masses: Float) -> Float:
 
 @functools.lru_cache(maxsize=64)
 def packed(colliders: tuple[Collider, ...]) -> tuple[Float, Float]:
-    """Rows and heights of colliders as kernels read them, kept while the colliders are the same."""
+    """Rows and heights of colliders in kernel form, cached for the same colliders."""
     return pack_colliders(colliders, 0.0)
 
 
@@ -168,16 +168,15 @@ def closest(
     """Closest distances of a rigid body's points to colliders, which may move.
 
     Args:
-        points: [N, 3] of the body, world [m].
-        motion: of the body.
-        colliders: as they are now.
+        points: [N, 3] points of the body, world frame [m].
+        motion: motion of the body.
+        colliders: current colliders.
         within: [m].
         ahead: [s].
 
     Returns:
-        Least distance [m], infinite from none; the speed at which that point and the collider
-        approach each other [m/s]; and whether any point that approaches a collider will be
-        ``within`` of it in the time ``ahead``.
+        Smallest distance [m], infinite without colliders; closing speed at that point [m/s]; and
+        whether any approaching point will be ``within`` of a collider in the time ``ahead``.
     """
     if not colliders:
         return math.inf, 0.0, False
@@ -222,13 +221,13 @@ def solid_gaps(pose: Float, size: Float, solids: Sequence[Solid]) -> tuple[Float
     """Lower bounds of solids' distances to an oriented box, and upper bounds of their speeds.
 
     Args:
-        pose: [4, 4] of the one box.
-        size: [3] of it [m].
-        solids: K of them.
+        pose: [4, 4] pose of the box.
+        size: [3] size of the box [m].
+        solids: K solids.
 
     Returns:
-        [K] lower bounds of the distance, along the faces of the boxes about these; below 0 where
-        they may overlap [m]; and [K] speeds that no point of them exceeds [m/s].
+        [K] lower bounds of the distance along the face normals of the bounding boxes [m], negative
+        for possible overlaps; and [K] upper bounds of the point speeds [m/s].
     """
     centres, turns, halves, speeds = _boxes_about(tuple(solids))
     between = np.abs((turns @ (pose[:3, 3] - centres)[:, :, None])[:, :, 0])
@@ -279,7 +278,7 @@ def _clearances(row: Any, data: Any, points: Any, distances: Any, normals: Any) 
 
 
 def nearest(colliders: Sequence[Collider], points: Float) -> tuple[Float, Float]:
-    """The same for the nearest of several colliders; infinite without colliders."""
+    """Like :func:`clearance`, for the nearest of several colliders; infinite without colliders."""
     best = np.full(len(points), np.inf)
     normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     for collider in colliders:

@@ -1,4 +1,4 @@
-"""Rollouts: a scenario's objects, colliders and gravity from one instant on, and their frames."""
+"""Rollouts: simulate objects of a scenario from one instant and record frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TrajectoryRecorder:
     """Records trajectories, shapes, energies and contacts, frame by frame.
 
     Args:
-        simulator: whose bodies are recorded; it is only read.
+        simulator: simulator to record; read-only.
     """
 
     def __init__(self, simulator: HybridSimulator) -> None:
@@ -44,7 +44,7 @@ class TrajectoryRecorder:
         self._start = 0.0
 
     def record(self, time: float) -> None:
-        """Record the present state as the frame of ``time`` [s]."""
+        """Record the current state as the frame of ``time`` [s]."""
         s = self._simulator
         kinetic, elastic, potential = energies(s.bodies, s.gravity)
         total = kinetic + elastic + potential
@@ -72,7 +72,7 @@ class TrajectoryRecorder:
             )
 
     def _shape(self, body: DeformableBody) -> int:
-        """Row of the body's current shape; a new row only after a change."""
+        """Row of the body's current shape; adds a row only after a change."""
         rows = self._shapes[body.name]
         moved = (body.local_positions() - body.rest.positions).astype(np.float16)
         if not rows and not moved.any():
@@ -129,7 +129,7 @@ def _wheel_lifts(body: DeformableBody, pose: Float, road: Sequence[Collider]) ->
     return np.zeros(0) if body.tyres is None else body.tyres.lifts(pose, road)
 
 
-# Broken parts of simulated vehicles, found in the frames.
+# Broken parts of simulated vehicles, detected from the frames.
 
 LEAVING_TIME = 0.04
 """After a part has broken its fragments are free [s]."""
@@ -163,7 +163,7 @@ def find_breakages(
 def _breakage(
     result: SimulationResult, own: ObjectResult, log: BreakageLog, part: Part, frame: int
 ) -> Breakage:
-    # Fragments leave with what is left of the velocity when all has given way there.
+    # Fragments leave with the velocity that remains after the local collapse.
     after = int(np.searchsorted(result.times_s, result.times_s[frame] + LEAVING_TIME))
     after = min(max(after, frame + 1), result.frames - 1)
     before = max(after - 1, 0)
@@ -209,20 +209,21 @@ class SimulateOptions:
 
     Attributes:
         preset: ``vehicle`` or ``paper``, see ``presets``.
-        objects: what takes part, with what is known of it; at least one.
-        colliders: that do not yield; those named in ``road`` carry tyres.
-        road: names of colliders that are ground.
-        start_us: scene time [us].
+        objects: simulated objects with their physical values; at least one.
+        colliders: rigid colliders; those named in ``road`` support tyres.
+        road: names of ground colliders.
+        start_us: scene time of the start [us].
         duration: [s].
-        frame_rate: frames kept per second.
-        times_s: instants of the frames after the start [s], rising, instead of both of these.
+        frame_rate: recorded frames per second.
+        times_s: increasing frame times after the start [s], instead of ``duration`` and
+            ``frame_rate``.
         gravity: [3] [m/s^2].
-        backend: of the solver.
-        brake_after_hit: fraction of the wheels' grip that is braked once a vehicle was hit.
-        background: whether walls, poles, trees and what else stands in the scene's background are
-            colliders too, see ``background``.
-        max_particles: of all bodies together; where they would be more, all are filled more
-            coarsely than the preset has it.
+        backend: solver backend.
+        brake_after_hit: braked fraction of the wheels' grip after a vehicle is hit.
+        background: whether obstacles of the scene's background (walls, poles, trees) are colliders,
+            see ``background``.
+        max_particles: maximum total number of particles; if exceeded, all objects are filled more
+            coarsely than in the preset.
     """
 
     preset: str = "vehicle"
@@ -270,14 +271,14 @@ def simulate(
     """Simulate objects that move, collide, deform and come to rest.
 
     Args:
-        scene: holds the Gaussians.
+        scene: scene with the Gaussians.
         state: the scenario's objects; a ``ScenarioState``.
-        options: what to simulate.
+        options: options of the rollout.
         on_progress: called with (frames done, frames) after each frame.
-        cancelled: asked before each step; when true, what was made until then is the result.
+        cancelled: polled before each step; if true, the simulation ends with the frames so far.
 
     Raises:
-        PhysicsError: for what cannot be simulated, with the reason.
+        PhysicsError: if the options cannot be simulated, with the reason.
     """
     gravity = np.array(options.gravity, dtype=np.float64)
     if gravity.shape != (3,) or not np.isfinite(gravity).all():
@@ -319,7 +320,7 @@ def simulate_bodies(
     on_progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> SimulationResult:
-    """The same for spawned bodies, which keep their final state."""
+    """Like :func:`simulate`, for spawned bodies, which keep their final state."""
     simulator = HybridSimulator(
         bodies,
         options.colliders,

@@ -1,4 +1,4 @@
-"""Bodies and colliders in motion: the simulator decides which bodies deform and which are rigid."""
+"""The hybrid simulator, which decides which bodies deform and which are rigid."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from .resting import GENTLE_THRESHOLD, RestingContacts, supports_of, touches_any
 from .result import ContactRecord
 from .tyres import TyreReaction
 
-# Contacts and energies, through both deformation and rigid motion.
+# Contacts and energies, over deforming and rigid motion.
 
 
 class ContactLog:
     """Impulses and energies since the start, by body and contact partner.
 
     Attributes:
-        collider_work: of moving colliders on bodies [J].
+        collider_work: work of moving colliders on bodies [J].
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class ContactLog:
         self.collider_work = 0.0
 
     def start_solver(self) -> None:
-        """A new solver counts from zero."""
+        """Reset the counters for a new solver."""
         self._solver_totals = {}
 
     def add_solver_contacts(
@@ -47,9 +47,9 @@ class ContactLog:
         """Add the growth of a solver's contacts since the last call.
 
         Args:
-            contacts: of the present solver, since its start.
+            contacts: contacts of the current solver since its start.
             time: [s].
-            names: of all bodies; others are colliders.
+            names: names of all bodies; all others are colliders.
         """
         for c in contacts:
             key = (c.body, c.other)
@@ -60,7 +60,7 @@ class ContactLog:
             self._solver_totals[key] = (np.array(c.impulse), c.friction_work, c.work)
 
     def add(self, body: str, other: str, impulse: Float, friction_work: float, time: float) -> None:
-        """Add an impulse [3] [N s] and the work of friction [J] at a time [s]."""
+        """Add an impulse [3] [N s] and friction work [J] at a time [s]."""
         key = (body, other)
         if not np.any(impulse):
             return
@@ -73,7 +73,7 @@ class ContactLog:
     def add_sleep(self, bodies: set[str], time: float, duration: float) -> None:
         """Count a step of sleep at a time [s].
 
-        What holds a sleeping body is recorded only in steps in which others rest beside it; all
+        Support forces of a sleeping body are recorded only in steps with resting neighbours; all
         other steps count as sleep once another impulse follows.
         """
         for key, (_, last) in self._times.items():
@@ -86,7 +86,7 @@ class ContactLog:
 
     @property
     def friction_work(self) -> float:
-        """Dissipated by friction so far [J]."""
+        """Energy dissipated by friction so far [J]."""
         return sum(self._friction_work.values())
 
     def records(self, masses: dict[str, float], gravity: Float) -> tuple[ContactRecord, ...]:
@@ -112,8 +112,10 @@ class ContactLog:
         )
 
     def _impact_delta_v(self, key: tuple[str, str], mass: float, gravity: Float) -> float:
-        """Of the impulse beyond what the weight asks for from the first touch to the last, but for
-        sleep in between; only the impulse's part against gravity can be that."""
+        """Delta-v of the impulse without the support of the weight between first and last touch.
+
+        Time asleep is excluded; only the component against gravity is reduced.
+        """
         impulse, (first, last) = self._impulses[key] / mass, self._times[key]
         awake = last - first - self._asleep[key]
         strength = float(np.linalg.norm(gravity))
@@ -130,7 +132,7 @@ def _three(vector: Float) -> tuple[float, float, float]:
 
 
 def energies(bodies: Iterable[DeformableBody], gravity: Float) -> tuple[float, float, float]:
-    """Kinetic, elastic and gravity energy of all bodies now [J]."""
+    """Current kinetic, elastic and gravity energy of all bodies [J]."""
     kinetic = elastic = potential = 0.0
     for body in bodies:
         kinetic += body.kinetic_energy
@@ -139,11 +141,11 @@ def energies(bodies: Iterable[DeformableBody], gravity: Float) -> tuple[float, f
     return kinetic, elastic, potential
 
 
-# Unyielding bodies: they stay rigid and are colliders for the other bodies.
+# Unyielding bodies stay rigid and act as colliders for other bodies.
 #
-# A cone does not dent a truck. Where the whole energy of an impact could not dent a body by as much
-# as its particles resolve, only the lighter body deforms. The other body becomes a few boxes on its
-# nearby surface for the lighter one's solver, and receives the impulse and moment they exchanged.
+# A cone does not dent a truck. If the total energy of an impact cannot dent a body by more than its
+# particles resolve, only the lighter body deforms. The other body is represented by a few boxes on
+# its nearby surface and receives the exchanged impulse and moment.
 
 LIGHTER = 10.0
 """A body may stay rigid against what is so many times lighter."""
@@ -156,14 +158,14 @@ ALIKE = 1.5
 
 
 def withstands(body: DeformableBody, other: DeformableBody, gravity: Float) -> bool:
-    """Whether a body keeps its shape in an impact with another at their current speeds.
+    """Whether a body keeps its shape in an impact with another one at their current speeds.
 
-    The force that yielding takes is the least yield stress near by over the other's smallest face.
-    What is only elastic gives way at any force, and so never withstands.
+    The yield force is the lowest nearby yield stress times the smallest face of the other body.
+    Purely elastic bodies deform at any force and never withstand.
 
     Args:
-        body: any.
-        other: that touches it, or will.
+        body: the body.
+        other: a body that touches it, or will.
         gravity: [3] [m/s^2].
     """
     a, b = body.motion, other.motion
@@ -185,7 +187,7 @@ def withstands(body: DeformableBody, other: DeformableBody, gravity: Float) -> b
 
 
 def as_boxes(body: DeformableBody, other: DeformableBody) -> list[Box]:
-    """The part of a body in another's reach as stacked boxes that move with the body."""
+    """The part of a body within reach of another, as stacked boxes that move with the body."""
     pose, m, s = body.T_world_object, body.motion, body.spacing
     local = body.local_positions()[_patch(body, other)]
     boxes: list[Box] = []
@@ -209,7 +211,7 @@ def as_boxes(body: DeformableBody, other: DeformableBody) -> list[Box]:
 def by_owner(
     contacts: Iterable[ContactTotals], owners: Mapping[str, DeformableBody]
 ) -> list[ContactTotals]:
-    """Contacts with the effects of a body's boxes summed under the body's name."""
+    """Contacts, with the effects of a body's boxes summed under the body's name."""
     found: dict[tuple[str, str], ContactTotals] = {}
     for c in contacts:
         other = owners[c.other].name if c.other in owners else c.other
@@ -228,7 +230,7 @@ def by_owner(
 
 
 def _patch(body: DeformableBody, other: DeformableBody) -> NDArray[np.bool_]:
-    """Which particles [N] of a body lie in a cube about another, edges along the body's own."""
+    """[N] whether particles of a body are in a cube around another, aligned with the body."""
     pose = body.T_world_object
     centre = pose[:3, :3].T @ (other.motion.centre - pose[:3, 3])
     half = other.reach + PATCH_CELLS * body.cell
@@ -275,27 +277,27 @@ TYRES = "tyres"
 
 
 class HybridSimulator:
-    """Bodies and colliders in motion.
+    """Simulator of bodies and colliders that switches bodies between rigid and deforming.
 
-    Each body is rigid until something comes near, deforms in a solver while it touches, and is
-    rigid again or asleep once it has settled. Bodies keep track of that themselves; the simulator
-    gives the orders.
+    A body is rigid until something comes near, deforms in a solver while in contact, and becomes
+    rigid or falls asleep once it has settled. Bodies track their state themselves; the simulator
+    triggers the transitions.
 
     Args:
-        bodies: that take part.
-        colliders: that do not yield.
-        road: names of those that carry tyres.
+        bodies: simulated bodies.
+        colliders: rigid colliders.
+        road: names of colliders that support tyres.
         gravity: [3] [m/s^2].
-        backend: of the solver.
-        brake_after_hit: fraction of the wheels' grip that is braked once a vehicle was hit.
+        backend: solver backend.
+        brake_after_hit: braked fraction of the wheels' grip after a vehicle is hit.
         cfl: fraction of a cell that waves may cross in a substep of the solver.
 
     Attributes:
-        bodies, colliders: as they are now.
+        bodies, colliders: current bodies and colliders.
         contact_log: impulses and energies since the start.
-        bounces: impacts of bodies that were given a restitution.
-        time: since the start [s].
-        substeps, rollbacks: of all solvers so far.
+        bounces: impacts of bodies with a requested restitution.
+        time: time since the start [s].
+        substeps, rollbacks: totals of all solvers so far.
     """
 
     def __init__(
@@ -363,7 +365,7 @@ class HybridSimulator:
             self._settle(body)
 
     def _activate(self, duration: float) -> None:
-        """Let all bodies in reach of others deform, and those in reach of these."""
+        """Activate all bodies within reach of others, and those within reach of these."""
         changed = True
         while changed:
             changed = False
@@ -401,7 +403,7 @@ class HybridSimulator:
             self._solver = None
 
     def _rigid_beside(self, deforming: list[DeformableBody]) -> list[tuple[Box, DeformableBody]]:
-        """Colliders that represent rigid bodies near a deforming one."""
+        """Boxes that represent rigid bodies near deforming ones."""
         return [
             (box, other)
             for body in deforming
@@ -413,9 +415,9 @@ class HybridSimulator:
         ]
 
     def _solver_of(self, deforming: list[DeformableBody], boxes: list[Box]) -> Solver:
-        """The solver of these bodies; a new one where it has to know of others, or of boxes.
+        """The solver of these bodies; a new one if bodies change or boxes are needed.
 
-        Boxes cover what is beside a body now, and are others in the next step.
+        Boxes cover the current surroundings of a body and change in every step.
         """
         names = [b.name for b in deforming]
         if self._solver is not None and self._solved == names and not boxes:
@@ -449,7 +451,7 @@ class HybridSimulator:
             self.contact_log.add(body.name, TYRES, r.impulse, r.friction_work, self.time)
 
     def _settle(self, body: DeformableBody) -> None:
-        """A body that has settled becomes rigid, or falls asleep."""
+        """Make a settled body rigid, or put it to sleep."""
         if body.may_rigidify and self._may_be_rigid(body):
             body.rigidify()
         elif body.may_sleep and not self._is_loaded(body) and self._put_to_sleep(body):
@@ -460,7 +462,7 @@ class HybridSimulator:
         self._solver = None
 
     def _brake_if_hit(self, body: DeformableBody) -> None:
-        """Lock the wheels of a vehicle after a hit, as options request."""
+        """Brake the wheels of a vehicle after a hit, as configured."""
         if body.hit or body.tyres is None:
             return
         for (name, other), impulse in self.contact_log.totals().items():
@@ -470,7 +472,7 @@ class HybridSimulator:
                 return
 
     def _put_to_sleep(self, body: DeformableBody) -> bool:
-        """Put a body with still supports to sleep; returns whether it has them."""
+        """Put a body to sleep if its supports are still; return whether they are."""
         others = [b for b in self.bodies if b is not body and not _moves(b)]
         supports = supports_of(body, self.colliders, self.road, others, self.gravity)
         if supports is None or {c.name for c in self.colliders if c.moving}.intersection(supports):
@@ -479,7 +481,7 @@ class HybridSimulator:
         return True
 
     def _wake(self) -> None:
-        """Wake bodies whose supports have begun to move, and those that rest on them."""
+        """Wake bodies with moving supports, and bodies that rest on them."""
         asleep = [b for b in self.bodies if b.mode == BodyMode.SLEEPING]
         if not asleep:
             return
@@ -508,8 +510,11 @@ class HybridSimulator:
         return not asleep and self._strikes_through(body, duration)
 
     def _is_struck(self, body: DeformableBody, held: Set[str], duration: float) -> bool:
-        """Whether a body that lies on something deforms again: with what it touches, or because
-        something comes near that is faster than what contacts bear."""
+        """Whether a supported body deforms again.
+
+        It does if its contact partners deform, or if something approaches faster than contacts can
+        bear.
+        """
         others = [b for b in self.bodies if b is not body]
         if any(b.name in held and b.mode == BodyMode.DEFORMING for b in others):
             return True
@@ -522,7 +527,7 @@ class HybridSimulator:
             if not collider.moving and (asleep or collider.name in held):
                 continue
             gap, approach = body.gap_to_colliders([collider])
-            # Nothing here carries a collider that moves, however slowly.
+            # Rigid contacts do not support moving colliders, however slow.
             least = APPROACH_MIN if collider.moving else GENTLE_THRESHOLD
             if approach > least and gap < _touch_distance(body) + approach * duration:
                 return True
@@ -531,7 +536,7 @@ class HybridSimulator:
     def _strikes_through(self, body: DeformableBody, duration: float) -> bool:
         """Whether the floor of a body on wheels strikes the road through its springs.
 
-        What comes down gently does not deform: springs and rigid contacts carry it.
+        Gentle landings are carried by springs and rigid contacts, without deformation.
         """
         if body.tyres is None:
             return False
@@ -540,8 +545,10 @@ class HybridSimulator:
         return approach > GENTLE_THRESHOLD and gap < ROAD_CELLS * body.cell + approach * duration
 
     def _may_be_rigid(self, body: DeformableBody) -> bool:
-        """Whether a deforming body that has settled is free, or lies on what does not deform any
-        more; then rigid contacts carry it from now on."""
+        """Whether a settled body is free or rests on non-deforming supports.
+
+        Rigid contacts then support it.
+        """
         fixed = [c for c in self._walls(body) if not c.moving]
         if body.tyres is not None and body.gap_to_colliders(self.road)[0] < body.spacing / 2:
             fixed += [c for c in self.road if not c.moving]
@@ -555,7 +562,7 @@ class HybridSimulator:
         return self._is_free(body) if found is None else found
 
     def _deforming_with(self, body: DeformableBody) -> list[DeformableBody]:
-        """Deforming bodies near a body, those near them, and so on."""
+        """Deforming bodies near a body, transitively."""
         left = [b for b in self.bodies if b.mode == BodyMode.DEFORMING and b is not body]
         found = [body]
         for at in found:
@@ -590,13 +597,13 @@ class HybridSimulator:
                 self._resting.begin(body, walls, others)
 
     def _is_loaded(self, body: DeformableBody) -> bool:
-        """Whether a deforming body may touch it."""
+        """Whether a deforming body may touch the body."""
         return any(
             b is not body and b.mode == BodyMode.DEFORMING and _near(body, b) for b in self.bodies
         )
 
     def _lay_to_rest(self, duration: float) -> None:
-        """Put still rigid bodies to sleep, all bodies in contact together."""
+        """Put still rigid bodies to sleep, one contact island at a time."""
         for body in self.bodies:
             if body.mode == BodyMode.RIGID and self._resting.partners(body):
                 body.note_standing(duration)
@@ -643,7 +650,7 @@ def _moves(body: DeformableBody) -> bool:
 
 
 def _touch_distance(body: DeformableBody) -> float:
-    """How near a collider may come to the outermost particles of a body that stays rigid [m]."""
+    """Minimum distance of a collider to the outermost particles of a rigid body [m]."""
     return TOUCH_CELLS * body.cell + body.spacing / 2
 
 
@@ -658,7 +665,7 @@ def _near(a: DeformableBody, b: DeformableBody) -> bool:
 
 
 def _closing(a: DeformableBody, b: DeformableBody) -> float:
-    """Speed at which two bodies approach each other [m/s]."""
+    """Closing speed of two bodies [m/s]."""
     along = b.motion.centre - a.motion.centre
     away = float(np.linalg.norm(along))
     return float((a.motion.velocity - b.motion.velocity) @ along) / max(away, 1e-9)

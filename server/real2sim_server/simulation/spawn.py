@@ -1,4 +1,4 @@
-"""Bodies from a scenario's objects."""
+"""Creation of bodies from scenario objects."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def spawn_bodies(
     """A body for each requested object, in its start state.
 
     Raises:
-        PhysicsError: for an object that is not there at ``start_us``, for things that reach into
-            one another, and as ``fill_object``.
+        PhysicsError: for an object that is absent at ``start_us``, for overlapping objects, and as
+            ``fill_object``.
     """
     subjects = _subjects(state, wanted, start_us)
     preset = filled_as_wanted(preset, subjects, list(wanted.values()), max_particles)
@@ -129,10 +129,11 @@ def filled_as_wanted(
     wanted: Sequence[ObjectPhysics],
     most: int = 10**12,
 ) -> Preset:
-    """The preset with particles as far apart as the finest grid that is asked for has them.
+    """The preset with the particle spacing of the finest requested grid.
 
     Raises:
-        PhysicsError: for a grid that is too coarse for an object, or takes more than ``most``.
+        PhysicsError: for a grid that is too coarse for an object or needs more than ``most``
+            particles.
     """
     asked = [
         (max(s.scaled_size) / w.grid, s.object_id, w.grid)
@@ -159,7 +160,7 @@ def filled_as_wanted(
 
 
 def _limit_particles(preset: Preset, subjects: Sequence[PlacedObject], most: int) -> Preset:
-    """The preset with particles so far apart that boxes full of them would hold ``most``."""
+    """The preset with a spacing at which full boxes hold at most ``most`` particles."""
     preset = spaced_for(preset, subjects)
     sizes = np.array([s.scaled_size for s in subjects])
     spacing = max(preset.spacing, float(np.cbrt(sizes.prod(axis=1).sum() / most)))
@@ -187,22 +188,22 @@ def require_separation(
     boxes: Sequence[tuple[Float, Sequence[float]]],
     colliders: Sequence[Collider],
 ) -> None:
-    """Refuse a start with bodies inside one another or inside a collider.
+    """Check that no bodies overlap each other or a collider at the start.
 
-    What overlaps by less than PENETRATION_MAX is left to contact: tracked boxes of parked cars do.
+    Overlaps below PENETRATION_MAX, as between tracked boxes of parked cars, are left to contact.
 
     Args:
         bodies: bodies.
-        boxes: of each, pose [4, 4] and size; particles may reach a little out of them.
-        colliders: that carry no tyres.
+        boxes: pose [4, 4] and size of each body; particles may extend slightly beyond.
+        colliders: colliders that do not support tyres.
 
     Raises:
-        PhysicsError: with the names.
+        PhysicsError: for overlaps, with the names.
     """
     for k, a in enumerate(bodies):
         for b, box in list(zip(bodies, boxes, strict=True))[k + 1 :]:
             depth = float(box_penetration(*boxes[k], *box))
-            # Corners of boxes may overlap where neither has particles.
+            # Boxes may overlap at corners without particles.
             if depth > PENETRATION_MAX and _particles_overlap(a, b):
                 raise PhysicsError(
                     f"objects {a.name!r} and {b.name!r} are {depth:.2f} m inside each other at the "
@@ -218,10 +219,10 @@ def require_separation(
 
 
 def _depth_inside(body: DeformableBody, collider: Collider) -> float:
-    """How far a body would have to be moved to leave a collider [m]; at most 0 where it is outside.
+    """Distance to move a body out of a collider [m]; at most 0 if it is outside.
 
-    No particle is deep inside a post, so of a solid that holds a particle the overlap of the box
-    about it counts, and of a mesh the shorter way off the place where the body touches it.
+    Particles are never deep inside a thin post, so for solids with a particle inside this is the
+    overlap with their bounding box, and for meshes the shorter distance from the contact point.
     """
     depth = -body.gap_to_colliders([collider])[0]
     if not isinstance(collider, Solid):
@@ -292,7 +293,7 @@ def _spawn_body(
     )
     if physics.restitution is not None:
         met = [c for c in colliders if tyres is None or c.name not in road]
-        # On its wheels a body rolls, whatever gravity wants.
+        # A body on wheels rolls, regardless of gravity.
         pull = gravity if tyres is None else np.zeros(3)
         body.rebound = fit_rebound(body, physics.restitution, met, pull)
     return body
@@ -301,9 +302,9 @@ def _spawn_body(
 def object_particles(
     scene: Scene, subject: PlacedObject, preset: Preset, start_us: int, *, mass: float | None = None
 ) -> Particles:
-    """Particles of an object, object frame; without the space between wheels.
+    """Particles of an object, object frame, without the space between the wheels.
 
-    The centre of mass of a vehicle on wheels is as high as its class has it.
+    A vehicle on wheels gets the height of the centre of mass of its class.
 
     Raises:
         ParticleError: as ``fill_object``.
@@ -318,7 +319,7 @@ def object_particles(
 
 
 def _with_centre(particles: Particles, subject: PlacedObject, preset: Preset) -> Particles:
-    """With the centre of mass of a vehicle on wheels as high as its class has it."""
+    """Particles with the centre of mass height of the vehicle's class, for vehicles on wheels."""
     size = subject.scaled_size
     if not (preset.wheels and subject.category in VEHICLES):
         return particles
@@ -327,9 +328,9 @@ def _with_centre(particles: Particles, subject: PlacedObject, preset: Preset) ->
 
 
 def object_volume(scene: Scene, subject: PlacedObject, start_us: int) -> float:
-    """Filled volume of an object [m^3], by voxels that only its own size determines.
+    """Filled volume of an object [m^3], with voxels that depend on its size only.
 
-    Voxels on the surface stick out by half of one, so that coarser particles have more volume.
+    Surface voxels extend beyond the object by half a voxel, so coarser voxels have more volume.
 
     Raises:
         ParticleError: as ``fill_object``.
@@ -353,7 +354,7 @@ def _pose(subject: PlacedObject, physics: ObjectPhysics, start_us: int) -> Float
 def _velocities(
     subject: PlacedObject, physics: ObjectPhysics, start_us: int
 ) -> tuple[Float, Float]:
-    """Velocity [m/s] and angular velocity [rad/s] at the start, as given or as recorded."""
+    """Initial velocity [m/s] and angular velocity [rad/s], as given or as recorded."""
     recorded = subject.trajectory.velocity(start_us) if physics.velocity is None else None
     velocity = _vector(physics.velocity, recorded, f"velocity of {subject.object_id!r}", SPEED_MAX)
     name = f"angular_velocity of {subject.object_id!r}"
@@ -371,7 +372,7 @@ def _tyres(subject: PlacedObject, particles: Particles, gravity: Float, *, brake
 
 
 def _vector(given: object, otherwise: Float | None, name: str, most: float) -> Float:
-    """The given vector [3] or the default; refused beyond ``most``."""
+    """The given vector [3] or the default; raises if its length exceeds ``most``."""
     vector = np.array(otherwise if given is None else given, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise PhysicsError(f"{name} must be 3 finite numbers, not {given!r}")

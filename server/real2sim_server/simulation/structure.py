@@ -1,14 +1,13 @@
-"""Vehicles as matter and as impact partners: structure by class, and default masses of objects.
+"""Crash structure of vehicle classes, and default masses of objects.
 
-A vehicle is a core that holds, with zones around it that give way: front and rear, sides (door,
-sill and B pillar together) and roof. Each zone has a force over its deflection, from published
-tests. :func:`vehicle_structure` makes materials of it, such that the zone as it is filled with
-particles carries that force; the closed loop takes the same figures per area of overlap.
+A vehicle is a stiff core with yielding zones around it: front and rear, sides (door, sill and B
+pillar together) and roof. Each zone has a force-deflection curve from published tests.
+:func:`vehicle_structure` derives materials so that the particles of a zone carry that force; the
+closed loop uses the same values per area of overlap.
 
-Both ends are two things in a row. The outer one (bumper, skin, headlamps, what is bolted on) folds
-at little force and is straightened again, slowly, by what is springy beside it; the inner one
-(rails) keeps what it was crushed by. Only so can a car be 0.6 m shorter for an instant, rebound
-from the wall at little of its speed, and be found 0.26 m shorter afterwards.
+Front and rear have two layers in series. The outer one (bumper, skin, headlamps, attachments) folds
+at low force and slowly recovers; the inner one (rails) keeps its crush. This reproduces a car with
+0.6 m dynamic crush, a rebound at a fraction of its speed, and 0.26 m residual crush.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ class VehicleStructure:
     """Force over deflection of a vehicle class.
 
     Attributes:
-        front, rear, side: force per metre of width and metre of deflection [N/m^2].
-        roof: force at 127 mm of deflection, in multiples of the vehicle's weight.
-        source: where the figures come from.
+        front, rear, side: force per width and deflection [N/m^2].
+        roof: force at 127 mm deflection, in multiples of the vehicle's weight.
+        source: source of the values.
     """
 
     front: float
@@ -73,7 +72,7 @@ PERSON_STIFFNESS, OTHER_STIFFNESS = 6e4, 3e5
 
 
 def stiffness_of(category: str) -> tuple[float, float, float]:
-    """Force of front, rear and sides of a category per width and deflection [N/m^2]."""
+    """Stiffness of front, rear and sides of a category: force per width and deflection [N/m^2]."""
     if category in STRUCTURES:
         found = STRUCTURES[category]
         return found.front, found.rear, found.side
@@ -143,14 +142,14 @@ shallower, and carries along what is beside the place that is struck."""
 def vehicle_structure(
     category: str, particles: Particles, *, spacing: float, section_height: float | None = None
 ) -> tuple[tuple[Material, ...], NDArray[np.int64], Particles]:
-    """A vehicle's materials, each particle's material, and particles with its masses.
+    """Materials of a vehicle, material index of each particle, and particles with new masses.
 
     Args:
         category: one of ``STRUCTURES``.
-        particles: at rest in the vehicle's frame, x ahead, z up; their masses sum to its mass.
-        spacing: of the particles [m].
-        section_height: of the ends, where particles are a column out of their middle [m]; such a
-            column has neither sides nor roof.
+        particles: particles at rest, vehicle frame (x forward, z up); their masses sum to its mass.
+        spacing: particle spacing [m].
+        section_height: height of the ends if the particles are a central column of the vehicle [m];
+            such a column has no sides and no roof.
     """
     structure = STRUCTURES[category]
     low = particles.positions.min(axis=0) - spacing / 2
@@ -185,7 +184,7 @@ def vehicle_structure(
 
 
 def _zones(place: Float, cells: Float, *, column: bool) -> NDArray[np.int64]:
-    """Zone of each particle at fractions [N, 3] of the vehicle's size, in cells [N, 3]."""
+    """Zone of each particle, from positions [N, 3] as fractions of the size and in cells [N, 3]."""
     zones = np.full(len(place), CORE)
     ahead = place[:, 0] > 0.5
     from_end = np.minimum(place[:, 0], 1 - place[:, 0])
@@ -200,7 +199,7 @@ def _zones(place: Float, cells: Float, *, column: bool) -> NDArray[np.int64]:
 
 
 def _end_height(particles: Particles, zones: NDArray[np.int64], ahead: int, size: Float) -> float:
-    """Mean filled height [m] over the plan of one end."""
+    """Mean filled height [m] over the plan area of one end."""
     first = ENDS + len(END_MATERIALS) * ahead
     end = (zones >= first) & (zones < first + len(END_MATERIALS))
     return float(particles.volumes[end].sum() / (END * size[0] * size[1]))
@@ -211,7 +210,7 @@ def _scaled(material: M, scale: float) -> M:
 
 
 def _roof(force: float, volume: float, height: float) -> Snow:
-    """What carries ``force`` [N] at the test's deflection, all over a zone of this volume."""
+    """The material of a zone of this volume that carries ``force`` [N] at the test deflection."""
     depth = (1 - BELT) * height
     strain = min(ROOF_TEST / depth, 0.9)
     stress = ROOF_SHARE * force * depth / volume / math.exp(ROOF_HARDENING * strain)
@@ -233,16 +232,17 @@ def _roof(force: float, volume: float, height: float) -> Snow:
 class ClassMass:
     """Default mass of a category.
 
-    A person's mass goes by height, since a tracked box is wider and longer than who walks in it.
+    The mass of a person depends on the height, because tracked boxes are wider and longer than the
+    person inside.
 
     Attributes:
         per_volume: mass per volume of the object's box [kg/m^3].
-        source: where the figure comes from.
-        person: whether it holds a person as high as the box.
-        besides: what comes to a person [kg].
+        source: source of the value.
+        person: whether it includes a person as high as the box.
+        besides: mass in addition to the person [kg].
         stability: static stability factor, half the track over the height of the centre of mass;
-            None where it lies where the filled shape has it.
-        stability_source: where that comes from.
+            None to use the centre of mass of the filled shape.
+        stability_source: source of that factor.
     """
 
     per_volume: float
@@ -308,10 +308,10 @@ box of even mass 0.31."""
 
 
 def yaw_inertia(category: str, mass: float, size: Sequence[float]) -> float:
-    """Inertia of an object about the vertical [kg m^2].
+    """Inertia of an object about the vertical axis [kg m^2].
 
     Args:
-        category: of the object.
+        category: category of the object.
         mass: [kg].
         size: (length, width, ...) of its box [m].
     """
@@ -321,16 +321,16 @@ def yaw_inertia(category: str, mass: float, size: Sequence[float]) -> float:
 
 
 def default_mass(category: str, size: Sequence[float], *, by_height: bool = True) -> float:
-    """Mass [kg] of an object of that category and box size (length, width, height) [m].
+    """Default mass [kg] of an object.
 
     Args:
-        category: of the object.
-        size: of its box.
-        by_height: persons weigh by their height; False: by the volume of their box, as episodes of
-            earlier versions had it.
+        category: category of the object.
+        size: (length, width, height) of its box [m].
+        by_height: whether the mass of a person depends on the height; if False, on the box volume,
+            as in episodes of earlier versions.
 
     Raises:
-        ParticleError: for a size that is not three positive lengths.
+        ParticleError: if ``size`` is not three positive lengths.
     """
     edges = np.asarray(size, dtype=np.float64)
     if edges.shape != (3,) or not (edges > 0).all():
@@ -343,7 +343,9 @@ def default_mass(category: str, size: Sequence[float], *, by_height: bool = True
 
 
 def centre_height(category: str, track: float) -> float | None:
-    """Height of the centre of mass above the road [m] of a vehicle with that track [m], by the
-    published stability of its class; None for classes without one."""
+    """Height of a vehicle's centre of mass above the road [m], from its track [m].
+
+    Uses the published static stability factor of its class; None for classes without one.
+    """
     stability = CLASS_MASSES.get(category, OTHER).stability
     return None if stability is None else track / (2 * stability)

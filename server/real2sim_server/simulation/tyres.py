@@ -1,4 +1,4 @@
-"""Tyres: four contact patches that carry, roll and grip, and rigid motion on them."""
+"""Tyres: four contact patches with suspension and friction, and rigid motion on them."""
 
 # Kernels take arrays by position, and Numba knows no keyword-only arguments.
 # ruff: noqa: PLR0917
@@ -19,7 +19,7 @@ from ..physics.colliders import Collider
 from ..physics.contact import collider_distance
 from .rigid import RigidMotion, clearance, nearest, packed
 
-# Compiled rigid motion on tyres: forces of the road on four patches, and the body's motion.
+# Compiled rigid motion on tyres: road forces on four patches, and body motion.
 
 
 ROLLING = 0.015
@@ -40,21 +40,21 @@ def advance_on_wheels(
     patches: Any, static_load: Any, rest: Any, tyres: Any, rows: Any, heights: Any,
     gravity: Any, dt: Any, steps: Any, impulse: Any,
 ) -> Any:  # fmt: skip
-    """Move a rigid body by ``steps`` of ``dt`` [s], in place; symplectic Euler.
+    """Advance a rigid body by ``steps`` of ``dt`` [s], in place; symplectic Euler.
 
     Args:
-        rotation: [3, 3] object to world, written to.
-        motion: [3, 3] rows centre, velocity and angular velocity, written to.
-        mass, inertia: of a ``RigidMotion``.
+        rotation: [3, 3] object to world; updated.
+        motion: [3, 3] rows centre, velocity and angular velocity; updated.
+        mass, inertia: see ``RigidMotion``.
         origin: [3] from the centre of mass to the object's origin, object frame [m].
-        patches, static_load, rest: of its tyres; [0, 3], [0], [0] without.
-        tyres: [5] their parameters.
-        rows, heights: of the colliders that carry tyres, packed.
+        patches, static_load, rest: see ``Tyres``; [0, 3], [0], [0] without tyres.
+        tyres: [5] tyre parameters.
+        rows, heights: packed colliders that support tyres.
         gravity: [3] [m/s^2].
-        impulse: [3] what the road did is added to it [N s].
+        impulse: [3] the impulse of the road is added to it [N s].
 
     Returns:
-        What slip of the tyres dissipated [J].
+        Energy dissipated by tyre slip [J].
     """
     friction_work = 0.0
     points = np.empty_like(patches)
@@ -80,7 +80,7 @@ def advance_on_wheels(
 
 @func
 def drift(rotation: Any, motion: Any, inertia: Any, inverse: Any, dt: Any) -> None:
-    """Move a body at its velocities for ``dt`` [s]; angular momentum stays."""
+    """Move a body at its velocities for ``dt`` [s]; conserves angular momentum."""
     spin = motion[2].copy()
     momentum = rotation @ (inertia @ (rotation.T @ spin))
     angle = dt * math.sqrt(spin @ spin)
@@ -88,7 +88,7 @@ def drift(rotation: Any, motion: Any, inertia: Any, inverse: Any, dt: Any) -> No
         x, y, z = dt * spin / angle
         k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         turned = (np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * (k @ k)) @ rotation
-        # One step of Newton and Schulz: rounding must not add up to a skewed frame.
+        # One Newton-Schulz step prevents accumulated rounding from skewing the rotation.
         rotation[:] = 0.5 * (turned @ (3.0 * np.eye(3) - turned.T @ turned))
     motion[0] += dt * motion[1]
     motion[2] = rotation @ (inverse @ (rotation.T @ momentum))
@@ -99,21 +99,21 @@ def press(
     points: Any, up: Any, forward: Any, motion: Any, mass: Any, inverse: Any, static_load: Any,
     rest: Any, tyres: Any, rows: Any, heights: Any, dt: Any, impulse: Any,
 ) -> Any:  # fmt: skip
-    """What the road does over ``dt`` [s] to four patches; velocities in ``motion`` are written to.
+    """Apply road forces to four patches over ``dt`` [s]; updates the velocities in ``motion``.
 
-    Springs and dampers carry along the normal. Across it each patch stops its slip as far as its
-    friction circle lets it: sideways always, along the wheel as far as it is braked.
+    Springs and dampers act along the normal. In the tangent plane, friction stops the slip of each
+    patch within its friction circle: laterally always, longitudinally as far as it is braked.
 
     Args:
-        points: [4, 3] the patches in the world [m].
+        points: [4, 3] patches, world frame [m].
         up, forward: [3] axes of the body.
         motion: see ``advance_on_wheels``.
         mass: [kg].
-        inverse: [3, 3] of the inertia, world axes.
-        impulse: [3] what the road did is added to it [N s].
+        inverse: [3, 3] inverse inertia, world axes.
+        impulse: [3] the impulse of the road is added to it [N s].
 
     Returns:
-        What slip dissipated [J].
+        Energy dissipated by slip [J].
     """
     count = len(points)
     loads, normals, used = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 2))
@@ -151,7 +151,7 @@ def press(
 
 @func
 def nearest_road(point: Any, rows: Any, heights: Any) -> Any:
-    """Height [m] of a point over the nearest collider, infinite over none; and its normal."""
+    """Height [m] of a point above the nearest collider, infinite without one; and its normal."""
     least, normal = math.inf, (0.0, 0.0, 1.0)
     for c in range(len(rows)):
         distance, n = collider_distance(rows[c], heights, point[0], point[1], point[2])
@@ -162,7 +162,7 @@ def nearest_road(point: Any, rows: Any, heights: Any) -> Any:
 
 @func
 def spring_force(squeeze: Any, speed: Any, static_load: Any, tyres: Any) -> Any:
-    """Of spring and damper of a wheel that is squeezed beyond rest [m] and moves [m/s] up; [N]."""
+    """Spring and damper force [N] of a wheel, by compression beyond rest [m] and its rate [m/s]."""
     omega = 2.0 * math.pi * tyres[FREQUENCY]
     carried = static_load / STATIC_GRAVITY
     if not squeeze > -STATIC_GRAVITY / (omega * omega):
@@ -177,7 +177,7 @@ def grip(
     v: Any, w: Any, arm: Any, normal: Any, forward: Any, load: Any, used: Any, mass: Any,
     inverse: Any, tyres: Any,
 ) -> Any:  # fmt: skip
-    """One patch: more impulse (3) [N s] across the road, within its friction circle."""
+    """Additional tangential impulse (3) [N s] of a patch, within its friction circle."""
     along = minus(forward, scaled(dot(forward, normal), normal))
     along = scaled(1.0 / max(math.sqrt(dot(along, along)), 1e-9), along)
     side = cross(normal, along)
@@ -195,7 +195,7 @@ def grip(
 
 @func
 def bend(axis: Any, arm: Any, inverse: Any) -> Any:
-    """How much faster a point moves along ``axis`` by turning, for one unit of impulse there."""
+    """Speed change of a point along ``axis`` by rotation, per unit of impulse there."""
     return dot(axis, cross(times(inverse, cross(arm, axis)), arm))
 
 
@@ -213,7 +213,7 @@ def velocity_at(v: Any, w: Any, arm: Any) -> Any:
 
 @func
 def vector(row: Any) -> Any:
-    """Three numbers of an array as a tuple."""
+    """The three numbers of an array as a tuple."""
     return row[0], row[1], row[2]
 
 
@@ -270,8 +270,8 @@ class TyreReaction:
     """The road's effect on a body through its tyres in one step.
 
     Attributes:
-        impulse: [3] on the body [N s].
-        friction_work: dissipated by slip [J].
+        impulse: [3] impulse on the body [N s].
+        friction_work: energy dissipated by slip [J].
     """
 
     impulse: Float
@@ -283,14 +283,14 @@ class Tyres:
     """A vehicle's four wheels and the road below them.
 
     Attributes:
-        patches: [4, 3] undersides of the wheels in the object's frame, as they stand at rest [m].
-        static_load: [4] what each carries at rest [N].
-        friction: of rubber on the road.
-        brake: fraction of the wheels' grip that holds against rolling, 0 rolls freely, 1 locks.
-        frequency: of the body on its springs [Hz].
-        damping: fraction of critical.
-        travel: by which springs give in beyond rest before the body strikes through [m].
-        rest: [4] height of the undersides above the road at which they carry ``static_load`` [m].
+        patches: [4, 3] undersides of the wheels at rest, object frame [m].
+        static_load: [4] load of each wheel at rest [N].
+        friction: tyre-road friction coefficient.
+        brake: fraction of the wheels' grip that resists rolling; 0 rolls freely, 1 is locked.
+        frequency: natural frequency of the body on its springs [Hz].
+        damping: damping ratio.
+        travel: spring travel beyond rest before bottoming out [m].
+        rest: [4] height of the undersides above the road at ``static_load`` [m].
     """
 
     patches: Float
@@ -312,11 +312,11 @@ class Tyres:
         friction: float = 0.7,
         brake: float = 0.0,
     ) -> Tyres:
-        """Wheels under a box of ``size`` [m], axles at 30 % of the length from the middle.
+        """Wheels under a box of ``size`` [m], with axles at 30 % of the length from the centre.
 
         Args:
             size: (length, width, height).
-            centre: [3] centre of mass in the object's frame [m].
+            centre: [3] centre of mass, object frame [m].
             weight: mass times gravity [N].
             friction, brake: see the class.
         """
@@ -329,21 +329,21 @@ class Tyres:
         return cls(patches, weight * fractions, friction=friction, brake=brake)
 
     def standing(self, T_world_object: Float, road: Sequence[Collider]) -> Tyres:
-        """Tyres whose rest is how the vehicle stands now, where wheels are about on the road.
+        """Tyres whose rest heights match the current pose, for wheels close to the road.
 
-        Tracked boxes miss the road by a few centimetres; that is no reason to jump. What is higher
-        up falls.
+        Tracked boxes miss the road by a few centimetres, which must not cause a jump. Vehicles that
+        are higher up fall.
         """
         heights, _ = nearest(road, self._points(T_world_object))
         near = (heights < ABOVE_MAX) & (heights > -LIFT_MAX)
         return replace(self, rest=np.where(near.all(), heights, np.zeros(4)))
 
     def braked(self, fraction: float) -> Tyres:
-        """The same with ``fraction`` of their grip braked, in [0, 1]."""
+        """The tyres with ``fraction`` of their grip braked, in [0, 1]."""
         return replace(self, brake=fraction)
 
     def lifts(self, T_world_object: Float, road: Sequence[Collider]) -> Float:
-        """[4] compression of the springs, so that wheels stand on the road, not in it [m]."""
+        """[4] spring compression that puts the wheels on the road instead of inside it [m]."""
         heights, normals = nearest(road, self._points(T_world_object))
         carrying = np.isfinite(heights) & (normals @ T_world_object[:3, 2] > UPRIGHT)
         squeeze = np.where(carrying, self.rest - heights, 0.0)
@@ -352,7 +352,7 @@ class Tyres:
     def carrying(
         self, T_world_object: Float, road: Sequence[Collider]
     ) -> Iterator[tuple[Collider, Float, Float]]:
-        """What carries each wheel that is not in the air, where [3] [m], and its normal [3]."""
+        """Supporting collider, contact point [3] [m] and normal [3] of each wheel on the ground."""
         points = self._points(T_world_object)
         droop = STATIC_GRAVITY / (2 * np.pi * self.frequency) ** 2
         over = [clearance(collider, points) for collider in road]
@@ -364,7 +364,7 @@ class Tyres:
                 yield road[k], point, normals[wheel]
 
     def grip_along(self, direction: Float, forward: Float) -> float:
-        """Most friction over load along a direction [3] on the road; less where a wheel rolls."""
+        """Maximum friction over load along a direction [3] on the road; reduced for rolling."""
         held = max(self.brake * self.friction, ROLLING)
         return min(self.friction, held / max(abs(float(direction @ forward)), 1e-9))
 
@@ -380,7 +380,7 @@ class Tyres:
         See ``rolling.press``.
 
         Returns:
-            The motion after, and what the road did.
+            The motion after it, and the reaction of the road.
         """
         moved = np.array([motion.centre, motion.velocity, motion.angular_velocity])
         impulse = np.zeros(3)
@@ -405,7 +405,7 @@ class Tyres:
 
     @cached_property
     def parameters(self) -> Float:
-        """[5] a row of tyre parameters for kernels."""
+        """[5] tyre parameters for kernels."""
         return np.array([self.friction, self.brake, self.frequency, self.damping, self.travel])
 
     def _points(self, T_world_object: Float) -> Float:

@@ -1,4 +1,4 @@
-"""The closed loop: the only package in which time passes."""
+"""The closed-loop simulation: the only package that advances time."""
 
 from .agents import Agents, Event, agent_fields
 from .common import WorldError

@@ -66,8 +66,8 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
 
 # --- Strides -------------------------------------------------------------------------------------
 
-# Pedestrians who left their recorded trajectories (led by a driver or a storyboard, or hit) walk
-# with strides that follow from their motion.
+# Pedestrians off their recorded trajectories (moved by a driver or a storyboard, or hit) walk with
+# strides computed from their motion.
 
 LED = 1e-3
 """A pedestrian this close to the recorded trajectory [m], also in the entries of the rotation,
@@ -80,12 +80,12 @@ Walker = tuple[int, ObjectState, Figure]
 
 @dataclass(frozen=True, eq=False)
 class Strides:
-    """Strides of people at one instant; a part of a world, so replayed and forked with it.
+    """Strides of pedestrians at one instant; part of the world, so replayed and forked with it.
 
     Attributes:
-        made: by object id, of those whom no trajectory leads.
-        objects: of the world, in their order.
-        walkers: row, object and figure of those among them that are people.
+        made: strides by object id, of pedestrians off their trajectories.
+        objects: objects of the world, in order.
+        walkers: row, object and figure of the pedestrians among them.
     """
 
     made: Mapping[str, Stride] = field(default_factory=dict)
@@ -93,15 +93,15 @@ class Strides:
     walkers: tuple[Walker, ...] = ()
 
     def after(self, scene: Scene, agents: Agents, *, since_us: int, t_us: int) -> Strides:
-        """One step on.
+        """The strides one step later.
 
         Args:
-            scene: that the objects are of.
-            agents: where everybody is now.
-            since_us, t_us: the last instant and now [us].
+            scene: scene of the objects.
+            agents: current poses of all objects.
+            since_us, t_us: previous and current time [us].
         """
         walkers = self.walkers
-        # Traffic makes a new tuple with every step, mostly of the same objects.
+        # Traffic creates a new tuple every step, mostly of the same objects.
         if agents.objects != self.objects:
             walkers = _walkers(scene, agents.objects)
         elif not walkers:
@@ -134,7 +134,7 @@ def _is_led(subject: ObjectState, transform: Float, t_us: int) -> bool:
 
 
 def _walking_speed(transform: Float, velocity: Float) -> float:
-    """Speed over the ground [m/s]; 0 for pedestrians who lie or fly."""
+    """Speed over the ground [m/s]; 0 for pedestrians that are lying or airborne."""
     return math.hypot(velocity[0], velocity[1]) if transform[2, 2] > UPRIGHT else 0.0
 
 
@@ -145,14 +145,17 @@ def _walking_speed(transform: Float, velocity: Float) -> float:
 class Event:
     """An event of a step, with the fields of the wire's Event.
 
-    Data of a ``collision``: when it began (``contact_us``, simulation time, within the step before
-    ``t_us``), where (``x``, ``y`` [m], world) and ``relative_speed`` there [m/s]; where momentum is
-    exchanged also the rest of :meth:`.collision.impact.Impact.event_data`. ``object_id`` is None
-    for the background, ``other_id`` the second object where the ego had no part. Of ``left_log``
-    and ``agents_react``: ``distance`` from the recording [m]. Of ``edited``: ``revision``.
-    Of ``storyboard``: ``element``, ``element_type`` and ``change``, see
-    :class:`.storyboard.progress.ElementChange`.
-    Of ``looped``: ``lap``, and ``x``, ``y`` [m], ``turn`` [rad] of :class:`.path.LoopTransform`.
+    ``data`` by kind:
+
+    - ``collision``: ``contact_us``, start time of the contact, within the step before ``t_us``;
+      ``x``, ``y``, its position [m], world frame; ``relative_speed`` there [m/s]. With collision
+      response also the rest of :meth:`.collision.impact.Impact.event_data`. ``object_id`` is None
+      for the background. ``other_id`` is the second object if the ego is not involved.
+    - ``left_log``, ``agents_react``: ``distance`` from the recording [m].
+    - ``edited``: ``revision``.
+    - ``storyboard``: ``element``, ``element_type`` and ``change``, see
+      :class:`.storyboard.progress.ElementChange`.
+    - ``looped``: ``lap``, and ``x``, ``y`` [m], ``turn`` [rad] of :class:`.path.LoopTransform`.
     """
 
     type: EventType
@@ -165,7 +168,7 @@ class Event:
     change: str | None = None
 
     def fields(self) -> dict[str, Any]:
-        """As a plain map for the wire."""
+        """The event as a plain map for the wire."""
         fields = {
             "type": self.type,
             "t_us": self.t_us,

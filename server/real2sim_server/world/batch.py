@@ -1,8 +1,8 @@
-"""Many worlds of one scene that step together as a structure of arrays, for learning.
+"""Batched worlds of one scene, stepped together as a structure of arrays, for learning.
 
-A step costs microseconds. :class:`BatchWorld` acts like a :class:`.world.World` at each of its
-places, within the part of the closed loop that :func:`check_batchable` accepts: the same plans
-lead to the same motions, contacts and ends.
+A step costs microseconds. Each world of a :class:`BatchWorld` behaves like a
+:class:`.world.World`: the same plans lead to the same motions, contacts and terminations. Only the
+options that :func:`check_batchable` accepts are supported.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ CHECKED = frozenset({"ego", "action", "agents", "contact"})
 
 
 def check_batchable(spec: ResetSpec) -> None:
-    """Refuse what batches do not know.
+    """Check that a batch supports all options of ``spec``.
 
     Raises:
-        WorldError: INVALID_REQUEST, naming every option that is outside and what is allowed.
+        WorldError: INVALID_REQUEST, with every unsupported option and its allowed values.
     """
     outside = [
         f"{name}={getattr(spec, name)!r}"
@@ -98,7 +98,7 @@ def check_batchable(spec: ResetSpec) -> None:
 
 # --- Tables --------------------------------------------------------------------------------------
 
-# Compiled code takes them as plain arrays, since parallel loops take no nested tuples.
+# Compiled code takes them as plain arrays: parallel loops do not support nested tuples.
 
 Longs = NDArray[np.int64]
 
@@ -107,10 +107,10 @@ class Tracks(NamedTuple):
     """Objects of the scenario, N of them.
 
     Attributes:
-        ends, times, knots: their trajectories, see ``edit.track_kernels.poses_at``.
+        ends, times, knots: trajectories, see ``edit.track_kernels.poses_at``.
         sizes: [N, 3] float64 [m].
-        driven: [N] bool, those that IDM drives.
-        path_ends: [N + 1] int64, where the path of each begins in ``paths``.
+        driven: [N] bool, objects with an IDM driver.
+        path_ends: [N + 1] int64, start of each object's path in ``paths``.
         paths: [P, KNOT] float64, see :mod:`.path`.
         desired: [N] float64 [m/s].
         idm: [5] float64: headway [s], gap [m], acceleration, braking, lateral acceleration
@@ -132,11 +132,11 @@ class Road(NamedTuple):
     """Ground and roads.
 
     Attributes:
-        heights, frame: of the ground, see ``scene.ground``.
-        route: knots of the recorded way, see :mod:`.path`.
-        line_points, line_ends, lane_points, lane_ends: of the route and of other lanes, see
-            ``scoring.road_kernels``.
-        half_widths: [2] float64, of both [m].
+        heights, frame: ground grid, see ``scene.ground``.
+        route: knots of the recorded path, see :mod:`.path`.
+        line_points, line_ends, lane_points, lane_ends: route and other lanes, see
+            ``scoring.road``.
+        half_widths: [2] float64, along the route and along other lanes [m].
         ego_size: [3] float64, (length, width, height) [m].
     """
 
@@ -152,7 +152,7 @@ class Road(NamedTuple):
 
 
 def tracks_of(state: ScenarioState, spec: ResetSpec) -> tuple[tuple[ObjectState, ...], Tracks]:
-    """The visible objects, and their tables."""
+    """The visible objects and their tables."""
     packed = state.tracks
     objects = packed.objects
     ends, times, knots = packed.arrays
@@ -205,7 +205,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(eq=False)
 class _Instant:
-    """All worlds at one instant; arguments of step_worlds but the last, which gear is engaged."""
+    """All worlds at one instant: the arguments of step_worlds, then the engaged gears."""
 
     motions: Float
     poses: Float
@@ -239,13 +239,13 @@ class _Instant:
 
 @dataclass(frozen=True, eq=False)
 class ThingsInWorlds:
-    """What the renderer draws of W worlds.
+    """Render instances of W worlds.
 
     Attributes:
-        things: the background and N objects, whose own poses and instants say nothing.
+        things: the background and N objects; ignore their own poses and times.
         poses: [W, 1 + N, 4, 4] float64, ``T_world_object``.
-        there: [W, 1 + N] bool, which of them exist now.
-        times_us: [W] int64, of colours that change over time [us].
+        there: [W, 1 + N] bool, whether each instance exists now.
+        times_us: [W] int64, time for colours that change over time [us].
     """
 
     things: tuple[Instance, ...]
@@ -256,12 +256,12 @@ class ThingsInWorlds:
 
 @dataclass(frozen=True, eq=False)
 class BatchStep:
-    """What a step has brought, by world.
+    """Results of a step, by world.
 
     Attributes:
-        progress: [W] float64, way along the route in this step [m].
-        at_fault: [W] int64, contacts begun that the ego is to blame for.
-        contacts: [W] int64, contacts begun.
+        progress: [W] float64, distance along the route in this step [m].
+        at_fault: [W] int64, new contacts for which the ego is at fault.
+        contacts: [W] int64, new contacts.
     """
 
     progress: Float
@@ -270,37 +270,37 @@ class BatchStep:
 
 
 class BatchWorld:
-    """W worlds of one scene and one reset; each place runs an episode of its own.
+    """W independent episodes of one scene and one reset.
 
-    Each behaves like a :class:`.world.World` within the supported part, see
-    :func:`check_batchable`: same motions, objects, contacts and ends. Worlds are independent of
-    each other, and no result depends on the number of threads.
+    Each episode behaves like a :class:`.world.World` with the same options: same motions, objects,
+    contacts and terminations. Results do not depend on the number of threads.
 
     Attributes:
-        scene: shared, immutable.
+        scene: the scene; shared, immutable.
         state: objects of all worlds.
-        spec: of all episodes but their start.
+        spec: options of all episodes, except their start times.
         worlds: W.
-        start_us, steps: [W] int64, where each episode began [us], and its steps since.
-        horizons: [W] int64, steps after which each is cut off.
-        terminated, truncated: [W] bool, how each has ended.
-        off_road: [W] bool, whether each was off the road in its episode.
-        touching: names of what each ego is in contact with.
+        start_us, steps: [W] int64, start time [us] and steps since then.
+        horizons: [W] int64, number of steps after which each episode is truncated.
+        terminated, truncated: [W] bool, how each episode ended.
+        off_road: [W] bool, whether each ego has been off the road in its episode.
+        touching: names of the objects each ego is in contact with.
     """
 
     def __init__(
         self, scene: Scene, spec: ResetSpec, worlds: int, *, state: ScenarioState | None = None
     ) -> None:
-        """All worlds at the start of an episode.
+        """Start an episode in every world.
 
         Args:
-            scene: that is driven in.
-            spec: of the episodes.
-            worlds: how many, at least 1.
-            state: objects; by default those of the scene.
+            scene: the scene to drive in.
+            spec: options of the episodes.
+            worlds: number of worlds, at least 1.
+            state: objects; those of the scene by default.
 
         Raises:
-            WorldError: INVALID_REQUEST for what batches do not know; and as ``World`` does.
+            WorldError: INVALID_REQUEST for options that batches do not support; errors of
+                ``World``.
             ValueError: fewer than one world.
         """
         if worlds < 1:
@@ -333,12 +333,12 @@ class BatchWorld:
 
     @property
     def times_us(self) -> Longs:
-        """[W] now [us]."""
+        """[W] current times [us]."""
         return self.start_us + self.steps * self.spec.dt_us
 
     @property
     def over(self) -> Flags:
-        """[W] which episodes have ended; these worlds stand still until they are reset."""
+        """[W] whether each episode has ended; ended worlds do not move until they are reset."""
         return self.terminated | self.truncated
 
     @property
@@ -352,32 +352,31 @@ class BatchWorld:
         return self._now.poses
 
     def body_pose(self, w: int) -> Float:
-        """``T_world_body`` [4, 4] float64 of one ego on its springs, which carries its cameras."""
+        """``T_world_body`` [4, 4] float64 of one ego: its sprung body, which carries cameras."""
         attitude = BodyAttitude(*self._attitudes[w].tolist())
         return tilted(self._now.poses[w], attitude, self.spec.ego)
 
     @property
     def route_s(self) -> Float:
-        """[W] float64, where the egos are along the route [m]; a view."""
+        """[W] float64, ego positions along the route [m]; a view."""
         return self._now.places[:, S]
 
     @property
     def route_offset(self) -> Float:
-        """[W] float64, how far beside the route, positive on the left [m]; a view."""
+        """[W] float64, lateral offsets from the route, positive left [m]; a view."""
         return self._now.places[:, OFFSET]
 
     def reset(
         self, where: ArrayLike | None = None, *, start_us: Sequence[int | None] | None = None
     ) -> None:
-        """Begin new episodes.
+        """Start new episodes.
 
         Args:
-            where: [W] bool or indices of worlds; all by default.
-            start_us: where each of them begins, None for that of the spec [us].
+            where: [W] bool or indices of worlds; all worlds by default.
+            start_us: start time of each selected world [us]; None for that of the spec.
 
         Raises:
-            WorldError: TIME_OUT_OF_RANGE for a start that does not fit the log; then nothing has
-                changed.
+            WorldError: TIME_OUT_OF_RANGE for a start outside the log; nothing is changed.
         """
         chosen = np.arange(self.worlds)[slice(None) if where is None else np.asarray(where)]
         starts = [self.spec.start_us] * len(chosen) if start_us is None else list(start_us)
@@ -386,16 +385,15 @@ class BatchWorld:
             self._place(w, world)
 
     def step(self, actions: ArrayLike, *, plan_us: ArrayLike | None = None) -> BatchStep:
-        """Move every world that is not over by one clock step.
+        """Advance every running world by one clock step.
 
         Args:
-            actions: [W, 2] acceleration [m/s^2] and road-wheel angle [rad] where the action of the
-                spec is ``control``; else [W, N, 3] poses x, y [m], yaw [rad] in the frame of each
-                vehicle.
-            plan_us: [N] times of those poses after now, increasing [us].
+            actions: [W, 2] acceleration [m/s^2] and road-wheel angle [rad] if the action of the
+                spec is ``control``; else [W, N, 3] poses x, y [m], yaw [rad], vehicle frame.
+            plan_us: [N] times of these poses relative to now, increasing [us].
 
         Raises:
-            ValueError: actions of another shape or not finite, or times that do not increase.
+            ValueError: wrong shape, values that are not finite, or times that do not increase.
         """
         given, after_us = self._checked(actions, plan_us)
         going, before, after = ~self.over, self._now, self._next
@@ -434,23 +432,25 @@ class BatchWorld:
         return BatchStep(progress, at_fault, contacts)
 
     def routes(self) -> NDArray[np.float32]:
-        """Waypoints [W, 20, 2] float32 along the route ahead, in the frame of each vehicle [m]."""
+        """Waypoints [W, 20, 2] float32 along the route ahead, vehicle frame [m]."""
         found = np.empty((self.worlds, WAYPOINTS, 2), np.float32)
         routes_ahead(self._road.route, self._now.motions, self._now.places, WAYPOINT_SPACING, found)
         return found
 
     def agents(self, w: int) -> Agents:
-        """Objects of one world now."""
+        """Current objects of one world."""
         return self._agents(self._now, w)
 
     def instances(self, w: int) -> list[Instance]:
-        """What the renderer draws of one world now; nothing is copied."""
+        """Current render instances of one world; nothing is copied."""
         shown_us = min(int(self.times_us[w]), self.scene.end_us)
         return compose(self.scene, self.state, self.agents(w), shown_us)
 
     def shown(self, worlds: Sequence[int]) -> ThingsInWorlds | None:
-        """What :meth:`instances` gives of some worlds, in arrays; None where an edit of the state
-        makes it hang on each world: its background, and shadows under moved objects."""
+        """The :meth:`instances` of some worlds as arrays.
+
+        None if edits make background or shadows differ between worlds.
+        """
         if self._things is None:
             return None
         chosen = np.asarray(worlds, np.int64)
@@ -468,7 +468,7 @@ class BatchWorld:
         )
 
     def _begin(self, start_us: int | None) -> World:
-        """The world at the start of an episode, kept for the next one from there."""
+        """The world at the start of an episode, cached by start time."""
         start = self.scene.start_us if start_us is None else int(start_us)
         if start not in self._begun:
             spec = self.spec.model_copy(update={"start_us": start, "sensors": []})
@@ -506,8 +506,11 @@ class BatchWorld:
     def _move_one_by_one(
         self, kinds: NDArray[np.int8], times_us: Longs, given: Float, after_us: Longs
     ) -> list[SinglePose | None]:
-        """Move the egos that are, or may come to be, in reverse gear, and those that follow plans
-        of a single pose: few are. What the next of those plans go on from."""
+        """Move the egos that the batch kernel does not support, one by one.
+
+        These are egos in or about to enter reverse gear, and egos with single-pose plans. Returns
+        the start of the next single-pose plan.
+        """
         now, after = self._now, self._next
         after.reversing[:] = now.reversing
         single: list[SinglePose | None] = [None] * self.worlds
@@ -551,8 +554,7 @@ class BatchWorld:
         return given, after_us
 
     def _meet(self, w: int, t_us: int, action: Float, plan_us: Longs) -> tuple[int, int]:
-        """Contacts of one world in a step in which it may have met something: those that the ego is
-        to blame for, and all that began."""
+        """New contacts of one world in a step with a possible contact: at-fault ones, and all."""
         found = self._contacts(w, t_us, action, plan_us)
         self.touching[w] = found.touching
         place = self._now.places[w]
@@ -562,7 +564,7 @@ class BatchWorld:
         return at_fault, len(found.begun)
 
     def _contacts(self, w: int, t_us: int, action: Float, plan_us: Longs) -> EgoContacts:
-        """By the same functions as a single world."""
+        """Contacts of one world, by the same functions as a single :class:`.world.World`."""
         before, after = self._next, self._now
         motion = before.motion(w)
         controller = self._controller(w, motion, t_us, action, plan_us)

@@ -1,4 +1,4 @@
-"""Compiled step of many worlds, each on one core, by the functions that step a single world."""
+"""Compiled step of many worlds in parallel, built from the functions of a single world."""
 
 # ruff: noqa: PLR0917 - kernels take arrays by position
 
@@ -24,9 +24,9 @@ from .traffic.driver import BACK_TO_LANE, HARDEST, STANDSTILL
 
 # --- Objects -------------------------------------------------------------------------------------
 
-# Recorded ones, and those that IDM drives. A driver is a number for each object: NONE while its
-# position is recorded; DRIVES; LEFT after the end of its path. Its state is the distance along its
-# path, the offset from it [m] and the speed [m/s].
+# Recorded objects and objects with IDM drivers. The driver status of an object is NONE while it
+# replays the recording, DRIVES, or LEFT after the end of its path. The state of a driver is the
+# distance along its path [m], the offset from it [m] and the speed [m/s].
 
 NONE, DRIVES, LEFT = 0, 1, 2
 
@@ -145,7 +145,7 @@ def place_on_path(path, s, speed, offset, drift, pose):
 
 @func
 def remainder(value, period):
-    """``math.remainder``, which compiled code does not know: between minus and plus half."""
+    """``math.remainder``, which Numba does not support; in [-period / 2, period / 2]."""
     return value - period * np.rint(value / period)
 
 
@@ -168,23 +168,23 @@ def step_worlds(
     """Move all worlds that are ``going`` by a step.
 
     Args:
-        going: [W] int8: STANDS, GOES, or MOVED where the ego's new motion is in ``new_motions``
-            already.
+        going: [W] int8: STANDS, GOES, or MOVED if ``new_motions`` already holds the ego's new
+            motion.
         times_us: [W] int64, before the step [us].
-        dt_us: of the step [us].
+        dt_us: time step [us].
         law: HOLD for commands, else the tracker of trajectories.
-        actions: [W, N, 3] float64: poses of plans; or [W, 1, 3] with acceleration, steering.
-        plan_us: [N] int64, times of the poses after now [us].
-        frame_is_vehicle: whether poses are those of the vehicle's frame.
+        actions: [W, N, 3] float64 poses of plans; or [W, 1, 3] with acceleration, steering.
+        plan_us: [N] int64, times of the poses relative to now [us].
+        frame_is_vehicle: whether poses are in the vehicle frame.
         vehicle: the members of VehicleParameters.
-        limits: acceleration or braking at most, steering rate, steering and wheelbase.
+        limits: maximum acceleration or braking, maximum steering rate, maximum steering, wheelbase.
         tracks, road: see :mod:`.batch`.
-        motions, poses, places: [W, STATE], [W, 4, 4], [W, PLACES], of the egos.
+        motions, poses, places: [W, STATE], [W, 4, 4], [W, PLACES], states of the egos.
         objects: [W, K, 10] float64, positions, quaternions, velocities of objects.
         present: [W, K] bool, which of them are in the world.
         drivers: [W, K] int8 and driving: [W, K, 3] float64, see :data:`NONE`.
-        new_motions ... new_driving: the same after the step, written.
-        near: [W] bool, written: whether the ego may have met an object within the step.
+        new_motions ... new_driving: the same after the step; outputs.
+        near: [W] bool, whether the ego may have touched an object within the step; output.
     """
     for w in prange(going.shape[0]):
         if going[w]:
@@ -250,7 +250,7 @@ def advanced(state, t_us, dt_us, law, action, plan_us, frame_is_vehicle, vehicle
 
 @func
 def stand(motion, pose, near_s, place, road):
-    """Put a vehicle onto the ground and look where it is along the route and on the road."""
+    """Place a vehicle on the ground and compute its route and road positions."""
     x, y, yaw = motion[0], motion[1], motion[2]
     pose[:, :] = pose_at(road.heights, road.frame, x, y, yaw)
     s, offset, point, path_yaw, _ = nearest_point(road.route, x, y, near_s)
@@ -274,9 +274,11 @@ def may_meet(
     motion, pose, new_motion, new_pose, dt, limits, size, objects, present, new_objects,
     new_present, sizes
 ):  # fmt: skip
-    """Whether the ego may have touched an object within the step: the first look of
-    ``collision.sweep``, at the boxes on a straight way, grown by how far the ego may have been
-    beside it."""
+    """Conservative test whether the ego may have touched an object within the step.
+
+    The broad phase of ``collision.sweep``: boxes on straight paths, grown by the ego's maximum
+    deviation from its own.
+    """
     slack = deviation(motion, new_motion, dt, limits, size)
     ahead = size[0] / 2 - REAR_OVERHANG
     turned = motion[2] + remainder(new_motion[2] - motion[2], 2 * math.pi)
@@ -317,7 +319,7 @@ def may_meet(
 
 @func
 def deviation(motion, new_motion, dt, limits, size):
-    """How far the box may have been from a straight way [m], as ``collision.sweep`` has it."""
+    """Maximum deviation of the box from a straight path [m], as in ``collision.sweep``."""
     hardest, steer_rate, most_steering, wheelbase = limits
     fastest = max(math.hypot(motion[3], motion[7]), math.hypot(new_motion[3], new_motion[7]))
     fastest += hardest * dt / 2

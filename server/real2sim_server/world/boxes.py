@@ -1,4 +1,4 @@
-"""Boxes on the plane: broad phase, headings, and the first contact of moving boxes."""
+"""Boxes in the plane: broad phase, headings, and first contact of moving boxes."""
 
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
@@ -23,7 +23,7 @@ def shifted(transform, ahead, up):
 
 @kernel
 def within_reach(T_world_box, size, transforms, sizes):
-    """Numbers [H] int64 of the boxes whose enclosing sphere intersects that of one box, of K boxes.
+    """Indices [H] int64 of the boxes, out of K, whose bounding sphere intersects that of one box.
 
     Args:
         T_world_box: [4, 4] float64.
@@ -48,15 +48,17 @@ def within_reach(T_world_box, size, transforms, sizes):
 
 @kernel
 def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
-    """Whether a vehicle could touch one of K boxes within a step, by boxes along its heading.
+    """Conservative test whether a vehicle could touch one of K boxes within a step.
+
+    Compares bounds along the vehicle's heading.
 
     Args:
-        ego: x, y of the middle of its box [m], yaw [rad], speed, lateral speed [m/s], yaw rate
-            [rad/s]; at the start of the step.
+        ego: x, y of the box centre [m], yaw [rad], speed, lateral speed [m/s], yaw rate [rad/s];
+            at the start of the step.
         size: length and width of its box [m].
-        dt: the step [s].
-        positions, quaternions, velocities, sizes: [K, 3], [K, 4], [K, 3], [K, 3] float64, of the
-            boxes at the end of the step, world [m], [m/s].
+        dt: time step [s].
+        positions, quaternions, velocities, sizes: [K, 3], [K, 4], [K, 3], [K, 3] float64, boxes at
+            the end of the step, world frame [m], [m/s].
     """
     x, y, yaw, forward, lateral, yaw_rate = ego
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -80,15 +82,17 @@ def may_overlap(ego, size, dt, positions, quaternions, velocities, sizes):
 
 @kernel
 def may_meet_any(ego, size, rows, start, end, sizes):
-    """Whether a vehicle could touch one of K boxes within a step, by boxes along its heading.
+    """Conservative test whether a vehicle could touch one of K boxes within a step.
+
+    Compares bounds along the vehicle's heading.
 
     Args:
-        ego: x, y of the middle of its box at the start [m], yaw [rad], how far it may get along
-            its heading and across it [m].
+        ego: x, y of the box centre at the start [m], yaw [rad], maximum displacement along its
+            heading and across it [m].
         size: length and width of its box [m].
-        rows: [K] int64, where each box stands in ``start``; -1 where it was not there.
-        start, end: positions [., 3] [m] and quaternions [., 4] of the boxes at the start and the
-            end of the step; in between they go straight and turn evenly.
+        rows: [K] int64, row of each box in ``start``; -1 if it was not present.
+        start, end: positions [., 3] [m] and quaternions [., 4] of the boxes at the start and end
+            of the step; position and yaw are interpolated linearly.
         sizes: [K, 3] float64 [m].
     """
     x, y, yaw, far, aside = ego
@@ -139,9 +143,9 @@ def heading(quaternion):
 
 # --- First contact -------------------------------------------------------------------------------
 
-# Conservative advancement (Mirtich 1996): two boxes are ``d`` apart, and no point of them moves
-# faster than ``u`` relative to the other. They cannot touch before ``d / u``. The largest gap along
-# a side's normal never exceeds ``d``, so time advances by gap over speed until the gap is closed.
+# Conservative advancement (Mirtich 1996): two boxes at distance ``d`` whose points move at most
+# at relative speed ``u`` cannot touch before ``d / u``. The largest gap along a side normal never
+# exceeds ``d``, so time advances by gap / speed until the gap is closed.
 
 WAY = 5
 """Columns of a way: fraction of the step, centre x, y [m], yaw [rad], height of the bottom [m]."""
@@ -155,22 +159,22 @@ MAX_PIECES = 64
 
 @kernel
 def first_contacts(way, size, rows, start, end, sizes, slack, tolerance):
-    """When the box of a vehicle first overlaps each of K boxes within a step.
+    """First contact of a vehicle's box with each of K boxes within a step.
 
     Args:
-        way: [M, 5] float64, the vehicle's box by fraction of the step, straight between rows; see
-            ``WAY``; its yaws are continuous.
+        way: [M, 5] float64, motion of the vehicle's box by fraction of the step, linear between
+            rows; see ``WAY``. Yaws are continuous.
         size: (length, width, height) of that box [m].
-        rows: [K] int64, where each object stands in ``start``; -1 where it was not there, and
-            stands where it is at the end.
-        start, end: positions [., 3] [m] and quaternions [., 4] of the objects, world.
+        rows: [K] int64, row of each object in ``start``; -1 if it was not present, in which case
+            it stays at its end pose.
+        start, end: positions [., 3] [m] and quaternions [., 4] of the objects, world frame.
         sizes: [K, 3] float64 [m].
-        slack: how far the vehicle's box is grown to all sides [m].
-        tolerance: boxes that come nearer than this are looked at again after as much motion [m].
+        slack: margin added to all sides of the vehicle's box [m].
+        tolerance: minimum advance between two distance checks [m].
 
     Returns:
-        Fractions [K] float64 of the step, inf where there is no contact; and whether the boxes
-        overlap at its end, [K] bool.
+        Fractions [K] float64 of the step, inf without contact; and [K] bool, whether the boxes
+        overlap at the end of the step.
     """
     count = len(sizes)
     first, touching = np.full(count, np.inf), np.zeros(count, np.bool_)
@@ -242,7 +246,7 @@ def first_contacts(way, size, rows, start, end, sizes, slack, tolerance):
 
 @kernel
 def _nearest(x, y, dx, dy):
-    """Distance [m] from the origin to the way from (x, y) on by (dx, dy) [m]."""
+    """Distance [m] from the origin to the segment from (x, y) to (x + dx, y + dy) [m]."""
     squared = dx * dx + dy * dy
     t = min(max(-(x * dx + y * dy) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
     return math.hypot(x + dx * t, y + dy * t)
@@ -250,8 +254,10 @@ def _nearest(x, y, dx, dy):
 
 @kernel
 def _gap(x, y, yaw, length, width, other_yaw, other_length, other_width):
-    """Largest gap [m] of two boxes along a normal of a side, the second's middle being (x, y) off;
-    below 0 where they overlap."""
+    """Largest gap [m] of two boxes along a side normal; negative if they overlap.
+
+    (x, y) is the centre of the second box relative to the first.
+    """
     cos_a, sin_a = math.cos(yaw), math.sin(yaw)
     cos_b, sin_b = math.cos(other_yaw), math.sin(other_yaw)
     c, s = abs(cos_a * cos_b + sin_a * sin_b), abs(sin_b * cos_a - cos_b * sin_a)
@@ -266,21 +272,21 @@ def _gap(x, y, yaw, length, width, other_yaw, other_length, other_width):
 
 @kernel
 def first_occupied(way, size, spacing, origin, cell, occupied, sums):
-    """When the box of a vehicle first lies on an occupied cell within a step.
+    """First overlap of a vehicle's box with an occupied grid cell within a step.
 
     Args:
         way: [M, 5] float64, as in :func:`first_contacts`.
         size: (length, width, height) of that box [m].
-        spacing: of the points all over the box that are looked at, and how far its corners move
-            from one look to the next, at most [m].
+        spacing: distance of the sample points in the box, and maximum motion of its corners between
+            two checks [m].
         origin: [2] float64, lowest corner of the grid [m].
-        cell: edge of a cell [m].
+        cell: edge length of a cell [m].
         occupied: [nx, ny] bool.
-        sums: [nx + 1, ny + 1] int64, occupied cells below and left of each corner of a cell.
+        sums: [nx + 1, ny + 1] int64, summed-area table of ``occupied``.
 
     Returns:
-        Fraction of the step, inf where there is none; the middle x, y [m] of what is hit; and
-        whether the box lies on an occupied cell at the end.
+        Fraction of the step, inf without overlap; mean position x, y [m] of the hit cells; and
+        whether the box overlaps an occupied cell at the end.
     """
     half = math.hypot(size[0], size[1]) / 2
     first, at_x, at_y, touching = np.inf, 0.0, 0.0, False
@@ -319,8 +325,10 @@ def first_occupied(way, size, spacing, origin, cell, occupied, sums):
 
 @kernel
 def holds_any(way, reach, origin, cell, sums):
-    """Whether a rectangle along the axes around a way and all within ``reach`` [m] of it holds an
-    occupied cell; see :func:`first_occupied`."""
+    """Whether the axis-aligned bounds of a motion, grown by ``reach`` [m], hold an occupied cell.
+
+    See :func:`first_occupied`.
+    """
     return _any_occupied(
         way[:, 1].min() - reach,
         way[:, 1].max() + reach,
@@ -334,7 +342,7 @@ def holds_any(way, reach, origin, cell, sums):
 
 @kernel
 def _any_occupied(low_x, high_x, low_y, high_y, origin, cell, sums):
-    """Whether a rectangle along the axes [m] holds an occupied cell."""
+    """Whether an axis-aligned rectangle [m] holds an occupied cell."""
     nx, ny = sums.shape[0] - 1, sums.shape[1] - 1
     a = min(max(math.floor((low_x - origin[0]) / cell), 0), nx)
     b = min(max(math.floor((high_x - origin[0]) / cell) + 1, 0), nx)
@@ -345,7 +353,7 @@ def _any_occupied(low_x, high_x, low_y, high_y, origin, cell, sums):
 
 @kernel
 def _hits(x, y, yaw, size, spacing, origin, cell, occupied):
-    """How many points all over a box lie on occupied cells, and their middle [m]."""
+    """Number of sample points of a box in occupied cells, and their mean position [m]."""
     rows = max(math.ceil(size[0] / spacing), 1) + 1
     columns = max(math.ceil(size[1] / spacing), 1) + 1
     cos, sin = math.cos(yaw), math.sin(yaw)

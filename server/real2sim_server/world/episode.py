@@ -1,4 +1,4 @@
-"""An episode: validation of its reset, clock, route beyond the log, and randomization."""
+"""Episodes: reset validation, clock, route beyond the log, and randomization."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from .traffic.driver import desired_speed, highest_speed
 
 @dataclass(frozen=True)
 class EpisodeClock:
-    """Times of an episode.
+    """The clock of an episode.
 
     Attributes:
         start_us: time of step 0 [us].
-        dt_us: from step to step [us].
-        horizon: number of steps after which the episode is cut off.
+        dt_us: time step [us].
+        horizon: number of steps after which the episode is truncated.
     """
 
     start_us: int
@@ -55,9 +55,9 @@ def episode_clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
     """The clock of an episode on ``scene``.
 
     Raises:
-        WorldError: TIME_OUT_OF_RANGE when start or horizon leave the log; UNKNOWN_CAMERA;
-            INVALID_REQUEST when a sensor's period and the clock step do not divide, a camera
-            is listed twice, or a start is sampled for a warm-up.
+        WorldError: TIME_OUT_OF_RANGE if the start or horizon is outside the log; UNKNOWN_CAMERA;
+            INVALID_REQUEST if a sensor period is not a multiple of the clock step, a camera is
+            listed twice, or a warm-up is combined with a sampled start.
     """
     clock = _clock(scene, spec)
     for sensor in spec.sensors:
@@ -76,14 +76,14 @@ def episode_clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
 def takes_effect_us(
     spec: ResetSpec, clock: EpisodeClock, t_us: int, latency_us: int, *, jitter_us: int = 0
 ) -> int:
-    """When a plan that comes at ``t_us`` takes effect [us]: after its latency and the warm-up.
+    """Time at which a plan received at ``t_us`` takes effect [us]: after latency and warm-up.
 
     Args:
-        spec: names the latency model.
-        clock: of the episode.
-        t_us: now [us].
-        latency_us: measured time to make the plan [us].
-        jitter_us: wait that the seed drew, on top of the model's [us].
+        spec: selects the latency model.
+        clock: clock of the episode.
+        t_us: current time [us].
+        latency_us: measured planning time [us].
+        jitter_us: sampled delay added to the latency model [us].
     """
     latency = spec.latency
     wait_us = {
@@ -149,11 +149,10 @@ def _check_sensor(scene: Scene, spec: ResetSpec, sensor: SensorSpec) -> None:
 
 # --- Beyond the log ------------------------------------------------------------------------------
 
-# The clock of an episode may outlast the recording (``beyond_log`` of its reset). The route then
-# continues with the final bend of the recorded drive, which fades into a straight line. With
-# ``loop``, an ego that reaches the end of the recorded drive is put back to its start, with the
-# same offset and heading error: a :class:`.path.LoopTransform`. Road users that follow the route
-# move with it; everything else stays.
+# An episode may outlast the recording (``beyond_log`` of its reset). The route then continues with
+# the final curvature of the recorded drive, which fades to zero. With ``loop``, an ego at the end
+# of the recorded drive is reset to its start with the same offset and heading error
+# (:class:`.path.LoopTransform`). Road users that follow the route move with it; all others stay.
 
 BEND_FROM = 10.0
 """The bend at the end of the recorded drive is that of its last metres [m]."""
@@ -181,11 +180,10 @@ STANDING = 2.0
 
 
 def driven_route(scene: Scene, spec: ResetSpec, horizon: int) -> LoggedPath:
-    """The path that an episode is measured along: the recorded drive and, where the episode may go
-    beyond it, its continuation.
+    """The reference path of an episode: the recorded drive and, if needed, its continuation.
 
     Raises:
-        WorldError: INVALID_REQUEST for a loop on a recorded drive that is none.
+        WorldError: INVALID_REQUEST for a loop on a recorded drive that is not closed.
     """
     recorded = LoggedPath(scene.ego)
     if spec.beyond_log == "end":
@@ -205,7 +203,7 @@ def driven_route(scene: Scene, spec: ResetSpec, horizon: int) -> LoggedPath:
 
 
 def lanes_route(route: LoggedPath, scene: Scene, spec: ResetSpec) -> LoggedPath:
-    """The path along which lanes of spawned objects run; it continues where the episode's ends."""
+    """The path that lanes of spawned objects follow; extends beyond the end of ``route``."""
     spawn = spec.agents.spawn
     if spawn is None or spec.beyond_log != "end":
         return route
@@ -213,7 +211,7 @@ def lanes_route(route: LoggedPath, scene: Scene, spec: ResetSpec) -> LoggedPath:
 
 
 def continued(path: LoggedPath, reach: float, ground: Ground) -> LoggedPath:
-    """The path and ``reach`` more metres of it, on the ground."""
+    """The path extended by ``reach`` metres along the ground."""
     before = path.at(max(path.length - BEND_FROM, 0.0))[3]
     bend = (float(path.yaws[-1]) - before) / min(BEND_FROM, path.length)
     bend = min(max(bend, -SHARPEST_BEND), SHARPEST_BEND)
@@ -238,8 +236,7 @@ def continued(path: LoggedPath, reach: float, ground: Ground) -> LoggedPath:
 
 
 def at_start_again(motion: Motion, near: PathPoint, route: LoggedPath, s: float) -> Motion:
-    """The motion at distance ``s`` of the route, beside it and turned against it as it is at
-    ``near``."""
+    """The motion moved to route distance ``s``, with the offset and heading error at ``near``."""
     x, y, _, yaw = route.at(s)
     return motion._replace(
         x=x - near.offset * math.sin(yaw),
@@ -258,16 +255,16 @@ the same object as long as an episode lasts: drivers begin anew with another."""
 def tracks_beyond_log(
     state: ScenarioState, until_us: int, prolonged: Prolonged, *, left: Iterable[str] = ()
 ) -> PackedTracks[ObjectState]:
-    """Tracks of the objects up to ``until_us`` [us]; standing objects are always present.
+    """Tracks of the objects up to ``until_us`` [us]; stationary objects are always present.
 
-    Of standing objects whose boxes overlap, such as two tracks of one parked car, only the one
-    that was recorded longest is there longer than it was recorded.
+    If boxes of stationary objects overlap (such as two tracks of one parked car), only the longest
+    recorded track is extended beyond its recorded time.
 
     Args:
         state: objects after all edits.
         until_us: end of the episode [us].
-        prolonged: of the episode; it is added to.
-        left: ids of those that have left.
+        prolonged: cache of extended trajectories of the episode; updated.
+        left: ids of objects that have left.
     """
     gone = frozenset(left)
     visible = [o for o in state.visible if o.object_id not in gone]
@@ -306,7 +303,7 @@ def _without_doubles(standing: list[ObjectState]) -> set[str]:
 
 
 def _prolonged(trajectory: Trajectory, start_us: int, end_us: int) -> Trajectory:
-    """The trajectory with its first pose from ``start_us`` on and its last one up to ``end_us``."""
+    """The trajectory, holding its first pose from ``start_us`` and its last up to ``end_us``."""
     p, q, times = trajectory.positions, trajectory.quaternions, trajectory.times_us
     if start_us < times[0]:
         p, q = np.vstack([p[:1], p]), np.vstack([q[:1], q])
@@ -321,13 +318,13 @@ def _prolonged(trajectory: Trajectory, start_us: int, end_us: int) -> Trajectory
 
 
 class LoopReset(NamedTuple):
-    """An ego back at the start of a loop.
+    """The reset of an ego to the start of a loop.
 
     Attributes:
-        laps: that it has driven.
-        way: length of them [m].
-        motion, point: of the ego there, and along the route.
-        seam: from where it was to where it is.
+        laps: number of completed laps.
+        way: their length [m].
+        motion, point: motion of the ego after the reset, and its route position.
+        seam: transform from before to after the reset.
     """
 
     laps: int
@@ -342,10 +339,10 @@ class EpisodeRoute:
     """Route of an episode.
 
     Attributes:
-        route: that everything is measured along.
-        lap_length: way after which a loop begins anew; infinite where there is none [m].
-        until_us: end of the episode where objects are there beyond the log; None where they are
-            not [us].
+        route: reference path.
+        lap_length: length of one lap [m]; infinite without a loop.
+        until_us: time up to which stationary objects persist beyond the log [us]; None if they end
+            with the log.
     """
 
     route: LoggedPath
@@ -358,7 +355,7 @@ class EpisodeRoute:
         """The route of an episode on ``scene``.
 
         Raises:
-            WorldError: INVALID_REQUEST for a loop on a recorded drive that is none.
+            WorldError: INVALID_REQUEST for a loop on a recorded drive that is not closed.
         """
         loops = spec.beyond_log == "loop"
         return cls(
@@ -370,13 +367,13 @@ class EpisodeRoute:
     def tracks(
         self, state: ScenarioState, *, left: Iterable[str] = ()
     ) -> PackedTracks[ObjectState]:
-        """Tracks of the objects by recording and edits, without those that have ``left``."""
+        """Object tracks from the recording and edits, without objects that have ``left``."""
         if self.until_us is None:
             return state.tracks
         return tracks_beyond_log(state, self.until_us, self._prolonged, left=left)
 
     def put_back(self, motion: Motion, point: PathPoint) -> LoopReset | None:
-        """The reset of a loop once the ego is at its end; None before."""
+        """The reset of a loop if the ego has reached its end, else None."""
         laps = max(math.floor(point.s / self.lap_length), 0)
         if laps == 0:
             return None
@@ -388,8 +385,8 @@ class EpisodeRoute:
 
 # --- Randomization -------------------------------------------------------------------------------
 
-# Every value has a name, such as ``start.lateral`` or ``agents.car_3.headway``, under which it is
-# sampled (see :class:`.common.Draws`) and reported.
+# Every value is sampled (see :class:`.common.Draws`) and reported under a name, such as
+# ``start.lateral`` or ``agents.car_3.headway``.
 
 START_ATTEMPTS = 16
 """Attempts to sample a start outside every object before the recorded one is used."""
@@ -403,14 +400,14 @@ def randomized_start(
     *,
     is_free: Callable[[Motion], bool],
 ) -> tuple[Motion, dict[str, float]]:
-    """The motion at the start of an episode, and the values sampled for it by name.
+    """The ego motion at the start of an episode, and the sampled values by name.
 
     Args:
-        recorded: the ego in the log at that time.
+        recorded: recorded ego motion at that time.
         path: the recorded drive.
-        spec: ranges.
-        draws: of the episode.
-        is_free: whether a motion touches no object.
+        spec: sampling ranges.
+        draws: random numbers of the episode.
+        is_free: whether the ego in a given motion touches no object.
     """
     widths = {f"start.{name}": width for name, width in spec.model_dump().items() if width}
     if not widths:
@@ -446,8 +443,8 @@ class RandomizedIdm:
     """Parameters of IDM drivers, sampled for each object.
 
     Attributes:
-        spec: widths of the factors.
-        draws: of the episode.
+        spec: ranges of the factors.
+        draws: random numbers of the episode.
     """
 
     spec: TrafficRandomization
@@ -461,7 +458,7 @@ class RandomizedIdm:
     def driver_of(
         self, subject: ObjectState, spec: IdmDriver
     ) -> tuple[IdmDriver, dict[str, float]]:
-        """The parameters of an object's driver, and the sampled ones by name."""
+        """The driver parameters of an object, and the sampled values by name."""
         sampled: dict[str, float] = {}
         for name, width in self.widths.items():
             value = getattr(spec, name)
@@ -499,14 +496,14 @@ def estimate_error(
     before: EstimateError | None = None,
     dt: float = 0.0,
 ) -> EstimateError | None:
-    """The error at a step; None where the estimate is the truth.
+    """The estimation error at a step; None if the estimate has no errors.
 
     Args:
         spec: standard deviations.
-        draws: of the episode.
-        step: of the clock.
-        before: the error one step earlier.
-        dt: clock step [s].
+        draws: random numbers of the episode.
+        step: clock step.
+        before: error of the previous step.
+        dt: time step [s].
     """
     deviations = (spec.position, spec.position, spec.heading, spec.speed)
     if not any(deviations):
@@ -521,29 +518,29 @@ def estimate_error(
 
 
 def latency_jitter_us(longest_us: int, draws: Draws, step: int) -> int:
-    """The wait added to the latency of the plan for a step [us]; 0 where none is sampled."""
+    """Sampled delay added to the plan latency of a step [us]; 0 without jitter."""
     return int(draws.uniform("latency", step)[0] * (longest_us + 1)) if longest_us else 0
 
 
 # --- Placement -----------------------------------------------------------------------------------
 
-# An edit of a running episode places road users beside the ego's route, from now on.
+# Edits of a running episode place road users relative to the ego's route, from the current time.
 
 
 def placed(
     operation: Operation, route: LoggedPath, s: float, ground: Ground, *, t_us: int
 ) -> Operation:
-    """The operation, completed with the time and the pose of the ego.
+    """The operation with absolute times and poses, resolved against the ego's current state.
 
     Args:
-        operation: of an author.
-        route: of the ego.
-        s: where the ego is along it [m].
-        ground: of the scene.
-        t_us: now [us].
+        operation: operation as requested.
+        route: route of the ego.
+        s: position of the ego along it [m].
+        ground: ground of the scene.
+        t_us: current time [us].
 
     Raises:
-        EditError: INVALID_OPERATION for a storyboard, which an episode has from its start.
+        EditError: INVALID_OPERATION for a storyboard; it cannot be added to a running episode.
     """
     if isinstance(operation, SetStoryboard):
         raise EditError(

@@ -1,4 +1,4 @@
-"""Inputs of the metrics from a world: context of an episode, and samples of an instant."""
+"""Metric inputs taken from a world: the context of an episode and samples of an instant."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class PendingStep(NamedTuple):
     """A step that has moved and is not evaluated yet.
 
     Attributes:
-        start: the world before it.
-        plan: new trajectory of the ego; None where there was none.
-        events: that led to it.
-        contacts: of its impacts; None where bodies pass through each other.
-        seam: over which the ego was put back before it moved; None where it was not.
+        start: the world before the step.
+        plan: new trajectory of the ego, or None.
+        events: events of the move.
+        contacts: contacts of its impacts; None without collision response.
+        seam: loop reset before the move, or None.
     """
 
     start: StepStart
@@ -89,8 +89,10 @@ def scoring_context(
 
 
 def _expert_beyond_log(scene: Scene, spec: ResetSpec, times: NDArray[np.int64]) -> list[float]:
-    """Where the recorded drive would be along the route [m] at times after its end: driven once
-    more in each lap of a loop, else going on at its mean speed."""
+    """Route positions [m] of the recorded drive at times after its end.
+
+    A loop repeats the drive in each lap; otherwise it continues at its mean speed.
+    """
     if not len(times):
         return []
     ego, path = scene.ego, LoggedPath(scene.ego)
@@ -107,7 +109,7 @@ def _expert_beyond_log(scene: Scene, spec: ResetSpec, times: NDArray[np.int64]) 
 
 
 def reactive(spec: ResetSpec) -> bool:
-    """Whether any other road user may see the ego."""
+    """Whether any other road user may react to the ego."""
     agents = spec.agents
     blind = {"log", "constant_velocity"}
     kinds = {agents.default, *(driver.kind for driver in agents.drivers.values())}
@@ -115,7 +117,7 @@ def reactive(spec: ResetSpec) -> bool:
 
 
 def _history(scene: Scene, spec: ResetSpec, clock: EpisodeClock) -> tuple[tuple[float, float], ...]:
-    """Speed and yaw of the log at the clock steps before the start, as far as it goes back."""
+    """Speed and yaw of the log at the clock steps before the start."""
     window = comfort_window(clock.dt_us * 1e-6) - 1
     times = [clock.start_us - clock.dt_us * k for k in range(window, 0, -1)]
     motions = [logged_motion(scene.ego, t, spec.ego) for t in times if t >= scene.start_us]
@@ -124,7 +126,7 @@ def _history(scene: Scene, spec: ResetSpec, clock: EpisodeClock) -> tuple[tuple[
 
 
 def ego_sample(motion: Motion, near: PathPoint, z: float, *, laps: float = 0.0) -> EgoSample:
-    """The ego for the scores; ``laps``: length of those that it has driven in a loop [m]."""
+    """The ego for the scores; ``laps``: length of the completed laps of a loop [m]."""
     return EgoSample(
         x=motion.x,
         y=motion.y,
@@ -156,5 +158,5 @@ def object_samples(agents: Agents) -> ObjectSamples:
 
 @cache_by_identity
 def _named(objects: tuple[ObjectState, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Ids and categories; the same tuple of objects comes with many steps."""
+    """Ids and categories, cached: many steps share the same tuple of objects."""
     return tuple([o.object_id for o in objects]), tuple([o.category for o in objects])

@@ -1,4 +1,4 @@
-"""The observation of one committed instant, apart from images."""
+"""The observation of one committed instant, without images."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class LanePiece(NamedTuple):
     """A piece of a lane.
 
     Attributes:
-        lane: of the map.
-        places: [K, 4] float64, x, y [m] and heading [rad] of its centre line in the world, and its
+        lane: lane of the map.
+        places: [K, 4] float64, x, y [m], heading [rad] of the centre line, world frame, and lane
             width [m].
     """
 
@@ -60,8 +60,8 @@ class LanePiece(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Places of all lanes: [P, 4] as of :class:`LanePiece`, the number of the lane of each [P], and
-    a tree of them."""
+    """Centre line points of all lanes [P, 4] as in :class:`LanePiece`, lane indices [P], and a
+    k-d tree of the points."""
 
     values: Float
     lane: NDArray[np.int64]
@@ -92,7 +92,7 @@ def lanes_around(graph: LaneGraph, x: float, y: float) -> tuple[LanePiece, ...]:
 
 
 def _run(nearest: int, lane: NDArray[np.int64], inside: set[int]) -> slice:
-    """Places around the nearest one, of its lane and within reach."""
+    """Range of points around the nearest one, in its lane and within reach."""
 
     def reaches(k: int) -> bool:
         return 0 <= k < len(lane) and lane[k] == lane[nearest] and k in inside
@@ -121,26 +121,26 @@ def _sampled(lane: Lane) -> Float:
 @made_quickly
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """The world at one instant, as the policy gets it.
+    """The world at one instant, as observed by the policy.
 
     Attributes:
-        step, t_us, revision: instant, and number of edits so far.
+        step, t_us, revision: clock step, time [us], and number of edits.
         motion: planar state of the ego.
-        T_world_vehicle: [4, 4] float64, its body, which carries the cameras.
+        T_world_vehicle: [4, 4] float64, pose of the ego's body, which carries the cameras.
         ego_size: (length, width, height) of the ego box [m].
-        command: which way the recorded drive turns next.
-        route: [20, 2] float64, the recorded way ahead in the vehicle frame [m].
-        agents: all objects, or None where the episode is not privileged.
-        events: of the step that led here.
+        command: next turn direction of the recorded drive.
+        route: [20, 2] float64, recorded path ahead, vehicle frame [m].
+        agents: all objects; None if the episode is not privileged.
+        events: events of the last step.
         metrics: see :func:`~.scoring.running_metrics`.
         terminated, truncated, reason: how the episode ended, if it did.
-        warming_up: whether the ego still moves as recorded.
-        lap: times that the ego has been put back to the start of the route.
-        drawn: what the seed has drawn in the step, by name.
-        truth: of an ego whose ``motion`` and ``T_world_vehicle`` are an estimate with errors; None
-            where they are the truth, or the episode is not privileged.
+        warming_up: whether the ego is still replaying the recording.
+        lap: number of times the ego has been reset to the start of the route.
+        drawn: values sampled in the step, by name.
+        truth: true ego state, if ``motion`` and ``T_world_vehicle`` are an estimate with errors and
+            the episode is privileged; else None.
         signals: traffic signals of the storyboard.
-        lanes: of the map near the ego, of privileged episodes.
+        lanes: map lanes near the ego; privileged episodes only.
     """
 
     step: int
@@ -169,13 +169,15 @@ class Observation:
         return ego_fields(self.motion, self.T_world_vehicle, self.ego_size)
 
     def truth_fields(self) -> dict[str, Any]:
-        """The wire's EgoState of the ego where it is, as a plain map; there has to be a truth."""
+        """The wire's EgoState of ``truth`` as a plain map; ``truth`` must not be None."""
         assert self.truth is not None
         return ego_fields(*self.truth, self.ego_size)
 
     def obs_fields(self) -> dict[str, Any]:
-        """The wire's Obs as a plain map, without ``frames`` and ``timing``; what few episodes have
-        is there where it is more than its default."""
+        """The wire's Obs as a plain map, without ``frames`` and ``timing``.
+
+        Optional fields are only included if they differ from their defaults.
+        """
         extra: dict[str, Any] = {}
         if self.lap:
             extra["lap"] = self.lap
@@ -233,13 +235,13 @@ def ego_fields(
 
 
 def _quaternion(T_world_vehicle: Float) -> tuple[float, float, float, float]:
-    """wxyz, w >= 0, of a vehicle that stands upright: one case of four, and no arrays."""
+    """wxyz, w >= 0, of an upright vehicle: one case of four, and no arrays."""
     (xx, xy, xz, _), (yx, yy, yz, _), (zx, zy, zz, _), _ = T_world_vehicle.tolist()
     # With the z axis up, w^2 + z^2 is at least a half, so the larger of the two is a safe pivot.
     w, z = 1 + xx + yy + zz, 1 - xx - yy + zz
     q = (w, zy - yz, xz - zx, yx - xy) if w >= z else (yx - xy, xz + zx, yz + zy, z)
     length = math.copysign(math.sqrt(sum(v * v for v in q)), q[0])
-    # A body that stands level would have minus zeros.
+    # A level body would have negative zeros.
     return (
         q[0] / length + 0.0,
         q[1] / length + 0.0,

@@ -1,4 +1,4 @@
-"""The recorded path of the ego vehicle, which everything else is measured along."""
+"""The recorded path of the ego: the reference for route distances and lateral offsets."""
 
 from __future__ import annotations
 
@@ -36,13 +36,12 @@ def nearest_point(knots, x, y, near_s):
 
     Args:
         knots: see above.
-        x, y: world [m].
-        near_s: distance along the path of the part to look at first [m]; NaN for none.
+        x, y: world frame [m].
+        near_s: distance along the path at which to start the search [m]; NaN for none.
 
     Returns:
-        Distance along the path [m], distance from it, positive on its left and beyond its ends
-        from the straight line on [m], position (x, y, z) [m], heading [rad], unit normal of the
-        floor.
+        Distance along the path [m], lateral offset, positive left [m], position (x, y, z) [m],
+        heading [rad] and unit normal of the floor. Beyond its ends the path continues straight.
     """
     segments = len(knots) - 1
     k, f, offset = 0, 0.0, math.inf
@@ -76,14 +75,14 @@ def nearest_point(knots, x, y, near_s):
 
 @kernel
 def waypoints(knots, s, pose, count, spacing):
-    """Places along the path, seen from a vehicle; beyond its end the path goes straight on.
+    """Waypoints along the path, vehicle frame; beyond its end the path continues straight.
 
     Args:
         knots: see above.
-        s: where along the path they begin [m].
-        pose: x, y [m], yaw [rad] of the vehicle in the world.
-        count: of them.
-        spacing: along the path, also from ``s`` to the first one [m].
+        s: start distance along the path [m].
+        pose: x, y [m], yaw [rad] of the vehicle, world frame.
+        count: number of waypoints.
+        spacing: distance between waypoints, and from ``s`` to the first [m].
 
     Returns:
         [count, 2] float64 in the vehicle frame [m].
@@ -110,8 +109,10 @@ def turn_between(knots, here, there):
 
 @kernel
 def point_at(knots, s):
-    """The point x, y, z [m] and heading [rad] at distance ``s`` [m]; before the start and after the
-    end of the path straight on."""
+    """The point x, y, z [m] and heading [rad] at distance ``s`` [m].
+
+    Before its start and beyond its end the path continues straight.
+    """
     yaw = _along(knots, s, 4)
     beyond = s - min(max(s, 0.0), knots[len(knots) - 1, 0])
     return (
@@ -134,19 +135,19 @@ def sharpest_turn(knots, s, reach):
 
 @kernel
 def next_in_strip(knots, s, box, bodies, own):
-    """The body that is next in the strip a box sweeps along the path.
+    """The next body ahead in the strip that a box sweeps along the path.
 
-    Bodies whose middle is beside or behind that of the box are not looked at.
+    Bodies whose centres are alongside or behind the centre of the box are ignored.
 
     Args:
         knots: see above.
-        s: where the middle of the box is along the path [m].
-        box: its offset from the path, length and width [m].
-        bodies: [B, 7] float64: middle x, y [m], yaw [rad], length, width [m], velocity x, y [m/s].
+        s: distance of the box centre along the path [m].
+        box: lateral offset from the path, length and width of the box [m].
+        bodies: [B, 7] float64: centre x, y [m], yaw [rad], length, width [m], velocity x, y [m/s].
         own: row of the box itself.
 
     Returns:
-        Gap from bumper to bumper [m], infinite where there is none, and speed along the path
+        Bumper-to-bumper gap [m], infinite if there is no body, and its speed along the path
         [m/s].
     """
     offset, length, width = box
@@ -173,15 +174,14 @@ def next_in_strip(knots, s, box, bodies, own):
 
 @kernel
 def previous_in_strip(knots, s, box, bodies, own):
-    """The body that comes next behind a box in the strip that it sweeps along the path, or is
-    beside it.
+    """The next body behind or alongside a box in the strip that it sweeps along the path.
 
     Args:
         knots, s, box, bodies, own: see :func:`next_in_strip`.
 
     Returns:
-        Gap from its front to the rear of the box [m], negative where they overlap along the path,
-        infinite where there is none, and speed along the path [m/s].
+        Gap from its front to the rear of the box [m], negative if they overlap along the path,
+        infinite if there is no body; and its speed along the path [m/s].
     """
     offset, length, width = box
     back = REACH - 1
@@ -208,8 +208,10 @@ def previous_in_strip(knots, s, box, bodies, own):
 
 @kernel
 def strip_ahead(knots, s, offset):
-    """Places x, y [m] and heading [rad] [REACH, 3] one metre apart from ``s`` on, ``offset`` to the
-    left of the path: what :func:`point_at` gives, whose search each place would begin anew."""
+    """Points [REACH, 3] x, y [m], heading [rad], every metre from ``s``, ``offset`` to the left.
+
+    Same results as :func:`point_at`, without a search per point.
+    """
     found = np.empty((REACH, 3))
     end, after = knots[len(knots) - 1, 0], _first_not_before(knots, s)
     for i in range(REACH):
@@ -242,7 +244,7 @@ def _nearest_row(strip, x, y):
 
 @kernel
 def _first_not_before(knots, s):
-    """Number of the first pose at distance ``s`` or farther; that of poses where there is none."""
+    """Index of the first pose at distance ``s`` or farther; the number of poses if none is."""
     low, high = 0, len(knots)
     while low < high:
         middle = (low + high) // 2
@@ -261,7 +263,7 @@ def _along(knots, s, column):
 
 @kernel
 def _between(knots, after, s, column):
-    """The same where ``after`` is the number of the first pose at ``s`` or farther."""
+    """Like :func:`_along`, with the index ``after`` of the first pose at ``s`` or farther."""
     if after == 0:
         return knots[0, column]
     if after == len(knots):
@@ -272,8 +274,7 @@ def _between(knots, after, s, column):
 
 @kernel
 def _foot(knots, x, y, first, last):
-    """Nearest segment from ``first`` to before ``last``, fraction of it, and the distance from
-    there, positive on the left [m]."""
+    """Nearest segment in [first, last), fraction along it, and offset, positive left [m]."""
     nearest, least, fraction, left = first, math.inf, 0.0, 0.0
     for k in range(first, last):
         dx, dy = x - knots[k, 1], y - knots[k, 2]
@@ -297,15 +298,15 @@ STUB = 1.0
 
 
 class PathPoint(NamedTuple):
-    """Nearest point of the path to somewhere.
+    """Nearest point of the path to a position.
 
     Attributes:
         s: distance from the start of the path [m].
-        offset: distance of the place from the path, positive on its left; from the straight line
-            on where that is beyond an end of the path [m].
-        position: the point itself, world [m].
+        offset: lateral offset of the position from the path, positive left [m]; beyond its ends
+            the path continues straight.
+        position: the path point, world frame [m].
         yaw: heading of the recorded vehicle there [rad].
-        up: unit normal of the recorded vehicle's floor there, world.
+        up: unit normal of the recorded vehicle's floor there, world frame.
     """
 
     s: float
@@ -352,15 +353,18 @@ class LoggedPath:
 
     @classmethod
     def through(cls, positions: Float, yaws: Float, ups: Float) -> Self:
-        """The path through places [P, 3] [m], P >= 2, with continuous headings [P] [rad] and unit
-        floor normals [P, 3]; places nearer than 5 cm to the one before are left out."""
+        """The path through positions [P, 3] [m], P >= 2.
+
+        Headings [P] [rad] must be continuous; floor normals [P, 3] are unit vectors. Positions less
+        than 5 cm from their predecessor are dropped.
+        """
         made = cls.__new__(cls)
         kept = _apart(positions)
         made._measure(positions[kept], yaws[kept], ups[kept])
         return made
 
     def beside(self, offset: float, *, reverse: bool = False) -> Self:
-        """The path ``offset`` metres to the left of this one; ``reverse``: the other way round."""
+        """The path ``offset`` metres to the left of this one, optionally in reverse direction."""
         left = np.stack([-np.sin(self.yaws), np.cos(self.yaws), np.zeros(len(self.yaws))], axis=1)
         positions, yaws, ups = self.positions + offset * left, self.yaws, self.ups
         if reverse:
@@ -373,8 +377,7 @@ class LoggedPath:
         return float(self.s[-1])
 
     def at(self, s: float) -> tuple[float, float, float, float]:
-        """The point x, y, z [m] and heading [rad] at distance ``s`` [m]; before the start and after
-        the end straight on."""
+        """The point x, y, z [m] and heading [rad] at distance ``s`` [m]; see :func:`point_at`."""
         x, y, z, yaw = point_at(self.knots, float(s))
         return x, y, z, yaw
 
@@ -386,16 +389,16 @@ class LoggedPath:
         """The nearest point of the path to (x, y).
 
         Args:
-            x, y: world [m].
-            near_s: where the vehicle was last; a path that crosses itself is not jumped over
-                while the vehicle stays within 10 m of the part around it.
+            x, y: world frame [m].
+            near_s: last distance of the vehicle along the path. It keeps the result on the same
+                branch of a self-crossing path while the vehicle is within 10 m of that branch.
         """
         around = math.nan if near_s is None else near_s
         return PathPoint(*nearest_point(self.knots, float(x), float(y), around))
 
 
 def _apart(positions: Float) -> list[int]:
-    """Indices of poses at least SPACING from the last one kept, seen from above."""
+    """Indices of poses at least SPACING from the last selected one, in the plane."""
     kept = [0]
     x, y = positions[0, :2].tolist()
     for i, (px, py) in enumerate(positions[:, :2].tolist()):
@@ -409,7 +412,7 @@ def _apart(positions: Float) -> list[int]:
 
 
 class LoopTransform(NamedTuple):
-    """Takes places as they were before the ego was put back to where they are for it after.
+    """Transform from world positions before a loop reset to the equivalent ones after it.
 
     Attributes:
         x, y: shift after the turn [m].
@@ -424,19 +427,19 @@ class LoopTransform(NamedTuple):
     def between(
         cls, before: tuple[float, float, float], after: tuple[float, float, float]
     ) -> LoopTransform:
-        """The one that takes the pose ``before``, x, y [m], yaw [rad], to the pose ``after``."""
+        """The transform from pose ``before`` (x, y [m], yaw [rad]) to pose ``after``."""
         turn = after[2] - before[2]
         cos, sin = math.cos(turn), math.sin(turn)
         x = after[0] - cos * before[0] + sin * before[1]
         return cls(x, after[1] - sin * before[0] - cos * before[1], turn)
 
     def place(self, x: float, y: float) -> tuple[float, float]:
-        """Where a place is [m]."""
+        """Transform a position [m]."""
         cos, sin = math.cos(self.turn), math.sin(self.turn)
         return cos * x - sin * y + self.x, sin * x + cos * y + self.y
 
     def poses(self, poses: Float) -> Float:
-        """Poses [N, 3] of x, y [m], yaw [rad]."""
+        """Transform poses [N, 3] of x, y [m], yaw [rad]."""
         cos, sin = math.cos(self.turn), math.sin(self.turn)
         x, y, yaw = poses.T
         return np.column_stack(
@@ -463,14 +466,14 @@ TURN = 0.35
 
 
 def route_ahead(path: LoggedPath, s: float, x: float, y: float, yaw: float) -> Float:
-    """Waypoints [20, 2] in the vehicle frame [m] along the path ahead of distance ``s``.
+    """Waypoints [20, 2] along the path ahead of distance ``s``, vehicle frame [m].
 
-    Where the recording ends, the route goes straight on.
+    Beyond the end of the recording the route continues straight.
 
     Args:
-        path: the recorded way.
-        s: where the vehicle is along it [m].
-        x, y, yaw: vehicle in the world [m], [rad].
+        path: the recorded path.
+        s: position of the vehicle along it [m].
+        x, y, yaw: vehicle pose, world frame [m], [rad].
     """
     found: Float = waypoints(path.knots, s, (x, y, yaw), WAYPOINTS, WAYPOINT_SPACING)
     return found
@@ -483,7 +486,7 @@ def whole_route(path: LoggedPath) -> Float:
 
 
 def command_ahead(path: LoggedPath, s: float) -> Command:
-    """Which way the path turns over the next 25 m."""
+    """Turn direction of the path over the next 25 m."""
     turn = turn_between(path.knots, s, s + COMMAND_AHEAD)
     if turn > TURN:
         return "left"

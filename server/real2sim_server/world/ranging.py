@@ -1,4 +1,4 @@
-"""LiDARs and radars of an episode: as its reset names them, their motion, and their clouds."""
+"""LiDARs and radars of an episode: specifications, motion during a sweep, and point clouds."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from .common import WorldError
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points of one sensor at one instant.
+    """Point cloud of one sensor at one instant.
 
     Attributes:
-        sensor: its name.
+        sensor: name of the sensor.
         modality: ``lidar`` or ``radar``.
-        t_us: instant [us]; a sweep ends then.
-        duration_us: from the first ray to the last; 0 of radars.
-        frame: of ``points``: ``sensor`` or ``vehicle``.
-        compensated: whether points are as seen from the pose at ``t_us``.
+        t_us: time of the cloud, the end of the sweep [us].
+        duration_us: time from the first ray to the last [us]; 0 for radars.
+        frame: frame of ``points``: ``sensor`` or ``vehicle``.
+        compensated: whether points are motion-compensated to the pose at ``t_us``.
         T_vehicle_sensor: [4, 4] float64.
         T_world_sensor: [4, 4] float64, at ``t_us``.
         columns: by name, [N] or [N, width] each, ``points`` [N, 3] float32 [m] first.
-        codec: ``raw`` or ``deflate``, how it is sent.
+        codec: transport encoding, ``raw`` or ``deflate``.
     """
 
     sensor: str
@@ -64,7 +64,7 @@ class Cloud:
 
 
 def in_frame(points: Float, frame: str, T_vehicle_sensor: Float) -> NDArray[np.float32]:
-    """Points [N, 3] of the sensor's frame in the requested frame."""
+    """Transform points [N, 3] from the sensor frame to ``frame``."""
     if frame == "vehicle":
         points = points @ T_vehicle_sensor[:3, :3].T + T_vehicle_sensor[:3, 3]
     return points.astype(np.float32)
@@ -79,7 +79,7 @@ class MotionSegment:
     """Motion during one step of the clock.
 
     Attributes:
-        since_us, until_us: its instants [us].
+        since_us, until_us: start and end [us].
         ego: (before, after) ``T_world_body`` [4, 4].
         agents: (before, after) poses of the other objects.
     """
@@ -95,7 +95,7 @@ class MotionHistory:
     """Motion of the last steps, oldest first; empty before the first step.
 
     Attributes:
-        keep_us: the history covers at least this time once that many steps have passed [us].
+        keep_us: minimum duration to cover, once enough steps have passed [us].
         segments: one per step.
     """
 
@@ -143,7 +143,7 @@ class MotionHistory:
 
 
 def _ends(segment: MotionSegment, object_id: str) -> tuple[Float, Float] | None:
-    """Poses of an object before and after a step; None where it was not there."""
+    """Poses of an object before and after a step; None if it was not present."""
     before, after = (rows_of(agents).get(object_id) for agents in segment.agents)
     if before is None or after is None:
         return None
@@ -153,7 +153,7 @@ def _ends(segment: MotionSegment, object_id: str) -> tuple[Float, Float] | None:
 def _along(
     times_us: Float, segments: Sequence[MotionSegment], ends: Sequence[tuple[Float, Float]]
 ) -> Float:
-    """Poses along segments, extrapolated straight backwards before the first one."""
+    """Poses along segments, linearly extrapolated before the first one."""
     found = np.empty((len(times_us), 4, 4))
     for number, (segment, (before, after)) in enumerate(zip(segments, ends, strict=True)):
         inside = times_us <= segment.until_us
@@ -166,14 +166,17 @@ def _along(
 
 
 def _between(before: Float, after: Float, part: Float) -> Float:
-    """Poses [P, 4, 4] at fractions ``part`` [P] of a segment; below 0 extrapolated, not turned."""
+    """Poses [P, 4, 4] at fractions ``part`` [P] of a segment.
+
+    Fractions below 0 extrapolate the position and hold the orientation.
+    """
     turns = matrix_to_quaternion(np.stack([before[:3, :3], after[:3, :3]]))
     places = before[:3, 3] + part[:, None] * (after[:3, 3] - before[:3, 3])
     return transform_from(places, slerp(turns[0], turns[1], np.clip(part, 0.0, 1.0)))
 
 
 def _on(pose: Float, velocity: Float, yaw_rate: float, seconds: Float) -> Float:
-    """Poses [S, 4, 4] at a steady speed, ``seconds`` [S] from ``pose``."""
+    """Poses [S, 4, 4] ``seconds`` [S] after ``pose``, at constant velocity and yaw rate."""
     found = np.broadcast_to(pose, (len(seconds), 4, 4)).copy()
     found[:, :3, 3] += seconds[:, None] * velocity
     if yaw_rate:
@@ -258,7 +261,7 @@ Mounted = MountedLidar | MountedRadar
 
 @dataclass(frozen=True, eq=False)
 class RangingSensors:
-    """All LiDARs and radars of an episode; false where there are none."""
+    """All LiDARs and radars of an episode; falsy if there are none."""
 
     lidars: tuple[MountedLidar, ...] = ()
     radars: tuple[MountedRadar, ...] = ()
@@ -277,7 +280,7 @@ class RangingSensors:
         return max((m.duration_us for m in self.lidars), default=0)
 
     def due(self, elapsed_us: int) -> tuple[Mounted, ...]:
-        """The sensors whose cloud is complete this long after the start."""
+        """The sensors whose cloud is complete ``elapsed_us`` after the start."""
         return tuple(m for m in self.all if elapsed_us % m.period_us == 0)
 
 
@@ -290,8 +293,8 @@ def mounted_sensors(
     """The sensors of an episode with steps of ``dt_us``.
 
     Raises:
-        WorldError: INVALID_REQUEST for models that are none or unknown, periods that are no
-            multiple of the step or too short for a sweep, and names that two sensors have.
+        WorldError: INVALID_REQUEST for invalid or unknown models, periods that are not a multiple
+            of the step or shorter than a sweep, and duplicate names.
     """
     if not lidars and not radars:
         return NO_SENSORS
@@ -364,7 +367,7 @@ def _key(spec: LidarSpec) -> tuple[str, Pose | None, float | None]:
 
 @lru_cache(maxsize=KEPT_LIDARS)
 def _radar(name: str, model: RadarModel, pose: Pose | None) -> Radar:
-    """The sensor with its rays, which are validated here."""
+    """The sensor with its validated rays."""
     radar = Radar(name, model) if pose is None else Radar(name, model, _transform(pose))
     assert radar.rays.beams.count == model.ray_count
     return radar
@@ -382,7 +385,7 @@ def _built(name: str, pose: Pose | None, rate_hz: float | None, model: str) -> L
 
 
 def _as_mounted(lidar: Lidar, name: str, pose: Pose | None, rate_hz: float | None) -> Lidar:
-    """The sensor with its name and pose, its sweep of another rate, its last ray at time 0."""
+    """The sensor with its name, pose and sweep rate; its last ray is fired at time 0."""
     beams = lidar.beams
     times = beams.time_us - beams.time_us.max()
     if rate_hz is not None:
@@ -396,7 +399,7 @@ def _as_mounted(lidar: Lidar, name: str, pose: Pose | None, rate_hz: float | Non
 
 
 def _turn_us(beams: Beams) -> float:
-    """From one sweep to the next: the rays' span and the step between two of its instants."""
+    """Time between sweeps: the span of the rays plus one firing interval."""
     instants = beams.slots[0]
     return float(np.ptp(instants)) * len(instants) / max(len(instants) - 1, 1)
 

@@ -1,4 +1,4 @@
-"""Measurements of LiDARs and radars in a world: the targets of their rays, and point clouds."""
+"""LiDAR and radar measurements in a world: ray targets and point clouds."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class RayTargets:
 
     Attributes:
         instances: background first, then the objects in their order, then fragments.
-        attributes: reflectivity, where it is known.
-        object_ids: of the objects.
+        attributes: reflectivity, if known.
+        object_ids: ids of the objects.
     """
 
     instances: tuple[Instance, ...]
@@ -41,8 +41,11 @@ class RayTargets:
 
 
 def ray_targets(world: World) -> RayTargets:
-    """The targets of rays in a world: LiDAR surfaces where the scene has them, objects deformed by
-    impacts as in images, no shadows."""
+    """The ray targets of a world.
+
+    LiDAR surfaces replace splats if the scene has them. Objects deformed by impacts look as in
+    images. Shadows are omitted.
+    """
     scene, agents = world.scene, world.agents
     shown_us = min(world.t_us, scene.end_us)
     found = [background_target(scene, world.state)]
@@ -76,7 +79,7 @@ def _deform(
 
 
 def sweep_request(world: World, lidar: Lidar, targets: RayTargets) -> CastRequest:
-    """The sweep that ends at the instant of ``world``."""
+    """The ray casting request of the sweep that ends at the instant of ``world``."""
     offsets = lidar.beams.slots[0]
     times = world.t_us + offsets
     history, agents = world.motion_history, world.agents
@@ -96,7 +99,7 @@ SEED_BYTES = 7
 def sweep_cloud(
     world: World, mounted: MountedLidar, targets: RayTargets, caster: CastBackend
 ) -> Cloud:
-    """The sweep of a LiDAR that ends at the instant of ``world``, deterministic to the bit."""
+    """The LiDAR sweep that ends at the instant of ``world``; bitwise deterministic."""
     return measured_sweep(
         sweep_request(world, mounted.lidar, targets),
         mounted,
@@ -143,13 +146,13 @@ def measured_sweep(
     """The point cloud that a LiDAR measures in a sweep.
 
     Args:
-        request: of the sweep.
+        request: ray casting request of the sweep.
         mounted: the LiDAR.
-        caster: casts the rays.
-        t_us: when the last one is fired [us].
-        seed: of noise and losses.
-        T_world_vehicle: [4, 4], true pose of the vehicle then.
-        T_world_estimate: [4, 4], its estimated pose.
+        caster: ray casting backend.
+        t_us: time of the last ray [us].
+        seed: seed of noise and dropped returns.
+        T_world_vehicle: [4, 4], true vehicle pose at ``t_us``.
+        T_world_estimate: [4, 4], estimated vehicle pose at ``t_us``.
     """
     spec, lidar = mounted.spec, mounted.lidar
     echo = caster.cast(request)
@@ -175,14 +178,14 @@ def measured_sweep(
 
 
 def sensor_seed(world: World, name: str) -> int:
-    """Seed of the noise of a sensor at an instant."""
+    """Noise seed of a sensor at the current instant."""
     words = f"{world.spec.seed}/{name}/{world.steps}"
     digest = hashlib.blake2b(words.encode(), digest_size=SEED_BYTES).digest()
     return int.from_bytes(digest, "little")
 
 
 def _returns(sweep: Sweep, echo: Echo, mounted: MountedLidar) -> dict[str, NDArray[Any]]:
-    """Columns of all returns, by ray, near to far; a spinning sensor row by row."""
+    """Columns of all returns, by ray, near to far; by row for a spinning sensor."""
     lidar = mounted.lidar
     hit = np.flatnonzero(sweep.hit.ravel())
     names = tuple(sweep.returns)
@@ -224,7 +227,7 @@ def _points(
     mounted: MountedLidar,
     T_world_lidar: Float,
 ) -> Float:
-    """[N, 3] in the sensor's frame, of a compensated cloud in that of ``T_world_lidar``."""
+    """Points [N, 3] in the sensor frame; at ``T_world_lidar`` if motion-compensated."""
     lidar, ray = mounted.lidar, returned["ray"]
     directions = lidar.beams.directions.reshape(-1, 3)[ray]
     points: Float = directions * returned["range"][:, None].astype(np.float64)
@@ -239,7 +242,7 @@ def _points(
 def scan_cloud(
     world: World, mounted: MountedRadar, targets: RayTargets, caster: CastBackend
 ) -> Cloud:
-    """The scan of a radar at the instant of ``world``, deterministic to the bit."""
+    """The radar scan at the instant of ``world``; bitwise deterministic."""
     radar, spec = mounted.radar, mounted.spec
     request = sweep_request(world, radar.rays, targets)
     echo = caster.cast(request)
@@ -292,8 +295,10 @@ def _patches(world: World, request: CastRequest, echo: Echo, targets: RayTargets
 def _owners(
     world: World, targets: RayTargets, members: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], Float, NDArray[np.uint8], Float, Float]:
-    """For each ray the number of the instance it hits, its class, and the world normal there;
-    for each instance its centre and its twist [6] in the world."""
+    """For each ray, the index of the hit instance, its class and the world normal there.
+
+    Also the centre and twist [6] of each instance, world frame.
+    """
     counts = [len(instance.cloud) for instance in targets.instances]
     firsts = np.cumsum([0, *counts])
     owner = np.searchsorted(firsts, members, side="right") - 1
@@ -314,7 +319,7 @@ def _owners(
 
 
 def _normals(instance: Instance, members: NDArray[np.int32]) -> Float:
-    """Shortest axes [P, 3] in the world of Gaussians."""
+    """Shortest axes [P, 3] of Gaussians, world frame."""
     cloud = instance.cloud
     scales = cloud.scales.detach().cpu().numpy()[members]
     quats = cloud.quats.detach().cpu().numpy()[members].astype(np.float64)
@@ -343,7 +348,7 @@ def _turns(world: World, object_ids: Any) -> Float:
 
 
 def _at(velocities: Float, owner: NDArray[np.int64], centres: Float, points: Float) -> Float:
-    """Velocity [P, 3] in the world of the points hit."""
+    """Velocities [P, 3] of hit points, world frame."""
     arms = points - centres[owner]
     own = velocities[owner]
     moving: Float = own[:, :3] + np.cross(own[:, 3:], arms)
@@ -351,7 +356,7 @@ def _at(velocities: Float, owner: NDArray[np.int64], centres: Float, points: Flo
 
 
 def _of_sensor(world: World, T_world_sensor: Float) -> Float:
-    """Velocity [3] of the sensor in the world."""
+    """Sensor velocity [3], world frame."""
     twist = world.twist
     arm = T_world_sensor[:3, 3] - world.T_world_body[:3, 3]
     moving: Float = twist[:3] + np.cross(twist[3:], arm)
@@ -359,7 +364,7 @@ def _of_sensor(world: World, T_world_sensor: Float) -> Float:
 
 
 def clouds_of(world: World, due: Sequence[Mounted], caster: CastBackend) -> list[Cloud]:
-    """Clouds of the ``due`` sensors at the instant of ``world``, in their order."""
+    """Point clouds of the ``due`` sensors at the instant of ``world``, in order."""
     targets = ray_targets(world)
     return [
         sweep_cloud(world, mounted, targets, caster)

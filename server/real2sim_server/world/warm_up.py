@@ -1,4 +1,4 @@
-"""Compiles the kernels of a step and of an edit before the first request needs them."""
+"""Kernel compilation ahead of the first request."""
 
 from __future__ import annotations
 
@@ -38,10 +38,9 @@ STEP_KERNELS = 28
 
 @cache
 def warm_up() -> None:
-    """Compile the kernels of a step and of an edit, or load them from the disk cache, once a
-    process.
+    """Compile the kernels of steps and edits, or load them from the disk cache, once per process.
 
-    A small episode uses them all: afterwards neither waits for the compiler.
+    Runs a small episode that uses all of them.
     """
     made.expect(STEP_KERNELS)
     scene = _street()
@@ -59,29 +58,33 @@ def warm_up() -> None:
         world.step(TrajectoryPlan(times_us=times, poses=poses, frame="world"))
         world.observe()
     _sweep(world)
-    # Which lane an ego is in that has left its own.
+    # Only called for an ego outside its own lane.
     world.context.in_lane(world.instant.ego._replace(offset=10.0))
-    # What only an ego that goes against its route calls.
+    # Only called for an ego that drives against its route.
     windowed_sum(NONE_AGAINST, 1.0, 2)
-    # What only perfect tracking and sliding vehicles call.
+    # Only called for perfect tracking and sliding vehicles.
     _track(EgoSpec(tracker="perfect"))
-    # What edits, views and rollouts ask of the ground.
+    # Ground queries of edits, views and rollouts.
     scene.ground.height(0.0, 0.0)
     scene.ground.height_at([[0.0, 0.0]])
     scene.ground.normal_at([[0.0, 0.0]])
-    # An edit that brings the cars near each other, for only then their boxes are compared.
+    # An edit that moves the cars close together: only then are their boxes compared.
     world.apply([Translate(object_id="ahead", x=-9.0)])
 
 
 def warm_up_planning() -> None:
-    """Like :func:`warm_up`, for trackers that plan ahead: they take as long as all the rest, and
-    few sessions have one, see :func:`plans_ahead`."""
+    """Like :func:`warm_up`, for trackers that plan ahead (see :func:`plans_ahead`).
+
+    Separate because they take as long as all other kernels and few sessions use them.
+    """
     _track(EgoSpec(tracker="ilqr"))
 
 
 def warm_up_deformation() -> None:
-    """Like :func:`warm_up`, for images of objects after impacts, which few sessions have: one car
-    runs into another, and one into the background, see :func:`may_deform`."""
+    """Like :func:`warm_up`, for images of deformed objects (see :func:`may_deform`).
+
+    Simulates a car-to-car impact and an impact with the background.
+    """
     scene = _street(_filling())
     subjects = {o.object_id: o for o in ScenarioState.of(scene).objects.values()}
     for against_background in (False, True):
@@ -93,34 +96,34 @@ def warm_up_deformation() -> None:
 
 
 def kernels_on_disk() -> bool:
-    """Whether an earlier run left what :func:`warm_up` compiles longest."""
+    """Whether the disk cache has the slowest kernels of :func:`warm_up`."""
     return is_on_disk(advance_vehicle)
 
 
 def planning_on_disk() -> bool:
-    """Whether an earlier run left what :func:`warm_up_planning` compiles."""
+    """Whether the disk cache has the kernels of :func:`warm_up_planning`."""
     return is_on_disk(prepare_schedule)
 
 
 def deformation_on_disk() -> bool:
-    """Whether an earlier run left what :func:`warm_up_deformation` compiles."""
+    """Whether the disk cache has the kernels of :func:`warm_up_deformation`."""
     from ..physics.backends.cpu.kernels import advance  # Imported only where something deforms.
 
     return is_on_disk(advance)
 
 
 def may_deform(spec: ResetSpec) -> bool:
-    """Whether images of an episode may need what :func:`warm_up_deformation` compiles."""
+    """Whether images of an episode may need the kernels of :func:`warm_up_deformation`."""
     return bool(spec.sensors) and spec.on_collision == "continue" and spec.contact.dents
 
 
 def plans_ahead(ego: EgoSpec) -> bool:
-    """Whether a vehicle needs what :func:`warm_up_planning` compiles."""
+    """Whether a vehicle needs the kernels of :func:`warm_up_planning`."""
     return KINDS.get(ego.tracker) in PLANNING_AHEAD
 
 
 def _sweep(world: World) -> None:
-    """A step beside objects and into the background."""
+    """A step next to objects and into the background."""
     start = StepStart(
         world.motion, world.T_world_vehicle, world.agents, t_us=0, dt_us=PERIOD_US, at=None
     )
@@ -146,7 +149,7 @@ def _track(ego: EgoSpec) -> None:
 
 
 def _impact(*, against_background: bool) -> Impact:
-    """The object ``ahead`` is hit from behind by the ego, or hits the background."""
+    """An impact of the ego on the rear of object ``ahead``, or of that object on the background."""
     properties = BodyProperties(mass=1500.0, inertia=2500.0, length=4.0, width=2.0)
     behind, ahead = (
         ImpactParticipant(properties, BodyState(x, 0.0, 0.0, speed, 0.0, 0.0), low=0.0, high=1.5)
@@ -169,7 +172,7 @@ def _impact(*, against_background: bool) -> Impact:
 
 
 def _filling() -> GaussianCloud:
-    """Gaussians all over a car, so that particles fill it."""
+    """Gaussians all over a car, so that it can be filled with particles."""
     places = np.stack(np.meshgrid(*(np.linspace(-s / 2, s / 2, 9) for s in CAR), indexing="ij"))
     means = torch.from_numpy(places.reshape(3, -1).T.astype(np.float32).copy())
     return _cloud(means)
@@ -187,7 +190,7 @@ def _cloud(means: torch.Tensor) -> GaussianCloud:
 
 
 def _street(of_cars: GaussianCloud | None = None) -> Scene:
-    """The ego behind one car and beside another, touching neither, in a scene of one Gaussian."""
+    """A scene with one background Gaussian, one car ahead of the ego and one next to it."""
     cloud = _cloud(torch.zeros(1, 3))
     times = np.arange(STEPS + 2) * PERIOD_US
     camera = Camera("front", 16, 16, np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]]), np.eye(4))

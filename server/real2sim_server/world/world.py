@@ -1,4 +1,4 @@
-"""The closed loop: one clock, one ego, the objects of a scenario."""
+"""The closed-loop world: one clock, one ego and the objects of a scenario."""
 
 from __future__ import annotations
 
@@ -60,34 +60,34 @@ OFF_ROUTE_DISTANCE = 10.0
 
 
 class World:
-    """A scene in which time passes, one step at a time.
+    """A closed-loop simulation of one scene.
 
-    Same scene, state, spec, operations and plans: the same observations, bit for bit. A step
-    replaces what it changes and never writes into it, so that :meth:`fork` is cheap.
+    The same scene, state, spec, operations and plans give the same observations, bit for bit. A
+    step replaces objects instead of modifying them, so :meth:`fork` is cheap.
 
     Attributes:
-        scene: shared, immutable.
+        scene: the scene; shared, immutable.
         state: objects after all edits.
-        spec: how the episode runs.
-        steps: clock steps done since the reset; ``step`` of the observation.
-        t_us: simulation time of this instant [us].
-        revision: edits of this session so far.
+        spec: options of the episode.
+        steps: clock steps since the reset; ``step`` in the observation.
+        t_us: current simulation time [us].
+        revision: number of edits in this session.
         motion: planar state of the ego.
-        T_world_vehicle: [4, 4] float64, the ego standing level on the ground; that touches others.
-        T_world_body: [4, 4] float64, its body on its springs, which carries the cameras.
+        T_world_vehicle: [4, 4] float64, ego pose level on the ground; used for contact.
+        T_world_body: [4, 4] float64, pose of the sprung body, which carries the cameras.
         traffic: drivers and poses of the other objects.
-        ground: of the scene.
-        accumulator: what the scores are made of.
-        instant: the last committed one, as the scores get it.
-        impacts: of the last step.
-        deformation: of objects after impacts; None where there is none.
+        ground: ground of the scene.
+        accumulator: running inputs of the scores.
+        instant: last committed instant, in the form that the scores take.
+        impacts: impacts of the last step.
+        deformation: objects deformed by impacts; None if there are none.
         terminated, truncated, reason: how the episode ended: ``collision``, ``horizon``,
-            ``deadline``, ``wall_clock``.
-        lap: times that the ego has been put back to the start of the route.
-        sampled: values sampled for the start and for objects so far, by name.
+            ``deadline`` or ``wall_clock``.
+        lap: number of times the ego has been reset to the start of the route.
+        sampled: values sampled for the start and the objects so far, by name.
         ranging: LiDARs and radars of the episode.
-        motion_history: of ego and objects, as far back as a sweep looks.
-        strides: of people who are not where their trajectories lead.
+        motion_history: motion of the ego and the objects, long enough for one sweep.
+        strides: walking motion of pedestrians that have left their trajectories.
     """
 
     def __init__(
@@ -99,10 +99,10 @@ class World:
         revision: int = 0,
         deformation: Deformation | None = None,
     ) -> None:
-        """The world at step 0, with the ego as recorded at the start time, on the ground.
+        """Create the world at step 0, with the ego on the ground in its recorded state.
 
         Raises:
-            WorldError: the episode cannot run as asked; see :func:`~.episode.episode_clock`.
+            WorldError: the spec is invalid for this scene; see :func:`~.episode.episode_clock`.
         """
         self.scene = scene
         self.state = state
@@ -121,7 +121,7 @@ class World:
         self.motion_history = MotionHistory.of(self.ranging.longest_us)
         self.strides = Strides()
         self.t_us = self._clock.at(self.steps)
-        # Until then the ego moves as recorded.
+        # The ego replays the recording until then.
         self._warm_up_end_us = self._clock.start_us + spec.warmup_us
         self._draws = Draws(spec.seed)
         self._episode_route = EpisodeRoute.of(scene, spec, self._clock)
@@ -155,7 +155,7 @@ class World:
 
     @property
     def horizon(self) -> int:
-        """Number of steps after which the episode is cut off."""
+        """Number of steps after which the episode is truncated."""
         return self._clock.horizon
 
     @property
@@ -165,18 +165,18 @@ class World:
 
     @property
     def agents(self) -> Agents:
-        """Poses of all objects now."""
+        """Current poses of all objects."""
         return self.traffic.agents
 
     @property
     def storyboard(self) -> StoryboardRun | None:
-        """The running storyboard of the episode; None where it has none."""
+        """The running storyboard of the episode, or None."""
         found = self.traffic.storyboard
         return found if isinstance(found, StoryboardRun) else None
 
     @property
     def route(self) -> LoggedPath:
-        """The path that everything is measured along."""
+        """The reference path for route distances and offsets."""
         return self._path
 
     @property
@@ -191,7 +191,7 @@ class World:
 
     @property
     def warming_up(self) -> bool:
-        """Whether the ego still moves as recorded."""
+        """Whether the ego is still replaying the recording."""
         return self.t_us < self._warm_up_end_us
 
     @property
@@ -201,7 +201,7 @@ class World:
 
     @property
     def T_world_estimate(self) -> Float:
-        """[4, 4] float64, the body at the ego's estimate of its pose; ``T_world_body`` where the
+        """[4, 4] float64, body pose as estimated by the ego; equals ``T_world_body`` if the
         estimate has no errors."""
         if self._estimate_error is None:
             return self.T_world_body
@@ -211,31 +211,36 @@ class World:
 
     @property
     def context(self) -> scoring.ScoringContext:
-        """The constant context of the scores."""
+        """Constants of the episode that the scores need."""
         return self._context
 
     def step(
         self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False
     ) -> list[Event]:
-        """Move the clock by one ``dt_us`` and evaluate the step, see :meth:`move` and
-        :meth:`evaluate`; its events, also part of the next observation."""
+        """Advance the clock by one ``dt_us``: :meth:`move`, then :meth:`evaluate`.
+
+        Returns the events of the step, which are also part of the next observation.
+        """
         self.move(plan, latency_us=latency_us, missed=missed)
         return self.evaluate()
 
     def move(self, plan: Plan | None = None, *, latency_us: int = 0, missed: bool = False) -> None:
-        """The first half of a step: everything that images show. :meth:`evaluate` must follow.
+        """Run the first half of a step, which updates everything visible in images.
 
-        Order: edits made since the last step are in effect, the ego of a loop that has reached its
-        end is put back to its start, then ego, objects, contact.
+        :meth:`evaluate` must follow. Edits made since the last step are already in effect. In a
+        loop, an ego at the end of the route is reset to its start. Then the ego and the objects
+        move, and contacts are resolved.
 
         Args:
-            plan: what the ego does. None keeps the last plan; before any, the ego follows the log.
-            latency_us: measured time to make the plan; counts where the episode says so.
-            missed: whether the planner was late, and the fallback of the episode holds.
+            plan: plan of the ego. None keeps the last plan; before the first plan, the ego follows
+                the log.
+            latency_us: measured planning time; only used if the latency model of the episode is
+                ``measured``.
+            missed: whether the planner missed its deadline, so that the fallback applies.
 
         Raises:
-            WorldError: EPISODE_OVER, or INVALID_ACTION for a plan of another kind than the reset
-                named or with times that are over; the world is as before.
+            WorldError: EPISODE_OVER, or INVALID_ACTION for a plan whose kind differs from the
+                reset's or whose times have passed. The world is unchanged.
         """
         self._check_running()
         sampled_before = self.traffic.sampled
@@ -270,9 +275,9 @@ class World:
         self._edit_events = ()
 
     def evaluate(self) -> list[Event]:
-        """The second half of a step, if it is pending: contacts, scores and events.
+        """Run the second half of a pending step: contacts, scores and events.
 
-        It changes nothing that images show, so they may be rendered at the same time.
+        It changes nothing visible in images, so they can be rendered concurrently.
         """
         if self._pending is not None:
             start, plan, events, contacts, seam = self._pending
@@ -289,8 +294,11 @@ class World:
         return list(self._events)
 
     def stop(self, reason: str) -> None:
-        """End the episode without a step, by ``deadline`` or ``wall_clock``. Raises
-        WorldError: EPISODE_OVER."""
+        """End the episode without a step; ``reason`` is ``deadline`` or ``wall_clock``.
+
+        Raises:
+            WorldError: EPISODE_OVER.
+        """
         self._check_running()
         self.truncated, self.reason = True, reason
         self._events = (*self._events, Event("stopped", self.t_us))
@@ -298,15 +306,15 @@ class World:
     def set_agent_plan(
         self, object_id: str, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]
     ) -> None:
-        """Give an externally driven object a plan, from the next step on.
+        """Set the plan of an externally driven object, effective from the next step.
 
         Args:
-            object_id: whose driver is ``external``.
-            times_us: [N] absolute, increasing, after now [us].
-            poses: [N] x, y [m], yaw [rad] of its box, world.
+            object_id: an object with an ``external`` driver.
+            times_us: [N] absolute times, increasing, in the future [us].
+            poses: [N] x, y [m], yaw [rad] of the box centre, world frame.
 
         Raises:
-            WorldError: EPISODE_OVER or INVALID_ACTION; nothing changed.
+            WorldError: EPISODE_OVER or INVALID_ACTION; the world is unchanged.
         """
         self._check_running()
         self.traffic = self.traffic.with_plan(object_id, self.t_us, times_us, poses)
@@ -314,18 +322,18 @@ class World:
     def apply(
         self, operations: Sequence[Operation], *, base_revision: int | None = None
     ) -> EditOutcome:
-        """Edit the objects at this instant, all operations or none; time does not move.
+        """Apply edits to the objects atomically at the current instant, without advancing time.
 
-        An object put onto the ego is a collision of the next step. A spawn without a time appears
-        now, and one with a place beside the route where that is now. Objects whose trajectory is
-        edited begin to follow it anew, also those that physics had taken over.
+        An object placed on the ego causes a collision in the next step. A spawn without a time
+        appears now; a route-relative spawn is placed relative to the ego's current position.
+        Objects with an edited trajectory restart on it, including those under physics control.
 
         Args:
             operations: validated wire models.
-            base_revision: revision of the session they were made for; None for any.
+            base_revision: session revision that the operations are based on; None for any.
 
         Raises:
-            EditError: STALE_REVISION, UNKNOWN_OBJECT or INVALID_OPERATION; nothing changed.
+            EditError: STALE_REVISION, UNKNOWN_OBJECT or INVALID_OPERATION; the world is unchanged.
         """
         if base_revision is not None and base_revision != self.revision:
             raise EditError(
@@ -347,7 +355,7 @@ class World:
         return outcome
 
     def observe(self) -> Observation:
-        """The observation at this instant, apart from images."""
+        """The current observation, without images."""
         motion, s, truth = self.motion, self._path_point.s, None
         if self._estimate_error is not None:
             truth = (motion, self.T_world_body) if self.spec.privileged else None
@@ -384,11 +392,11 @@ class World:
         return () if lanes is None else lanes_around(lanes, motion.x, motion.y)
 
     def metrics(self) -> dict[str, float]:
-        """Scores so far, see :func:`~.scoring.running_metrics`."""
+        """Running scores; see :func:`~.scoring.running_metrics`."""
         return scoring.running_metrics(self.accumulator, self._context)
 
     def scores(self) -> list[Score]:
-        """All scores so far, with terms and versions."""
+        """All current scores, with terms and versions."""
         return scoring.scores_of(self.accumulator, self._context)
 
     def instances(self) -> list[Instance]:
@@ -406,7 +414,7 @@ class World:
         return drawn
 
     def moving_instances(self) -> list[Instance]:
-        """The same, with the velocities of objects, for cameras whose exposure takes time."""
+        """Like :meth:`instances`, with object velocities, for motion blur and rolling shutter."""
         drawn = self.instances()
         for k, velocity in enumerate(self.agents.velocities, start=1):
             twist = np.zeros(6)
@@ -416,22 +424,22 @@ class World:
 
     @property
     def twist(self) -> Float:
-        """[6] of the ego in the world: velocity [m/s] of its origin, angular velocity [rad/s]."""
+        """[6] ego twist, world frame: velocity of the origin [m/s], angular velocity [rad/s]."""
         vx, vy = self.motion.velocity
         found: Float = np.array([vx, vy, 0.0, 0.0, 0.0, self.motion.yaw_rate])
         return found
 
     def due_sensors(self) -> list[SensorSpec]:
-        """Sensors of the reset that deliver a frame at this step; all of them at step 0."""
+        """Sensors that deliver a frame at this step; all sensors at step 0."""
         elapsed = self.steps * self._clock.dt_us
         return [s for s in self.spec.sensors if elapsed % (s.period_us or self._clock.dt_us) == 0]
 
     def due_ranging(self) -> tuple[Mounted, ...]:
-        """LiDARs and radars whose cloud is complete at this step; all of them at step 0."""
+        """LiDARs and radars whose point cloud is complete at this step; all of them at step 0."""
         return self.ranging.due(self.steps * self._clock.dt_us)
 
     def fork(self) -> World:
-        """An independent copy of the world, which shares everything immutable."""
+        """An independent copy of the world that shares all immutable data."""
         return copy_with(self)
 
     # --- phases of a step -------------------------------------------------------------------
@@ -445,7 +453,7 @@ class World:
             )
 
     def _with_plan(self, plan: Plan | None, latency_us: int, jitter_us: int) -> EgoController:
-        """The controller with a plan of the policy, which takes effect after its latency."""
+        """The controller with the policy's plan, which takes effect after its latency."""
         if plan is None:
             return self._controller
         from_us = takes_effect_us(
@@ -465,7 +473,7 @@ class World:
         return controller, [Event("deadline_missed", self.t_us)]
 
     def _put_back(self, controller: EgoController) -> tuple[EgoController, list[Event]]:
-        """Put the ego of a loop back to the start of the recorded drive once it is at its end."""
+        """In a loop, reset an ego at the end of the recorded drive to its start."""
         put = self._episode_route.put_back(self.motion, self._path_point)
         self._seam = put.seam if put is not None else None
         if put is None:
@@ -481,7 +489,7 @@ class World:
         return controller.put_back(put.seam), [Event("looped", self.t_us, data=data)]
 
     def _let_agents_react(self) -> list[Event]:
-        """Let objects stop repeating the log once the ego is too far from its recorded pose."""
+        """Switch objects from replay to reactive driving once the ego is too far off its log."""
         agents = self.spec.agents
         if agents.ego_off_log == "replay" or self.traffic.reacting:
             return []
@@ -544,8 +552,10 @@ class World:
     def _apply_impacts(
         self, impacts: tuple[Impact, ...] | None, before: Agents
     ) -> StepContacts | None:
-        """Contacts of the impacts, which deform objects; None where bodies pass through each
-        other."""
+        """Resolve impacts, which deform objects, and return their contacts.
+
+        None if the episode has no collision response.
+        """
         if impacts is None:
             return None
         if self.deformation is not None and impacts:
@@ -556,7 +566,7 @@ class World:
         return contacts_of_impacts(impacts, self.t_us, touching=touching, before=before)
 
     def _step_start(self, controller: EgoController) -> StepStart:
-        """The world before a step, and the motion of the ego under its controller from there."""
+        """The world before a step, and the ego motion that its controller produces."""
         motion, t_us, at = self.motion, self.t_us, None
         if self.spec.action != "pose" and not self.warming_up:
 
@@ -567,8 +577,10 @@ class World:
         return StepStart(motion, self.T_world_vehicle, self.agents, t_us, dt_us, at)
 
     def _overlap_contacts(self, start: StepStart) -> StepContacts:
-        """Contacts where bodies pass through each other; the first may end the episode. While the
-        ego moves as recorded, nobody drives into anybody."""
+        """Contacts without collision response; the first may end the episode.
+
+        There are none while the ego replays the recording.
+        """
         found = self._contacts.ego_contacts(start, self.T_world_vehicle, self.motion, self.agents)
         if self.t_us <= self._warm_up_end_us:
             self._contacts = self._contacts.after_warm_up(found.touching)
@@ -579,7 +591,7 @@ class World:
         return contacts
 
     def _departure_events(self) -> list[Event]:
-        """Events of an ego that leaves the surroundings of the recorded path, or the road."""
+        """Events of an ego that leaves the corridor of the recorded path or the road."""
         events = []
         distance = math.dist(self._path_point.position[:2], (self.motion.x, self.motion.y))
         was_off_route, self._off_route = self._off_route, distance > OFF_ROUTE_DISTANCE
@@ -622,7 +634,7 @@ class World:
             pose = self.ground.pose_on(motion.x, motion.y, motion.yaw)
             return set(overlapping_rows(ego_box(pose, size), size, others))
 
-        # Boxes of a recording may overlap slightly; a sampled start must not touch anybody else.
+        # Recorded boxes may overlap slightly; a sampled start must not add further overlaps.
         return randomized_start(
             recorded,
             self._path,
@@ -662,8 +674,10 @@ class World:
         )
 
     def _tracks_of(self, state: ScenarioState) -> PackedTracks[ObjectState]:
-        """Where the recording and edits have the objects; in later laps without those that moved
-        in the recording, which are over."""
+        """Object tracks from the recording and edits.
+
+        Later laps omit objects that moved in the recording: their tracks have ended.
+        """
         left = self.traffic.recorded_movers(state.visible) if self.lap else frozenset[str]()
         return self._episode_route.tracks(state, left=left)
 

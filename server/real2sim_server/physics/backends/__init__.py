@@ -1,4 +1,4 @@
-"""Solver backends, one module or folder each, behind one Protocol."""
+"""Solver backends, which implement one Protocol."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def select_backend(name: str = "auto") -> SolverBackend:
     """Return the backend with this name.
 
     Args:
-        name: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``: a GPU is used only on
-            request, because its last bits differ from the CPU's.
+        name: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``. A GPU is only used on
+            request, because its results differ from the CPU's in the last bits.
 
     Raises:
-        SolverError: for an unknown name, or for ``cuda`` where no device is usable.
+        SolverError: for an unknown name, or for ``cuda`` without a usable device.
     """
     if name in ("auto", "cpu"):
         from .cpu.backend import CpuSolverBackend

@@ -1,11 +1,11 @@
-"""Which blocks of the grid hold particles, and which are neighbours.
+"""Occupied blocks of the grid and their neighbours.
 
-The grid is cut into blocks of 4^3 nodes. Particles are sorted by block and body: what a *block*
-of the kernels holds are the particles of one body there. It scatters into its own tile of 8^3
-nodes, one block and a margin of two nodes below and above, so that no two write to the same place
-and the sums do not depend on threads. Particles may leave their block by one cell before they must
-be sorted again. A *field* is a block of nodes with the velocities of one body: where it has
-particles, and all around.
+The grid is divided into blocks of 4^3 nodes. Particles are sorted by block and body: a *block* of
+the kernels holds the particles of one body in one block. It scatters into its own tile of 8^3
+nodes (the block plus a margin of two nodes on each side), so that no two blocks write to the same
+place and sums do not depend on threads. Particles may leave their block by one cell before they
+must be sorted again. A *field* is a block of nodes with the velocities of one body; it exists for
+occupied blocks and all their neighbours.
 """
 
 from __future__ import annotations
@@ -86,15 +86,15 @@ def arrange(
     Args:
         blocks: [N, 3] block of each particle's first node.
         bodies: [N].
-        laws: [N] small numbers; within a block those of the same law stand together.
+        laws: [N] small numbers; particles of a block are grouped by law.
         dx: cell size [m].
-        colliders: in their present poses.
+        colliders: colliders in their current poses.
 
     Returns:
-        order [N], which particle comes at each place, and the layout.
+        Particle order [N] and the layout.
 
     Raises:
-        ParticleError: for particles too far away to be addressed.
+        ParticleError: for particles beyond the addressable range.
     """
     if np.abs(blocks).max(initial=0) >= COORDINATE_LIMIT - 2:
         reach = COORDINATE_LIMIT * BLOCK * dx
@@ -185,7 +185,7 @@ def _near_colliders(
     reach: float,
     wanted: NDArray[np.bool_],
 ) -> tuple[Int, Int]:
-    """Those of the ``wanted`` colliders near each block, as starts [M + 1] and a flat list.
+    """The ``wanted`` colliders near each block, as starts [M + 1] and a flat list.
 
     Args:
         blocks: [M, 3].
@@ -221,7 +221,7 @@ def distances(
 
 
 def _distances_to_bounds(solid: Solid, points: NDArray[np.floating[Any]]) -> Float:
-    """Signed distances [N] [m] of points [N, 3] to the box about a solid."""
+    """Signed distances [N] [m] of points [N, 3] to the bounding box of a solid."""
     low, high = solid.bounds
     local = (points - solid.pose[:3, 3]) @ solid.pose[:3, :3] - (low + high) / 2
     over = np.abs(local) - (high - low) / 2
@@ -246,7 +246,7 @@ def _above_ground(row: Float, heights: Float, points: NDArray[np.floating[Any]])
 
 
 def _chunks(block_start: Int) -> Int:
-    """Cut blocks into CHUNKS of about equal work: particles, and something for the tile itself."""
+    """Divide blocks into CHUNKS of about equal work, by particles plus a constant per tile."""
     blocks = len(block_start) - 1
     work = np.append(0, np.cumsum(np.diff(block_start) + 30))
     wanted = work[-1] * np.arange(CHUNKS + 1) / CHUNKS

@@ -1,4 +1,4 @@
-"""The reference backend: plain torch, float64, slow, obvious and differentiable.
+"""The reference backend: plain torch in float64, slow, simple and differentiable.
 
 Other backends are tested against it.
 """
@@ -81,12 +81,12 @@ class NodeContact:
     """Effect of contact on a body's nodes in one substep.
 
     Attributes:
-        body: who was touched.
-        other: collider index, or body index when ``by_body``.
+        body: index of the body.
+        other: collider index, or body index if ``by_body``.
         at: [U, 3] nodes [m].
         impulse: [U, 3] [N s].
-        slip: [U, 3] velocity relative to the other, after the contact [m/s].
-        velocity: [U, 3] of the other [m/s].
+        slip: [U, 3] velocity relative to ``other`` after the contact [m/s].
+        velocity: [U, 3] velocity of ``other`` [m/s].
     """
 
     body: int
@@ -99,7 +99,7 @@ class NodeContact:
 
 
 def with_stress(state: TorchState, params: TorchParameters) -> TorchState:
-    """The state with stress and energy of its deformation."""
+    """The state with stress and energy computed from its deformation."""
     return _update_stress(state, params, state.x, state.v, state.L, state.F, state.F_total, 0.0)
 
 
@@ -190,7 +190,7 @@ def _to_grid(
 
 
 def surface_offset(centroid: Tensor) -> Tensor:
-    """Where surfaces lie, from centroid offsets [cells]; see :mod:`..contact`."""
+    """Surface positions from centroid offsets [cells]; see :mod:`..contact`."""
     return _interpolate(SURFACE_TABLE, centroid / 1.5)
 
 
@@ -254,8 +254,10 @@ def _resolve_body_contact(
 
 
 def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
-    """Contact normals [U, 3] from a to b, and where [U] the surfaces face each other or one body is
-    all around."""
+    """Contact normals [U, 3] from a to b, and whether [U] the surfaces are in contact.
+
+    They are if they face each other or one body surrounds the node.
+    """
     size_a, size_b = moment_a[:, :3].norm(dim=-1), moment_b[:, :3].norm(dim=-1)
     out_of_a = -moment_a[:, :3] / size_a.clamp(min=1e-30)[:, None]
     into_b = moment_b[:, :3] / size_b.clamp(min=1e-30)[:, None]
@@ -269,7 +271,7 @@ def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _face_score(size: Tensor, fraction: Tensor) -> Tensor:
-    """How well first moments tell normals; see :mod:`..contact`."""
+    """Reliability of normals from first moments; see :mod:`..contact`."""
     flat = _interpolate(FLAT_TABLE, fraction).clamp(min=1e-3)
     return (size / flat).clamp(max=1) ** 2 * size
 
@@ -328,9 +330,9 @@ def _resolve_thin_colliders(
 ) -> Tensor:
     """Velocities [N, 3] of particles after contact with thin colliders, body after body.
 
-    See ``contact.resolve_particle_collider``. On the CPU a particle is asked about those near its
-    block alone, and twice where they are several; asking about one more that it does not touch
-    changes nothing.
+    See ``contact.resolve_particle_collider``. The CPU backend only tests colliders near a
+    particle's block, and makes two passes for several colliders; testing more colliders does not
+    change the result.
     """
     thin = [(k, c) for k, c in enumerate(colliders) if is_thin(c, params.dx)]
     half = params.volume ** (1 / 3) / 2
@@ -365,7 +367,7 @@ def _material_velocity(collider: Collider, points: Tensor) -> Tensor:
 
 
 class ReferenceSolverBackend:
-    """Solver to compare others with, and to differentiate; see :func:`substep`."""
+    """Differentiable solver that other backends are compared with; see :func:`substep`."""
 
     name = "reference"
 
@@ -375,7 +377,7 @@ class ReferenceSolverBackend:
 
 
 def torch_model(model: Model) -> tuple[TorchState, TorchParameters]:
-    """A model as tensors: where a differentiable rollout starts."""
+    """A model as tensors, the start of a differentiable rollout."""
     start = model.start
     table = torch.from_numpy(model.table)
     params = TorchParameters(
@@ -402,7 +404,7 @@ def torch_model(model: Model) -> tuple[TorchState, TorchParameters]:
 
 
 class ReferenceSimulation:
-    """A model in motion; every substep makes a new state."""
+    """A running simulation; every substep creates a new state."""
 
     def __init__(self, model: Model, colliders: Sequence[Collider]) -> None:
         self._model = model

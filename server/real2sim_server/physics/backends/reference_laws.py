@@ -1,9 +1,8 @@
-"""Stress in plain torch, batched over particles: the oracle, and the differentiable path.
+"""Stress in plain torch, batched over particles: test oracle and differentiable path.
 
-Written in matrix form where ``stress.stress_update`` works with scalars and principal values:
-logarithms by repeated square roots, flow by matrix exponentials. Nothing here divides by
-differences of principal values, so gradients are right at rest, too. Only snow needs singular
-values.
+Uses matrix form instead of the scalars and principal values of ``stress.stress_update``:
+logarithms by repeated square roots, flow by matrix exponentials. It does not divide by differences
+of principal values, so gradients are also valid at rest. Only snow needs singular values.
 """
 
 from __future__ import annotations
@@ -80,7 +79,7 @@ def polar_rotation(F: Tensor) -> Tensor:
 
 
 def inverse(a: Tensor) -> Tensor:
-    """Inverses [N, 3, 3] by cross products, which is many times faster than by factorising."""
+    """Inverses [N, 3, 3] by cross products; much faster than factorisation."""
     x, y, z = a.unbind(-2)
     yz = torch.linalg.cross(y, z)
     columns = torch.stack([yz, torch.linalg.cross(z, x), torch.linalg.cross(x, y)], dim=-1)
@@ -289,7 +288,7 @@ def _capsule_distance(capsule: Capsule, q: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _mesh_distance(mesh: TriangleMesh, q: Tensor) -> tuple[Tensor, Tensor]:
-    """By every triangle: slow, obvious."""
+    """Brute force over all triangles."""
     surface = mesh.surface
     corners, normals = torch.as_tensor(surface.corners), torch.as_tensor(surface.normals)
     places, parts = _nearest_of_triangles(corners, q)
@@ -308,8 +307,10 @@ def _mesh_distance(mesh: TriangleMesh, q: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _nearest_of_triangles(corners: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Nearest places [N, T, 3] on triangles, and parts [N, T] that they lie on: the least of the
-    face, where the point is above it, of the three edges and of the three corners."""
+    """Nearest points [N, T, 3] on triangles, and the feature [N, T] that they belong to.
+
+    The nearest of the face (if the point is above it), the three edges and the three corners.
+    """
     a, b, c = corners.unbind(1)
     normal = torch.linalg.cross(b - a, c - a)
     square = normal.square().sum(-1)
@@ -344,7 +345,7 @@ _LOCAL: dict[type[Solid], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
 
 
 def first_touch(solid: Solid, x: Tensor, way: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """Fraction [N] of each way until a particle touches a solid, MISSES where none; normals.
+    """Fraction [N] of each displacement until a particle touches a solid, or MISSES; normals.
 
     See ``contact.resolve_particle_collider``.
     """

@@ -1,6 +1,6 @@
-"""Cases with known answers; tests and ``real2sim validate`` run the same ones.
+"""Validation cases with known answers, for tests and ``real2sim validate``.
 
-Every case is a function of the backend's name and returns checks: measured, expected, tolerance.
+Every case is a function of the backend name and returns checks: measured, expected, tolerance.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Checks of the validation table, and the small setups that cases share."""
+"""Checks of the validation table, and setups shared by cases."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ..solver import Solver, SolverOptions
 
 @dataclass(frozen=True)
 class ReferenceCurve:
-    """A measured quantity over time or space beside its theory, for the page.
+    """A measured curve over time or space with its theory, for the HTML page.
 
     Attributes:
-        x, measured, expected: of one length; ``expected`` may hold NaN where theory is silent.
+        x, measured, expected: arrays of equal length; ``expected`` may be NaN.
         x_label, y_label: with units.
     """
 
@@ -34,11 +34,11 @@ class Check:
     """A measured value against theory.
 
     Attributes:
-        name: what it is, with its case.
-        measured, expected: the two numbers, in ``unit``.
-        tolerance: largest allowed distance of the two, in ``unit``.
+        name: name of the quantity, with its case.
+        measured, expected: values in ``unit``.
+        tolerance: maximum allowed difference, in ``unit``.
         unit: SI unit, empty for ratios.
-        curve: what led to it, where that says more than a number.
+        curve: underlying curve, or None.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether they agree; never for a NaN."""
+        """Whether the values agree; False for NaN."""
         return bool(abs(self.measured - self.expected) <= self.tolerance)
 
 

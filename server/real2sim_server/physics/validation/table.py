@@ -26,10 +26,10 @@ class CaseResult:
 
     Attributes:
         name: key of CASES.
-        about: what it is, one sentence.
-        checks: its lines; none when it broke off.
-        error: why it broke off, or empty.
-        seconds: it took.
+        about: description in one sentence.
+        checks: its checks; empty if it failed with an error.
+        error: the error, or empty.
+        seconds: run time.
     """
 
     name: str
@@ -40,7 +40,7 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether it came to its end and every line holds."""
+        """Whether it completed and every check passed."""
         return not self.error and all(check.passed for check in self.checks)
 
 
@@ -54,13 +54,13 @@ def run_table(
     """Run the named cases, or all, and compare them with theory.
 
     Args:
-        backend: of the solver.
-        cases: names; all of CASES when not given.
-        available: what names may stand for; CASES when not given.
-        on_progress: takes (cases done, cases).
+        backend: solver backend.
+        cases: names of the cases; all by default.
+        available: available cases; CASES by default.
+        on_progress: called with (cases done, cases).
 
     Raises:
-        PhysicsError: for names there are not.
+        PhysicsError: for unknown names.
     """
     if backend not in BACKENDS:
         raise PhysicsError(f"unknown backend {backend!r}; allowed are {list(BACKENDS)}")
@@ -113,7 +113,7 @@ def _run_case(name: str, case: Case, backend: str) -> CaseResult:
     try:
         checks = tuple(case(backend))
     except (PhysicsError, IndexError, ValueError) as problem:
-        # A case that finds no contact or no crossing must fail its line, not the table.
+        # A case without the expected contact must fail its own row, not the table.
         error = f"{type(problem).__name__}: {problem}"
     return CaseResult(name, about, checks, error, time.perf_counter() - begin)
 
@@ -175,7 +175,7 @@ def _row(check: Check) -> str:
 
 
 def _margin(check: Check) -> str:
-    """A dot between the two ends of the tolerance; at the rim when outside."""
+    """A dot between the two ends of the tolerance; at the edge if outside."""
     off = check.measured - check.expected
     error = off / check.tolerance if check.tolerance > 0 else math.copysign(2, off) * (off != 0)
     error = 1.15 if math.isnan(error) else min(max(error, -1.15), 1.15)

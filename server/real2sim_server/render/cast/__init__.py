@@ -1,7 +1,7 @@
-"""LiDAR from Gaussians: rays followed in 3D, one origin and pose for each instant of a sweep.
+"""LiDAR ray casting through Gaussians, in 3D, with a sensor pose for each instant of a sweep.
 
-``cast`` gives what the light of each ray meets (an :class:`Echo`), ``detect`` what the sensor makes
-of it (a :class:`Sweep`). Nothing here is compiled before the first call.
+``cast`` computes the light that each ray returns (an :class:`Echo`), ``detect`` the measurements of
+the sensor (a :class:`Sweep`). Kernels are compiled on the first call.
 """
 
 from .call import (

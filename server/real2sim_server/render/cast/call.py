@@ -1,4 +1,4 @@
-"""Casting a LiDAR sweep through Gaussians, of one instant or of a recorded scene."""
+"""Ray casting of LiDAR sweeps, for given instances or a recorded scene."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _normals: weakref.WeakKeyDictionary[GaussianCloud, Array] = weakref.WeakKeyDicti
 
 
 def facing(cloud: GaussianCloud, beams: Beams, T_cloud_lidar: Float) -> Array:
-    """Cosine [N] of the angle between each Gaussian's shortest axis and the light on its centre.
+    """Cosine [N] of the angle between each Gaussian's shortest axis and the ray to its centre.
 
     Args:
-        cloud: in its own frame.
-        beams: of the sensor.
+        cloud: Gaussians in their own frame.
+        beams: beams of the sensor.
         T_cloud_lidar: [S, 4, 4] pose of the sensor in that frame at each instant of the sweep.
     """
     means = array_of(cloud.means)
@@ -54,12 +54,12 @@ def facing(cloud: GaussianCloud, beams: Beams, T_cloud_lidar: Float) -> Array:
 
 
 def facing_of_request(request: CastRequest) -> list[Array]:
-    """``facing`` of the Gaussians of each instance."""
+    """:func:`facing` of the Gaussians of each instance."""
     return [_facing_of(request, index) for index in range(len(request.instances))]
 
 
 def attributes_towards(request: CastRequest, incidence: float) -> tuple[Array | None, ...]:
-    """Attributes of a request with the reflectivity that Gaussians have towards its sensor."""
+    """Attributes of a request with the reflectivity of Gaussians towards its sensor."""
     alike = np.float32(incidence)
     found: list[Array | None] = []
     for index, given in enumerate(request.attributes):
@@ -79,7 +79,7 @@ def _facing_of(request: CastRequest, index: int) -> Array:
 
 
 def normals_of(cloud: GaussianCloud) -> Array:
-    """Shortest axes [N, 3]; kept as long as the cloud."""
+    """Shortest axes [N, 3]; cached for the lifetime of the cloud."""
     known = _normals.get(cloud)
     if known is None:
         shortest = array_of(cloud.scales).argmin(1)
@@ -99,27 +99,26 @@ def cast(
     incidence: float = 1.0,
     backend: str = "auto",
 ) -> Echo:
-    """What every ray of one sweep meets; :func:`.detect` makes measurements of it.
+    """Cast the rays of one sweep; pass the result to :func:`.detect` for measurements.
 
-    Each Gaussian answers a ray by its value at the point of the ray where it is largest (exact in
-    3D, after Moenne-Loccoz et al. 2024), which is also the range of its sample. Samples are taken
-    from near to far by the distance of their centres.
+    The response of a Gaussian to a ray is its maximum along the ray (exact in 3D, after
+    Moenne-Loccoz et al. 2024); the position of the maximum is the range of the sample. Samples are
+    sorted by the distance of the Gaussians' centres.
 
     Args:
-        instances: what the light meets.
+        instances: instances in the scene.
         lidar: the sensor.
-        T_world_lidar: pose of the sensor, [4, 4] when it stands still, else [S, 4, 4] at the
-            instants ``lidar.beams.slots[0]``.
+        T_world_lidar: pose of the sensor, [4, 4] if stationary, else [S, 4, 4] at the instants
+            ``lidar.beams.slots[0]``.
         object_poses: for each instance ``T_world_object`` [S, 4, 4] at the same instants, or None
-            where it stands at its own; None for all that stand still.
-        attributes: for each instance [N, 2] float32, reflectivity and share of lost rays.
-        incidence: share of the reflectivity that does not mind how squarely the light meets a
-            surface, 0 to 1; the rest goes with the cosine to its normal.
+            if it is stationary; None if all are stationary.
+        attributes: for each instance [N, 2] float32, reflectivity and fraction of lost rays.
+        incidence: fraction of the reflectivity that is independent of the angle of incidence, 0 to
+            1; the rest is proportional to the cosine of that angle.
         backend: ``cpu``, ``cuda``, ``reference``, or ``auto``, which is ``cpu``.
 
     Raises:
-        RenderError: poses or attributes of other shapes or values, a backend that is unknown or
-            lacks what it needs.
+        RenderError: invalid poses or attributes, or an unknown or unusable backend.
     """
     request = checked_request(
         instances,
@@ -141,7 +140,7 @@ def checked_request(
     attributes: Sequence[NDArray[np.float32] | None] | None = None,
     incidence: float = 1.0,
 ) -> CastRequest:
-    """The request of :func:`cast`. Raises like it."""
+    """The validated request of :func:`cast`; raises the same errors."""
     if not 0 <= incidence <= 1:
         raise RenderError(f"incidence must be from 0 to 1, not {incidence!r}")
     request = CastRequest(
@@ -157,8 +156,10 @@ def checked_request(
 
 
 def prepare_rays(lidar: Lidar) -> None:
-    """Make what casting on the CPU keeps of a sensor's rays, on any thread: half a million of them
-    take a second at their first sweep otherwise."""
+    """Prepare the ray tables of a sensor for the CPU backend; thread-safe.
+
+    Otherwise the first sweep is delayed, by a second for half a million rays.
+    """
     from .layout import layout_of
 
     layout_of(lidar.beams)
@@ -166,10 +167,10 @@ def prepare_rays(lidar: Lidar) -> None:
 
 @cache
 def select_caster(name: str = "auto") -> CastBackend:
-    """The backend of that name, made on first use.
+    """Return the backend with a name, created on first use.
 
     Raises:
-        RenderError: unknown, or something that it needs is not here.
+        RenderError: unknown backend, or missing requirements.
     """
     chosen = "cpu" if name == "auto" else name
     if chosen not in CASTERS:
@@ -258,15 +259,14 @@ def _attributes(
     return tuple(checked)
 
 
-# Recorded scenes: everything moves along its own trajectory.
+# Recorded scenes: objects move along their trajectories.
 
 Attributes = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class SweepScene:
-    """What rays may meet: one entry for each instance, as :func:`~.call.cast` takes them, and the
-    ``incidence`` of all."""
+    """Ray targets: one entry per instance, as for :func:`~.call.cast`, and their ``incidence``."""
 
     instances: tuple[Instance, ...]
     poses: tuple[Float | None, ...]
@@ -274,7 +274,7 @@ class SweepScene:
     incidence: float = 1.0
 
     def request(self, lidar: Lidar, T_world_lidar: ArrayLike) -> CastRequest:
-        """A sweep through it. Raises RenderError as :func:`~.call.cast` does."""
+        """A request for a sweep. Raises RenderError like :func:`~.call.cast`."""
         return checked_request(
             self.instances,
             lidar,
@@ -286,9 +286,9 @@ class SweepScene:
 
 
 def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "auto") -> Echo:
-    """What ``lidar`` on the recording vehicle meets in the sweep about ``t_us`` [us].
+    """Cast the sweep of ``lidar`` on the recording vehicle around ``t_us`` [us].
 
-    A scene's own set for LiDARs (``scene.lidar``) is met where there is one.
+    Uses the scene's LiDAR Gaussians (``scene.lidar``) if it has them.
     """
     met = recorded_scene(scene, lidar, t_us)
     request = met.request(lidar, sensor_poses(scene.ego, lidar, t_us))
@@ -296,7 +296,7 @@ def recorded_sweep(scene: Scene, lidar: Lidar, t_us: int, *, backend: str = "aut
 
 
 def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:
-    """Background and the objects that exist at ``t_us``, and how they move over the sweep."""
+    """The background and the objects present at ``t_us``, with their motion over the sweep."""
     times = t_us + lidar.beams.slots[0]
     cloud, attributes = lidar_target(scene, None)
     instances, known = [Instance(cloud)], [attributes]
@@ -315,7 +315,7 @@ def recorded_scene(scene: Scene, lidar: Lidar, t_us: int) -> SweepScene:
 
 
 def lidar_target(scene: Scene, object_id: str | None) -> tuple[GaussianCloud, Attributes | None]:
-    """Gaussians that a LiDAR meets of an object, or of the background, and their attributes."""
+    """LiDAR Gaussians of an object (None for the background), and their attributes."""
     if scene.lidar is not None:
         held = scene.lidar.background if object_id is None else scene.lidar.objects.get(object_id)
         if held is not None:
@@ -324,19 +324,19 @@ def lidar_target(scene: Scene, object_id: str | None) -> tuple[GaussianCloud, At
 
 
 def incidence_of(scene: Scene) -> float:
-    """Share of light that the surfaces of a scene send back however they face the sensor."""
+    """Fraction of a scene's reflectivity that is independent of the angle of incidence."""
     return 1.0 if scene.lidar is None else scene.lidar.incidence
 
 
 def sensor_poses(ego: Trajectory, lidar: Lidar, t_us: int) -> Float:
-    """``T_world_lidar`` [S, 4, 4] on a vehicle that drives along ``ego`` [T_world_vehicle]."""
+    """``T_world_lidar`` [S, 4, 4] on a vehicle with trajectory ``ego`` (``T_world_vehicle``)."""
     return transforms_at(ego, t_us + lidar.beams.slots[0]) @ lidar.T_vehicle_lidar
 
 
 def transforms_at(trajectory: Trajectory, times_us: Float) -> Float:
     """``T_fixed_moving`` [S, 4, 4] at any times [us].
 
-    Beyond its ends the path goes straight on with the speed it has there, for the parts of a sweep
+    Beyond its ends, the trajectory is extrapolated at constant velocity, for the parts of a sweep
     before the first and after the last box.
     """
     known = trajectory.times_us.astype(np.float64)
@@ -357,15 +357,14 @@ def transforms_at(trajectory: Trajectory, times_us: Float) -> Float:
 
 
 def kernels_of_casting_on_disk() -> bool:
-    """Whether an earlier run left what :func:`warm_up_casting` compiles."""
+    """Whether the disk cache has the kernels of :func:`warm_up_casting`."""
     from .blend import follow_rays  # Imported only where it is needed.
 
     return is_on_disk(follow_rays)
 
 
 def warm_up_casting() -> None:
-    """Compile or load everything that a first sweep would wait for; takes twenty seconds the first
-    time."""
+    """Compile or load everything that a first sweep needs; takes 20 s the first time."""
     cloud = GaussianCloud(
         means=torch.tensor([[3.0, 0.0, 0.0], [0.4, 0.1, 0.2]]),
         quats=torch.tensor([[1.0, 0, 0, 0]] * 2),

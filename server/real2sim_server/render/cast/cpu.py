@@ -1,4 +1,4 @@
-"""cast() on the CPU: prepare, sort, deal to tiles, follow the rays."""
+"""cast() on the CPU: prepare records, sort, assign to tiles, trace rays."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ VALUES = 5
 
 
 class CpuCaster:
-    """cast() for any CPU. One call at a time; those of other threads wait."""
+    """cast() on the CPU. Calls are serialised across threads."""
 
     name = "cpu"
 
@@ -58,8 +58,10 @@ class CpuCaster:
         return echo_of(request, lights, timing)
 
     def trace(self, request: CastRequest, reach: NDArray[np.float32]) -> RayHits:
-        """Hits of the rays of a request, each up to its ``reach`` [R] [m], or where that is 0
-        until its light is gone."""
+        """Hits of the rays of a request, each up to its ``reach`` [R] [m].
+
+        A reach of 0 follows the ray until its light is absorbed.
+        """
         with self._lock:
             records, regions, motions = self._prepare(request)
             layout = layout_of(request.lidar.beams)
@@ -126,7 +128,7 @@ class CpuCaster:
 
 
 def sensor_of(request: CastRequest) -> Sensor:
-    """The LiDAR of a request as kernels take it."""
+    """The LiDAR of a request in kernel form."""
     lidar = request.lidar
     layout = layout_of(lidar.beams)
     times = lidar.beams.slots[0]
@@ -198,7 +200,7 @@ def _follow(  # noqa: PLR0917
 
 
 def echo_of(request: CastRequest, lights: Lights, timing: dict[str, float]) -> Echo:
-    """Lights in the order of the sensor's rays, their owners by what they are called outside."""
+    """Lights in the order of the sensor's rays, with external instance ids and members."""
     shape = request.lidar.shape
     values = np.ascontiguousarray(lights.values.T).reshape(VALUES, *shape)
     body, member = lights.owners[:, 0], lights.owners[:, 1]

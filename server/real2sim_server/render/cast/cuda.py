@@ -1,8 +1,8 @@
-"""cast() on an NVIDIA GPU: prepare, deal to tiles, sort, follow the rays.
+"""cast() on an NVIDIA GPU: prepare records, assign to tiles, sort, trace rays.
 
-Work space grows to the largest sweep so far. Clouds and the tables of a sensor are copied to the
-device once and stay while they live. NVRTC compiles ``kernels/``; the NumPy types mirror the
-structures of ``kernels/beams.h`` field by field.
+Work space grows to the largest sweep so far. Clouds and sensor tables are copied to the device once
+and cached for their lifetime. NVRTC compiles ``kernels/``; the NumPy types mirror the structures of
+``kernels/beams.h`` field by field.
 """
 
 from __future__ import annotations
@@ -83,16 +83,19 @@ KERNELS = ("prepare", "list_tiles", "follow")
 
 
 def compiled_kernels(architecture: str) -> bytes:
-    """The cubin for an architecture (``sm_90``), from the disk where it was compiled before.
+    """The cubin for an architecture (``sm_90``), cached on disk.
 
     Raises:
-        RenderError: it does not compile; the message has NVRTC's words.
+        RenderError: compilation failed; the message includes NVRTC's log.
     """
     return _source().kept(architecture)
 
 
 def compile_kernels(architecture: str) -> tuple[bytes, dict[str, Usage]]:
-    """Cubin, which is kept on the disk, and what each kernel takes. Raises like the other."""
+    """The cubin, cached on disk, and the resource usage of each kernel.
+
+    Raises the errors of :func:`compiled_kernels`.
+    """
     code, log = _source().compiled(architecture)
     return code, usage_of(log)
 
@@ -118,7 +121,7 @@ PARTS = ("means", "quats", "scales", "opacities")
 
 
 class CudaCaster:
-    """cast() on the current CUDA device of torch. One call at a time; those of other threads wait.
+    """cast() on the current CUDA device of torch. Calls are serialised across threads.
 
     Raises:
         RenderError: the kernels do not compile for the device.
@@ -140,7 +143,7 @@ class CudaCaster:
         """Follow every ray of the request.
 
         Raises:
-            RenderError: more Gaussians, or more of them in tiles, than can be sorted at once.
+            RenderError: too many Gaussians or tile entries to sort at once.
         """
         start = time.perf_counter()
         with self._lock:
@@ -168,7 +171,7 @@ class CudaCaster:
         return Lights(*(part.cpu().numpy() for part in (values, owners, several)))
 
     def _pairs(self, sweep: NDArray[np.void], held: _Held, blocks: int) -> int:
-        """List which records each tile may hold; how many such pairs there are."""
+        """List the records of each tile; return the number of pairs."""
         self._launcher.launch("prepare", blocks, held.put(sweep))
         ends = torch.cumsum(held.given["counts"], 0)
         held.write(sweep, "counts", ends)
@@ -259,10 +262,10 @@ class CudaCaster:
 
 
 class _Held:
-    """Memory of one sweep on the device, which lives until the sweep is done.
+    """Device memory of one sweep, released when the sweep is done.
 
     Attributes:
-        given: what the fields of a Sweep point to, by name.
+        given: tensors that the fields of a Sweep point to, by name.
     """
 
     def __init__(self, launcher: Launcher) -> None:
@@ -271,17 +274,17 @@ class _Held:
         self.given: dict[str, Tensor] = {}
 
     def moved(self, values: Tensor | NDArray[np.generic]) -> Tensor:
-        """A copy on the device, or what lies there already."""
+        """The values on the device; copied only if necessary."""
         tensor = values if isinstance(values, Tensor) else torch.from_numpy(values)
         return tensor.to(self._launcher.device).contiguous()
 
     def pointer(self, tensor: Tensor) -> int:
-        """Address of a tensor, which is kept."""
+        """Address of a tensor, which is kept alive."""
         self._kept.append(tensor)
         return self._launcher.pointer(tensor)
 
     def write(self, sweep: NDArray[np.void], name: str, tensor: Tensor) -> None:
-        """Let a field of a Sweep point to a tensor."""
+        """Set a field of a Sweep to the address of a tensor."""
         self.given[name] = tensor
         sweep[name] = self._launcher.pointer(tensor)
 

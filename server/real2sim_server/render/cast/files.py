@@ -1,4 +1,4 @@
-"""Sweeps as files: point clouds (.ply), arrays (.npz) and pictures (.png)."""
+"""File output of sweeps: point clouds (.ply), arrays (.npz) and images (.png)."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Picture = NDArray[np.uint8]
 
 
 def write_sweep(sweep: Sweep, lidar: Lidar, path: Path) -> None:
-    """Write ``sweep`` in the format that the name of ``path`` says, one of SUFFIXES.
+    """Write ``sweep`` in the format of the suffix of ``path``, one of SUFFIXES.
 
-    ``.ply`` holds the points that return, in the sensor's frame at their own instants, with
-    intensity, ring or ray, instance and time; ``.npz`` every array of the sweep and the angles.
+    ``.ply`` has the returned points, sensor frame at the time of each ray, with intensity, ring or
+    ray, instance and time. ``.npz`` has all arrays of the sweep and the angles.
     """
     suffix = path.suffix.lower()
     if suffix == ".ply":
@@ -46,7 +46,7 @@ def write_sweep(sweep: Sweep, lidar: Lidar, path: Path) -> None:
 
 
 def ply_bytes(sweep: Sweep) -> bytes:
-    """The points that return as binary PLY."""
+    """The returned points as binary PLY."""
     hit = sweep.hit
     rows = np.broadcast_to(np.arange(hit.shape[0]).reshape(-1, *[1] * (hit.ndim - 1)), hit.shape)
     fields: list[tuple[str, str, NDArray[Any]]] = [
@@ -82,7 +82,7 @@ def _arrays(sweep: Sweep, lidar: Lidar) -> dict[str, NDArray[Any]]:
 
 
 def sweep_picture(sweep: Sweep, lidar: Lidar) -> Picture:
-    """RGB: from above (ahead is up), below it the range image and the intensity image."""
+    """RGB image: top view (forward is up), range image and intensity image below each other."""
     import cv2
 
     above = _from_above(sweep)
@@ -102,7 +102,7 @@ def sweep_picture(sweep: Sweep, lidar: Lidar) -> Picture:
 
 
 def _from_above(sweep: Sweep) -> Picture:
-    """The points within FAR / 2, ahead up and left to the left, coloured by intensity."""
+    """Top view of the points within FAR / 2, forward up, coloured by intensity."""
     scale = TOP_SIZE / FAR
     points, shown = sweep.points[sweep.hit], sweep.intensity[sweep.hit]
     colours = _colours(np.clip(shown * 1.5, 0, 1))
@@ -115,7 +115,7 @@ def _from_above(sweep: Sweep) -> Picture:
 
 
 def _unrolled(image: Picture, lidar: Lidar) -> Picture:
-    """An image by azimuth, left at the left, and elevation, high at the top."""
+    """An image over azimuth (left is left) and elevation (up is up)."""
     azimuth, elevation = lidar.beams.azimuth, lidar.beams.elevation
     if len(lidar.shape) == 2:
         rows = np.argsort(-elevation[:, 0], kind="stable")

@@ -1,8 +1,8 @@
-"""Tiles of a LiDAR's rays: bands of elevation, cut into tiles by azimuth, and their lists.
+"""Tiles of a LiDAR's rays (bands of elevation, divided by azimuth) and their record lists.
 
-A tile is eight groups of eight rays. The groups of a tile differ in elevation, the rays of a group
-in azimuth, since objects on the road appear wide and low to a sensor. Turning sensors fill tiles of
-eight rows by eight columns, tables are cut into tiles by sorting. Made once for each ``Beams``.
+A tile has eight groups of eight rays. Groups differ in elevation, rays of a group in azimuth,
+because objects on the road appear wide and low. Spinning sensors fill tiles of eight rows by eight
+columns; ray tables are divided by sorting. The layout is computed once per ``Beams``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_BANDS = 250
 
 
 class BeamLayout(NamedTuple):
-    """Tiles of rays and tables to find them, as kernels take them.
+    """Tiles of rays and lookup tables, in kernel form.
 
     Attributes:
         rays: [T, 64] int32, index of each ray in the flat order of the beams; -1 fills up.
@@ -73,7 +73,7 @@ class BeamLayout(NamedTuple):
 
 @weak_cache
 def layout_of(beams: Beams) -> BeamLayout:
-    """The layout of ``beams``, made at the first call."""
+    """The layout of ``beams``, cached."""
     tiles, bands = _turning_tiles(beams) if len(beams.shape) == 2 else _table_tiles(beams)
     azimuth, elevation = beams.azimuth.ravel(), beams.elevation.ravel()
     tiles, bands = _by_azimuth(tiles, bands, azimuth, beams.slots[1].ravel())
@@ -165,8 +165,10 @@ def _table_tiles(beams: Beams) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def _by_azimuth(
     tiles: NDArray[np.int64], bands: NDArray[np.int64], azimuth: Float, slots: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Tiles by band and then by azimuth; those that reach over +-pi, or hold both the begin and
-    the end of the sweep, are parted in two."""
+    """Tiles by band, then azimuth.
+
+    Tiles across +-pi, or with both the start and the end of the sweep, are split in two.
+    """
     middle = (int(slots.max()) + 1) / 2
     cuts: list[tuple[Float, float, float]] = [
         (azimuth, 0.0, np.pi),
@@ -252,14 +254,14 @@ def _turning(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
 
 
 def _staring(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
-    """Of a sensor that looks everywhere at any time."""
+    """Values of a sensor without scan order."""
     times = beams.slots[0]
     middle = np.full(AZIMUTH_BINS, len(times) // 2, dtype=np.int32)
     return middle, 4.0, float(times[-1] - times[0]) / 2, 0.0
 
 
 def _turning_table(beams: Beams) -> tuple[NDArray[np.int32], float, float, float]:
-    """Of a table; it may be that of a turning sensor, as recorded sweeps are."""
+    """Values of a ray table, which may be that of a spinning sensor (recorded sweeps)."""
     times, slots = beams.slots
     duration = float(times[-1] - times[0])
     bins, when = _azimuth_bins(wrapped(beams.azimuth)), times[slots]
@@ -292,12 +294,12 @@ def _turning_table(beams: Beams) -> tuple[NDArray[np.int32], float, float, float
 
 
 def _difference(a: Float, b: Float) -> Float:
-    """a - b [rad], the short way round."""
+    """Wrapped difference a - b [rad]."""
     turned: Float = (np.asarray(a) - np.asarray(b) + np.pi) % (2 * np.pi) - np.pi
     return turned
 
 
-# Data that the kernels hand to each other
+# Data exchanged between kernels
 
 RECORD = 16
 """float32 values of a record: one cache line for each Gaussian that a ray may meet."""
@@ -379,7 +381,7 @@ class Sensor(NamedTuple):
 
 
 class Lights(NamedTuple):
-    """What the blending writes, by ray; [0] where not asked for.
+    """Outputs of the blending, by ray; [0] if not requested.
 
     Attributes:
         values: [R, 6] float32: median range, sum of w tau, sum of w, of w reflectivity, of w loss,

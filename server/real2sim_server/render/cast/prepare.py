@@ -1,12 +1,12 @@
 """From the Gaussians of one body to records of those that rays may meet, and at which angles.
 
-The sensor moves while it turns, so the instant at which it looks at each Gaussian is found first.
-Where the sweep begins and ends the same place is seen twice, a turn apart; Gaussians there become
-two records, one for the tiles of either half of the sweep.
+The sensor moves while it spins, so the time at which it scans each Gaussian is computed first. At
+the azimuth where the sweep starts and ends, Gaussians are scanned twice, one turn apart, and become
+two records, one for the tiles of each half of the sweep.
 
 Eight Gaussians are whitened and bounded at a time. Angles are exact tangents to the ellipsoid
-alpha = 1/255 as seen by the sensor when it looks at the centre, widened by its motion until it
-looks at the edges.
+alpha = 1/255 at the scan time of its centre, widened by the sensor motion until its edges are
+scanned.
 """
 
 # Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.

@@ -1,6 +1,6 @@
-"""cast() in plain torch: every ray against every Gaussian, in float64. The oracle of the others.
+"""cast() in plain torch: every ray against every Gaussian, in float64; the oracle for tests.
 
-:func:`follow` is differentiable by torch itself.
+:func:`follow` is differentiable with torch.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ RAYS = 256
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What rays meet, from near to far.
+    """Samples along rays, from near to far.
 
     Attributes:
         tau: [R, N] range [m].
-        weight: [R, N] share of the ray's light that is stopped there; 0 where it is not met.
-        before: [R, N] light that arrives there.
-        order: [R, N] int64, the Gaussian of each sample.
+        weight: [R, N] fraction of the ray's light absorbed there; 0 without a hit.
+        before: [R, N] transmittance before the sample.
+        order: [R, N] int64, index of the Gaussian of each sample.
     """
 
     tau: Tensor
@@ -227,8 +227,10 @@ class _Results:
 def _echoes(
     samples: Iterable[tuple[float, float, float]], pulse: float
 ) -> Iterable[tuple[float, float, float]]:
-    """Range, power and reflectivity of each run of samples that lie within a pulse of the one
-    before, where it is strong enough."""
+    """Range, power and reflectivity of each echo.
+
+    An echo is a sufficiently strong run of samples, each within a pulse length of the previous one.
+    """
     last = total = ranges = shown = 0.0
     for tau, power, reflectivity in (*samples, (np.inf, 0.0, 0.0)):
         if total > 0 and abs(tau - last) > pulse:

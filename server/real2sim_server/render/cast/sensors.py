@@ -1,13 +1,13 @@
-"""From what light meets to what a LiDAR or a radar measures.
+"""Measurement models of LiDARs and radars.
 
-A LiDAR adds a detection limit, losses and range noise. Randomness is a hash of the seed and the
-ray's number, so a sweep has the same bits on any number of threads, and changing one ray changes no
-other.
+The LiDAR model adds a detection limit, dropped returns and range noise. Random numbers are hashes
+of the seed and the ray index, so a sweep is bitwise independent of the number of threads, and
+changing one ray does not affect others.
 
-A radar adds reflected power, cells, a threshold, clutter and ghosts. A ray stands for its solid
-angle. Its patch has the radar cross section (RCS) of its area, seen from the sensor, times a factor
-by class and incidence: a lobe about the normal, and a floor for corners and edges. Powers of
-patches in one cell of range, azimuth, elevation and radial velocity add up; a cell above the
+The radar model adds reflected power, resolution cells, a threshold, clutter and ghosts. Each ray
+represents its solid angle. Its patch has the radar cross section (RCS) of its projected area times
+a factor by class and incidence: a lobe around the normal, and a floor for corners and edges. Powers
+of patches in one cell of range, azimuth, elevation and radial velocity add up. A cell above the
 threshold is one detection, at the power-weighted mean of its patches. Power falls with the fourth
 power of range: a target of REFERENCE_RCS is just detected at the radar's ``detection_range_m``.
 """
@@ -34,18 +34,18 @@ LOST, ACROSS, AROUND = 0, 1, 2
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What a LiDAR measures in one turn or frame; arrays are of the sensor's shape.
+    """Measurements of a LiDAR in one turn or frame; arrays have the sensor's shape.
 
     Attributes:
-        range: [m], noise included; 0 where nothing returns.
-        returns: ranges by name (``first``, ``strongest``, ``last``) of sensors with more than one.
-        intensity: reflectivity, 0 to 1; 0 where nothing returns.
-        hit: rays that return.
-        drop_probability: how likely each ray is lost whatever it meets, 0 to 1.
-        instance: uint16, instance_id of what is met; 0 where nothing returns.
-        velocity: [..., 3] m/s in the world of what is met; None where nobody asked.
-        time_us: when each ray is fired, relative to the sweep's time stamp.
-        points: [..., 3] in the sensor's frame at the ray's own instant [m].
+        range: [m], including noise; 0 without a return.
+        returns: ranges by name (``first``, ``strongest``, ``last``) of multi-return sensors.
+        intensity: reflectivity, 0 to 1; 0 without a return.
+        hit: whether each ray has a return.
+        drop_probability: probability that a ray is lost regardless of its target, 0 to 1.
+        instance: uint16, instance_id of the target; 0 without a return.
+        velocity: [..., 3] velocity of the target, world frame [m/s]; None if not requested.
+        time_us: firing time of each ray relative to the timestamp of the sweep [us].
+        points: [..., 3] sensor frame at the time of the ray [m].
     """
 
     range: Image
@@ -63,10 +63,10 @@ def detect(echo: Echo, lidar: Lidar, *, seed: int = 0, request: CastRequest | No
     """Measure ``echo`` with the detector of ``lidar``.
 
     Args:
-        echo: what light meets.
-        lidar: whose rays these are.
-        seed: of noise and losses.
-        request: of the cast, for the velocity of what is met.
+        echo: result of :func:`cast`.
+        lidar: the sensor.
+        seed: seed of noise and dropped returns.
+        request: request of the cast, for target velocities.
     """
     probability = drop_probability(echo, lidar)
     hit = echo.hit & (uniform(seed, lidar.beams.count, LOST).reshape(lidar.shape) >= probability)
@@ -92,8 +92,11 @@ def detect(echo: Echo, lidar: Lidar, *, seed: int = 0, request: CastRequest | No
 
 
 def drop_probability(echo: Echo, lidar: Lidar) -> Image:
-    """How likely each ray is lost: by the sensor's own rate, by what the log lost there, and for
-    want of power, which falls with the square of the range."""
+    """Probability that each ray is lost.
+
+    Combines the sensor's drop rate, the rate learned from the log, and insufficient power, which
+    falls with the square of the range.
+    """
     detection = lidar.detection
     limit = detection.reflectivity / detection.range_m**2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -159,12 +162,12 @@ CLUTTER, CLUTTER_PLACE, GHOST = 11, 12, 16
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """What P rays meet, in the sensor's frame.
+    """Targets of P rays, sensor frame.
 
     Attributes:
         range: [P] [m].
         azimuth, elevation: [P] [rad].
-        velocity: [P] radial, away from the sensor, relative to it [m/s].
+        velocity: [P] radial velocity relative to the sensor, positive when receding [m/s].
         incidence: [P] angle between ray and normal, 0 to pi/2 [rad].
         semantic: [P] uint8 classes.
         instance: [P] uint16; 0 is background.
@@ -181,15 +184,15 @@ class Patches:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What a radar reports, D detections, the nearest first.
+    """D detections of a radar, nearest first.
 
     Attributes:
         range: [D] [m].
         azimuth, elevation: [D] [rad].
-        velocity: [D] radial, relative to the sensor, below 0 when nearing [m/s].
+        velocity: [D] radial velocity relative to the sensor, negative when approaching [m/s].
         rcs: [D] [dBsm].
-        snr: [D] power above that which is just detected [dB].
-        instance: [D] uint16 of what reflects most of it; 0 is background, or nothing.
+        snr: [D] power above the detection threshold [dB].
+        instance: [D] uint16, instance of the strongest reflection; 0 for background or no target.
         kind: [D] uint8: TARGET, CLUTTER_KIND or GHOST_KIND.
     """
 
@@ -207,7 +210,7 @@ class Detections:
 
     @property
     def points(self) -> Float:
-        """[D, 3] in the sensor's frame [m]."""
+        """[D, 3] points, sensor frame [m]."""
         flat = self.range * np.cos(self.elevation)
         x, y = flat * np.cos(self.azimuth), flat * np.sin(self.azimuth)
         return np.stack([x, y, self.range * np.sin(self.elevation)], axis=-1)
@@ -217,7 +220,7 @@ TARGET, CLUTTER_KIND, GHOST_KIND = 0, 1, 2
 
 
 def radar_detections(patches: Patches, radar: Radar, *, seed: int = 0) -> Detections:
-    """What ``radar`` detects of ``patches``: the same for the same seed."""
+    """Detections of ``radar`` for ``patches``; deterministic for a seed."""
     targets = _above_threshold(_cells(patches, radar), radar)
     ghosts = _ghosts(targets, radar, seed)
     seen = _measured(_joined([targets, ghosts]), radar, seed)
@@ -226,7 +229,7 @@ def radar_detections(patches: Patches, radar: Radar, *, seed: int = 0) -> Detect
 
 
 def patch_rcs(patches: Patches, solid_angle: float) -> Float:
-    """RCS [P] [m^2] of what each ray stands for, whose solid angle at the axis is given [sr]."""
+    """RCS [P] [m^2] of the patch of each ray; ``solid_angle``: of a ray at the axis [sr]."""
     table = np.full(256, DEFAULT)
     for name, value in REFLECTIVITY.items():
         table[SEMANTIC_CLASSES[name]] = value
@@ -237,7 +240,7 @@ def patch_rcs(patches: Patches, solid_angle: float) -> Float:
 
 
 def _cells(patches: Patches, radar: Radar) -> Detections:
-    """One for each cell that reflects anything, noiseless."""
+    """One noiseless detection per cell with any reflection."""
     model = radar.model
     rcs = patch_rcs(patches, radar.solid_angle)
     near, far = model.range_m
@@ -276,12 +279,12 @@ def _cells(patches: Patches, radar: Radar) -> Detections:
 
 
 def folded(velocity: Float, most: float | None) -> Float:
-    """Velocities as a radar reads them that knows -most to most alone."""
+    """Velocities folded into the unambiguous range, -most to most."""
     return velocity if most is None else (velocity + most) % (2 * most) - most
 
 
 def _snr(rcs: Float, distance: Float, radar: Radar) -> Float:
-    """Power above that which is just detected [dB], of targets of ``rcs`` [dBsm]."""
+    """Power above the detection threshold [dB], for targets of ``rcs`` [dBsm]."""
     reach = radar.model.detection_range_m
     reference = 10 * np.log10(REFERENCE_RCS)
     found: Float = rcs - reference + 40 * np.log10(reach / distance)
@@ -295,7 +298,7 @@ def _above_threshold(cells: Detections, radar: Radar) -> Detections:
 
 
 def _measured(found: Detections, radar: Radar, seed: int) -> Detections:
-    """With the noise of each measured number."""
+    """Detections with measurement noise."""
     model, count = radar.model, len(found)
     noise = [normal(seed + k * 7919, count) for k in range(3)]
     velocity = found.velocity + noise[2] * model.velocity_noise_mps
@@ -308,7 +311,7 @@ def _measured(found: Detections, radar: Radar, seed: int) -> Detections:
 
 
 def _ghosts(targets: Detections, radar: Radar, seed: int) -> Detections:
-    """Objects seen again behind themselves: the way there and back twice."""
+    """Ghost detections behind targets, from double reflections."""
     model = radar.model
     drawn = uniform(seed, len(targets), GHOST) < model.ghost_rate
     chosen = _picked(targets, np.flatnonzero(drawn & (targets.instance > 0)))
@@ -327,7 +330,7 @@ def _ghosts(targets: Detections, radar: Radar, seed: int) -> Detections:
 
 
 def _clutter(radar: Radar, seed: int) -> Detections:
-    """Detections of nothing: their number by Poisson, their places even over the field of view."""
+    """False detections: Poisson distributed number, uniform positions in the field of view."""
     model = radar.model
     count = poisson(model.clutter_rate, float(uniform(seed, 1, CLUTTER)[0]))
     places = [uniform(seed, count, CLUTTER_PLACE + k) for k in range(4)]

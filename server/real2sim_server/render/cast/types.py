@@ -1,4 +1,4 @@
-"""Input and output of cast(), and the motion of sensor and bodies over a sweep."""
+"""Inputs and outputs of cast(), and the motion of sensor and bodies over a sweep."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class CastRequest:
-    """A checked cast() call. A sweep has S instants, see ``Beams.slots``.
+    """A validated cast() call. A sweep has S instants, see ``Beams.slots``.
 
     Attributes:
-        instances: what the light meets; ``T_world_object`` is where each stands at the sweep's
-            time stamp.
+        instances: instances in the scene; ``T_world_object`` is the pose at the timestamp of the
+            sweep.
         lidar: the sensor.
         T_world_lidar: [S, 4, 4] float64 at each instant.
-        object_poses: for each instance [S, 4, 4] float64, or None where it stands still.
-        attributes: for each instance [N, 2] float32, reflectivity and share of lost rays of its
-            Gaussians, or None where nobody knows them.
+        object_poses: for each instance [S, 4, 4] float64, or None if stationary.
+        attributes: for each instance [N, 2] float32, reflectivity and fraction of lost rays of its
+            Gaussians, or None if unknown.
     """
 
     instances: tuple[Instance, ...]
@@ -48,8 +48,8 @@ class Return:
     """One of several returns of each ray.
 
     Attributes:
-        range: along the ray [m]; 0 where there is none.
-        power: share of the ray's light that comes back from there, two ways, 0 to 1.
+        range: along the ray [m]; 0 without a return.
+        power: fraction of the ray's light returned from there (two-way), 0 to 1.
         intensity: reflectivity there.
     """
 
@@ -60,18 +60,18 @@ class Return:
 
 @dataclass(frozen=True, eq=False)
 class Echo:
-    """What the light of each ray meets, before the detector. All arrays are of the LiDAR's shape.
+    """The light of each ray before detection. All arrays have the LiDAR's shape.
 
     Attributes:
-        range: where the light has fallen to a half (median) [m]; 0 where it never does.
-        expected: mean range over all light that was stopped [m]; 0 where none was.
-        opacity: share of the light that was stopped, 0 to 1.
-        intensity: reflectivity, mean over that light.
-        drop: share of lost rays, the same mean.
-        instance: uint16, instance_id at the median; 0 where there is none.
-        member: int32, number of the Gaussian at the median, counted over all instances in their
-            order; -1 where there is none.
-        returns: ``first`` and ``last``, and ``strongest`` of three; empty of a single return.
+        range: median range, where transmittance falls to one half [m]; 0 if it never does.
+        expected: mean range over the absorbed light [m]; 0 if none is absorbed.
+        opacity: fraction of absorbed light, 0 to 1.
+        intensity: reflectivity, mean over the absorbed light.
+        drop: fraction of lost rays, the same mean.
+        instance: uint16, instance_id at the median; 0 if there is none.
+        member: int32, index of the Gaussian at the median, counted over all instances in order; -1
+            if there is none.
+        returns: ``first`` and ``last``, plus ``strongest`` for three returns; empty for one return.
         timing_ms: milliseconds by stage.
     """
 
@@ -87,7 +87,7 @@ class Echo:
 
     @property
     def hit(self) -> NDArray[np.bool_]:
-        """Rays that lose half of their light or more."""
+        """Whether each ray loses at least half of its light."""
         return self.range > 0
 
 
@@ -96,10 +96,10 @@ class RayHits:
     """Gaussians hit by rays, from near to far.
 
     Attributes:
-        begins: [R + 1] int64, where the hits of each ray begin among all M.
-        members: [M] int32, numbers of the Gaussians, counted over all instances in their order.
-        alpha: [M] float32, share of the arriving light that is stopped.
-        tau: [M] float32, where [m].
+        begins: [R + 1] int64, start of the hits of each ray among all M.
+        members: [M] int32, indices of the Gaussians, counted over all instances in order.
+        alpha: [M] float32, absorbed fraction of the arriving light.
+        tau: [M] float32, range [m].
     """
 
     begins: NDArray[np.int64]
@@ -109,7 +109,7 @@ class RayHits:
 
 
 class CastBackend(Protocol):
-    """One way to cast. All members give the same echoes within rounding."""
+    """A ray casting backend. All backends give the same echoes within rounding."""
 
     name: str
 
@@ -118,9 +118,9 @@ class CastBackend(Protocol):
         ...
 
 
-# Motion in the frame of the sweep, the sensor's own at the middle instant. Each body is placed in
-# it as it stands then. At other instants the body counts as still and the sensor as moved, so a ray
-# meets the body as it stands at the ray's own instant.
+# Motion in the frame of the sweep, which is the sensor frame at the middle instant. Bodies are
+# placed in it at that instant. For other instants the relative motion is applied to the sensor, so
+# a ray hits a body at its pose at the time of the ray.
 
 STILL = 1e-9
 """Poses that differ by less are the same."""
@@ -128,12 +128,12 @@ STILL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Ways in which the sensor moves against bodies.
+    """Relative motions of the sensor and the bodies.
 
     Attributes:
-        of_body: for each instance the way; 0 is against what stands still.
+        of_body: index of the motion of each instance; 0 is relative to stationary bodies.
         to_sensor: [ways, S, 4, 4], from the frame of the sweep to the sensor's at each instant.
-        speed, turn: [ways], at most [m/s], [rad/s].
+        speed, turn: [ways], maximum speed [m/s] and angular speed [rad/s].
         linear, offset: for each instance [3, 3] and [3], from its cloud's frame to that of the
             sweep, scale included.
     """
@@ -147,7 +147,7 @@ class Motion:
 
 
 def motions_of(request: CastRequest) -> Motion:
-    """The ways of a request."""
+    """The relative motions of a request."""
     seconds = request.lidar.beams.slots[0] * 1e-6
     middle = len(seconds) // 2
     T_lidar_world = invert_transform(request.T_world_lidar)
@@ -173,7 +173,7 @@ def motions_of(request: CastRequest) -> Motion:
 
 
 def _rates(to_sensor: Float, seconds: Float) -> tuple[Float, Float]:
-    """Largest speed and turn of each way over its instants."""
+    """Maximum linear and angular speed of each motion over its instants."""
     if len(seconds) < 2:
         return np.zeros(len(to_sensor)), np.zeros(len(to_sensor))
     places = invert_transform(to_sensor)
@@ -190,9 +190,9 @@ def _rates(to_sensor: Float, seconds: Float) -> tuple[Float, Float]:
 
 
 def point_velocities(request: CastRequest, echo: Echo, hit: NDArray[np.bool_]) -> Image:
-    """Velocity [..., 3] [m/s] in the world of the point that each ray meets; 0 elsewhere.
+    """Velocity [..., 3] [m/s], world frame, of the point that each ray hits; 0 without a hit.
 
-    That of the body's own motion between the instants before and after the ray's.
+    Computed from the body's poses at the instants before and after the ray.
     """
     lidar = request.lidar
     times, slots = lidar.beams.slots
@@ -219,6 +219,6 @@ def point_velocities(request: CastRequest, echo: Echo, hit: NDArray[np.bool_]) -
 
 
 def _each(transforms: Float, points: Float) -> Float:
-    """Points [N, 3], each by its own transform [N, 4, 4]."""
+    """Transform points [N, 3], each by its own transform [N, 4, 4]."""
     moved: Float = apply_transform(transforms, points[:, None])[:, 0]
     return moved

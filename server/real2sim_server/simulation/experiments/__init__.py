@@ -1,4 +1,4 @@
-"""The paper's experiments on vehicles of a scene, and the pictures they leave."""
+"""The paper's experiments and crash tests with vehicles of a scene, and their films."""
 
 from .film import FilmPlan, draw_curves, views, write_film
 from .setups import Experiment, scene_road, set_up

@@ -60,14 +60,14 @@ class CrashPulse:
 
     Attributes:
         speed: closing speed [m/s].
-        dynamic_crush, residual_crush: of the struck side against the vehicle's middle, at most and
-            in the end [m].
-        peak: largest deceleration [g], averaged over 10 ms.
-        time_to_peak: from contact [s].
-        duration: for which the deceleration was above a tenth of its peak [s].
-        delta_v: change of velocity along the first closing direction [m/s].
+        dynamic_crush, residual_crush: maximum and final crush of the struck side relative to the
+            middle of the vehicle [m].
+        peak: maximum deceleration [g], averaged over 10 ms.
+        time_to_peak: time from contact to the peak [s].
+        duration: time for which the deceleration exceeds a tenth of its peak [s].
+        delta_v: velocity change along the initial closing direction [m/s].
         restitution: separation over approach speed.
-        energy_peak: largest total energy over the first, which no crash may raise.
+        energy_peak: maximum total energy over the initial one; must not exceed 1.
     """
 
     speed: float
@@ -82,7 +82,7 @@ class CrashPulse:
 
 
 def column_car(*, speed: float = 0.0) -> DeformableBody:
-    """A column out of the middle of the barrier test's car, along x, at ``speed`` [m/s]."""
+    """A central column of the barrier test's car, along x, at ``speed`` [m/s]."""
     preset = preset_of("vehicle")
     fraction = float(np.prod(COLUMN) / np.prod(MALIBU_SIZE[1:]))
     block = box_particles((MALIBU_SIZE[0], *COLUMN), spacing=preset.spacing, density=1.0)
@@ -116,7 +116,7 @@ def whole_car(
     spacing: float = SPACING,
     tyres: Tyres | None = None,
 ) -> DeformableBody:
-    """A plain car with hood, cabin and boot, of the Malibu's size; ``place``: of its box."""
+    """A generic car with bonnet, cabin and boot, of the Malibu's size; ``place``: box centre."""
     body = vehicle_body(CAR_SIZE, mass=mass, friction=0.4, spacing=spacing)
     cos, sin = np.cos(yaw), np.sin(yaw)
     pose = np.eye(4)
@@ -201,11 +201,11 @@ def crash_pulse(
     """Measure the pulse of a simulated crash.
 
     Args:
-        result: frames of all bodies.
-        name: of the vehicle.
+        result: simulation result.
+        name: name of the vehicle.
         speed: closing speed [m/s].
-        axis, side: which face of it was struck: 0 its ends, 1 its sides, 2 its roof; 1 or -1.
-        across: half width of the struck place along the vehicle [m]; the whole face by default.
+        axis, side: struck face: axis 0 for the ends, 1 for the sides, 2 for the roof; side 1 or -1.
+        across: half width of the struck area along the vehicle [m]; the whole face by default.
     """
     own, times = result.objects[name], result.times_s
     v = own.velocities - own.velocities[0]
@@ -233,7 +233,7 @@ def crash_pulse(
 
 
 def _deflection(own: ObjectResult, axis: int, side: float, across: float | None) -> Float:
-    """[F] how far a face came towards the middle of the vehicle, on average [m]."""
+    """[F] mean displacement of a face towards the middle of the vehicle [m]."""
     rest = own.rest.astype(np.float64)
     struck, kept = _face(rest, axis, side, across)
     if not len(own.shapes):
@@ -468,7 +468,7 @@ def thin_post(backend: str) -> list[Check]:
         )
         result = simulate_bodies([whole_car(velocity=(speed, 0, 0))], options)
         own = result.objects["car"]
-        # What turns about a post beside its middle goes on, but its part at the post does not.
+        # In an off-centre hit the vehicle rotates and moves on, but its part at the post stops.
         closing = own.velocities[-1, 0] - own.angular_velocities[-1, 2] * aside
         name = f"post of {POST} m, {aside} m aside"
         checks += [
@@ -494,7 +494,7 @@ def _block(name: str, place: Sequence[float], speed: float) -> DeformableBody:
 
 
 def _momenta(bodies: Sequence[DeformableBody]) -> Float:
-    """[2, 3] momentum [N s], and angular momentum about the origin [N m s], of all together."""
+    """[2, 3] total momentum [N s], and total angular momentum about the origin [N m s]."""
     total = np.zeros((2, 3))
     for motion in (b.motion for b in bodies):
         orbital = np.cross(motion.centre, motion.momentum)

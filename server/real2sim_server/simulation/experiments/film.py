@@ -1,4 +1,4 @@
-"""Films of a rollout, strips of stills, curves, and the plan that films an experiment again."""
+"""Films, still strips and curves of a rollout, and the stored plan of a film."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class FilmPlan:
     """Subjects and viewpoints of a film.
 
     Attributes:
-        focus: [3] point of the world that the near camera faces [m].
+        focus: [3] target point of the near camera, world frame [m].
         side: [3] direction from the focus to the near camera.
-        distance: of that camera [m].
+        distance: distance of that camera from the focus [m].
         start_us: scene time of the start [us].
         without: objects that are not shown.
-        slow: how many times slower it plays than it was.
-        obstacles: boxes that vehicles run into, which no recording shows.
-        follows: object that focus and near camera move along with; None: they stay.
+        slow: slow-motion factor.
+        obstacles: virtual boxes that vehicles run into.
+        follows: object that focus and near camera follow; None if they are fixed.
     """
 
     focus: Float
@@ -69,7 +69,7 @@ class FilmPlan:
 
     @classmethod
     def of(cls, experiment: Experiment, height: Callable[[float, float], float]) -> FilmPlan:
-        """The plan of an experiment; ``height``: of the ground at a place [m]."""
+        """The plan of an experiment; ``height``: ground height at x, y [m]."""
         solid: list[Obstacle] = []
         for collider in experiment.options.colliders:
             if collider.name in experiment.options.road:
@@ -109,7 +109,7 @@ class FilmPlan:
         """Read the file of :meth:`save`.
 
         Raises:
-            PhysicsError: there is none, or none that can be read.
+            PhysicsError: missing or unreadable file.
         """
         try:
             record: dict[str, Any] = json.loads((folder / FILE).read_text())
@@ -144,7 +144,7 @@ def _slab(wall: Plane, focus: Float, height: Callable[[float, float], float]) ->
 
 
 def obstacle_cloud(obstacle: Obstacle) -> GaussianCloud:
-    """Gaussians on the faces of a box, in the world: concrete, or steel where it is slender."""
+    """Gaussians on the faces of a box, world frame: concrete, or steel for slender boxes."""
     pose, size = obstacle
     colour = np.array(STEEL if size[:2].max() < SLENDER else CONCRETE)
     places, turns, lit = [], [], []
@@ -172,7 +172,7 @@ def obstacle_cloud(obstacle: Obstacle) -> GaussianCloud:
 
 
 def _face(size: Float, axis: int, side: float) -> Float:
-    """[K, 3] points over one face of a box, in its frame."""
+    """[K, 3] points on one face of a box, box frame."""
     one, two = (axis + 1) % 3, (axis + 2) % 3
     grids = [
         (np.arange(max(round(size[a] / PITCH), 1)) + 0.5) / max(round(size[a] / PITCH), 1) - 0.5
@@ -208,14 +208,13 @@ class FilmView:
     """A camera of the film.
 
     Attributes:
-        camera: in the world: ``T_vehicle_camera`` is ``T_world_camera``, at the start.
-        background: what of it is drawn.
-        clear: what takes no part is left out when it comes this near [m]; nobody ever saw it from
-            there, and it would hide what is to be seen.
-        without: objects that are left out.
-        obstacles: what vehicles run into and no recording shows.
-        moved: [F, 3] by how much the camera has moved in each frame of the result [m]; None where
-            it stands.
+        camera: camera in the world: ``T_vehicle_camera`` is ``T_world_camera`` at the start.
+        background: the visible part of the background.
+        clear: uninvolved objects closer than this are omitted [m]; they would hide the subjects and
+            were not recorded from so near.
+        without: objects that are omitted.
+        obstacles: virtual obstacles that vehicles run into.
+        moved: [F, 3] displacement of the camera in each frame [m]; None if it is fixed.
     """
 
     camera: Camera
@@ -235,12 +234,12 @@ class FilmView:
 
 
 def views(playback: Playback, plan: FilmPlan, *, width: int | None = None) -> list[FilmView]:
-    """The scene's first camera where it stood at the start, and one near the subjects.
+    """The scene's first camera at its initial pose, and a camera near the subjects.
 
     Args:
-        playback: what is shown.
-        plan: from where.
-        width: of each [px]; the recorded one by default.
+        playback: playback to film.
+        plan: film plan with the viewpoint.
+        width: image width [px]; the recorded one by default.
     """
     scene = playback.scene
     recorded = scene.rig.cameras[0]
@@ -272,7 +271,7 @@ def views(playback: Playback, plan: FilmPlan, *, width: int | None = None) -> li
 
 
 def _moved(result: SimulationResult, plan: FilmPlan) -> Float | None:
-    """[F, 3] how the near camera goes along the road with what it follows, if it does [m]."""
+    """[F, 3] displacement of the near camera along the road with its subject [m], or None."""
     if plan.follows is None or plan.follows not in result.objects:
         return None
     places = result.objects[plan.follows].positions
@@ -283,8 +282,7 @@ def _moved(result: SimulationResult, plan: FilmPlan) -> Float | None:
 def _before(
     cloud: GaussianCloud, viewer: Float, moved: Float | None, plan: FilmPlan
 ) -> GaussianCloud:
-    """The background without trees and posts between a near viewer and the focus, wherever the
-    viewer goes."""
+    """The background without trees and posts between the near camera and the focus, on its path."""
     means = cloud.means.detach().cpu().numpy()
     way = np.zeros((1, 3)) if moved is None else moved[:: max(len(moved) // WAY_PLACES, 1)]
     near = np.zeros(len(means), dtype=bool)
@@ -295,7 +293,7 @@ def _before(
 
 
 def look_at(viewer: Float, focus: Float) -> Float:
-    """``T_world_camera`` [4, 4] of an upright OpenCV camera at ``viewer`` that sees ``focus``."""
+    """``T_world_camera`` [4, 4] of an upright OpenCV camera at ``viewer`` that faces ``focus``."""
     z = (focus - viewer) / np.linalg.norm(focus - viewer)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
@@ -349,15 +347,15 @@ def write_film(
     """Write ``film.mp4``, the views side by side, and ``strip.png``, stills row by row.
 
     Args:
-        playback: what is shown.
-        shown: as ``views`` gives them.
-        folder: for the files.
-        slow: how many times slower it plays than it was.
-        backend: of the renderer.
-        on_progress: called with (pictures done, pictures).
+        playback: playback to film.
+        shown: views of :func:`views`.
+        folder: output folder.
+        slow: slow-motion factor.
+        backend: renderer backend.
+        on_progress: called with (images done, images).
 
     Raises:
-        VideoError: when OpenCV cannot encode.
+        VideoError: if OpenCV cannot encode.
     """
     result = playback.result
     frame_rate = float(result.figures["frame_rate"])
@@ -379,8 +377,7 @@ def write_film(
 
 
 def _stills(result: SimulationResult, frames: Sequence[int]) -> set[int]:
-    """Frames of a film that tell what happens: the beginning, before, in and after the hardest
-    moment, and the end."""
+    """Key frames of a film: start, before, at and after the hardest impact, and end."""
     energy = result.energies[:, ENERGIES.index("kinetic")]
     lost = -np.diff(energy[list(frames)])
     hardest = int(lost.argmax()) if len(lost) else 0
@@ -393,7 +390,7 @@ def _stills(result: SimulationResult, frames: Sequence[int]) -> set[int]:
 
 
 def draw_curves(result: SimulationResult, path: Path) -> None:
-    """Speed, height, impulses and energies over time, deforming marked; PNG or SVG."""
+    """Plot speed, height, impulses and energies over time, with deforming phases; PNG or SVG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

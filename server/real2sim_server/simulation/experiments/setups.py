@@ -1,4 +1,4 @@
-"""Experiments on the vehicles of a scene: the paper's three, and crash tests on its street."""
+"""Experiments with vehicles of a scene: the paper's three, and crash tests on its road."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..rollout import SimulateOptions
 from ..spawn import object_particles, spaced_for
 from ..structure import VEHICLES
 
-# Viewpoints of the recording vehicle: a side that no camera saw cannot be shown.
+# Viewpoints of the recording vehicle: sides that no camera saw cannot be shown.
 
 VIEWS_MAX = 24
 """Recorded frames that are considered."""
@@ -32,9 +32,9 @@ class Visibility:
     """Visibility of an object over the recording.
 
     Attributes:
-        direction: [3] towards the cameras, object frame, each view weighed by the solid angle the
-            object took up; its length grows with how well it was seen.
-        front, rear: solid angles of views that came from ahead and from behind, summed up.
+        direction: [3] towards the cameras, object frame: sum of the view directions weighted by the
+            solid angle of the object; longer for better visibility.
+        front, rear: total solid angles of views from ahead and from behind.
     """
 
     direction: Float
@@ -43,7 +43,7 @@ class Visibility:
 
     @property
     def whole(self) -> float:
-        """All views together."""
+        """Total solid angle of all views."""
         return self.front + self.rear
 
 
@@ -69,7 +69,7 @@ def visibility_of(scene: Scene, subject: PlacedObject) -> Visibility:
 def in_view(
     camera: Camera, T_world_vehicle: Float, point: Float, *, farthest: float, nearest: float = 0.0
 ) -> bool:
-    """Whether a point of the world is on the camera's image, between two depths [m]."""
+    """Whether a world point is in the camera's image, between two depths [m]."""
     x, y, z = (camera.viewmat(T_world_vehicle) @ np.append(point, 1.0))[:3]
     if not max(nearest, DEPTH_MIN) < z < farthest:
         return False
@@ -95,15 +95,15 @@ class Experiment:
     """A simulation and its camera.
 
     Attributes:
-        name: of the experiment.
-        options: what to simulate.
+        name: name of the experiment.
+        options: simulation options.
         subjects: objects that are shown.
-        focus: [3] point of the world that the near camera faces [m].
-        side: [3] direction from the focus to a near-by viewer, unit.
-        distance: of that viewer [m].
+        focus: [3] target point of the near camera, world frame [m].
+        side: [3] unit vector from the focus to the near camera.
+        distance: distance of that camera from the focus [m].
         without: objects that are not shown.
-        slow: how many times slower films show it than it was.
-        follows: subject that the near-by viewer moves along with; None: he stays.
+        slow: slow-motion factor of films.
+        follows: subject that the near camera follows; None if it is fixed.
     """
 
     name: str
@@ -122,12 +122,12 @@ class Request:
     """Input of an experiment's setup.
 
     Attributes:
-        scene, state: the scene, and its objects.
-        chosen: vehicles that may take part, the best seen first; as ``named`` if they were.
+        scene, state: the scene and its objects.
+        chosen: candidate vehicles, most visible first; in the given order if ``named``.
         start_us: scene time [us].
-        preset: of the materials.
-        speed: [m/s]; None for the experiment's own.
-        grids: that objects will be given, see ``ObjectPhysics.grid``.
+        preset: material preset.
+        speed: [m/s]; None for the experiment's default.
+        grids: requested grids of objects, see ``ObjectPhysics.grid``.
     """
 
     scene: Scene
@@ -141,7 +141,7 @@ class Request:
 
 
 def scene_road(scene: Scene, state: PlacedObjects, t_us: int) -> HeightField:
-    """The scene's ground around all objects there at ``t_us`` and around the ego's path."""
+    """The scene's ground around all objects present at ``t_us`` and around the ego's path."""
     there = [
         o.trajectory.pose(t_us)[0][None, :2] for o in state.visible if o.trajectory.covers(t_us)
     ]
@@ -158,11 +158,11 @@ def level(direction: Float) -> Float:
 def viewer(
     scene: Scene, subject: PlacedObject, pose: Float, *, slant: float, rise: float = 0.4
 ) -> Float:
-    """Direction [3] to a viewer on the recorded side and end.
+    """Direction [3] to a camera on the recorded side and end.
 
     Args:
-        slant: how much to the side, against along the subject; less for a side hardly seen.
-        rise: how much up.
+        slant: lateral over longitudinal component; reduced for hardly visible sides.
+        rise: upward component.
     """
     x, y, _ = visibility_of(scene, subject).direction
     slant = min(slant, max(SIDEWAYS * abs(y) / max(abs(x), 1e-9), SLANT_MIN))
@@ -180,12 +180,12 @@ def beside(
     ahead: float = FROM_AHEAD,
     rise: float = 0.35,
 ) -> Float:
-    """Direction [3] to a viewer on the recorded side.
+    """Direction [3] to a camera on the recorded side.
 
     Args:
-        ahead: how much ahead, against to the side; little where what it runs into is broad, so that
-            it hides nothing.
-        rise: how much up.
+        ahead: forward over lateral component; keep it small for broad obstacles, which would hide
+            the subject.
+        rise: upward component.
     """
     forward = level(pose[:3, 0])
     left = np.cross([0.0, 0.0, 1.0], forward)
@@ -195,7 +195,7 @@ def beside(
 
 
 def others_near(request: Request, options: SimulateOptions, focus: Float) -> frozenset[str]:
-    """Uninvolved objects that come near: they would drive through the experiment."""
+    """Uninvolved objects that would drive through the experiment."""
     times = options.start_us + np.linspace(0, options.duration * 1e6, 5).astype(np.int64)
     return frozenset(
         s.object_id
@@ -234,7 +234,7 @@ FRAME_RATE, SLOW = 60.0, 4.0
 
 
 def frontal(request: Request) -> Experiment:
-    """One vehicle squarely into a block of concrete, at 15 m/s."""
+    """One vehicle head-on into a concrete block, at 15 m/s."""
     subject = _best(request)
     speed = 15.0 if request.speed is None else request.speed
     pose, forward = _on_the_road(request, subject)
@@ -260,13 +260,13 @@ def pole(request: Request) -> Experiment:
     place = nose + (GAP + POLE / 2) * forward
     place = place + seen_side * OFF_CENTRE * subject.scaled_size[1] * left
     post = _standing_box("pole", (POLE, POLE, POLE_HEIGHT), place, forward, request)
-    # From ahead, where what a post leaves of a front is seen on both of its sides.
+    # From ahead, where the crushed front is visible on both sides of the post.
     side = beside(request.scene, subject, pose, ahead=1.0, rise=0.65)
     return _experiment(request, "pole", subject, speed * forward, [post], focus=nose, side=side)
 
 
 def t_bone(request: Request) -> Experiment:
-    """One vehicle into the middle of a standing vehicle's side, at 15 m/s."""
+    """One vehicle into the side of a stationary vehicle, at its middle, at 15 m/s."""
     speed = 15.0 if request.speed is None else request.speed
     runner = _best(request)
     others = [s for s in _candidates(request) if s is not runner]
@@ -275,7 +275,7 @@ def t_bone(request: Request) -> Experiment:
     struck = _seen_best(request, others)
     own, forward = _on_the_road(request, runner)
     left = np.cross([0.0, 0.0, 1.0], forward)
-    # The side that was seen is the one that is struck.
+    # Strike the recorded side.
     ahead = left if visibility_of(request.scene, struck).direction[1] >= 0 else -left
     reach = runner.scaled_size[0] / 2 + GAP + struck.scaled_size[1] / 2
     target = np.eye(4)
@@ -286,8 +286,8 @@ def t_bone(request: Request) -> Experiment:
         runner.object_id: ObjectPhysics(T_world_object=own, velocity=speed * forward),
         struck.object_id: ObjectPhysics(T_world_object=target, velocity=(0.0, 0.0, 0.0)),
     }
-    # Along the struck side and past the runner, going along with the struck one: the dent is seen
-    # between them when they have parted.
+    # Look along the struck side past the striking vehicle and follow the struck one: the dent is
+    # visible between them after they have separated.
     side = ahead - 0.6 * forward + np.array([0.0, 0.0, 0.5])
     focus = target[:3, 3] - ASIDE * forward
     plan = _made(request, "t_bone", objects, [], focus=focus, side=side, distance=6.5)
@@ -301,7 +301,7 @@ def roof(request: Request) -> Experiment:
     own, forward = _on_the_road(request, subject)
     left = np.cross([0.0, 0.0, 1.0], forward)
     seen = 1.0 if visibility_of(request.scene, subject).direction[1] >= 0 else -1.0
-    # Turned over, the side that was seen is on the other side, and its edge comes down first.
+    # Upside down, the recorded side is on the other side, and its edge lands first.
     turn = -seen * TURNED_OVER
     side = forward - seen * 1.1 * left + np.array([0.0, 0.0, 0.08])
     c, s = np.cos(turn), np.sin(turn)
@@ -350,7 +350,7 @@ def _seen_best(request: Request, candidates: list[PlacedObject]) -> PlacedObject
 
 
 def _on_the_road(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
-    """Its pose [4, 4], moved to where crashes take place, and where it faces there [3]."""
+    """Its pose [4, 4] at the crash site, and its forward direction there [3]."""
     pose = subject.trajectory.transform(request.start_us)
     path = request.scene.ego.positions
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -363,7 +363,7 @@ def _on_the_road(request: Request, subject: PlacedObject) -> tuple[Float, Float]
 
 
 def _height(request: Request, subject: PlacedObject, pose: Float) -> float:
-    """Of its centre where it stands on the ground at the place of ``pose`` as it does now [m]."""
+    """Height of its centre at the position of ``pose``, at its current height above ground [m]."""
     ground = request.scene.ground
     x, y, z = subject.trajectory.transform(request.start_us)[:3, 3]
     return float(z - ground.height(x, y) + ground.height(pose[0, 3], pose[1, 3]))
@@ -452,20 +452,20 @@ def set_up(
     start_us: int | None = None,
     grids: Sequence[int] = (),
 ) -> Experiment:
-    """An experiment on a scene.
+    """Set up an experiment on a scene.
 
     Args:
-        name: ``wall``: one vehicle against a virtual wall; ``pair``: vehicles into as many standing
-            ones, without gravity; ``drop``: vehicles raised and let fall on the extracted ground;
+        name: ``wall``: one vehicle against a virtual wall; ``pair``: vehicles into as many
+            stationary ones, without gravity; ``drop``: vehicles dropped on the extracted ground;
             ``frontal``, ``t_bone``, ``pole``, ``roof``: see ``crashes``.
-        preset: of the materials; ``paper`` for its experiments and ``vehicle`` for crashes unless
-            told.
-        speed: [m/s]; the experiment's own by default.
-        objects: ids to take; by default vehicles in view, those seen best where it hits. For
-            ``pair`` any number from two on: the first half runs into the others, and of an odd
-            number the last one stands where it is.
+        preset: material preset; by default ``paper`` for the paper's experiments and ``vehicle``
+            for crashes.
+        speed: [m/s]; the experiment's default if None.
+        objects: ids of the objects; by default the visible vehicles whose impact side was recorded
+            best. ``pair`` takes two or more: the first half runs into the others, and the last one
+            of an odd number is stationary.
         start_us: [us]; the first frame by default.
-        grids: that will be asked for, see ``ObjectPhysics.grid``: how far particles reach out.
+        grids: requested grids, see ``ObjectPhysics.grid``; they determine the extent of particles.
 
     Raises:
         PhysicsError: unknown name or objects, or no vehicles in view.
@@ -488,7 +488,7 @@ def set_up(
 
 
 def most_visible(scene: Scene, state: PlacedObjects, t_us: int) -> list[PlacedObject]:
-    """Vehicles before the first camera, the largest on its image first."""
+    """Vehicles in front of the first camera, largest in its image first."""
     camera = scene.rig.cameras[0]
     ego = scene.ego.transform(t_us)
     found = []
@@ -505,7 +505,7 @@ def most_visible(scene: Scene, state: PlacedObjects, t_us: int) -> list[PlacedOb
 
 def _wall(request: Request) -> Experiment:
     start_us = request.start_us
-    # What is to be crushed must have been seen.
+    # The crushed end must be visible in the recording.
     subject = max(request.chosen, key=lambda s: visibility_of(request.scene, s).front)
     speed = 2.5 if request.speed is None else request.speed
     pose = subject.trajectory.transform(start_us)
@@ -551,7 +551,7 @@ def _standing_road(request: Request, subject: PlacedObject) -> Collider:
 
 
 def _pair(request: Request) -> Experiment:
-    """Two vehicles start behind standing ones, half a width off centre, as traffic hits."""
+    """Two vehicles start behind stationary ones, half a width off centre."""
     speed, start_us = 3.5 if request.speed is None else request.speed, request.start_us
     chosen = request.chosen
     if len(chosen) < 2:
@@ -609,7 +609,7 @@ def _pair(request: Request) -> Experiment:
 def _way_aside(
     pair: Sequence[tuple[Float, Float]], placed: Sequence[tuple[Float, Float]], forward: Float
 ) -> Float:
-    """Shortest sideways shift [3] that frees a pair's boxes of all placed ones [m]."""
+    """Shortest lateral shift [3] that separates a pair's boxes from all placed ones [m]."""
     side = np.cross([0.0, 0.0, 1.0], forward)
     for k in range(ASIDE_TRIES):
         shift: Float = ASIDE_STEP * ((k + 1) // 2) * (1 if k % 2 else -1) * side
@@ -657,7 +657,7 @@ def _drop(request: Request) -> Experiment:
 def _reach(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
     """Extent of an object's particles back and forth along its own axes, [3] and [3] [m].
 
-    Tracked boxes are not that exact: particles reaches up to a voxel out of them.
+    Tracked boxes are less exact: particles extend up to a voxel beyond them.
     """
     preset = spaced_for(preset_of(request.preset), [subject])
     if request.grids:

@@ -1,4 +1,4 @@
-"""Ego and objects as rigid bodies on the plane, and the impacts between them."""
+"""Ego and objects as planar rigid bodies, and the impacts between them."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ AT_REST = 0.05
 
 @dataclass(frozen=True)
 class BodyProperties:
-    """Mass, shape and friction of a body.
+    """Mass, shape, friction and stiffness of a body.
 
     Attributes:
         mass: [kg].
         inertia: about the vertical axis through the centre of mass [kg m^2].
-        length, width: of its box [m].
-        box_ahead: from the centre of mass forward to the centre of the box [m].
+        length, width: size of its box [m].
+        box_ahead: distance from the centre of mass forward to the box centre [m].
         axles: distances of front and rear axle from the centre of mass [m]; None for bodies
-            without wheels, which slide alike in all directions.
-        friction: of tyres or body on the ground.
-        drag: deceleration per gravity along rolling wheels.
-        stiffness: of its front, rear and sides, per width of what is crushed [N/m^2].
-        vehicle: whether it yields as a vehicle does.
+            without wheels, which slide isotropically.
+        friction: friction coefficient of tyres or body on the ground.
+        drag: rolling deceleration per gravity.
+        stiffness: stiffness of front, rear and sides per crushed width [N/m^2].
+        vehicle: whether it has the crush characteristic of a vehicle.
     """
 
     mass: float
@@ -59,7 +59,7 @@ class BodyProperties:
     vehicle: bool = True
 
     def shortened(self, front: float, rear: float) -> BodyProperties:
-        """With its ends so much nearer to its middle [m]."""
+        """The body with its front and rear shortened [m]."""
         length, ahead = self.length - front - rear, self.box_ahead + (rear - front) / 2
         return replace(self, length=length, box_ahead=ahead)
 
@@ -75,7 +75,7 @@ class BodyState(NamedTuple):
     turn: float
 
     def velocity_at(self, x: float, y: float) -> tuple[float, float]:
-        """World velocity [m/s] of the body's point that is at (x, y)."""
+        """World velocity [m/s] of the body point at (x, y)."""
         return self.vx - self.turn * (y - self.y), self.vy + self.turn * (x - self.x)
 
     def pushed(
@@ -103,11 +103,11 @@ def integrate_sliding(
     acceleration: float = 0.0,
     steering: float = 0.0,
 ) -> BodyState:
-    """The body ``h`` seconds later, its wheels rolling, slipping or sliding.
+    """The body ``h`` seconds later, with rolling, slipping or sliding wheels.
 
-    A tyre's lateral force grows with the slip angle up to the friction limit, less what drag,
-    brakes or engine take of the friction circle. Load transfer is left out: after an impact the
-    directions of all forces are far less certain than the loads.
+    The lateral tyre force grows with the slip angle up to the friction limit, reduced by the
+    longitudinal force (friction circle). Load transfer is neglected: after an impact the force
+    directions are far less certain than the loads.
 
     Args:
         body, properties: the body.
@@ -190,12 +190,12 @@ unbraked."""
 
 @dataclass(frozen=True, eq=False)
 class ImpactedObject:
-    """An object that physics moves after an impact; an :class:`~..traffic.driver.AgentDriver`.
+    """An object under physics control after an impact; an :class:`~..traffic.driver.AgentDriver`.
 
     Attributes:
-        subject: the object as it was before the impact.
+        subject: the object before the impact.
         properties, body: rigid body.
-        height: of its box centre above the ground [m].
+        height: height of its box centre above the ground [m].
         pose: see :class:`~..traffic.driver.AgentDriver`.
     """
 
@@ -207,19 +207,22 @@ class ImpactedObject:
     present: bool = True
 
     def advance(self, surroundings: Surroundings) -> Self:
-        """Itself: the collision step moves it together with all bodies that it may hit."""
+        """Returns itself; the collision solver moves it together with all other bodies."""
         return self
 
     def at(self, body: BodyState, pose: AgentPose, properties: BodyProperties) -> Self:
-        """The object at another place, and as short as it is by now."""
+        """The object at another pose, with its shortened box."""
         return replace(self, body=body, pose=pose, properties=properties)
 
 
 def object_properties(
     subject: ObjectState, contact: ContactSpec, *, friction: float, size: tuple[float, ...]
 ) -> BodyProperties:
-    """An object as a rigid body: a box, of even mass if it is no vehicle; cars have their axles at
-    0.3 of their length."""
+    """An object as a rigid body.
+
+    Objects other than vehicles have uniform density. The axles of cars are at 0.3 of their length
+    from the centre.
+    """
     length, width = size[0], size[1]
     given = subject.physics
     mass = contact.masses.get(subject.object_id, given.mass if given else None)
@@ -274,7 +277,7 @@ def ego_body(motion: Motion, spec: EgoSpec) -> BodyState:
 
 
 def ego_motion(body: BodyState, before: Motion, spec: EgoSpec) -> Motion:
-    """The motion of a body; steering and actuators as they were."""
+    """The ego motion of a body, with steering and actuators of ``before``."""
     rear = vehicle_parameters(spec).rear
     cos, sin = math.cos(body.yaw), math.sin(body.yaw)
     return before._replace(
@@ -288,7 +291,7 @@ def ego_motion(body: BodyState, before: Motion, spec: EgoSpec) -> Motion:
 
 
 def is_rolling(motion: Motion, spec: EgoSpec) -> bool:
-    """Whether a vehicle that was pushed goes where its wheels point again."""
+    """Whether a pushed vehicle rolls in the direction of its wheels again."""
     steered = motion.speed * math.tan(motion.steering) / spec.wheelbase
     return abs(motion.lateral_speed) < 0.2 and abs(motion.yaw_rate - steered) < 0.1
 
@@ -300,7 +303,7 @@ MUTUAL_STIFFNESS = 405e3
 
 
 class ImpactParticipant(NamedTuple):
-    """A body as it was when an impact began; ``low``, ``high``: of its box [m]."""
+    """A body at the start of an impact; ``low``, ``high``: bottom and top of its box [m]."""
 
     properties: BodyProperties
     body: BodyState
@@ -310,31 +313,31 @@ class ImpactParticipant(NamedTuple):
 
 @dataclass(frozen=True)
 class Impact:
-    """Impulse, energy and change of velocity of two bodies in one step of the clock.
+    """Impulse, energy loss and velocity changes of two bodies in one clock step.
 
     Attributes:
-        object_id: of the object; None for the background.
-        other_id: second object, where the ego had no part in it; else None.
-        t_us: of the step in which it was [us].
-        point: middle of the contact when it began, world [m].
-        normal: out of the object into the other body.
-        approach_speed: along the normal when it began [m/s].
-        relative_speed: of the two centres [m/s].
-        impulse: on the ego, or on ``other_id``, summed over the step [N s].
-        delta_v, object_delta_v: length of the change of velocity of the ego (or ``other_id``) and
+        object_id: id of the object; None for the background.
+        other_id: id of the second object if the ego is not involved; else None.
+        t_us: time of the step [us].
+        point: centre of the contact at its start, world frame [m].
+        normal: contact normal, out of the object into the other body.
+        approach_speed: closing speed along the normal at the start [m/s].
+        relative_speed: relative speed of the two centres [m/s].
+        impulse: impulse on the ego, or on ``other_id``, summed over the step [N s].
+        delta_v, object_delta_v: magnitude of the velocity change of the ego (or ``other_id``) and
             of the object [m/s].
         energy: kinetic energy lost [J].
-        whole: length of the impulse of the whole impact [N s], and ``delta_v``,
-            ``object_delta_v`` and ``energy`` those of it, as the mechanics of a sudden impulse
-            have them; None where the impact was sudden, or had begun before.
-        stiffness: of what was crushed [N/m].
-        breadth: how far the background reaches to both sides of the point, across the normal [m];
-            None where it had no part.
-        side: of the ego on which the contact began.
-        speeds: of the first body and of the object when it began [m/s].
-        began_us: when it began in this step [us].
+        whole: magnitude of the impulse of the complete impact [N s], with its ``delta_v``,
+            ``object_delta_v`` and ``energy``, by instantaneous impulse mechanics; None if the
+            impact is instantaneous or started in an earlier step.
+        stiffness: stiffness of the crushed structure [N/m].
+        breadth: extent of the background to both sides of the point, across the normal [m]; None
+            if it is not involved.
+        side: side of the ego at which the contact started.
+        speeds: speeds of the first body and of the object at the start [m/s].
+        began_us: start time in this step [us].
         since: the same as a fraction of the step.
-        participants: the ego (or ``other_id``) and the object when it began; None for the
+        participants: the ego (or ``other_id``) and the object at the start; None for the
             background.
     """
 
@@ -360,7 +363,7 @@ class Impact:
 
     @property
     def crush(self) -> float:
-        """Depth of both deformations together [m], if all energy lost went into a linear spring."""
+        """Total crush depth of both bodies [m], if all lost energy went into a linear spring."""
         return math.sqrt(2 * max(self.energy, 0.0) / self.stiffness)
 
     def event_data(self) -> dict[str, float]:

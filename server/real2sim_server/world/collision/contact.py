@@ -1,4 +1,4 @@
-"""Contact of two boxes on the plane: manifold, impulse, impacts that take time, and obstacles."""
+"""Planar box contact: manifolds, impulses, impacts of finite duration, and obstacles."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ SLOW = 0.3
 
 
 class ContactManifold(NamedTuple):
-    """Where two bodies overlap.
+    """Overlap of two bodies.
 
     Attributes:
-        x, y: middle of the overlap [m].
+        x, y: centroid of the overlap [m].
         nx, ny: unit normal, out of the second body into the first.
-        depth: of the overlap along the normal [m].
+        depth: penetration depth along the normal [m].
     """
 
     x: float
@@ -40,7 +40,7 @@ class ContactManifold(NamedTuple):
 
 
 class ContactImpulse(NamedTuple):
-    """An impulse on the first body [N s], and the speed at which the two approached [m/s]."""
+    """An impulse on the first body [N s], and the closing speed [m/s]."""
 
     jx: float
     jy: float
@@ -53,12 +53,12 @@ Bodies = tuple[Body, Body | None]
 
 
 class RelativeMotion(NamedTuple):
-    """How two bodies move against each other at a place, and what impulses there change of it.
+    """Relative motion of two bodies at a point, and its response to impulses there.
 
     Attributes:
         nx, ny: unit normal, out of the second body into the first.
-        normal, tangent: velocity of the first against the second [m/s].
-        knn, knt, ktt: change of these per impulse [1/kg].
+        normal, tangent: velocity of the first body relative to the second [m/s].
+        knn, knt, ktt: velocity change per impulse [1/kg].
     """
 
     nx: float
@@ -70,20 +70,22 @@ class RelativeMotion(NamedTuple):
     ktt: float
 
     def limited(self, push: float, friction: float) -> ContactImpulse:
-        """An impulse with the normal part ``push`` [N s], and across it as much as ends sliding,
-        at most friction times that."""
+        """An impulse with normal part ``push`` [N s] and Coulomb friction.
+
+        The tangential part stops sliding, up to ``friction`` times the normal part.
+        """
         jt = -(self.tangent + self.knt * push) / self.ktt
         jt = min(max(jt, -friction * push), friction * push)
         nx, ny = self.nx, self.ny
         return ContactImpulse(push * nx - jt * ny, push * ny + jt * nx, -self.normal)
 
     def normal_part(self, impulse: ContactImpulse) -> float:
-        """Of an impulse along the normal [N s]."""
+        """Normal part of an impulse [N s]."""
         return impulse.jx * self.nx + impulse.jy * self.ny
 
 
 def relative_motion(bodies: Bodies, manifold: ContactManifold) -> RelativeMotion:
-    """Of two bodies at a contact."""
+    """Relative motion of two bodies at a contact."""
     nx, ny, tx, ty = manifold.nx, manifold.ny, -manifold.ny, manifold.nx
     vx = vy = knn = knt = ktt = 0.0
     for sign, pair in zip((1.0, -1.0), bodies, strict=True):
@@ -103,13 +105,15 @@ def relative_motion(bodies: Bodies, manifold: ContactManifold) -> RelativeMotion
 def overlap_patch(
     first: list[Corner], second: list[Corner], nx: float, ny: float
 ) -> tuple[float, float, float, float] | None:
-    """Centroid x, y of the overlap of two convex quadrilaterals, its mean depth along the normal
-    and its width across it [m]; None where there is none."""
+    """Centroid x, y, mean depth along the normal and width across it of an overlap [m].
+
+    The overlap is that of two convex quadrilaterals; None without overlap.
+    """
     return patch_of(overlap_shape(first, second), nx, ny)
 
 
 def patch_of(shape: list[Corner], nx: float, ny: float) -> tuple[float, float, float, float] | None:
-    """The same of an overlap as it is."""
+    """Like :func:`overlap_patch`, for a given overlap polygon."""
     if len(shape) < 3:
         return None
     x0, y0 = shape[0]
@@ -128,12 +132,12 @@ def patch_of(shape: list[Corner], nx: float, ny: float) -> tuple[float, float, f
 def overlap_span(
     first: list[Corner], second: list[Corner], nx: float, ny: float
 ) -> tuple[float, float]:
-    """From where to where across a unit normal two overlapping quadrilaterals overlap [m]."""
+    """Interval of the overlap of two quadrilaterals across a unit normal [m]."""
     return span_across(overlap_shape(first, second), nx, ny)
 
 
 def span_across(shape: list[Corner], nx: float, ny: float) -> tuple[float, float]:
-    """From where to where a shape reaches across a unit normal [m]."""
+    """Interval of a shape across a unit normal [m]."""
     across = [y * nx - x * ny for x, y in shape]
     return min(across), max(across)
 
@@ -150,10 +154,10 @@ def corners(body: BodyState, properties: BodyProperties) -> list[Corner]:
 
 
 def contact_manifold(first: list[Corner], second: list[Corner]) -> ContactManifold | None:
-    """Where two convex quadrilaterals overlap; None where they do not.
+    """The contact manifold of two convex quadrilaterals; None without overlap.
 
-    The normal is that of least penetration among the edges of both (separating axes); the point
-    is the centroid of the overlap.
+    The normal is the edge normal of least penetration (separating axes); the point is the centroid
+    of the overlap.
     """
     best: tuple[float, float, float] | None = None
     for shape, outward in ((second, 1.0), (first, -1.0)):
@@ -205,17 +209,17 @@ def contact_impulse(
     restitution: float,
     friction: float,
 ) -> ContactImpulse | None:
-    """The impulse of a planar impact; None where the bodies part already.
+    """The impulse of a planar impact; None if the bodies are already separating.
 
-    Newton's restitution along the normal, and along the tangent as much as ends sliding, at most
-    friction times the normal impulse (Brach & Brach 2011, Vehicle Accident Analysis and
-    Reconstruction Methods, ch. 6).
+    Newton's restitution along the normal; the tangential impulse stops sliding, limited by friction
+    times the normal impulse (Brach & Brach 2011, Vehicle Accident Analysis and Reconstruction
+    Methods, ch. 6).
 
     Args:
-        first, second: bodies before the impact; None for what cannot move.
+        first, second: bodies before the impact; None for an immovable body.
         manifold: point and normal.
-        restitution: separation per approach speed; 0 for slow approaches.
-        friction: tangential per normal impulse at most.
+        restitution: separation speed over approach speed; 0 for slow approaches.
+        friction: friction coefficient.
     """
     nx, ny, tx, ty = manifold.nx, manifold.ny, -manifold.ny, manifold.nx
     vx, vy = first[0].velocity_at(manifold.x, manifold.y)
@@ -246,14 +250,14 @@ def contact_impulse(
     return ContactImpulse(jn * nx + jt * tx, jn * ny + jt * ty, -normal)
 
 
-# --- Impacts that take time ----------------------------------------------------------------------
+# --- Impacts of finite duration ------------------------------------------------------------------
 
-# While two bodies approach, a force pushes them apart that grows with the crush of their
-# structures. Afterwards part of it remains until the impulse of restitution is reached (Poisson's
-# hypothesis). A collinear impact therefore exchanges the impulse of an instantaneous one, over the
-# time that masses and structures take. Crush is permanent: a later impact meets the crushed
-# structure, which yields no further below the force reached before. Two boxes that still overlap
-# after an impact do not push each other until they come closer than they were then.
+# During compression, a force that grows with the crush depth pushes the bodies apart. During
+# restitution, part of it acts until the impulse of restitution is reached (Poisson's hypothesis).
+# A collinear impact therefore exchanges the same impulse as an instantaneous one, over a duration
+# set by masses and stiffness. Crush is permanent: in a later impact the structure only yields
+# beyond the force reached before. Boxes that still overlap after an impact exert no force until
+# they come closer than at its end.
 
 SPREAD = 0.5
 """By how much wider than the place of contact a structure is that yields there [m]."""
@@ -268,7 +272,7 @@ MIN_WIDTH = 0.1
 
 
 class Patch(NamedTuple):
-    """Where two bodies reach into one another: centroid x, y; depth and width across [m]."""
+    """Overlap of two bodies: centroid x, y, depth, and width across the normal [m]."""
 
     x: float
     y: float
@@ -277,19 +281,19 @@ class Patch(NamedTuple):
 
 
 class Pulse(NamedTuple):
-    """An impact under way.
+    """An ongoing impact.
 
     Attributes:
-        normal: direction of the unit normal, out of the second body, less the yaw of the body whose
-            face it belongs to [rad]: the face turns with it.
-        restitution: of the impulse of compression that comes back.
-        compression, restored: impulses along the normal until now [N s].
-        depth: to which the two were crushed together, at most until now [m].
-        width: of the contact there [m].
-        loading: whether the two still come nearer to each other.
-        kept: part of the depth by which they are shorter already [m].
-        settled: depth at which they were when it was over [m].
-        face: whose face the normal belongs to, 0 or 1.
+        normal: direction of the unit normal, out of the second body, relative to the yaw of the
+            body that owns the face [rad], so that it rotates with the face.
+        restitution: fraction of the compression impulse that is restored.
+        compression, restored: normal impulses so far [N s].
+        depth: maximum total crush depth so far [m].
+        width: contact width at that depth [m].
+        loading: whether the bodies are still approaching.
+        kept: part of the depth already applied as shortening [m].
+        settled: overlap depth at the end of the impact [m].
+        face: index of the body that owns the face, 0 or 1.
     """
 
     normal: float
@@ -304,25 +308,25 @@ class Pulse(NamedTuple):
     face: int = 1
 
     def along(self, bodies: Bodies) -> tuple[float, float]:
-        """The unit normal as it is now."""
+        """The current unit normal."""
         owner = bodies[self.face]
         angle = self.normal + (owner[0].yaw if owner is not None else 0.0)
         return math.cos(angle), math.sin(angle)
 
     def has_settled(self, patch: Patch) -> bool:
-        """Whether the impact is over and the two are no deeper in one another than at its end."""
+        """Whether the impact is over and the overlap is no deeper than at its end."""
         return self.over and patch.depth <= self.settled
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left to be given back."""
+        """Whether the restitution is complete."""
         return (
             not self.loading and self.restored >= (1 - 1e-9) * self.restitution * self.compression
         )
 
 
 def face_owner(bodies: Bodies, nx: float, ny: float) -> int:
-    """Which of two bodies has a face across a normal: 0 or 1, which is where both have one."""
+    """Index of the body with a face perpendicular to a normal: 0 or 1; 1 if both have one."""
     first, second = bodies
     if second is None:
         return 1
@@ -331,7 +335,7 @@ def face_owner(bodies: Bodies, nx: float, ny: float) -> int:
 
 
 def mutual_stiffness(bodies: Bodies, nx: float, ny: float) -> float:
-    """Of the faces that meet, one behind the other, per width [N/m^2]; ``n`` out of the second."""
+    """Series stiffness of the contacting faces per width [N/m^2]; ``n`` out of the second."""
     first, second = bodies
     own = _face_stiffness(first, -nx, -ny)
     if second is None:
@@ -341,11 +345,10 @@ def mutual_stiffness(bodies: Bodies, nx: float, ny: float) -> float:
 
 
 def yielding_patch(first: list[Corner], second: list[Corner], nx: float, ny: float) -> Patch | None:
-    """Where two boxes reach into one another, with the middle of what yields there; None where they
-    do not.
+    """The overlap of two boxes, with the centroid of the yielding structure; None without overlap.
 
-    Structure yields beside the contact, too, but not beyond an edge: a place at the edge of a face
-    is pushed back from further inside.
+    Structure next to the contact yields as well, but not beyond an edge, so at the edge of a face
+    the centroid moves inwards.
     """
     found = overlap_patch(first, second, nx, ny)
     if found is None:
@@ -360,7 +363,7 @@ def yielding_patch(first: list[Corner], second: list[Corner], nx: float, ny: flo
 
 
 def contact_width(bodies: Bodies, width: float, nx: float, ny: float) -> float:
-    """Of structure that yields where the contact is ``width`` wide [m]."""
+    """Width of the yielding structure for a contact of ``width`` [m]."""
     first, second = bodies
     face = _face_width(first, nx, ny)
     if second is not None:
@@ -371,14 +374,14 @@ def contact_width(bodies: Bodies, width: float, nx: float, ny: float) -> float:
 def advance_pulse(
     bodies: Bodies, pulse: Pulse, patch: Patch, h: float, *, friction: float
 ) -> tuple[Pulse, ContactImpulse | None]:
-    """What the two exchange in the next ``h`` seconds; None for nothing.
+    """The impulse exchanged in the next ``h`` seconds, or None.
 
     Args:
-        bodies: both; None for what cannot move.
-        pulse: until now.
-        patch: where they overlap now.
+        bodies: both bodies; None for an immovable one.
+        pulse: impact so far.
+        patch: current overlap.
         h: [s].
-        friction: tangential per normal impulse at most.
+        friction: friction coefficient.
     """
     nx, ny = pulse.along(bodies)
     if patch.depth > pulse.depth:
@@ -406,7 +409,7 @@ def advance_pulse(
 
 
 def _face_stiffness(body: Body, ux: float, uy: float) -> float:
-    """Of the face that looks along (ux, uy) most [N/m^2]."""
+    """Stiffness of the face most aligned with (ux, uy) [N/m^2]."""
     ahead, aside = _along(body[0], ux, uy)
     front, rear, side = body[1].stiffness
     if abs(ahead) < abs(aside):
@@ -427,12 +430,12 @@ def _along(body: BodyState, ux: float, uy: float) -> tuple[float, float]:
 def shortened(
     body: Body, pulse: Pulse, ux: float, uy: float, stiffness: float
 ) -> tuple[float, float]:
-    """By how much the front and the rear of a body stay shorter after a pulse [m].
+    """Permanent shortening of the front and the rear of a body by a pulse [m].
 
     Args:
-        body: whose face towards (ux, uy) was struck.
-        pulse: at its end.
-        stiffness: of both faces together, per width [N/m^2].
+        body: body whose face towards (ux, uy) was struck.
+        pulse: pulse at its end.
+        stiffness: combined stiffness of both faces per width [N/m^2].
     """
     ahead, aside = _along(body[0], ux, uy)
     if abs(ahead) < abs(aside):
@@ -455,7 +458,7 @@ BREADTH = 1.0
 
 @dataclass(frozen=True, eq=False)
 class ObstacleGrid:
-    """A grid on the plane.
+    """Occupancy grid of background obstacles.
 
     Attributes:
         origin: [2] lowest corner [m].
@@ -467,13 +470,13 @@ class ObstacleGrid:
 
     @cached_property
     def sums(self) -> NDArray[np.int64]:
-        """[nx + 1, ny + 1], occupied cells below and left of each corner of a cell."""
+        """[nx + 1, ny + 1], summed-area table of ``occupied``."""
         sums = np.zeros((self.occupied.shape[0] + 1, self.occupied.shape[1] + 1), np.int64)
         sums[1:, 1:] = self.occupied.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
         return sums
 
     def manifold(self, body: BodyState, properties: BodyProperties) -> ContactManifold | None:
-        """Where a body overlaps occupied cells; the normal points from their middle to its box."""
+        """Contact manifold of a body with occupied cells; the normal points towards its box."""
         points = footprint(body, properties)
         cells = np.floor((points - self.origin) / OBSTACLE_CELL).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.occupied.shape)).all(axis=1)
@@ -485,8 +488,10 @@ class ObstacleGrid:
         return _nearest_side(body, properties, x, y)
 
     def patch(self, body: BodyState, properties: BodyProperties, nx: float, ny: float) -> Patch:
-        """How far occupied cells reach into a body, from its face against the unit normal ``n``,
-        which points out of them; only where :meth:`manifold` finds any."""
+        """Overlap of occupied cells with a body, from its face opposite to the unit normal ``n``.
+
+        ``n`` points out of the cells. Requires a :meth:`manifold`.
+        """
         points = footprint(body, properties)
         cells = np.floor((points - self.origin) / OBSTACLE_CELL).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.occupied.shape)).all(axis=1)
@@ -498,8 +503,10 @@ class ObstacleGrid:
         return Patch(x, y, float(along[hit].max() - along.min()), width)
 
     def breadth(self, x: float, y: float, nx: float, ny: float) -> tuple[float, float]:
-        """How far what stands at x, y reaches to both sides of it across the normal ``n`` [m], at
-        most BREADTH: a pole hardly, a wall as far as is looked."""
+        """Extent of the obstacle at x, y to both sides across the normal ``n`` [m].
+
+        At most BREADTH: small for a pole, BREADTH for a wall.
+        """
         steps = np.arange(0.0, BREADTH + OBSTACLE_CELL / 4, OBSTACLE_CELL / 2)
         deep = np.arange(-OBSTACLE_CELL, OBSTACLE_CELL * 1.01, OBSTACLE_CELL / 2)
         found = []
@@ -528,7 +535,7 @@ class ObstacleGrid:
 def _nearest_side(
     body: BodyState, properties: BodyProperties, x: float, y: float
 ) -> ContactManifold:
-    """The manifold at (x, y) on the side of the box that is nearest to it."""
+    """The manifold at (x, y), on the nearest side of the box."""
     cos, sin = math.cos(body.yaw), math.sin(body.yaw)
     dx = x - body.x - properties.box_ahead * cos
     dy = y - body.y - properties.box_ahead * sin
@@ -542,7 +549,7 @@ def _nearest_side(
 
 
 def footprint(body: BodyState, properties: BodyProperties) -> Float:
-    """Points [N, 2] [m] all over the body's box, no farther apart than half a cell."""
+    """Points [N, 2] [m] that cover the body's box, at most half a cell apart."""
     nx = max(math.ceil(properties.length / (OBSTACLE_CELL / 2)), 1) + 1
     ny = max(math.ceil(properties.width / (OBSTACLE_CELL / 2)), 1) + 1
     u = np.linspace(-properties.length / 2, properties.length / 2, nx) + properties.box_ahead
@@ -557,14 +564,13 @@ _grids: WeakKeyDictionary[Scene, ObstacleGrid] = WeakKeyDictionary()
 
 
 def obstacle_grid(scene: Scene, path: LoggedPath) -> ObstacleGrid:
-    """The grid of a scene's background; made once for each scene in memory.
+    """The obstacle grid of a scene's background, cached per scene.
 
-    Which cells are occupied is what :func:`~...scene.ground.occupied_cells` says, in simulations
-    too.
+    Occupied cells come from :func:`~...scene.ground.occupied_cells`, as in simulations.
 
     Args:
-        scene: whose background.
-        path: recorded way of the ego.
+        scene: scene with the background.
+        path: recorded path of the ego.
     """
     found = _grids.get(scene)
     if found is None:

@@ -1,4 +1,4 @@
-"""Contacts from step to step, and the motion of ego and objects in a step with contact."""
+"""Contact state across steps, and the motion of ego and objects in a step with contact."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class StepMotion(NamedTuple):
     """Ego and objects after a step.
 
     Attributes:
-        controller, motion: of the ego.
-        traffic: the objects, impacted ones among them.
-        contacts: to go on with.
-        impacts: of the step; None where bodies pass through each other.
+        controller, motion: controller and motion of the ego.
+        traffic: the objects, including impacted ones.
+        contacts: contact state after the step.
+        impacts: impacts of the step; None without collision response.
     """
 
     controller: EgoController
@@ -52,15 +52,14 @@ class ContactState:
     """Contacts at one instant of an episode.
 
     Attributes:
-        spec: of the episode.
-        ego_size: of the ego's box [m].
-        obstacles: of the background; None where it does not count.
-        touching: names of what is in contact.
-        ignored_pairs: pairs that overlapped when the episode began; they pass through each other
-            until they have parted.
-        sliding: whether the ego has been pushed and no longer rolls as it is steered.
-        pulses: impacts under way, by the names of the two.
-        ego_crush: by how much the ego's front and rear are shorter than they were [m].
+        spec: options of the episode.
+        ego_size: size of the ego's box [m].
+        obstacles: obstacles of the background; None if they are ignored.
+        touching: names of all bodies in contact.
+        ignored_pairs: pairs that overlapped at the start; they do not collide until they separate.
+        sliding: whether the ego slides after an impact and does not follow its steering.
+        pulses: ongoing impacts, by pair of names.
+        ego_crush: permanent shortening of the ego's front and rear [m].
     """
 
     spec: ResetSpec
@@ -92,13 +91,13 @@ class ContactState:
 
     @property
     def exchanges_momentum(self) -> bool:
-        """Whether bodies push each other; one that is put somewhere by poses cannot be pushed."""
+        """Whether there is collision response; not if poses place the ego."""
         return self.spec.on_collision == "continue" and self.spec.action != "pose"
 
     def ego_contacts(
         self, start: StepStart, T_world_vehicle: Float, motion: Motion, agents: Agents
     ) -> EgoContacts:
-        """Contacts of the ego that stands so after a step, and which of them began in it."""
+        """Contacts of the ego after a step, and which of them are new."""
         if self.spec.contact.swept:
             return swept_contacts(
                 start,
@@ -130,14 +129,14 @@ class ContactState:
         t_us: int,
         height: HeightAt,
     ) -> StepMotion:
-        """One step of the ego, with the impacts of it and of the objects.
+        """Advance the ego by one step, with all impacts.
 
         Args:
-            controller, motion: of the ego at the start.
+            controller, motion: controller and motion of the ego at the start.
             before: objects at the start.
-            traffic: objects at the end, were nothing in their way.
-            t_us: at the start [us].
-            height: of the ground at x, y [m].
+            traffic: objects at the end without impacts.
+            t_us: start time [us].
+            height: ground height at x, y [m].
         """
         if not self.exchanges_momentum or not self._may_collide(motion, before, traffic):
             controller, motion = controller.advance(motion, t_us, self.spec.dt_us)
@@ -177,13 +176,12 @@ class ContactState:
         return StepMotion(steered.controller, result.motion, collided, contacts, result.impacts)
 
     def after_warm_up(self, touching: frozenset[str]) -> ContactState:
-        """After a step in which the ego moved as recorded: what it touches there counts no more
-        than what it touches at the start."""
+        """The state after a warm-up step; its contacts are ignored like those at the start."""
         ignored = frozenset(frozenset(("", name)) for name in touching)
         return replace(self, touching=touching, ignored_pairs=ignored)
 
     def _may_collide(self, motion: Motion, before: Agents, traffic: Traffic) -> bool:
-        """Whether anything could touch anything within the step."""
+        """Conservative test whether any two bodies could touch within the step."""
         if self.sliding or self.obstacles is not None:
             return True
         if any(isinstance(driver, ImpactedObject) for driver in traffic.drivers.values()):
@@ -204,14 +202,14 @@ def may_meet(
     ego_size: tuple[float, float, float],
     dt: float,
 ) -> bool:
-    """Whether the ego could touch an object within the step, wherever it can drive in it.
+    """Conservative test whether the ego could touch an object, for any motion within its limits.
 
     Args:
-        motion: of the ego at the start of the step.
-        before, after: objects at its start and its end.
+        motion: ego motion at the start of the step.
+        before, after: objects at the start and the end of the step.
         spec: limits of the vehicle.
-        ego_size: of its box [m].
-        dt: the step [s].
+        ego_size: size of its box [m].
+        dt: time step [s].
     """
     if not after.objects:
         return False
@@ -239,13 +237,13 @@ def may_meet(
 def may_collide(
     motion: Motion, agents: Agents, *, ego_size: tuple[float, float, float], dt: float
 ) -> bool:
-    """Whether the ego could touch an object within the step, by boxes along its heading.
+    """Conservative test whether the ego could touch an object, by bounds along its heading.
 
     Args:
-        motion: of the ego at the start of the step.
-        agents: at its end.
-        ego_size: of its box [m].
-        dt: the step [s].
+        motion: ego motion at the start of the step.
+        agents: objects at its end.
+        ego_size: size of the ego's box [m].
+        dt: time step [s].
     """
     if not agents.objects:
         return False
@@ -264,7 +262,7 @@ def may_collide(
 
 
 class _SteppedController:
-    """The controller of the ego through the substeps of a step that begins at ``t_us``."""
+    """The controller of the ego in the substeps of a step that starts at ``t_us``."""
 
     def __init__(self, controller: EgoController, t_us: int) -> None:
         self.controller = controller
@@ -286,17 +284,17 @@ def _impacted_objects(traffic: Traffic) -> dict[str, ImpactedObject]:
 
 # --- Contacts of a step --------------------------------------------------------------------------
 
-# Events for the planner, records for the scores.
+# Events for the policy, records for the scores.
 
 
 class StepContacts(NamedTuple):
     """Contacts of one step.
 
     Attributes:
-        events: collisions that began.
+        events: new collisions.
         records: contacts of the ego.
-        touching: names of what is in contact now.
-        secondary: contacts between objects that began.
+        touching: names of all bodies in contact.
+        secondary: new contacts between objects.
     """
 
     events: tuple[Event, ...] = ()
@@ -306,7 +304,7 @@ class StepContacts(NamedTuple):
 
 
 def contacts_of_overlaps(found: EgoContacts, t_us: int) -> StepContacts:
-    """Contacts of a step in which bodies pass through each other."""
+    """Contacts of a step without collision response."""
     events = (Event("collision", t_us, c.object_id, data=c.event_data()) for c in found.begun)
     return StepContacts(tuple(events), found.records, found.touching)
 
@@ -314,12 +312,12 @@ def contacts_of_overlaps(found: EgoContacts, t_us: int) -> StepContacts:
 def contacts_of_impacts(
     impacts: tuple[Impact, ...], t_us: int, *, touching: frozenset[str], before: Agents
 ) -> StepContacts:
-    """Contacts of a step in which bodies push each other.
+    """Contacts of a step with collision response.
 
     Args:
-        impacts: of the step.
-        t_us: at its end [us].
-        touching: names of what was in contact one step before.
+        impacts: impacts of the step.
+        t_us: time at its end [us].
+        touching: names of all bodies in contact before the step.
         before: objects at its start.
     """
     begun = [i for i in impacts if _pair_name(i) not in touching]
@@ -334,7 +332,7 @@ def contacts_of_impacts(
 def _ego_records(
     impacts: tuple[Impact, ...], *, touching: frozenset[str], agents: Agents
 ) -> tuple[ContactRecord, ...]:
-    """Impacts of the ego for the scores."""
+    """Score records of the ego's impacts."""
     categories = {o.object_id: o.category for o in agents.objects}
     return tuple(
         ContactRecord(

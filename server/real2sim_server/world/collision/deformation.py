@@ -1,9 +1,9 @@
-"""Deformation of objects after impacts: drawn on demand, solved by the MPM.
+"""Deformation of objects after impacts, solved on demand by the MPM.
 
-The impulse alone decides the motion: it costs microseconds, so an episode without cameras never
-waits for the MPM, and every device computes the same. An image that shows a deformed object solves
-the deformation, from the impact alone. The result is the same after a crash of the worker, in a
-fork and in a recording.
+The motion depends on impulses only, which take microseconds, so an episode without cameras never
+runs the MPM and all devices compute the same motion. The deformation is solved when an image shows
+the object. It depends on the impact only, so it is the same in forks, recordings and after a
+restart of the worker.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from .bodies import BodyState, Impact, ImpactParticipant
 
 # --- Damage --------------------------------------------------------------------------------------
 
-# Parts of a vehicle that impacts break and fold, followed through their frames.
+# Broken and folded parts of a vehicle, over the frames of an impact.
 
 HARD = 5.0
 """Fragments fly as far as they do from a limit passed once, per so much approach speed [m/s]."""
@@ -49,21 +49,21 @@ class VehicleDamage:
 
     Attributes:
         most: [G, 3] largest shortening so far.
-        broken: parts that broke.
+        broken: broken parts.
     """
 
     most: Float
     broken: tuple[Breakage, ...] = ()
 
     def hanging(self, t_us: int) -> int:
-        """The instant at which what hangs loose is drawn [us]: none after it hangs still."""
+        """Time at which loose parts are drawn [us]; constant once they are still."""
         fell = [b.time_s for b in self.broken if b.kind == "bumper"]
         if not fell:
             return 0
         return min(t_us, math.ceil((max(fell) + HANGS_STILL) * 1e6))
 
     def cloud(self, vehicle: DamagedVehicle, displacements: Float, t_us: int) -> GaussianCloud:
-        """What is drawn with particles displaced [N, 3] [m]."""
+        """The Gaussians for particle displacements [N, 3] [m]."""
         time_s = t_us * 1e-6
         ages = {b.part: max(time_s - b.time_s, 0.0) for b in self.broken}
         return vehicle.cloud(displacements, self.most, ages)
@@ -71,13 +71,13 @@ class VehicleDamage:
 
 @dataclass(eq=False)
 class DamageHistory:
-    """The damage of one impact, frame by frame, always the same.
+    """The damage of one impact, frame by frame; deterministic.
 
     Attributes:
-        object_id: the vehicle.
-        vehicle: as it is drawn.
-        log: of its parts, as it was before the impact.
-        before: what was damaged before.
+        object_id: id of the vehicle.
+        vehicle: its drawable form.
+        log: breakage log before the impact.
+        before: damage before the impact.
     """
 
     object_id: str
@@ -92,8 +92,8 @@ class DamageHistory:
         """The damage after the first frames of an impact, one each ``crash.FRAME_S``.
 
         Args:
-            frames: displacements [N, 3] of the vehicle's particles, from contact on [m].
-            impact: in which it was the body ``role``.
+            frames: displacements [N, 3] of the vehicle's particles, from first contact [m].
+            impact: the impact, in which the vehicle was body ``role``.
         """
         if self._now is None or self._log is None or self._frames > len(frames):
             self._frames, self._now = 0, self.before
@@ -109,13 +109,13 @@ class DamageHistory:
         return self._now
 
     def final_log(self) -> BreakageLog:
-        """Of the parts after what was asked for last."""
+        """The breakage log after the last requested frame."""
         return self.log if self._log is None else self._log
 
     def _breakage(
         self, part: Part, place: Float, impact: Impact, role: int, frame: int
     ) -> Breakage:
-        """A part that broke in a frame; the pulse says how the vehicle goes on."""
+        """A part that broke in a frame; its velocity follows from the impulse."""
         assert impact.participants is not None
         own = impact.participants[role]
         assert own is not None
@@ -184,10 +184,10 @@ FOR_GOOD = 2**62
 
 
 class Deformation(Protocol):
-    """Deforms objects after impacts. Immutable: an impact makes a new one, so that worlds can fork.
+    """Deforms objects after impacts. Immutable: an impact returns a new one, so worlds can fork.
 
-    The world moves impacted objects as rigid bodies; the deformation gets every impact and gives
-    what is drawn instead of an object's own Gaussians.
+    The world moves impacted objects as rigid bodies. The deformation receives every impact and
+    provides the Gaussians to draw instead of an object's own.
     """
 
     @property
@@ -198,13 +198,13 @@ class Deformation(Protocol):
         """After an impact; ``subjects``: all objects by id."""
 
     def solve(self, t_us: int) -> None:
-        """Find the shapes at an instant that are not known yet, before they are drawn."""
+        """Solve the missing shapes at an instant, before drawing."""
 
     def deformed_instance(self, object_id: str, instance: Instance, t_us: int) -> Instance:
-        """What is drawn of an object; the given instance where it is not deformed."""
+        """The instance to draw; ``instance`` itself if the object is not deformed."""
 
     def fragments(self, t_us: int) -> list[Instance]:
-        """What has come off objects, with their ids."""
+        """Fragments of objects, with the ids of these objects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,9 +212,9 @@ class DeformationTracker:
     """The shapes of all objects of a world, by the MPM.
 
     Attributes:
-        scene: holds their Gaussians.
-        breakage: whether vehicles fold, and lose lamps and glass; else they are only dented.
-        deformed: objects after an impact that may deform them, by id.
+        scene: scene with their Gaussians.
+        breakage: whether vehicles fold and lose lamps and glass; else they are only dented.
+        deformed: objects with potentially deforming impacts, by id.
     """
 
     scene: Scene
@@ -227,7 +227,7 @@ class DeformationTracker:
         return bool(self.deformed)
 
     def with_impact(self, impact: Impact, subjects: Mapping[str, ObjectState]) -> Self:
-        """After an impact; slow ones leave no trace."""
+        """After an impact; slow ones do not deform."""
         if impact.participants is None or impact.approach_speed < MIN_APPROACH_SPEED:
             return self
         names = (impact.other_id, impact.object_id)
@@ -242,12 +242,12 @@ class DeformationTracker:
         return replace(self, deformed=deformed)
 
     def solve(self, t_us: int) -> None:
-        """Solve all impacts as far as their shapes at an instant need it."""
+        """Solve all impacts up to an instant."""
         for deformed in self.deformed.values():
             deformed.displacements(t_us)
 
     def deformed_instance(self, object_id: str, instance: Instance, t_us: int) -> Instance:
-        """The object as it is at ``t_us``, in the colours that it had before its first impact."""
+        """The object at ``t_us``, in its colours before the first impact."""
         deformed = self.deformed.get(object_id)
         if deformed is None or deformed.origin.subject.scale != instance.scale:
             return instance
@@ -257,7 +257,7 @@ class DeformationTracker:
         return replace(instance, cloud=cloud, colour=None, scale=(1.0, 1.0, 1.0))
 
     def fragments(self, t_us: int) -> list[Instance]:
-        """What has come off vehicles by ``t_us``, each vehicle's as one instance with its id."""
+        """Fragments of vehicles at ``t_us``, one instance per vehicle, with its id."""
         found = []
         for deformed in self.deformed.values():
             damage = deformed.damage(t_us)
@@ -298,7 +298,7 @@ class DeformationTracker:
 class _UndeformedObject:
     """An object before its first impact.
 
-    Everything is found on demand and kept; a lock lets sessions on several threads share it.
+    All properties are computed on demand and cached; thread-safe.
     """
 
     def __init__(
@@ -314,7 +314,7 @@ class _UndeformedObject:
 
     @property
     def vehicle(self) -> DamagedVehicle:
-        """It as a vehicle that breaks."""
+        """The object as a breakable vehicle."""
         if self._vehicle is None:
             self._vehicle = DamagedVehicle(
                 self.cloud,
@@ -327,7 +327,7 @@ class _UndeformedObject:
         return self._vehicle
 
     def unbroken(self) -> BreakageLog:
-        """Of its parts, before any impact."""
+        """The breakage log before any impact."""
         return BreakageLog(
             self.subject.category,
             self.subject.scaled_size,
@@ -357,7 +357,7 @@ class _UndeformedObject:
         return self._body
 
     def deformed(self, displacements: Float) -> GaussianCloud:
-        """Its Gaussians moved with the particles around them, where those have moved."""
+        """Its Gaussians, moved by the displacements of nearby particles."""
         if self._pieces is None:
             means = self.cloud.means.detach().cpu().numpy().astype(np.float64)
             self._pieces = _pieces(means, self.body.rest.positions)
@@ -376,8 +376,7 @@ class _UndeformedObject:
 
 
 class _Piece:
-    """Gaussians of one part of an object; each part follows its particles by itself, so that what
-    is drawn of it does not depend on the others."""
+    """Gaussians of one part of an object; parts are deformed independently of each other."""
 
     def __init__(self, rows: NDArray[np.int64], points: Float) -> None:
         self.rows = rows
@@ -386,19 +385,19 @@ class _Piece:
         self._embedding: Embedding | None = None
 
     def touches(self, body: crash.CrashBody, moved: NDArray[np.bool_]) -> bool:
-        """Whether any particle that has moved, [N] bool, is near."""
+        """Whether any moved particle ([N] bool) is nearby."""
         places, reach = body.rest.positions[moved], REACH * body.spacing
         return bool(((places > self._low - reach) & (places < self._high + reach)).all(1).any())
 
     def follow(self, body: crash.CrashBody, displacements: Float) -> Deformed:
-        """Where they are when particles are displaced [N, 3] [m]."""
+        """The deformed Gaussians for particle displacements [N, 3] [m]."""
         if self._embedding is None:
             self._embedding = Embedding(body.rest.positions, self._points, spacing=body.spacing)
         return self._embedding.follow(displacements)
 
 
 def _pieces(points: Float, rest: Float) -> list[_Piece]:
-    """Points [G, 3] of an object in even parts between the ends of its particles [N, 3]."""
+    """Split points [G, 3] of an object into even parts between the ends of its particles [N, 3]."""
     low, high = rest.min(axis=0), rest.max(axis=0)
     inner = np.clip((points - low) / np.maximum(high - low, 1e-6), 0, 1 - 1e-9)
     cells = (inner * PARTS).astype(np.int64) @ [PARTS[1] * PARTS[2], PARTS[2], 1]
@@ -409,13 +408,13 @@ def _pieces(points: Float, rest: Float) -> list[_Piece]:
 
 @dataclass(eq=False)
 class _DeformedObject:
-    """An object after its impacts; unchanged without any.
+    """An object after its impacts; unchanged without impacts.
 
     Attributes:
-        origin: the object.
-        impacts: number of them.
-        before: the same object before the latest.
-        collision, role: the latest, and which of its two bodies the object was.
+        origin: the undeformed object.
+        impacts: number of impacts.
+        before: the object before the latest impact.
+        collision, role: the latest impact, and the index of the object in it.
     """
 
     origin: _UndeformedObject
@@ -428,7 +427,7 @@ class _DeformedObject:
 
     @property
     def body(self) -> crash.CrashBody:
-        """Its particles after all of them."""
+        """Its particles after all impacts."""
         outcome = self.outcome()
         if outcome is not None:
             return outcome.body
@@ -436,24 +435,26 @@ class _DeformedObject:
             return self.before.body if self.before is not None else self.origin.body
 
     def outcome(self) -> crash.ImpactResult | None:
-        """What the latest impact did in the end; None where it left no trace."""
+        """The final result of the latest impact; None without deformation."""
         return None if self.collision is None else self.collision.outcomes()[self.role]
 
     def displacements(self, t_us: int) -> list[Float]:
-        """Of its particles by the latest impact, frame by frame until an instant; see
-        :class:`~real2sim_server.simulation.impact.ImpactResult`."""
+        """Particle displacements by the latest impact, frame by frame up to an instant.
+
+        See :class:`~real2sim_server.simulation.impact.ImpactResult`.
+        """
         if self.collision is None:
             return []
         age_s = (t_us - self.collision.impact.began_us) * 1e-6
         return self.collision.displacements(self.role, max(int(age_s / crash.FRAME_S), 0))
 
     def cloud(self, t_us: int) -> GaussianCloud | None:
-        """Its Gaussians at an instant; None while they are as they were."""
+        """Its Gaussians at an instant; None if unchanged."""
         frames = self.displacements(t_us)
         if not frames:
             return self.before.cloud(t_us) if self.before is not None else None
         damage = self.damage(t_us)
-        # A bumper hangs farther down for a while.
+        # A loose bumper keeps sinking for a while.
         key = (len(frames), 0 if damage is None else damage.hanging(t_us))
         with self.origin.lock:
             if self._shown is None or self._shown[0] != key:
@@ -465,7 +466,7 @@ class _DeformedObject:
             return self._shown[1]
 
     def damage(self, t_us: int) -> VehicleDamage | None:
-        """What has folded and broken until an instant; None where nothing does."""
+        """Damage up to an instant; None if the object cannot break."""
         if not self.origin.breakage:
             return None
         frames = self.displacements(t_us)
@@ -477,7 +478,7 @@ class _DeformedObject:
             return history.after(frames, self.collision.impact, self.role)
 
     def _begin_history(self) -> DamageHistory:
-        """Of the latest impact, after all that the ones before have done."""
+        """The damage history of the latest impact, on top of all earlier ones."""
         if self._history is None:
             origin, before = self.origin, None
             log = origin.unbroken()
@@ -493,7 +494,7 @@ class _DeformedObject:
 
 
 class _ImpactSolution:
-    """An impact, and its deformation of both bodies, solved on demand."""
+    """The deformation of both bodies of an impact, solved on demand."""
 
     def __init__(
         self, impact: Impact, before_impact: tuple[_DeformedObject | None, _DeformedObject | None]
@@ -506,14 +507,14 @@ class _ImpactSolution:
         self._outcomes: tuple[crash.ImpactResult | None, crash.ImpactResult | None] | None = None
 
     def displacements(self, role: int, count: int) -> list[Float]:
-        """The first ``count`` frames of one of its bodies; fewer where it is over before."""
+        """The first ``count`` frames of one of its bodies; fewer if the impact ends earlier."""
         with self._lock:
             if self._before_impact[role] is None:
                 return []
             return self._attempt(lambda simulation: simulation.displacements(role, count), [])
 
     def outcomes(self) -> tuple[crash.ImpactResult | None, crash.ImpactResult | None]:
-        """Of the ego or first object, and of the object."""
+        """Results of the ego or first object, and of the object."""
         with self._lock:
             if self._outcomes is None:
                 results = self._attempt(lambda simulation: simulation.results(), None)
@@ -526,7 +527,7 @@ class _ImpactSolution:
             return self._outcomes
 
     def _attempt(self, ask: Callable[[crash.ImpactSimulation], T], nothing: T) -> T:
-        """What the simulation answers; ``nothing`` where the solver fails."""
+        """Query the simulation; ``nothing`` if the solver fails."""
         if self._failed:
             return nothing
         try:
@@ -534,7 +535,7 @@ class _ImpactSolution:
                 self._simulation = self._begin()
             return ask(self._simulation)
         except PhysicsError as error:
-            # A picture without the deformation serves an episode better than its end.
+            # Prefer an image without deformation to ending the episode.
             self._failed = True
             _log.warning(
                 "no deformation after the impact at %s us: %s", self.impact.began_us, error
@@ -571,14 +572,14 @@ class _ImpactSolution:
         )
 
     def _pose(self, body: BodyState, ahead: float, height: float) -> Float:
-        """About the place of the impact, so that numbers stay small wherever a street lies."""
+        """Pose relative to the place of the impact, to keep coordinates small."""
         x, y = self.impact.point
         centre = np.array([body.x - x, body.y - y, height])
         centre[:2] += ahead * np.array([np.cos(body.yaw), np.sin(body.yaw)])
         return transform_from(centre, yaw_quaternion(body.yaw))
 
     def _wall(self) -> Box:
-        """What the object ran into, as broad as the background is there."""
+        """The obstacle that the object hit, as broad as the background there."""
         nx, ny = self.impact.normal
         depth, width, height = WALL
         right, left = self.impact.breadth or (width / 2, width / 2)

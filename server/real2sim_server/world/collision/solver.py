@@ -1,4 +1,4 @@
-"""A step of the clock with collisions: substeps, each with contact impulses."""
+"""A clock step with collisions: substeps with contact impulses."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from .solver_state import (
 
 # --- Corners -------------------------------------------------------------------------------------
 
-# Bodies that pass through a corner of each other between two substeps.
+# Bodies that pass through each other's corner between two substeps.
 
 SLOWEST = 0.05
 """Bodies that move less than this against each other in a substep cannot do so unseen [m]."""
@@ -53,8 +53,10 @@ Way = tuple[BodyState, BodyState]
 
 
 def crossing(first: Way, second: Way, shapes: tuple[BodyProperties, BodyProperties]) -> float:
-    """Fraction of a substep at which two bodies that do not overlap at its end first do; inf where
-    they never do, or hardly move against each other."""
+    """Fraction of a substep at which two bodies, separate at its end, first overlap.
+
+    inf if they never do or hardly move relative to each other.
+    """
     (a, b), (c, d) = first, second
     if math.hypot((b.x - a.x) - (d.x - c.x), (b.y - a.y) - (d.y - c.y)) < SLOWEST:
         return math.inf
@@ -86,7 +88,7 @@ def between(way: Way, fraction: float) -> BodyState:
 
 
 def drifted(body: BodyState, seconds: float) -> BodyState:
-    """A body so much later [s], its velocity kept."""
+    """A body ``seconds`` later at constant velocity."""
     return body._replace(
         x=body.x + seconds * body.vx,
         y=body.y + seconds * body.vy,
@@ -118,12 +120,10 @@ class CollisionResult:
 
 
 def solve_collisions(step: CollisionStep) -> CollisionResult:
-    """Move ego and objects through a step in substeps of 10 ms; bodies in contact exchange
-    impulses.
+    """Advance ego and objects by a step in substeps of 10 ms, with contact impulses.
 
-    An object with an impact is moved by physics from then on; the ego goes by its controller
-    again once its wheels roll. Contacts are handled in the order of ids, so that the outcome is
-    the same whatever else runs.
+    An impacted object stays under physics control. The ego returns to its controller once its
+    wheels roll. Contacts are processed in the order of ids, so results are deterministic.
     """
     state = _begin(step)
     motion, sliding = step.motion, step.sliding
@@ -138,7 +138,7 @@ def solve_collisions(step: CollisionStep) -> CollisionResult:
         pushed = _resolve_contacts(state, (end - begin) * 1e-6)
         if pushed or sliding:
             motion = ego_motion(state.bodies[EGO], motion, step.spec)
-            # What is pushed for long is pushed by little at a time: wheels must not undo it.
+            # Lasting contacts push a little in each substep, which the wheels must not undo.
             going_on = pushed and step.contact.progressive
             sliding = going_on or not is_rolling(motion, step.spec)
     return CollisionResult(
@@ -190,8 +190,10 @@ def _begin(step: CollisionStep) -> SolverState:
 
 
 def _prescribed_motion(step: CollisionStep, row: int | None, k: int) -> PrescribedMotion:
-    """Of the object that is in row ``k`` at the end and was in another at the start; an object
-    that has just appeared stands where it is."""
+    """Prescribed motion of an object from ``row`` at the start to row ``k`` at the end.
+
+    A new object is stationary.
+    """
     source, j = (step.after, k) if row is None else (step.before, row)
     yaw = float(quaternion_yaw(source.quaternions[j]))
     turn = math.remainder(float(quaternion_yaw(step.after.quaternions[k])) - yaw, math.tau)
@@ -233,8 +235,10 @@ def _move_objects(state: SolverState, begin: int, end: int) -> None:
 
 
 def _resolve_contacts(state: SolverState, h: float) -> bool:
-    """Let all bodies in contact exchange impulses; whether the ego was pushed in the substep of
-    ``h`` seconds."""
+    """Apply impulses to all bodies in contact; return whether the ego was pushed.
+
+    ``h``: length of the substep [s].
+    """
     ego_pushed = False
     for a, b in _near_pairs(state):
         pair = frozenset((a, b))
@@ -263,16 +267,17 @@ def _resolve_contacts(state: SolverState, h: float) -> bool:
 
 
 def _touch(state: SolverState, a: str, b: str, manifold: ContactManifold, h: float) -> bool:
-    """Exchange momentum for ``h`` seconds, or at once where impacts are sudden; whether there was
-    any to exchange."""
+    """Exchange momentum for ``h`` seconds, or instantaneously; return whether any was exchanged."""
     if state.step.contact.pulse:
         return exchange(state, a, b, manifold, h)
     return _apply_impulse(state, a, b, manifold)
 
 
 def _resolve_crossing(state: SolverState, a: str, b: str, h: float) -> bool:
-    """Let bodies that overlapped only within the substep exchange an impulse where they first did;
-    whether they have."""
+    """Apply an impulse to bodies that overlap only within the substep, at their first contact.
+
+    Returns whether there was one.
+    """
     if not (a in state.earlier and b in state.earlier):
         return False
     ends = {i: state.bodies[i] for i in (a, b)}
@@ -295,7 +300,7 @@ def _resolve_crossing(state: SolverState, a: str, b: str, h: float) -> bool:
 
 
 def _near_pairs(state: SolverState) -> list[tuple[str, str]]:
-    """Pairs of a body that physics moves and another within reach; in the order of ids."""
+    """Pairs of a body under physics control and another one within reach, in the order of ids."""
     return [
         (a, b)
         for a, b in itertools.combinations(sorted(state.bodies), 2)
@@ -311,7 +316,7 @@ def _within_reach(state: SolverState, a: str, b: str) -> bool:
 
 
 def _apply_impulse(state: SolverState, a: str, b: str, manifold: ContactManifold) -> bool:
-    """Exchange momentum; whether there was any to exchange."""
+    """Exchange momentum; return whether any was exchanged."""
     contact, second = state.step.contact, None
     first = (state.bodies[a], state.properties[a])
     if b != BACKGROUND:

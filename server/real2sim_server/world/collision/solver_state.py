@@ -1,4 +1,4 @@
-"""State of the substeps of a step with collisions: bodies, contacts and exchanged impulses."""
+"""Collision solver state within a step: bodies, contacts and exchanged impulses."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ class CollisionStep:
     """A step before its collisions are solved.
 
     Attributes:
-        t_us, dt_us: the step [us].
-        motion, sliding: the ego, and whether physics moves it rather than its controller.
-        advance: ``advance(motion, since_us, us)`` moves the ego by its controller.
-        command: of the controller, in a motion so many microseconds after the start.
+        t_us, dt_us: start and duration of the step [us].
+        motion, sliding: ego motion, and whether it is under physics control.
+        advance: ``advance(motion, since_us, us)``, moves the ego with its controller.
+        command: ``command(motion, since_us)``, the controller command.
         spec, ego_size, contact: parameters.
-        before, after: objects as their drivers move them; impacted ones among them.
-        impacted: objects that physics moves, by id.
-        ignored_pairs: bodies that overlapped without an impact; they do not collide.
-        background: obstacles of the background; None where they are left out.
+        before, after: objects as moved by their drivers, including impacted ones.
+        impacted: objects under physics control, by id.
+        ignored_pairs: overlapping bodies that do not collide.
+        background: obstacles of the background; None if they are ignored.
         height: ground height [m] at x, y.
-        pulses: impacts under way, by the names of the two.
-        ego_crush: by how much the ego's front and rear are shorter than they were [m].
+        pulses: ongoing impacts, by pair of names.
+        ego_crush: permanent shortening of the ego's front and rear [m].
     """
 
     t_us: int
@@ -85,7 +85,7 @@ class CollisionStep:
 
 @dataclass(eq=False)
 class PairImpulse:
-    """Impulse and energy that two bodies have exchanged in this step."""
+    """Impulse and energy exchanged by two bodies in this step."""
 
     manifold: ContactManifold
     approach: float
@@ -105,8 +105,11 @@ class PairImpulse:
 
 
 class PrescribedMotion(NamedTuple):
-    """How its driver moves an object through the step: places at the start and the end [m], yaw at
-    the start and its change [rad], velocity [m/s] and turn rate [rad/s]."""
+    """Motion of an object by its driver during the step.
+
+    Positions at the start and end [m], initial yaw and its change [rad], velocity [m/s] and yaw
+    rate [rad/s].
+    """
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -124,8 +127,11 @@ class PrescribedMotion(NamedTuple):
 
 @dataclass(eq=False)
 class SolverState:
-    """Bodies by id while the substeps run; ``heights``: bottom and top of each box [m];
-    ``earlier``: the bodies before the present substep, where what happens within it counts."""
+    """Bodies by id during the substeps.
+
+    ``heights``: bottom and top of each box [m]. ``earlier``: bodies before the current substep, if
+    contacts within it count.
+    """
 
     step: CollisionStep
     properties: dict[str, BodyProperties]
@@ -149,7 +155,7 @@ def bodies_of(state: SolverState, a: str, b: str) -> Bodies:
 
 
 def masses_of(bodies: Bodies) -> tuple[float, float]:
-    """Of both [kg]; infinite for the background."""
+    """Masses of both bodies [kg]; infinite for the background."""
     first, second = bodies
     return first[1].mass, math.inf if second is None else second[1].mass
 
@@ -157,7 +163,7 @@ def masses_of(bodies: Bodies) -> tuple[float, float]:
 def pushed(
     bodies: Bodies, at: tuple[float, float], impulse: ContactImpulse
 ) -> tuple[tuple[BodyState, BodyState | None], float]:
-    """Two bodies after an impulse on the first at a place, and the energy that was lost [J]."""
+    """Two bodies after an impulse on the first one at a point, and the lost energy [J]."""
     (first, properties), second = bodies
     after = first.pushed(properties, *at, impulse.jx, impulse.jy)
     lost = first.energy(properties) - after.energy(properties)
@@ -171,7 +177,7 @@ def pushed(
 def pair_impulse(
     state: SolverState, pair: tuple[str, str], manifold: ContactManifold, *, approach: float
 ) -> PairImpulse:
-    """What two bodies have exchanged so far; a new record where their contact begins."""
+    """The exchange record of two bodies; a new one at the start of their contact."""
     exchanged = state.impulses.get(pair)
     if exchanged is None:
         first = (state.bodies[pair[0]], state.properties[pair[0]])
@@ -217,8 +223,10 @@ def _side(
 
 
 def make_dynamic(state: SolverState, impacted_now: set[str]) -> None:
-    """Let physics move bodies; those that they overlap already, other than in this contact, are
-    ignored until they have parted."""
+    """Put bodies under physics control.
+
+    Existing overlaps other than this contact are ignored until the bodies separate.
+    """
     for i in sorted(impacted_now):
         shape = corners(state.bodies[i], state.properties[i])
         for j in sorted(state.bodies.keys() - impacted_now - state.dynamic):
@@ -235,15 +243,14 @@ def make_dynamic(state: SolverState, impacted_now: set[str]) -> None:
 
 # --- Impact along a face -------------------------------------------------------------------------
 
-# Strips of structure yield independently. Force acts only where two bodies still approach each
-# other, and grows with the depth of penetration there, as on the points around a vehicle in SMAC
-# (McHenry 1971). Where one turns away, force remains on the part that the other still runs into and
-# moves along the face with it; at the centre of the whole contact it would end as soon as that
-# centre stops.
+# Strips of structure yield independently. Force acts only on strips that are still approaching and
+# grows with their penetration depth, as on the points around a vehicle in SMAC (McHenry 1971). If
+# one body rotates away, force remains on the strips still in compression and moves along the face;
+# a single force at the contact centre would end as soon as that centre stops.
 #
-# The force of vehicles is progressive: the outermost structure folds at little force, which grows
-# with the folding speed, and the rails behind it carry the published stiffness. An impact at 10 m/s
-# therefore lasts longer than one at 30.
+# The force of vehicles is progressive: the outer structure folds at a low force that grows with
+# the folding speed, and the rails behind it have the published stiffness. An impact at 10 m/s
+# therefore lasts longer than one at 30 m/s.
 
 STRIPS = 16
 SHALLOW, DEEPENING, RATE = 0.2, 0.35, 0.015
@@ -254,7 +261,7 @@ on at 30 m/s; and to how long they push."""
 
 
 class Strip(NamedTuple):
-    """Part of a contact: its middle x, y, and how deep the two are in one another there [m]."""
+    """A strip of a contact: centre x, y and penetration depth [m]."""
 
     x: float
     y: float
@@ -262,21 +269,21 @@ class Strip(NamedTuple):
 
 
 class FaceContact(NamedTuple):
-    """Where two boxes reach into one another: all of it, and in strips of one width across."""
+    """The overlap of two boxes: as a whole, and in strips of equal width."""
 
     patch: Patch
     strips: tuple[Strip, ...]
 
 
 class Push(NamedTuple):
-    """An impulse on the first body, its opposite on the second, at x, y [m]."""
+    """An impulse on the first body at x, y [m]; the second body receives the opposite."""
 
     x: float
     y: float
     impulse: ContactImpulse
 
     def on(self, bodies: Bodies) -> Bodies:
-        """Both afterwards."""
+        """Both bodies after the push."""
         (first, properties), second = bodies
         jx, jy, _ = self.impulse
         pushed = first.pushed(properties, self.x, self.y, jx, jy), properties
@@ -288,7 +295,7 @@ class Push(NamedTuple):
 def face_contact(
     first: list[Corner], second: list[Corner], nx: float, ny: float
 ) -> FaceContact | None:
-    """Where two boxes reach into one another along a unit normal; None where they do not."""
+    """The overlap of two boxes along a unit normal; None without overlap."""
     shape = overlap_shape(first, second)
     found = patch_of(shape, nx, ny)
     if found is None:
@@ -314,15 +321,15 @@ def advance_face_pulse(
     friction: float,
     progressive: bool = False,
 ) -> tuple[Pulse, list[Push]]:
-    """What the two exchange in the next ``h`` seconds, one push after the other.
+    """The pushes exchanged in the next ``h`` seconds, in order.
 
     Args:
-        bodies: both; None for what cannot move.
-        pulse: until now.
-        contact: where they overlap now.
+        bodies: both bodies; None for an immovable one.
+        pulse: impact so far.
+        contact: current overlap.
         h: [s].
-        friction: tangential per normal impulse at most.
-        progressive: force grows with the closing speed and more than in proportion to depth.
+        friction: friction coefficient.
+        progressive: whether the force grows with closing speed and superlinearly with depth.
     """
     nx, ny = pulse.along(bodies)
     if contact.patch.depth > pulse.depth:
@@ -349,8 +356,10 @@ def _compressed(
     law: tuple[float, float],
     friction: float,
 ) -> tuple[Pulse, list[Push]]:
-    """The push of strips whose bodies come nearer, at most what stops them; ``law``: impulse per
-    depth of a strip [N s/m], and depth that speed counts as [s]."""
+    """The push of approaching strips, limited to stopping them.
+
+    ``law``: impulse per depth of a strip [N s/m], and equivalent depth per speed [s].
+    """
     nx, ny = pulse.along(bodies)
     stiffness, rate = law
     parting = [(s, _parting(bodies, s, nx, ny)) for s in contact.strips]
@@ -371,7 +380,7 @@ def _compressed(
 def _restored(
     bodies: Bodies, pulse: Pulse, contact: FaceContact, stiffness: float, friction: float
 ) -> tuple[Pulse, list[Push]]:
-    """The push that gives back a part of what was compressed, all along the contact."""
+    """The push that restores part of the compression impulse, along the whole contact."""
     nx, ny = pulse.along(bodies)
     depth, place = _resultant(contact.strips, nx, ny)
     left = pulse.restitution * pulse.compression - pulse.restored
@@ -384,10 +393,9 @@ def _restored(
 
 
 def _progressive(contact: FaceContact, restitution: float) -> FaceContact:
-    """A contact with those depths at which the stiffness of two vehicles gives their force.
+    """A contact with effective depths, for which the linear stiffness gives the progressive force.
 
-    What is wholly given back takes all the stiffness: how fast it was folded has added to what
-    there is to be given.
+    Fully elastic contacts use the linear stiffness.
     """
     strips = []
     for s in contact.strips:
@@ -399,7 +407,7 @@ def _progressive(contact: FaceContact, restitution: float) -> FaceContact:
 def _resultant(
     strips: tuple[Strip, ...] | list[Strip], nx: float, ny: float
 ) -> tuple[float, ContactManifold]:
-    """Sum of the depths of strips [m], and the place where force by depth has no moment."""
+    """Sum of the depths of strips [m], and their depth-weighted centre."""
     depth = sum(s.depth for s in strips)
     if depth <= 0.0:
         return 0.0, ContactManifold(0.0, 0.0, nx, ny, 0.0)
@@ -409,7 +417,7 @@ def _resultant(
 
 
 def _parting(bodies: Bodies, strip: Strip, nx: float, ny: float) -> float:
-    """Speed at which two bodies part along the normal at a strip [m/s]."""
+    """Separation speed of two bodies along the normal at a strip [m/s]."""
     first, second = bodies
     vx, vy = first[0].velocity_at(strip.x, strip.y)
     if second is not None:
@@ -419,7 +427,7 @@ def _parting(bodies: Bodies, strip: Strip, nx: float, ny: float) -> float:
 
 
 def _chord(shape: list[Corner], across: float) -> tuple[float, float]:
-    """From where to where along the normal a convex shape reaches at a place across it [m].
+    """Interval of a convex shape along the normal, at a position across it [m].
 
     Corners are given as (along, across).
     """
@@ -432,14 +440,14 @@ def _chord(shape: list[Corner], across: float) -> tuple[float, float]:
     return (min(found), max(found)) if found else (0.0, 0.0)
 
 
-# --- Impacts under way ---------------------------------------------------------------------------
+# --- Ongoing impacts -----------------------------------------------------------------------------
 
-# Contacts that have begun, the record of their impulses, and how much shorter the bodies are
-# afterwards. :mod:`.contact` computes what two bodies exchange in an instant.
+# Active contacts, the record of their impulses, and the permanent shortening of the bodies.
+# :mod:`.contact` computes single exchanges.
 
 
 def exchange(state: SolverState, a: str, b: str, manifold: ContactManifold, h: float) -> bool:
-    """Exchange momentum for ``h`` seconds; whether there was any to exchange."""
+    """Exchange momentum for ``h`` seconds; return whether any was exchanged."""
     pulse = state.pulses.get((a, b)) or _begin_pulse(state, a, b, manifold)
     if pulse is None:
         return False
@@ -488,7 +496,7 @@ def _push(state: SolverState, a: str, b: str, push: Push, exchanged: PairImpulse
 
 
 def _begin_pulse(state: SolverState, a: str, b: str, manifold: ContactManifold) -> Pulse | None:
-    """The pulse of two bodies that have just met; None where they part already."""
+    """The pulse of a new contact; None if the bodies are already separating."""
     bodies, contact = bodies_of(state, a, b), state.step.contact
     whole = contact_impulse(
         *bodies, manifold, restitution=contact.restitution, friction=contact.friction
@@ -514,14 +522,14 @@ def _begin_pulse(state: SolverState, a: str, b: str, manifold: ContactManifold) 
 
 
 def end_pulse(state: SolverState, a: str, b: str) -> None:
-    """Two bodies have parted."""
+    """End the pulse of two separated bodies."""
     pulse = state.pulses.pop((a, b), None)
     if pulse is not None:
         _shorten(state, a, b, pulse)
 
 
 def _shorten(state: SolverState, a: str, b: str, pulse: Pulse) -> None:
-    """The ends of two bodies stay shorter by what was crushed for good."""
+    """Shorten the ends of two bodies by their permanent crush."""
     bodies = bodies_of(state, a, b)
     nx, ny = pulse.along(bodies)
     stiffness = mutual_stiffness(bodies, nx, ny)
@@ -535,7 +543,7 @@ def _shorten(state: SolverState, a: str, b: str, pulse: Pulse) -> None:
 
 
 def _face(state: SolverState, a: str, b: str, nx: float, ny: float) -> FaceContact | None:
-    """Where two vehicles or objects meet, in strips; None for the background, and for nowhere."""
+    """The contact of two objects in strips; None for the background or without overlap."""
     first, second = bodies_of(state, a, b)
     if second is None or not state.step.contact.distributed:
         return None
@@ -543,7 +551,7 @@ def _face(state: SolverState, a: str, b: str, nx: float, ny: float) -> FaceConta
 
 
 def _patch(state: SolverState, a: str, b: str, nx: float, ny: float) -> Patch | None:
-    """Where two bodies reach into one another, seen along a normal."""
+    """The overlap of two bodies along a normal."""
     first, second = bodies_of(state, a, b)
     if second is None:
         assert state.step.background is not None

@@ -1,8 +1,8 @@
-"""Contacts of the ego where no momentum is exchanged: at an instant, and within a step.
+"""Contacts of the ego without collision response: at an instant, and swept over a step.
 
-Within a step, boxes are swept from the instant before to the instant after. The ego moves as its
-controller does, sampled every 50 ms; other objects move straight from instant to instant and turn
-evenly. Boxes are seen from above; boxes whose heights do not overlap do not touch.
+Within a step, boxes are swept from the previous to the current instant. The ego follows its
+controller, sampled every 50 ms; position and yaw of other objects are interpolated linearly. Boxes
+are compared in the plane; boxes whose height ranges do not overlap do not touch.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ BACKGROUND = "background"
 
 @dataclass(frozen=True)
 class OverlapContact:
-    """One object whose box began to overlap the ego box.
+    """A new overlap of an object with the ego box.
 
     Attributes:
-        object_id: the object; None for the background.
-        relative_speed: length of the difference of the two velocities [m/s].
-        t_us: when it began [us]; None where only instants are looked at.
-        place: where it began, x, y [m], where ``t_us`` says when.
+        object_id: id of the object; None for the background.
+        relative_speed: magnitude of the relative velocity [m/s].
+        t_us: start time [us]; None if only instants are compared.
+        place: contact position x, y [m] at ``t_us``.
     """
 
     object_id: str | None
@@ -62,12 +62,12 @@ class OverlapContact:
 @made_quickly
 @dataclass(frozen=True, eq=False)
 class EgoContacts:
-    """Contacts of the ego at an instant where no momentum is exchanged.
+    """Contacts of the ego at an instant, without collision response.
 
     Attributes:
         touching: ids of the objects whose boxes overlap the ego's, and ``background``.
-        begun: contacts that were not there one step before.
-        records: of those, for the scores.
+        begun: contacts that are new in this step.
+        records: score records of the new contacts.
     """
 
     touching: frozenset[str]
@@ -85,11 +85,10 @@ def ego_contacts(
     obstacles: ObstacleGrid | None,
     before: frozenset[str],
 ) -> EgoContacts:
-    """Which objects the ego box overlaps, and which of those contacts are new.
+    """Objects that overlap the ego box, and which of these contacts are new.
 
-    Objects that overlap the ego box when an episode starts count as being in contact already, so
-    they are reported only after they have separated once: boxes of a recording often overlap
-    slightly, and nobody drove into anybody then.
+    Overlaps at the start of an episode are not reported until the objects have separated once:
+    recorded boxes often overlap slightly without a collision.
     """
     T_world_box = ego_box(T_world_vehicle, ego_size)
     rows = overlapping_rows(T_world_box, ego_size, agents)
@@ -174,14 +173,14 @@ COARSE = 2e-2
 
 
 class StepStart(NamedTuple):
-    """The world before a step, and how the ego went on from there.
+    """The world before a step, and the ego motion during it.
 
     Attributes:
-        motion, T_world_vehicle: of the ego.
+        motion, T_world_vehicle: motion and pose of the ego.
         agents: the objects.
-        t_us, dt_us: of the step [us].
-        at: motion of the ego so many microseconds later; None where it is put to its place, which
-            it reaches straight.
+        t_us, dt_us: start and duration of the step [us].
+        at: ``at(since_us)``, ego motion within the step; None if poses place the ego, whose path is
+            then straight.
     """
 
     motion: Motion
@@ -193,8 +192,10 @@ class StepStart(NamedTuple):
 
 
 class _Contact(NamedTuple):
-    """A contact that begins: the fraction of the step, and the row of the object; None for the
-    background, with the place where it is hit."""
+    """A new contact: fraction of the step, and row of the object.
+
+    The row is None for the background, which has the contact position instead.
+    """
 
     fraction: float
     row: int | None
@@ -212,16 +213,16 @@ def swept_contacts(
     obstacles: ObstacleGrid | None,
     before: frozenset[str],
 ) -> EgoContacts:
-    """Contacts of the ego in a step, those that begin in the order in which they do.
+    """Contacts of the ego in a step; new ones in the order of their start.
 
     Args:
-        start: the world before.
-        motion, T_world_vehicle: of the ego after the step.
+        start: the world before the step.
+        motion, T_world_vehicle: motion and pose of the ego after the step.
         agents: the objects after the step.
-        spec: of the episode.
-        ego_size: of the ego's box [m].
-        obstacles: of the background; None where it does not count.
-        before: names of what was in contact before the step; nothing of it begins.
+        spec: options of the episode.
+        ego_size: size of the ego's box [m].
+        obstacles: obstacles of the background; None if they are ignored.
+        before: names in contact before the step; their contacts are not new.
     """
     sweep = _Sweep(start, motion, T_world_vehicle, agents, ego=spec.ego, size=ego_size)
     begun, touching = sweep.objects(before)
@@ -231,7 +232,7 @@ def swept_contacts(
             begun.append(hit)
         if lies_on:
             touching.append(BACKGROUND)
-    # Objects in the order of their rows where they are hit at once, the background last.
+    # Simultaneous contacts in row order, the background last.
     begun.sort(key=lambda c: (c.fraction, math.inf if c.row is None else c.row))
     found = [sweep.described(contact) for contact in begun]
     return EgoContacts(
@@ -262,13 +263,13 @@ class _Sweep:
         self._slack = 0.0
         if start.at is not None and start.dt_us > PIECE_US:
             self._exact = None
-            # A vehicle that is put on its plan may have been anywhere.
+            # A vehicle placed by poses may have moved arbitrarily.
             self._slack = _deviation(start, motion, ego, size)
             if ego.tracker == "perfect":
                 self._rough, self._slack = self.way, 0.0
 
     def objects(self, before: frozenset[str]) -> tuple[list[_Contact], list[str]]:
-        """Contacts with objects that begin, and names of what is in contact at the end."""
+        """New contacts with objects, and names of the objects in contact at the end."""
         objects = self._agents.objects
         if not objects:
             return [], []
@@ -335,7 +336,7 @@ class _Sweep:
 
     @property
     def way(self) -> Float:
-        """Of the ego's box, as near as it is known."""
+        """Motion of the ego's box, as accurately as known."""
         if self._exact is None:
             at, dt_us = self._start.at, self._start.dt_us
             assert at is not None
@@ -349,7 +350,7 @@ class _Sweep:
         return self._size[0] / 2 - REAR_OVERHANG
 
     def _way(self, motions: list[Motion]) -> Float:
-        """Rows for the kernels, evenly over the step."""
+        """Rows for the kernels, evenly spaced over the step."""
         rows, yaw, axle, last = [], motions[0].yaw, self._axle, len(motions) - 1
         for k, motion in enumerate(motions):
             fraction = k / last
@@ -374,7 +375,7 @@ class _Sweep:
         return first, touching
 
     def _ego_at(self, fraction: float) -> tuple[Motion, Box]:
-        """The ego at a fraction of the step: velocity, and box seen from above."""
+        """The ego at a fraction of the step: motion, and box in the plane."""
         way = self.way
         x, y, yaw = (float(np.interp(fraction, way[:, 0], way[:, c])) for c in (1, 2, 3))
         box = (x, y, yaw, *self._size[:2])
@@ -384,7 +385,7 @@ class _Sweep:
         return (at(since_us) if since_us else self._start.motion), box
 
     def _object_at(self, row: int, fraction: float) -> tuple[Box, tuple[float, float]]:
-        """An object at a fraction of the step: its box seen from above, its velocity."""
+        """An object at a fraction of the step: box in the plane, and velocity."""
         after, before, k = self._agents, self._start.agents, int(self._rows[row])
         x, y = after.positions[row, :2].tolist()
         vx, vy = after.velocities[row, :2].tolist()
@@ -402,13 +403,15 @@ class _Sweep:
 
 
 def _height(T_world_vehicle: Float, ahead: float) -> float:
-    """Of the vehicle's floor [m], so far ahead of the rear axle."""
+    """Height of the vehicle's floor [m], ``ahead`` of the rear axle."""
     return T_world_vehicle.item(2, 3) + ahead * T_world_vehicle.item(2, 0)
 
 
 def _deviation(start: StepStart, motion: Motion, ego: EgoSpec, size: Size) -> float:
-    """How far the ego's box may have been, within the step, from one that goes straight and turns
-    evenly [m]: no way to its place is longer than the vehicle can drive."""
+    """Maximum deviation of the ego's box from linear interpolation within the step [m].
+
+    Bounded because its path cannot be longer than the vehicle can drive.
+    """
     before, seconds = start.motion, start.dt_us * 1e-6
     fastest = max(
         math.hypot(before.speed, before.lateral_speed),
@@ -424,7 +427,7 @@ def _deviation(start: StepStart, motion: Motion, ego: EgoSpec, size: Size) -> fl
 
 
 def _place(box: Box, other: Box) -> tuple[float, float]:
-    """The middle of where two boxes touch [m]."""
+    """The centre of the contact of two boxes [m]."""
     shapes = []
     for x, y, yaw, length, width in (box, other):
         body = BodyState(x, y, yaw, 0.0, 0.0, 0.0)

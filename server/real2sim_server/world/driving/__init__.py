@@ -1,7 +1,7 @@
-"""How the controlled vehicle moves and steers: plain compiled functions.
+"""Compiled dynamics and trackers of the controlled vehicle.
 
-All functions take and return floats, tuples and arrays. Python calls :mod:`.entries`, which chooses
-from the models of :mod:`.vehicle` and the trackers of :mod:`.trackers`.
+All functions take and return floats, tuples and arrays. Python calls :mod:`.entries`, which selects
+a model of :mod:`.vehicle` and a tracker of :mod:`.trackers`.
 """
 
 from .curve import MOVING, NO_POSE

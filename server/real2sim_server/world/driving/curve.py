@@ -1,11 +1,11 @@
 """A planned trajectory as a smooth curve over time.
 
-Cubic Hermite through the vehicle's pose when it got the plan, and the plan's poses. Tangents are
-finite differences of the plan, turned into the planned headings. After its last pose the curve
-goes on with its last speed and turn rate, so that there is something to aim at.
+A cubic Hermite curve through the vehicle pose at reception of the plan and the poses of the plan.
+Tangents are finite differences of the plan, aligned with the planned headings. Beyond its last
+pose the curve continues at the last speed and turn rate, so that trackers always have a target.
 
-Its knots are [K, 6] float64, one row a pose, the first that of the vehicle: time from the start
-[s], x, y [m], yaw [rad], and the tangent, a velocity x, y [m/s], all in the world.
+Knots are [K, 6] float64, one row per pose, the vehicle's first: time from the start [s], x, y [m],
+yaw [rad], and the tangent velocity x, y [m/s], world frame.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ NO_POSE = math.nan, 0.0, 0.0, 0.0
 
 
 class PlanCurve(NamedTuple):
-    """A plan to be followed.
+    """A plan to follow.
 
     Attributes:
         knots: see above.
-        turn_rate: at the last pose, and from there on [rad/s].
-        early: how long before it takes effect a command is given [s]; the plan counts as over once
-            one that is given after its end would take effect.
+        turn_rate: turn rate at and beyond the last pose [rad/s].
+        early: delay between a command and its effect [s]; the plan is over once a command given
+            after its end would take effect.
     """
 
     knots: np.ndarray
@@ -51,15 +51,15 @@ class PlanCurve(NamedTuple):
 
 @func
 def curve_through(state, seconds, poses, vehicle, before):
-    """The plan of a vehicle in a state.
+    """The curve of a plan, from a vehicle state.
 
     Args:
-        state: of the vehicle at the start.
-        seconds: [N] float64, increasing, above 0, times of the poses from the start [s].
-        poses: [N, 3] float64, x, y [m], yaw [rad], world.
-        vehicle: constants.
-        before: time [s] and x, y [m], yaw [rad] of the pose that a plan of a single pose goes on
-            from, see :data:`NO_POSE`.
+        state: vehicle state at the start.
+        seconds: [N] float64, times of the poses from the start, positive and increasing [s].
+        poses: [N, 3] float64, x, y [m], yaw [rad], world frame.
+        vehicle: vehicle constants.
+        before: time [s] and x, y [m], yaw [rad] of the previous plan's pose if both plans have a
+            single pose, see :data:`NO_POSE`.
     """
     last = len(seconds)
     knots = np.empty((last + 1, 6))
@@ -89,7 +89,7 @@ def is_over(curve, t):
 
 @func
 def at(curve, t):
-    """x, y [m] and velocity x, y [m/s] in the world, ``t`` >= 0 seconds after the start."""
+    """x, y [m] and velocity x, y [m/s], world frame, ``t`` >= 0 seconds after the start."""
     knots = curve.knots
     last = len(knots) - 1
     if t >= knots[last, T]:
@@ -106,16 +106,16 @@ def at(curve, t):
 
 @func
 def planned_at(curve, t, version):
-    """Like :func:`at`, but where the plan itself would be before its first pose: on the arc that
-    leads there. The vehicle's distance from it is its error, which :func:`at` hides.
+    """Like :func:`at`, but on the extrapolated plan before its first pose.
 
-    A plan that begins late says nothing about the way to it; there the two are the same.
+    Before its first pose the plan is extrapolated backwards along an arc. The distance of the
+    vehicle from that arc is its tracking error, which :func:`at` hides. For plans that begin late,
+    both functions agree.
 
     Args:
-        curve: of the plan.
+        curve: curve of the plan.
         t: seconds after its start, at least 0.
-        version: of the trackers; since 2 the arc is driven with the acceleration of the first
-            poses, without which plans that are made anew at every step have none.
+        version: version of the trackers; from 2 on the arc has the acceleration of the first poses.
     """
     knots = curve.knots
     first = knots[1, T]
@@ -140,11 +140,10 @@ def heading(curve, t):
 
 @func
 def _slope(knots, i):
-    """Velocity [m/s] at a pose after the vehicle's own: the slope there of the parabola through
-    three neighbours.
+    """Velocity [m/s] at a plan pose: slope of the parabola through three neighbouring poses.
 
-    The vehicle's own pose is no neighbour: where it is off the plan, its way onto it says nothing
-    about the plan's speed.
+    The vehicle's own pose is excluded: if it is off the plan, the segment from it says nothing
+    about the planned speed.
     """
     last = len(knots) - 1
     if last == 2:
@@ -181,9 +180,10 @@ def _far_slope(chord, slope):
 
 @func
 def _arrival(knots, speed, vehicle, before):
-    """Velocity [m/s] at a single planned pose, as far as in reach: that of the way from the pose
-    before it, else from where the vehicle is. The latter mixes what the plan moves with what the
-    vehicle is off it, which short steps make large.
+    """Velocity [m/s] at a single planned pose, within the vehicle's limits.
+
+    Computed from the previous plan's pose, else from the vehicle pose. The latter includes the
+    tracking error, which dominates at short time steps.
     """
     seconds, since = knots[1, T], 0.0
     dx, dy = knots[1, X] - knots[0, X], knots[1, Y] - knots[0, Y]
@@ -202,7 +202,7 @@ def _arrival(knots, speed, vehicle, before):
 
 @func
 def _along_heading(velocity, yaw):
-    """The velocity turned into the planned heading, where that is roughly where it goes."""
+    """The velocity rotated into the planned heading, if both roughly agree."""
     vx, vy = velocity
     speed = math.hypot(vx, vy)
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -213,7 +213,7 @@ def _along_heading(velocity, yaw):
 
 @func
 def _last_turn_rate(knots, state, vehicle, before):
-    """Turn rate [rad/s] at the last pose, as far as the vehicle can turn."""
+    """Turn rate [rad/s] at the last pose, within the vehicle's limits."""
     last = len(knots) - 1
     h = knots[last, T] - knots[last - 1, T]
     rate = wrapped(knots[last, YAW] - knots[last - 1, YAW]) / h
@@ -229,7 +229,7 @@ def _last_turn_rate(knots, state, vehicle, before):
 
 @func
 def _along_arc(knot, rate, since):
-    """Place and velocity on an arc, ``since`` seconds after a knot; before it where negative."""
+    """Position and velocity on an arc, ``since`` seconds after a knot (before it if negative)."""
     vx, vy = knot[VX], knot[VY]
     half = rate * since / 2
     cos, sin = math.cos(half), math.sin(half)
@@ -242,7 +242,7 @@ def _along_arc(knot, rate, since):
 
 @func
 def _first_gain(knots):
-    """Acceleration [m/s^2] along the way from the first planned pose to the next."""
+    """Acceleration [m/s^2] along the path from the first planned pose to the next."""
     before = math.hypot(knots[1, VX], knots[1, VY])
     along = knots[1, VX] * knots[2, VX] + knots[1, VY] * knots[2, VY]
     after = math.copysign(math.hypot(knots[2, VX], knots[2, VY]), along)
@@ -251,8 +251,10 @@ def _first_gain(knots):
 
 @func
 def _along_changing_arc(knot, rate, gain, since):
-    """Place and velocity on an arc ``since`` <= 0 seconds before a knot, driven with a constant
-    acceleration [m/s^2]; it stands before it has begun to move."""
+    """Position and velocity on an arc at ``since`` <= 0 seconds relative to a knot.
+
+    The arc has a constant acceleration [m/s^2]; the vehicle is at rest before it starts to move.
+    """
     speed = math.hypot(knot[VX], knot[VY])
     if speed == 0.0:
         return knot[X], knot[Y], 0.0, 0.0

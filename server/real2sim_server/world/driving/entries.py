@@ -1,4 +1,4 @@
-"""What Python calls: plain tuples and arrays in and out, since others are slow to pass."""
+"""Entry points for Python, with plain tuples and arrays: other types are slow to pass to Numba."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def world_poses(poses, frame):
 
     Args:
         poses: [N, 3] float64, in the frame.
-        frame: x, y [m], yaw [rad] of the frame in the world.
+        frame: pose x, y [m], yaw [rad] of the frame in the world.
 
     Returns:
         [N, 3] float64.
@@ -52,8 +52,11 @@ def world_poses(poses, frame):
 
 @kernel
 def placed_poses(poses, frame, clearly):
-    """Poses of a frame in the world, see :func:`world_poses`; and whether each lies ahead of the
-    one before by ``clearly`` [m] along the sum of their headings."""
+    """World poses as :func:`world_poses`, and whether they clearly lead forwards.
+
+    They do if each pose is at least ``clearly`` [m] ahead of its predecessor along the sum of their
+    headings.
+    """
     moved, ahead = world_poses(poses, frame), True
     cos, sin = math.cos(moved[0, 2]), math.sin(moved[0, 2])
     for k in range(1, len(moved)):
@@ -71,10 +74,10 @@ def plan_curve(state, start_us, plan, vehicle):
 
     Args:
         state: nine floats of a :class:`.vehicle.PlanarState`.
-        start_us: when the vehicle is in that state [us].
+        start_us: time of that state [us].
         plan: times [N] int64, increasing, after ``start_us`` [us]; poses [N, 3] float64, x, y [m],
-            yaw [rad], world; and seconds from the start, x, y, yaw of the single pose of the plan
-            before, which one of a single pose goes on from, else ``NO_POSE``.
+            yaw [rad], world frame; and time from the start [s], x, y, yaw of the previous plan's
+            pose if both plans have a single pose, else ``NO_POSE``.
         vehicle: the members of a :class:`.vehicle.VehicleParameters`.
 
     Returns:
@@ -97,16 +100,13 @@ def curve_at(curve, t):
 
 @kernel
 def prepare_schedule(state, pending, law, vehicle, dt_us):
-    """The schedule of a tracker that plans ahead, from a state on; arguments as in
-    :func:`advance_vehicle`.
+    """The schedule of a tracker that plans ahead; arguments as in :func:`advance_vehicle`.
 
-    Apart from it, since planning ahead takes most of the time that all of this takes to compile,
-    and few drives plan ahead.
+    A separate entry point, because it dominates the compile time and few drives need it.
 
     Returns:
-        Four float64 arrays of two dimensions: the schedule (see :class:`.trackers.Tracker`) by
-        which engine and brakes go, then the one of the steering gear. Each begins when a command
-        given now arrives there.
+        Four 2-D float64 arrays: the schedule (see :class:`.trackers.Tracker`) for engine and
+        brakes, then that for the steering. Each starts at the arrival time of a command given now.
     """
     kind, knots, turn_rate, since, _, _ = law
     parameters = VehicleParameters(*vehicle)
@@ -126,23 +126,23 @@ def prepare_schedule(state, pending, law, vehicle, dt_us):
 
 @kernel
 def advance_vehicle(state, pending, law, vehicle, dt_us):
-    """The vehicle ``dt_us`` later, in equal substeps of 10 ms at most.
+    """Advance the vehicle by ``dt_us``, in equal substeps of at most 10 ms.
 
-    Within a substep the steering angle moves at most at its rate limit. The kinematic bicycle
-    follows the arc of its mean exactly; speed changes linearly until it reaches 0 or the greatest
-    speed. The dynamic bicycle does the same at walking pace and slips on its tyres above, see
-    :mod:`.vehicle`. Braking never ends in reversing.
+    Within a substep the steering angle obeys its rate limit. The kinematic bicycle follows the arc
+    of the mean steering angle exactly; speed changes linearly until it reaches 0 or the maximum
+    speed. The dynamic bicycle equals it at walking pace and has tyre slip above, see
+    :mod:`.vehicle`. Braking stops at rest.
 
     Args:
         state: nine floats of a :class:`.vehicle.PlanarState`.
-        pending: [W, 2] float64, commands on their way to the wheels, newest first.
-        law: kind, knots and turn rate of its plan, seconds since that began, the command to hold,
-            which trackers ignore, and the schedules: of :func:`prepare_schedule` for trackers
+        pending: [W, 2] float64, delayed commands, newest first.
+        law: kind, knots and turn rate of its plan, seconds since its start, the command to hold
+            (ignored by trackers), and the schedules: of :func:`prepare_schedule` for trackers
             that plan ahead, else :data:`NO_SCHEDULE`.
         vehicle: the members of a :class:`.vehicle.VehicleParameters`.
 
     Returns:
-        State and commands on their way, in the form in which they came.
+        State and delayed commands, in the form of the arguments.
     """
     since = law[3]
     substeps, h = _substeps(dt_us)
@@ -160,8 +160,10 @@ def advance_vehicle(state, pending, law, vehicle, dt_us):
 
 @kernel
 def driver_command(state, law, vehicle):
-    """The command of a law: acceleration [m/s^2] and road-wheel angle [rad]; arguments as in
-    :func:`advance_vehicle`. Trackers that plan ahead do here what the plain LQR would."""
+    """The command of a law: acceleration [m/s^2] and road-wheel angle [rad].
+
+    Arguments as in :func:`advance_vehicle`. Trackers that plan ahead return the LQR command.
+    """
     kind, knots, turn_rate, since, hold, _ = law
     if kind == HOLD:
         return hold
@@ -174,14 +176,14 @@ def driver_command(state, law, vehicle):
 
 @func
 def _substeps(dt_us):
-    """How many substeps a step has, and their length [s]."""
+    """Number of substeps of a step, and their length [s]."""
     count = -(-dt_us // SUBSTEP_US)
     return count, dt_us * 1e-6 / count
 
 
 @func
 def _arrivals(vehicle, h):
-    """Substeps until a command is known to reach engine and brakes, and the steering gear."""
+    """Known delays of commands to engine and brakes, and to the steering, in substeps."""
     return (
         delay_substeps(vehicle.known_drive_delay, h),
         delay_substeps(vehicle.known_steering_delay, h),
@@ -190,13 +192,13 @@ def _arrivals(vehicle, h):
 
 @func
 def _timely_command(law, now, queue, vehicle, timing):
-    """The command of a law for a substep, each part of it for the time at which it arrives.
+    """The command of a law for a substep, computed for the arrival times of its two parts.
 
     Args:
         law, vehicle: as in :func:`advance_vehicle`.
-        now: state of the vehicle.
-        queue: commands on their way, and how many.
-        timing: seconds since the plan began, seconds since the step began, length of the substep.
+        now: vehicle state.
+        queue: delayed commands and their number.
+        timing: seconds since the start of the plan and of the step, length of the substep.
     """
     if law[0] == HOLD:
         return Command(*law[4])

@@ -1,7 +1,7 @@
 """Compiled trackers: every value of ``EgoSpec.tracker`` except ``perfect``.
 
-A tracker is two compiled functions, see :class:`Tracker`. A new tracker needs these two functions
-and an entry in :data:`TRACKERS`.
+A tracker is two compiled functions, see :class:`Tracker`. To add one, write these functions and add
+an entry to :data:`TRACKERS`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .vehicle import (
     wrapped,
 )
 
-# --- Linear-quadratic regulators along and across the plan ---------------------------------------
+# --- Longitudinal and lateral linear-quadratic regulators ----------------------------------------
 
 TIME = 0.6
 """Time scale of the regulator along the plan [s]: (r/q)^(1/4) of its weights."""
@@ -55,14 +55,14 @@ class PlanPoint(NamedTuple):
 
 @func
 def regulate(state, curve, t, vehicle, _schedule):
-    """What to do, ``t`` seconds after the plan's start.
+    """The LQR command, ``t`` seconds after the plan's start.
 
-    Two decoupled regulators, with the plan's own acceleration and curvature fed forward. Along
-    the plan the error obeys e'' = a - a_ref in time; across it e'' = k - k_ref in path length,
-    for small heading errors. Both are double integrators, whose Riccati equation for the cost
-    q e^2 + r u^2 has the solution u = -(e/l^2 + sqrt(2) e'/l) with l = (r/q)^(1/4) (Anderson &
-    Moore 1990, Optimal Control, ch. 3). Lags that are known are part of both, see
-    :func:`lagging_gains`; what the plan itself needs is fed forward by as much earlier.
+    Two decoupled regulators with feedforward of the planned acceleration and curvature. The
+    longitudinal error obeys e'' = a - a_ref in time, the lateral error e'' = k - k_ref in path
+    length, for small heading errors. Both are double integrators, whose Riccati equation for the
+    cost q e^2 + r u^2 has the solution u = -(e/l^2 + sqrt(2) e'/l) with l = (r/q)^(1/4) (Anderson &
+    Moore 1990, Optimal Control, ch. 3). Known lags are part of both, see :func:`lagging_gains`; the
+    feedforward is advanced by the same time.
     """
     if is_over(curve, t):
         last = curve.knots[len(curve.knots) - 1]
@@ -88,7 +88,7 @@ def regulate(state, curve, t, vehicle, _schedule):
 
 @func
 def lagging_gains(lag):
-    """Gains of the regulator of a double integrator behind a lag of the first order.
+    """Regulator gains of a double integrator behind a first-order lag.
 
     For e'' = a and lag a' = u - a with the cost e^2 + u^2 the optimal u is -(e + b e' + c a). The
     squares z of the closed loop's poles solve lag^2 z^3 = z^2 + 1 (symmetric root locus); its real
@@ -117,11 +117,11 @@ def point_at(curve, t, ahead, version):
     """The plan ``t`` seconds after its start, with derivatives.
 
     Args:
-        curve: of the plan.
+        curve: curve of the plan.
         t: [s].
         ahead: heading of the vehicle [rad].
-        version: of the trackers; since 2 a plan that goes against that heading, as one does that
-            the vehicle has run past, has a speed below 0.
+        version: version of the trackers; from 2 on, a plan against that heading (such as one that
+            the vehicle has passed) has a negative speed.
     """
     x, y, vx, vy = planned_at(curve, t, version)
     _, _, wx, wy = planned_at(curve, t + DIFFERENCE, version)
@@ -147,7 +147,7 @@ def _steering_onto(point, coming, state, vehicle):
     curvature is ``coming`` [1/m] once the steering gear has followed."""
     dx, dy = state.x - point.x, state.y - point.y
     across = dy * math.cos(point.yaw) - dx * math.sin(point.yaw)
-    # Where the vehicle really goes: with slipping tyres not quite where it points.
+    # Direction of motion: with tyre slip it differs from the heading.
     direction = state.yaw + math.atan2(state.lateral_speed, max(state.speed, 1.0))
     off = wrapped(direction - point.yaw)
     scale = max(HEADWAY * state.speed, SHORTEST)
@@ -164,7 +164,7 @@ def _steering_onto(point, coming, state, vehicle):
 
 @func
 def _steering_of(curvature, speed, vehicle):
-    """Road-wheel angle [rad] that keeps a curvature [1/m]."""
+    """Road-wheel angle [rad] for a curvature [1/m]."""
     rolling = math.atan(vehicle.wheelbase * curvature)
     return steady_steering(vehicle.model, rolling, curvature, speed, vehicle)
 
@@ -184,13 +184,13 @@ MAX_LAG = 2.0
 
 @func
 def pursue(state, curve, t, vehicle, _schedule):
-    """What to do, ``t`` seconds after the plan's start.
+    """The pure pursuit command, ``t`` seconds after the plan's start.
 
-    Steering is pure pursuit (Coulter 1992, CMU-RI-TR-92-01): the arc that ends at the aim. The
-    aim lies on the plan, so the arc carries the plan's curvature. Acceleration is what brings the
-    vehicle to where the plan is after the look-ahead time T, from s = v T + a T^2 / 2; with its
-    two gains 2 / T^2 and 2 / T the lag behind a moving plan decays with damping 0.7. Lags that are
-    known count as dead times: each command is for where the vehicle will be after its lag.
+    Steering follows the arc to a target point on the plan (Coulter 1992, CMU-RI-TR-92-01), which
+    includes the plan's curvature. The acceleration brings the vehicle to the planned position after
+    the look-ahead time T, from s = v T + a T^2 / 2; with its gains 2 / T^2 and 2 / T the lag behind
+    a moving plan decays with damping 0.7. Known lags are treated as dead times: commands are
+    computed for the predicted state after the lag.
     """
     if is_over(curve, t):
         last = curve.knots[len(curve.knots) - 1]
@@ -211,7 +211,7 @@ def pursue(state, curve, t, vehicle, _schedule):
 
 @func
 def _coasted(state, seconds):
-    """The vehicle some time later, were its drive and its turn rate per way to stay as they are."""
+    """The vehicle some time later, at constant drive acceleration and curvature."""
     if seconds == 0.0:
         return state
     speed = max(state.speed + state.drive * seconds, 0.0)
@@ -245,9 +245,9 @@ def _steering(state, x, y, vehicle):
 
 @func
 def _farther_aim(state, curve, t):
-    """The first place of the plan after ``t`` that is far enough.
+    """The first point of the plan after ``t`` beyond the minimum distance.
 
-    Where the plan stops before that, a place on the line straight on from where it stands.
+    If the plan stops earlier, a point on the straight line beyond its end.
     """
     x, y = state.x, state.y
     for _ in range(AIM_TRIES):
@@ -260,7 +260,7 @@ def _farther_aim(state, curve, t):
 
 @func
 def _straight_on(state, x, y, yaw):
-    """A place to aim at, on the line from (x, y) along ``yaw``."""
+    """A target point on the line from (x, y) along ``yaw``."""
     dx, dy = math.cos(yaw), math.sin(yaw)
     along = max((state.x - x) * dx + (state.y - y) * dy, 0.0)
     reach = along + max(MIN_AIM, state.speed * LOOKAHEAD)
@@ -269,8 +269,10 @@ def _straight_on(state, x, y, yaw):
 
 @func
 def _acceleration(state, dx, dy, vx, vy):
-    """Acceleration [m/s^2] to close a gap [m] to a plan of a velocity [m/s] in the look-ahead
-    time; both in the world."""
+    """Acceleration [m/s^2] that closes a gap [m] to a moving plan in the look-ahead time.
+
+    Gap and plan velocity [m/s] are in the world frame.
+    """
     cos, sin = math.cos(state.yaw), math.sin(state.yaw)
     ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
     planned = math.copysign(math.hypot(vx, vy), vx * cos + vy * sin)
@@ -316,12 +318,12 @@ NX, NU = 6, 2
 
 
 class Model(NamedTuple):
-    """The vehicle as it is planned with.
+    """The vehicle model used for planning.
 
     Attributes:
-        vehicle: its constants.
-        kept: share of the acceleration before a step that is left after it.
-        held: share of it in the mean over the step.
+        vehicle: vehicle constants.
+        kept: fraction of the acceleration before a step that remains after it.
+        held: mean of that fraction over the step.
     """
 
     vehicle: VehicleParameters
@@ -339,7 +341,7 @@ def prepare(state, curve, since, vehicle):
 
 @func
 def follow_schedule(state, curve, t, vehicle, schedule):
-    """What the schedule says for now; what the plain LQR would where it is empty."""
+    """The command of the schedule; that of the LQR if the schedule is empty."""
     states, inputs, elapsed = schedule
     if len(states) == 0:
         return regulate(state, curve, t, vehicle, schedule)
@@ -399,11 +401,11 @@ def _model_of(vehicle):
 
 @func
 def _reference_states(state, curve, since, version):
-    """Wanted states [STEPS + 1, 6]; yaws continuous from the vehicle's."""
+    """Reference states [STEPS + 1, 6]; yaws continuous from the vehicle's."""
     wanted = np.zeros((STEPS + 1, NX))
     yaw = state.yaw
     for k in range(STEPS + 1):
-        # After its end the plan is taken to go on; the vehicle brakes once it gets there.
+        # The plan is extrapolated beyond its end; the vehicle brakes once it gets there.
         point = point_at(curve, since + k * STEP, state.yaw, version)
         yaw += wrapped(point.yaw - yaw)
         wanted[k, 0], wanted[k, 1], wanted[k, 2], wanted[k, 3] = point.x, point.y, yaw, point.speed
@@ -412,8 +414,7 @@ def _reference_states(state, curve, since, version):
 
 @func
 def _rollout(tried, schedule, change, model):
-    """Writes to ``tried`` the schedule that a fraction of the change of the inputs leads to, within
-    limits."""
+    """Roll out a fraction of the input change, within limits; writes the schedule to ``tried``."""
     (tried_states, tried_inputs), (states, inputs) = tried, schedule
     gain, forward, feedback = change
     for k in range(STEPS):
@@ -427,7 +428,7 @@ def _rollout(tried, schedule, change, model):
 
 @func
 def _step(states, inputs, k, model):
-    """Holds the limits of a row of inputs and writes the state that it leads to."""
+    """Clamp a row of inputs to the limits and write the resulting state."""
     before, after, vehicle = states[k], states[k + 1], model.vehicle
     x, y, yaw, speed, steering = before[0], before[1], before[2], before[3], before[4]
     a = clamped(inputs[k, 0], -vehicle.max_braking, vehicle.max_acceleration)
@@ -503,8 +504,8 @@ def _backward(states, inputs, wanted, model):
 
 @func
 def _linearise(A, B, along, model):
-    """Writes the derivatives of the next state by state [6, 6], above its diagonal, and by input
-    [6, 2]; what they leave out is 0."""
+    """Write the derivatives of the next state by state [6, 6], above the diagonal, and by input
+    [6, 2]; all other entries are 0."""
     state, after = along
     way = (state[3] + after[3]) / 2 * STEP
     middle = (state[2] + after[2]) / 2
@@ -520,8 +521,8 @@ def _linearise(A, B, along, model):
     A[0, 4] = -way * sin * by_steering / 2
     A[1, 4] = way * cos * by_steering / 2
     A[2, 4] = by_steering
-    # An input acts over the step: on average it has changed speed and angle by half of itself. So
-    # has the acceleration before it, as far as that is held.
+    # An input acts over the whole step: its mean effect on speed and angle is half of it. The same
+    # applies to the held part of the previous acceleration.
     for i in range(3):
         A[i, 5] = A[i, 3] * STEP / 2 * model.held
         B[i, 0], B[i, 1] = A[i, 3] * STEP / 2 * (1 - model.held), A[i, 4] * STEP / 2
@@ -552,17 +553,17 @@ def _transposed(result, M, N):
 
 
 class Tracker(NamedTuple):
-    """Makes the vehicle follow a plan; both are made by :func:`real2sim_server._numba.func`.
+    """A tracker; create both functions with :func:`real2sim_server._numba.func`.
 
     Attributes:
-        command: ``command(state, curve, t, vehicle, schedule)``, the :class:`.vehicle.Command` of a
-            substep, ``t`` seconds after the plan began; ``schedule`` is what was prepared (it may
-            be empty) and the seconds since then. State and time are those at which the command
-            reaches the wheels; lags that it has to allow for are ``vehicle.known_steering_lag``
-            and ``vehicle.known_drive_lag``.
-        prepare: ``prepare(state, curve, since, vehicle)``, once a clock step, ``since`` seconds
-            after the plan began: a schedule, two float64 arrays of two dimensions. None for
-            trackers that do not plan ahead.
+        command: ``command(state, curve, t, vehicle, schedule)``, returns the
+            :class:`.vehicle.Command` of a substep, ``t`` seconds after the start of the plan.
+            ``schedule`` is the prepared schedule (possibly empty) and the seconds since then. State
+            and time are predicted for the arrival of the command at the wheels; the command must
+            compensate for the lags ``vehicle.known_steering_lag`` and ``vehicle.known_drive_lag``.
+        prepare: ``prepare(state, curve, since, vehicle)``, called once per clock step, ``since``
+            seconds after the start of the plan; returns a schedule, two 2-D float64 arrays. None
+            for trackers that do not plan ahead.
     """
 
     command: Any

@@ -25,17 +25,17 @@ GENTLE_BRAKING = 2.0
 
 
 class PlanarState(NamedTuple):
-    """A vehicle on the plane, referred to its rear axle.
+    """Planar vehicle state at the rear axle.
 
     Attributes:
-        x, y: rear axle centre, world [m].
+        x, y: rear axle centre, world frame [m].
         yaw: heading [rad], not wrapped.
         speed: along the heading [m/s].
         acceleration: along the heading, mean over the last step [m/s^2].
-        steering: road-wheel angle, positive to the left [rad].
+        steering: road-wheel angle, positive left [rad].
         yaw_rate: [rad/s].
-        lateral_speed: of the rear axle, positive to the left; 0 while its wheels roll [m/s].
-        drive: acceleration that engine or brakes bring about now [m/s^2].
+        lateral_speed: lateral speed of the rear axle, positive left [m/s]; 0 without slip.
+        drive: current acceleration by engine or brakes [m/s^2].
     """
 
     x: float
@@ -58,13 +58,13 @@ class Command(NamedTuple):
 
 @func
 def clamped(value, least, most):
-    """``value``, or the bound that it is beyond."""
+    """``value`` clamped to [least, most]."""
     return min(max(value, least), most)
 
 
 @func
 def wrapped(angle):
-    """The angle [rad] less the full turns in it: within half a turn."""
+    """The angle wrapped to [-pi, pi) [rad]."""
     return angle - math.tau * math.floor(angle / math.tau + 0.5)
 
 
@@ -72,44 +72,44 @@ GRAVITY = 9.81
 
 
 def wheel_load(mass: float, height: float, base: float, arm: float, acceleration: float) -> float:
-    """Load [N] on the wheels at one end of a base, of a mass that accelerates towards that end.
+    """Load [N] on the wheels at one end of a base, for a mass accelerating towards that end.
 
-    The one formula of load transfer: of tyres along the vehicle, of the suspension along and
-    across it. Compiled code takes it through :func:`real2sim_server._numba.func`.
+    Used for the longitudinal load transfer of tyres, and for both directions of the suspension.
+    Compiled code uses it through :func:`real2sim_server._numba.func`.
 
     Args:
         mass: [kg].
-        height: of the centre of mass [m].
-        base: between the two ends [m].
-        arm: from the other end to the centre of mass [m].
+        height: height of the centre of mass [m].
+        base: distance between the two ends [m].
+        arm: distance from the other end to the centre of mass [m].
         acceleration: [m/s^2].
     """
     return max(mass * (GRAVITY * arm - acceleration * height) / base, 0.0)
 
 
 class VehicleParameters(NamedTuple):
-    """A car as two axles that carry a mass, with the limits of what moves and steers it.
+    """Two-axle vehicle parameters with actuator limits.
 
     Attributes:
-        model: number of its model, see :data:`VEHICLE_MODELS`.
+        model: number of the model, see :data:`VEHICLE_MODELS`.
         wheelbase: [m].
         mass: [kg].
         inertia: about the vertical axis through the centre of mass [kg m^2].
         front, rear: distance of each axle from the centre of mass [m].
-        height: of the centre of mass [m].
-        friction: of tyres on the road.
+        height: height of the centre of mass [m].
+        friction: tyre-road friction coefficient.
         front_cornering, rear_cornering: lateral force per load and slip angle [1/rad].
         understeer: steering angle beyond L/R per lateral acceleration [rad s^2/m]: m/L (b/C_f -
-            a/C_r) (Gillespie 1992, eq. 6-15) with stiffnesses in proportion to the loads at rest,
-            where the geometry cancels out.
-        max_steer, max_steer_rate: of the road wheels [rad], [rad/s].
+            a/C_r) (Gillespie 1992, eq. 6-15) with stiffnesses proportional to the static loads,
+            so that the geometry cancels out.
+        max_steer, max_steer_rate: limits of the road wheels [rad], [rad/s].
         max_acceleration, max_braking: [m/s^2].
         max_speed: [m/s].
         steering_delay, drive_delay: dead times of commands [s].
-        steering_lag, drive_lag: time constants of the first order [s].
-        known_steering_delay, known_steering_lag, known_drive_delay, known_drive_lag: what trackers
-            take these four to be [s]: the same, or 0 where they know nothing of them.
-        tracker_version: of the trackers, see ``EgoSpec``.
+        steering_lag, drive_lag: first-order time constants [s].
+        known_steering_delay, known_steering_lag, known_drive_delay, known_drive_lag: the same four
+            values as assumed by trackers [s]; 0 if trackers do not compensate for them.
+        tracker_version: version of the trackers, see ``EgoSpec``.
     """
 
     model: int
@@ -143,10 +143,10 @@ class VehicleParameters(NamedTuple):
 
 
 def choice(functions: Sequence[Any]) -> Any:
-    """The compiled function ``call(number, *args)``, which calls that one of ``functions``.
+    """A compiled dispatcher ``call(number, *args)`` over ``functions``.
 
-    All take the same arguments and return the same types. The number is compared one by one, which
-    costs nothing measurable for a handful of them and lets the compiler see into all of them.
+    All functions must have the same argument and return types. It is a chain of comparisons, so
+    that the compiler can inline all of them.
     """
     first, *rest = functions
     if not rest:
@@ -178,14 +178,13 @@ def step_rolling(state, command, vehicle, h):
 
 @func
 def rolling_steering(rolling, _curvature, _speed, _vehicle):
-    """Road-wheel angle [rad] that keeps a curvature: that of wheels that roll."""
+    """Road-wheel angle [rad] for a curvature, without slip."""
     return rolling
 
 
 @func
 def rolled(state, command, acceleration, vehicle, h):
-    """Kinematic bicycle: wheels go where they point; what brings ``acceleration`` about may be
-    asked for more."""
+    """Kinematic bicycle step with ``acceleration``, which may be below the commanded one."""
     steering = _limited_steering(state.steering, command.steering, vehicle, h)
     speed, distance = _limited_speed(state.speed, acceleration, vehicle, h)
     curvature = math.tan((state.steering + steering) / 2) / vehicle.wheelbase
@@ -214,7 +213,7 @@ def _limited_steering(steering, wanted, vehicle, h):
 
 @func
 def _limited_speed(speed, wanted, vehicle, h):
-    """Speed after ``h`` seconds and distance covered; linear in time until a limit is met."""
+    """Speed after ``h`` seconds and distance covered; linear in time up to the limits."""
     acceleration = clamped(wanted, -vehicle.max_braking, vehicle.max_acceleration)
     if acceleration == 0.0:
         return speed, speed * h
@@ -228,7 +227,7 @@ def _limited_speed(speed, wanted, vehicle, h):
 
 @func
 def sinc(angle):
-    """sin(angle) / angle, by its series near 0 where the quotient loses its digits."""
+    """sin(angle) / angle, by its series near 0 to avoid cancellation."""
     if abs(angle) < 1e-4:
         return 1.0 - angle * angle / 6.0
     return math.sin(angle) / angle
@@ -245,7 +244,7 @@ its lateral motion fades into that of the tyres [m/s]."""
 
 @func
 def tyre_weight(speed):
-    """Weight of the tyres' lateral motion, 0 to 1; the rest is rolling."""
+    """Blending weight of the dynamic bicycle, 0 to 1; the rest is kinematic."""
     return clamped((speed - SLOWEST) / (FASTER - SLOWEST), 0.0, 1.0)
 
 
@@ -254,11 +253,11 @@ def integrate(vehicle, state, steering, acceleration, h):
     """The state ``h`` seconds later, by the classical Runge-Kutta method.
 
     Args:
-        vehicle: constants.
-        state: of the centre of mass, see :func:`rates`.
-        steering: at the beginning and the end; in between it moves linearly [rad].
+        vehicle: vehicle constants.
+        state: state of the centre of mass, see :func:`rates`.
+        steering: angle at the start and the end, linear in between [rad].
         acceleration: by engine or brakes [m/s^2].
-        h: at most 10 ms; the fastest motion is that of the tyres, about 1/(60 vx) s.
+        h: at most 10 ms; the fastest time constant is that of the tyres, about 1/(60 vx) s.
     """
     begin, end = steering
     middle = (begin + end) / 2
@@ -279,8 +278,10 @@ def integrate(vehicle, state, steering, acceleration, h):
 
 @func
 def rates(vehicle, state, steering, acceleration):
-    """Time derivative of (x, y, yaw, vx, vy, yaw rate) of the centre of mass: place and heading in
-    the world, velocity in the vehicle frame."""
+    """Time derivative of (x, y, yaw, vx, vy, yaw rate) of the centre of mass.
+
+    Position and heading are in the world frame, velocity is in the vehicle frame.
+    """
     _, _, yaw, vx, vy, turn = state
     front, rear = axle_forces(vehicle, (vx, vy, turn), steering, acceleration)
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -299,11 +300,11 @@ def rates(vehicle, state, steering, acceleration):
 def axle_forces(vehicle, moving, steering, acceleration):
     """Lateral forces [N] of front and rear axle, each across its wheels.
 
-    Loads shift with the longitudinal acceleration, whose force is shared by load, so that each
-    axle's friction circle leaves it the same part for cornering.
+    Loads shift with the longitudinal acceleration. The longitudinal force is distributed by load,
+    so both axles keep the same fraction of their friction circle for cornering.
 
     Args:
-        vehicle: constants.
+        vehicle: vehicle constants.
         moving: velocity of the centre of mass in the vehicle frame [m/s], forward above 0, and
             yaw rate [rad/s].
         steering: road-wheel angle [rad].
@@ -361,7 +362,7 @@ def _integrated(state, rate, h):
 
 @func
 def step_slipping(state, command, vehicle, h):
-    """The vehicle ``h`` seconds later; fades into the kinematic bicycle where it is slow."""
+    """The vehicle ``h`` seconds later; blends into the kinematic bicycle at low speed."""
     most = vehicle.friction * GRAVITY
     limited = clamped(command.acceleration, -most, most)
     rolling = rolled(state, command, limited, vehicle, h)
@@ -396,8 +397,7 @@ def step_slipping(state, command, vehicle, h):
 
 @func
 def understeer_steering(rolling, curvature, speed, vehicle):
-    """Road-wheel angle [rad] that keeps a curvature: more than that of wheels that roll, by the
-    understeer at the lateral acceleration."""
+    """Road-wheel angle [rad] for a curvature: the no-slip angle plus the understeer angle."""
     return rolling + vehicle.understeer * speed**2 * curvature
 
 
@@ -405,17 +405,17 @@ def understeer_steering(rolling, curvature, speed, vehicle):
 
 
 class VehicleModel(NamedTuple):
-    """How a vehicle moves; both are made by :func:`real2sim_server._numba.func`.
+    """A vehicle model; create both functions with :func:`real2sim_server._numba.func`.
 
     Attributes:
-        step: ``step(state, command, vehicle, h)``, the :class:`PlanarState` ``h`` seconds
-            later (at most 10 ms) under a :class:`Command` that has reached the wheels, for
-            :class:`.vehicle.VehicleParameters`; holds their limits.
-        steady_steering: ``steady_steering(rolling, curvature, speed, vehicle)``, the road-wheel
-            angle [rad] that keeps a curvature [1/m] at a speed [m/s], where wheels that only roll
-            would need the angle ``rolling``. Trackers steer by it.
-        backwards: name of the model whose mirror image drives backwards in its place, at the low
-            speeds of a reverse gear; None for a model that cannot.
+        step: ``step(state, command, vehicle, h)``, returns the :class:`PlanarState` ``h`` seconds
+            later (at most 10 ms) under a :class:`Command` that has reached the wheels; must obey
+            the limits of the :class:`.vehicle.VehicleParameters`.
+        steady_steering: ``steady_steering(rolling, curvature, speed, vehicle)``, returns the
+            road-wheel angle [rad] for a curvature [1/m] at a speed [m/s]; ``rolling`` is the angle
+            without slip. Used by trackers.
+        backwards: name of the model whose mirror image is used in reverse gear, at low speed; None
+            if the model cannot reverse.
     """
 
     step: Any
@@ -474,20 +474,20 @@ def vehicle_parameters(spec: EgoSpec) -> VehicleParameters:
 
 # --- Actuators -----------------------------------------------------------------------------------
 
-# Dead times, followed by first-order lags, lie between a command and the wheels.
+# Commands reach the wheels after a dead time and a first-order lag.
 
 
 @func
 def delay_line(pending, vehicle, h):
-    """The line of delayed commands in substeps of ``h`` seconds, and one more.
+    """The delay line of commands in substeps of ``h`` seconds, with one extra row.
 
     Args:
-        pending: [W, 2] float64, on their way, newest first.
-        vehicle: constants.
+        pending: [W, 2] float64, delayed commands, newest first.
+        vehicle: vehicle constants.
         h: [s].
 
     Returns:
-        Line [D + 1, 2] float64 for delays of D substeps, and how many of its rows are in use.
+        Line [D + 1, 2] float64 for delays of D substeps, and the number of rows in use.
     """
     longest = max(delay_substeps(vehicle.drive_delay, h), delay_substeps(vehicle.steering_delay, h))
     line = np.empty((longest + 1, 2))
@@ -499,7 +499,7 @@ def delay_line(pending, vehicle, h):
 
 @func
 def delayed_commands(line, waiting):
-    """The commands still on their way: [W, 2] float64, newest first."""
+    """The delayed commands [W, 2] float64, newest first."""
     pending = np.empty((min(waiting, len(line) - 1), 2))
     for k in range(len(pending)):
         pending[k, 0], pending[k, 1] = line[k, 0], line[k, 1]
@@ -508,12 +508,12 @@ def delayed_commands(line, waiting):
 
 @func
 def push_command(line, waiting, command):
-    """Puts a command at the head of those on their way; how many they are now.
+    """Push a command to the head of the delay line; return the number of rows in use.
 
     Args:
-        line: [W, 2] float64, commands newest first; the last drops out where it is full.
-        waiting: rows of it in use.
-        command: the command now.
+        line: [W, 2] float64, commands, newest first; the last one drops out of a full line.
+        waiting: number of rows in use.
+        command: current command.
     """
     waiting = min(waiting + 1, len(line))
     for k in range(waiting - 1, 0, -1):
@@ -524,17 +524,16 @@ def push_command(line, waiting, command):
 
 @func
 def actuator_outputs(queue, state, vehicle, h, ahead):
-    """What engine, brakes and steering gear aim at in a substep of ``h`` seconds.
+    """Targets of engine, brakes and steering in a substep of ``h`` seconds.
 
-    Until the first command arrives they keep what they do.
+    Until the first command arrives, actuators hold their output.
 
     Args:
-        queue: line of commands and how many of its rows are in use.
-        state: of the vehicle when the substep begins.
-        vehicle: constants.
+        queue: delay line and the number of rows in use.
+        state: vehicle state at the start of the substep.
+        vehicle: vehicle constants.
         h: [s].
-        ahead: substeps after that in which the newest command was given; commands that are not
-            given yet are taken to be like the newest.
+        ahead: substeps since the newest command; future commands are assumed to equal it.
     """
     line, waiting = queue
     drive, steering = state.drive, state.steering
@@ -558,8 +557,7 @@ def delay_substeps(delay, h):
 
 @func
 def leading(value, wanted, h, lag):
-    """What to ask of a first-order lag at ``value`` so that it is at ``wanted`` ``h`` seconds
-    later."""
+    """Input that moves a first-order lag from ``value`` to ``wanted`` in ``h`` seconds."""
     if lag == 0.0:
         return wanted
     return value - (wanted - value) / math.expm1(-h / lag)
@@ -567,7 +565,7 @@ def leading(value, wanted, h, lag):
 
 @func
 def _first_order_lag(value, wanted, h, lag):
-    """Where a first-order lag is ``h`` seconds later."""
+    """Output of a first-order lag ``h`` seconds later."""
     if lag == 0.0:
         return wanted
     return value - (wanted - value) * math.expm1(-h / lag)
@@ -575,20 +573,20 @@ def _first_order_lag(value, wanted, h, lag):
 
 # --- Prediction ----------------------------------------------------------------------------------
 
-# Trackers that know the dead times decide for the state in which their command will take effect (a
-# Smith predictor without model error), so that dead time does not make the loop less stable.
+# Trackers that know the dead times compute commands for the state at which they take effect (a
+# Smith predictor without model error), so that dead time does not destabilise the loop.
 
 
 @func
 def foreseen_state(state, queue, vehicle, h, substeps):
-    """The vehicle some substeps later, under the commands that are on their way.
+    """The predicted vehicle some substeps later, under the delayed commands.
 
     Args:
-        state: of the vehicle.
-        queue: line of commands and how many of its rows are in use.
-        vehicle: constants.
+        state: vehicle state.
+        queue: delay line and the number of rows in use.
+        vehicle: vehicle constants.
         h: length of a substep [s].
-        substeps: how many.
+        substeps: number of substeps.
     """
     for k in range(substeps):
         outputs = actuator_outputs(queue, state, vehicle, h, k + 1)

@@ -1,4 +1,4 @@
-"""Controllers of the ego: they follow the plan in effect, or the log before any plan."""
+"""Controllers of the ego: they follow the active plan, or the log before the first plan."""
 
 from __future__ import annotations
 
@@ -39,13 +39,12 @@ from .plan import (
 @made_quickly
 @dataclass(frozen=True, eq=False)
 class ControlledTracker:
-    """A controller in the vehicle, bound by the vehicle's limits; knows nothing of the past, so
-    that a copied world goes on alike.
+    """A tracker within the limits of the vehicle; stateless, so worlds can be forked.
 
     Attributes:
         kind: number of the tracker, see :mod:`..driving.trackers`.
-        reference: what is followed.
-        spec: of the vehicle.
+        reference: reference trajectory.
+        spec: vehicle specification.
     """
 
     kind: int
@@ -56,38 +55,39 @@ class ControlledTracker:
         """The vehicle ``dt_us`` later.
 
         Args:
-            motion: now.
-            since: time since the reference began [s].
-            dt_us: how far to go [us].
+            motion: current motion.
+            since: time since the start of the reference [s].
+            dt_us: duration [us].
         """
         return advance_motion(
             motion, self.reference.control_law(self.kind), self.spec, dt_us, since=since
         )
 
     def command(self, motion: Motion, t: float) -> Command:
-        """What to do in a motion, ``t`` seconds after the reference began."""
+        """The command for a motion, ``t`` seconds after the start of the reference."""
         return commanded(motion, self.reference.control_law(self.kind), self.spec, since=t)
 
     def put_back(self, seam: LoopTransform) -> Self:
-        """The tracker of a vehicle that was put back over the seam."""
+        """The tracker after a loop reset of the vehicle."""
         return replace(self, reference=self.reference.put_back(seam))
 
 
 @dataclass(frozen=True, eq=False)
 class PerfectTracker:
-    """No controller at all: the vehicle is put where the plan is. For open-loop comparisons; obeys
-    no limit of any vehicle.
+    """Moves the vehicle exactly along the plan, without any vehicle limits.
+
+    For open-loop comparisons.
 
     Attributes:
-        reference: what is followed.
-        spec: of the vehicle.
+        reference: reference trajectory.
+        spec: vehicle specification.
     """
 
     reference: ReferenceTrajectory
     spec: EgoSpec
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
-        """The vehicle ``dt_us`` later: the plan's place, or its last one once it is over."""
+        """The vehicle ``dt_us`` later, at the planned pose (the last one after the plan's end)."""
         t = since + dt_us * 1e-6
         if t >= self.reference.end:
             return teleported(motion, self.reference.last_pose, self.spec, dt_us)
@@ -98,22 +98,22 @@ class PerfectTracker:
         return teleported(motion, (x, y, yaw), self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
-        """What an LQR would do; for vehicles that were pushed."""
+        """The LQR command; used for vehicles pushed by an impact."""
         return commanded(motion, self.reference.control_law(LQR), self.spec, since=t)
 
     def put_back(self, seam: LoopTransform) -> Self:
-        """The tracker of a vehicle that was put back over the seam."""
+        """The tracker after a loop reset of the vehicle."""
         return replace(self, reference=self.reference.put_back(seam))
 
 
 @dataclass(frozen=True, eq=False)
 class GearedLeg:
-    """A leg of a plan as it is followed.
+    """A leg of a plan with its reference.
 
     Attributes:
-        backwards: whether in reverse gear; the reference is then the mirror image's.
-        begin_us, end_us: from the beginning of the plan [us].
-        reference: what is followed.
+        backwards: whether it is driven in reverse gear; the reference is mirrored then.
+        begin_us, end_us: relative to the start of the plan [us].
+        reference: reference trajectory.
     """
 
     backwards: bool
@@ -124,12 +124,12 @@ class GearedLeg:
 
 @dataclass(frozen=True, eq=False)
 class GearedTracker:
-    """A controller that changes gear where its plan turns back.
+    """A tracker that changes gear at the cusps of its plan.
 
     Attributes:
         kind: number of the tracker, see :mod:`..driving.trackers`.
-        legs: of the plan, one after the other.
-        spec: of the vehicle.
+        legs: consecutive legs of the plan.
+        spec: vehicle specification.
     """
 
     kind: int
@@ -137,7 +137,7 @@ class GearedTracker:
     spec: EgoSpec
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
-        """The vehicle ``dt_us`` later, ``since`` seconds after the plan began."""
+        """The vehicle ``dt_us`` later, ``since`` seconds after the start of the plan."""
         at_us = round(since * 1e6)
         end_us = at_us + dt_us
         while at_us < end_us:
@@ -155,14 +155,14 @@ class GearedTracker:
         return motion
 
     def command(self, motion: Motion, t: float) -> Command:
-        """What to do in a motion, ``t`` seconds after the plan began."""
+        """The command for a motion, ``t`` seconds after the start of the plan."""
         leg = self._leg_at(round(t * 1e6))
         law = leg.reference.control_law(self.kind)
         since = t - leg.begin_us * 1e-6
         return command_in_gear(motion, law, self.spec, since=since, backwards=leg.backwards)
 
     def put_back(self, seam: LoopTransform) -> Self:
-        """The tracker of a vehicle that was put back over the seam."""
+        """The tracker after a loop reset of the vehicle."""
         legs = [replace(leg, reference=leg.reference.put_back(seam)) for leg in self.legs]
         return replace(self, legs=tuple(legs))
 
@@ -177,8 +177,10 @@ def tracker_of(
     spec: EgoSpec,
     before: SinglePose | None = None,
 ) -> ControlledTracker | GearedTracker | PerfectTracker:
-    """The tracker that the spec names, of a vehicle that is in ``motion`` at ``start_us``;
-    ``before``: what a trajectory of a single pose goes on from."""
+    """The tracker of a spec, for a vehicle in ``motion`` at ``start_us``.
+
+    ``before``: the pose of the previous plan, for plans of a single pose.
+    """
     if spec.tracker != "perfect" and can_reverse(spec):
         legs = legs_of(trajectory, motion, before)
         if len(legs) > 1 or legs[0].backwards or motion.reversing or motion.speed < 0:
@@ -213,7 +215,7 @@ def _geared(
 def make_tracker(
     reference: ReferenceTrajectory, spec: EgoSpec
 ) -> ControlledTracker | PerfectTracker:
-    """The tracker that the spec names, of a plan that leads forwards."""
+    """The tracker of a spec, for a plan that leads forwards."""
     if spec.tracker == "perfect":
         return PerfectTracker(reference, spec)
     return ControlledTracker(KINDS[spec.tracker], reference, spec)
@@ -233,24 +235,24 @@ class Controller(Protocol):
     """Moves the ego until another one takes over."""
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
-        """The vehicle ``dt_us`` later; ``since`` seconds after the controller began."""
+        """The vehicle ``dt_us`` later, ``since`` seconds after the controller's start."""
 
     def command(self, motion: Motion, t: float) -> Command:
-        """What it would do in a motion, ``t`` seconds after it began."""
+        """The command for a motion, ``t`` seconds after the controller's start."""
 
     def put_back(self, seam: LoopTransform) -> Self:
-        """The controller of an ego that was put back over the seam."""
+        """The controller after a loop reset of the ego."""
 
 
 @made_quickly
 @dataclass(frozen=True)
 class ConstantCommand:
-    """The same command all the time.
+    """A constant command.
 
     Attributes:
         constant: acceleration in the direction of the gear, and road-wheel angle.
-        spec: of the vehicle.
-        gear: in which it was given; None: the one that is engaged.
+        spec: vehicle specification.
+        gear: gear of the command; None for the engaged one.
     """
 
     constant: Command
@@ -268,7 +270,7 @@ class ConstantCommand:
         return advance_in_gear(motion, law, self.spec, dt_us, since=0.0, backwards=backwards)
 
     def command(self, motion: Motion, t: float) -> Command:
-        """That command, along the heading."""
+        """The constant command, along the heading."""
         acceleration, steering = self.constant
         return Command(-acceleration if self._backwards(motion) else acceleration, steering)
 
@@ -276,19 +278,19 @@ class ConstantCommand:
         return self.gear == "reverse" if self.gear is not None else motion.reversing
 
     def put_back(self, seam: LoopTransform) -> Self:
-        """Itself: a command has no place."""
+        """Returns itself: a command is independent of the position."""
         return self
 
 
 @dataclass(frozen=True)
 class Teleport:
-    """The vehicle is put somewhere and stays there."""
+    """Places the vehicle at a pose, where it stays."""
 
     pose: Pose
     spec: EgoSpec
 
     def advance(self, motion: Motion, since: float, dt_us: int) -> Motion:
-        """The vehicle at its place, with the velocity that brought it there."""
+        """The vehicle at the pose, with the velocity of the displacement."""
         return teleported(motion, self.pose, self.spec, dt_us)
 
     def command(self, motion: Motion, t: float) -> Command:
@@ -296,7 +298,7 @@ class Teleport:
         return Command(-EMERGENCY_BRAKING, motion.steering)
 
     def put_back(self, seam: LoopTransform) -> Self:
-        """The pose beyond the seam."""
+        """The pose after a loop reset."""
         x, y, yaw = seam.poses(np.array([self.pose]))[0].tolist()
         return replace(self, pose=(x, y, yaw))
 
@@ -307,8 +309,8 @@ class PendingPlan:
     """A plan that has not taken effect yet.
 
     Attributes:
-        from_us: when it does [us].
-        plan: in the world.
+        from_us: time at which it takes effect [us].
+        plan: plan, world frame.
     """
 
     from_us: int
@@ -316,11 +318,11 @@ class PendingPlan:
 
     @property
     def trajectory(self) -> PlannedTrajectory | None:
-        """The plan where it is a trajectory."""
+        """The plan if it is a trajectory, else None."""
         return self.plan if isinstance(self.plan, PlannedTrajectory) else None
 
     def put_back(self, seam: LoopTransform) -> PendingPlan:
-        """The plan of an ego that was put back over the seam."""
+        """The plan after a loop reset of the ego."""
         if isinstance(self.plan, PlannedTrajectory):
             return replace(self, plan=replace(self.plan, poses=seam.poses(self.plan.poses)))
         if isinstance(self.plan, PoseCommand):
@@ -335,12 +337,12 @@ class EgoController:
     """The active controller of the ego and the pending plans. Immutable.
 
     Attributes:
-        spec: of the episode.
-        ego: as it was recorded; followed while there is no plan.
-        controller: active; None before the first plan.
-        since_us: when it took over [us].
-        pending: plans that have not taken effect yet, in the order in which they will.
-        single: the pose of the active plan, where it is one of a single pose.
+        spec: options of the episode.
+        ego: recorded trajectory, followed before the first plan.
+        controller: active controller; None before the first plan.
+        since_us: its start time [us].
+        pending: plans that have not taken effect yet, in order of activation.
+        single: pose of the active plan if it has a single pose.
     """
 
     spec: ResetSpec
@@ -351,17 +353,17 @@ class EgoController:
     single: SinglePose | None = None
 
     def with_plan(self, plan: Plan, motion: Motion, t_us: int, from_us: int) -> EgoController:
-        """With one more plan.
+        """Add a plan.
 
         Args:
-            plan: of the planner.
-            motion: that it answers.
-            t_us: of that observation [us].
-            from_us: when it takes effect [us].
+            plan: plan of the policy.
+            motion: ego motion of the observation that the plan is based on.
+            t_us: time of that observation [us].
+            from_us: time at which the plan takes effect [us].
 
         Raises:
-            WorldError: INVALID_ACTION for another kind than the reset named, or times that are
-                over.
+            WorldError: INVALID_ACTION if the kind differs from that of the reset, or its times have
+                passed.
         """
         if plan.kind != self.spec.action:
             raise WorldError(
@@ -390,7 +392,7 @@ class EgoController:
         return copy_with(self, pending=pending)
 
     def advance(self, motion: Motion, t_us: int, us: int) -> tuple[EgoController, Motion]:
-        """Controller and vehicle ``us`` later than ``t_us``."""
+        """Controller and vehicle ``us`` microseconds after ``t_us``."""
         current, end_us = self, t_us + us
         while t_us < end_us:
             current = current.activated(motion, t_us)
@@ -402,19 +404,19 @@ class EgoController:
         return current, motion
 
     def put_back(self, seam: LoopTransform) -> EgoController:
-        """The controller and its plans of an ego that was put back over the seam."""
+        """The controller and its plans after a loop reset of the ego."""
         controller = self.controller.put_back(seam) if self.controller is not None else None
         pending = tuple(plan.put_back(seam) for plan in self.pending)
         single = self.single and self.single.put_back(seam)
         return replace(self, controller=controller, pending=pending, single=single)
 
     def command(self, motion: Motion, t_us: int) -> Command:
-        """Of the active controller in a motion at ``t_us``."""
+        """The command of the active controller for a motion at ``t_us``."""
         assert self.controller is not None
         return self.controller.command(motion, (t_us - self.since_us) * 1e-6)
 
     def activated(self, motion: Motion, t_us: int) -> EgoController:
-        """With the newest plan that has taken effect by ``t_us`` under control."""
+        """Activate the newest plan that has taken effect by ``t_us``."""
         current = self
         while current.pending and current.pending[0].from_us <= t_us:
             plan, *rest = current.pending
@@ -441,7 +443,7 @@ class EgoController:
                 assert_never(plan)
 
     def _follow_log(self, motion: Motion, t_us: int) -> Controller:
-        # Even spacing: some logs have poses milliseconds apart, whose differences are noise.
+        # Resampled evenly: some logs have poses milliseconds apart, whose differences are noise.
         end_us = self.ego.end_us
         count = max(-(-(end_us - t_us) // LOG_SPACING_US), 1)
         times = np.linspace(t_us, max(end_us, t_us + 1), count + 1).astype(np.int64)[1:]
@@ -455,7 +457,7 @@ class EgoController:
 
 
 def emergency_brake(controller: EgoController, motion: Motion, spec: EgoSpec) -> Controller:
-    """The fallback of a planner that is late: brake, and keep the wheels as they are."""
+    """The fallback for a late planner: brake and hold the steering."""
     if controller.spec.action == "pose":
         return Teleport((motion.x, motion.y, motion.yaw), spec)
     return ConstantCommand(
@@ -464,7 +466,7 @@ def emergency_brake(controller: EgoController, motion: Motion, spec: EgoSpec) ->
 
 
 def plan_in_world(plan: Plan, motion: Motion) -> WorldPlan:
-    """A plan that answers the observation of ``motion``, with its poses in the world."""
+    """The plan in the world frame; ``motion`` is the ego motion that it is based on."""
     if not isinstance(plan, TrajectoryPlan):
         return plan
     frame = (motion.x, motion.y, motion.yaw) if plan.frame == "vehicle" else None

@@ -1,4 +1,4 @@
-"""Motion of the controlled vehicle: a bicycle on the plane at its rear axle, and its suspension."""
+"""Motion of the controlled vehicle: a planar bicycle model at the rear axle, and suspension."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Motion(NamedTuple):
     """Planar state of the vehicle: a :class:`..driving.PlanarState`, and delayed commands.
 
     Attributes:
-        pending: commands on their way to the wheels, newest first; one for each 10 ms of delay.
+        pending: delayed commands, newest first, one per 10 ms of delay.
         reversing: whether the reverse gear is engaged, see :mod:`.plan`.
     """
 
@@ -61,7 +61,7 @@ class Motion(NamedTuple):
 
     @property
     def velocity(self) -> tuple[float, float]:
-        """Of the rear axle in the world [m/s]."""
+        """Velocity of the rear axle, world frame [m/s]."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return (
             self.speed * cos - self.lateral_speed * sin,
@@ -70,19 +70,19 @@ class Motion(NamedTuple):
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """All but pending commands and gear, as :mod:`..driving` takes a state."""
+        """The state in the form of :mod:`..driving`, without pending commands and gear."""
         x, y, yaw, speed, acceleration, steering, yaw_rate, lateral_speed, drive, _, _ = self
         kinematic = (float(x), float(y), float(yaw), float(speed), float(acceleration))
         return (*kinematic, float(steering), float(yaw_rate), float(lateral_speed), float(drive))
 
 
 class ControlLaw(NamedTuple):
-    """Gives commands to the vehicle, see :func:`..driving.advance_vehicle`.
+    """Source of vehicle commands, see :func:`..driving.advance_vehicle`.
 
     Attributes:
         kind: HOLD, PURSUIT, LQR or ILQR.
-        knots, turn_rate: the plan that trackers follow.
-        hold: the command of HOLD.
+        knots, turn_rate: plan of a tracker.
+        hold: command of HOLD.
     """
 
     kind: int
@@ -93,12 +93,12 @@ class ControlLaw(NamedTuple):
     def arguments(
         self, since: float, schedule: Schedules = NO_SCHEDULE
     ) -> tuple[int, Float, float, float, tuple[float, float], Schedules]:
-        """The law ``since`` seconds after its plan began, as :mod:`..driving` takes it."""
+        """The law in the form of :mod:`..driving`, ``since`` seconds after the plan's start."""
         return self.kind, self.knots, self.turn_rate, since, self.hold, schedule
 
 
 def constant_law(command: Command) -> ControlLaw:
-    """Gives the same command all the time."""
+    """A law with a constant command."""
     return ControlLaw(HOLD, hold=(float(command.acceleration), float(command.steering)))
 
 
@@ -108,11 +108,11 @@ def advance_motion(
     """The vehicle ``dt_us`` later, see :func:`..driving.advance_vehicle`.
 
     Args:
-        motion: now.
-        law: gives its commands.
-        spec: of the vehicle.
-        dt_us: how far to go [us].
-        since: time since the law's plan began [s].
+        motion: current motion.
+        law: source of commands.
+        spec: vehicle specification.
+        dt_us: duration [us].
+        since: time since the start of the law's plan [s].
     """
     pending = np.array(motion.pending) if motion.pending else NOTHING_PENDING
     vehicle = tuple(vehicle_parameters(spec))
@@ -126,7 +126,7 @@ def advance_motion(
 
 
 def commanded(motion: Motion, law: ControlLaw, spec: EgoSpec, *, since: float = 0.0) -> Command:
-    """The command of the law, ``since`` seconds after its plan began."""
+    """The command of the law, ``since`` seconds after its plan's start."""
     return Command(
         *driver_command(motion.numbers, law.arguments(since), tuple(vehicle_parameters(spec)))
     )
@@ -135,10 +135,10 @@ def commanded(motion: Motion, law: ControlLaw, spec: EgoSpec, *, since: float = 
 def teleported(
     motion: Motion, pose: tuple[float, float, float], spec: EgoSpec, dt_us: int
 ) -> Motion:
-    """The vehicle put to ``pose`` x, y [m], yaw [rad]; its velocities follow from the way there.
+    """The vehicle moved to ``pose`` x, y [m], yaw [rad], with velocities from the displacement.
 
-    The way is taken as the arc that ends with the new heading, so that a pose sequence along a
-    circle has the speed along the circle.
+    The path is an arc that ends in the new heading, so that poses along a circle have the speed
+    along the circle.
     """
     x, y, yaw = pose
     seconds = dt_us * 1e-6
@@ -199,16 +199,15 @@ def _steering_of(speed: float, yaw_rate: float, spec: EgoSpec) -> float:
 
 # --- Suspension ----------------------------------------------------------------------------------
 
-# Load transfer between axles or sides compresses the springs; the body follows as a damped
-# oscillator and moves the cameras. Dynamics and contact ignore it: tyres get the load transfer at
-# once, and boxes in contact stay level. A body at constant velocity comes to rest level.
+# Load transfer compresses the springs; the body follows as a damped oscillator and moves the
+# cameras. Dynamics and contact ignore it: tyre loads change instantly, and boxes stay level. At
+# constant velocity the body settles level.
 #
-# The axes are the vehicle's: pitch is about y, positive nose down; roll is about x, positive to the
-# right.
+# Axes are those of the vehicle: pitch about y, positive nose down; roll about x, positive right.
 
 
 class BodyAttitude(NamedTuple):
-    """Pitch and roll against the ground [rad], and their rates [rad/s]."""
+    """Pitch and roll relative to the ground [rad], and their rates [rad/s]."""
 
     pitch: float = 0.0
     pitch_rate: float = 0.0
@@ -226,15 +225,15 @@ Value = TypeVar("Value", float, Float)
 
 
 class Suspension(NamedTuple):
-    """Springs of a body.
+    """Suspension parameters.
 
     Attributes:
-        vehicle: on its wheels.
-        pitch, roll: angle per load that goes to the front axle, or to the left side [rad/N].
-        pitch_frequency, roll_frequency: natural, undamped [rad/s].
-        damping: of the critical one.
-        track: between left and right wheels [m].
-        lift: height of the rear axle's place in the body per pitch [m/rad].
+        vehicle: vehicle parameters.
+        pitch, roll: angle per load transferred to the front axle, or to the left side [rad/N].
+        pitch_frequency, roll_frequency: undamped natural frequencies [rad/s].
+        damping: damping ratio.
+        track: distance between left and right wheels [m].
+        lift: vertical motion of the body at the rear axle per pitch angle [m/rad].
     """
 
     vehicle: VehicleParameters
@@ -252,14 +251,14 @@ def sprung(
 ) -> BodyAttitude:
     """The attitude ``seconds`` later, at the end of a step.
 
-    Tyres make the accelerations that tilt a body, so what is beyond their friction (an impact) does
-    not count. A body without suspension, and one that is put somewhere by poses, is level.
+    Accelerations are limited to the tyre friction, so impacts do not tilt the body. A body without
+    suspension or placed by poses is level.
 
     Args:
-        attitude: before.
-        before, after: motion of the vehicle; the acceleration of ``after`` is the step's mean.
-        seconds: of the step.
-        ego: of the episode.
+        attitude: attitude before the step.
+        before, after: vehicle motion; the acceleration of ``after`` is the mean over the step.
+        seconds: duration of the step.
+        ego: ego options of the episode.
     """
     if ego.suspension is None or ego.tracker == "perfect":
         return LEVEL
@@ -276,7 +275,7 @@ def sprung(
         attitude.pitch, attitude.pitch_rate, springs.pitch * to_front, seconds,
         (springs.pitch_frequency, springs.damping),
     )  # fmt: skip
-    # A body rolls away from the side that is relieved.
+    # A body rolls away from the unloaded side.
     roll = _oscillated(
         attitude.roll, attitude.roll_rate, -springs.roll * to_left, seconds,
         (springs.roll_frequency, springs.damping),
@@ -287,13 +286,13 @@ def sprung(
 def sprung_side_by_side(
     attitudes: Float, before: Float, after: Float, seconds: float, ego: EgoSpec
 ) -> Float:
-    """What :func:`sprung` does, to the bit, of many vehicles.
+    """:func:`sprung` for many vehicles, with bitwise equal results.
 
     Args:
-        attitudes: [W, 4] float64, a :class:`BodyAttitude` a row.
-        before, after: [W, 9] float64, a ``driving.PlanarState`` a row.
-        seconds: of the step.
-        ego: of a vehicle on springs that is steered.
+        attitudes: [W, 4] float64, one :class:`BodyAttitude` per row.
+        before, after: [W, 9] float64, one ``driving.PlanarState`` per row.
+        seconds: duration of the step.
+        ego: options of a vehicle with suspension that is not placed by poses.
     """
     springs = suspension_of(ego)
     vehicle, mass, height = springs.vehicle, springs.vehicle.mass, springs.vehicle.height
@@ -320,12 +319,12 @@ def sprung_side_by_side(
 
 
 def tilted(T_world_vehicle: Float, attitude: BodyAttitude, ego: EgoSpec) -> Float:
-    """``T_world_body`` [4, 4] of the body over a vehicle that stands level on the ground."""
+    """``T_world_body`` [4, 4] of the sprung body of a vehicle that is level on the ground."""
     if attitude == LEVEL or ego.suspension is None:
         return T_world_vehicle
     cos_p, sin_p = math.cos(attitude.pitch), math.sin(attitude.pitch)
     cos_r, sin_r = math.cos(attitude.roll), math.sin(attitude.roll)
-    # Of one flat tuple: nested lists take twice as long.
+    # A flat tuple: nested lists take twice as long.
     T_vehicle_body = np.array(
         (
             *(cos_p, sin_p * sin_r, sin_p * cos_r, 0.0),
@@ -341,12 +340,12 @@ def tilted(T_world_vehicle: Float, attitude: BodyAttitude, ego: EgoSpec) -> Floa
 @cache_by_identity
 @lru_cache(maxsize=256)
 def suspension_of(ego: EgoSpec) -> Suspension:
-    """The springs of a vehicle that has some."""
+    """The suspension of a vehicle; the spec must have one."""
     spec, vehicle = ego.suspension, vehicle_parameters(ego)
     assert spec is not None
     length = vehicle.wheelbase
     front, rear = (2 * math.pi * f for f in (spec.front_frequency, spec.rear_frequency))
-    # Springs carry the mass at their axle with its ride frequency: k = m w^2.
+    # Springs carry the mass at their axle at its ride frequency: k = m w^2.
     at_front, at_rear = vehicle.mass * vehicle.rear / length, vehicle.mass * vehicle.front / length
     soft_front, soft_rear = 1 / (at_front * front**2), 1 / (at_rear * rear**2)
     # Masses at the wheels: inertias m a b in pitch and m (track / 2)^2 in roll.
@@ -366,12 +365,12 @@ def suspension_of(ego: EgoSpec) -> Suspension:
 
 
 def _roll_per_load(spec: SuspensionSpec, stiffness: float) -> float:
-    """Half of the springs is at each side, and each side moves by the load that it gets."""
+    """Roll angle per load: each side has half of the springs and moves by its load change."""
     return (1 - spec.roll_resistance) * 2 / (stiffness / 2) / spec.track
 
 
 def _transfer(vehicle: VehicleParameters, base: float, arm: float, acceleration: float) -> float:
-    """Load [N] that goes towards an end of a base as the vehicle accelerates towards it."""
+    """Load change [N] at one end of a base as the vehicle accelerates towards it."""
     mass, height = vehicle.mass, vehicle.height
     return wheel_load(mass, height, base, arm, acceleration) - wheel_load(
         mass, height, base, arm, 0.0
@@ -381,8 +380,10 @@ def _transfer(vehicle: VehicleParameters, base: float, arm: float, acceleration:
 def _oscillated(
     value: Value, rate: Value, rest: Value, seconds: float, oscillator: tuple[float, float]
 ) -> tuple[Value, Value]:
-    """Value and rate of a damped oscillator (its frequency [rad/s] and damping, below 1) that is
-    drawn to ``rest``, ``seconds`` later: exact for steps of any length."""
+    """Value and rate of a damped oscillator ``seconds`` later; exact for any step length.
+
+    Takes its frequency [rad/s], damping ratio below 1, and equilibrium ``rest``.
+    """
     frequency, damping = oscillator
     decay, swing = damping * frequency, frequency * math.sqrt(1 - damping * damping)
     cos, sin = math.cos(swing * seconds), math.sin(swing * seconds)

@@ -1,4 +1,4 @@
-"""Planned trajectories: the reference to follow, its legs of one gear each, and reverse gear."""
+"""Planned trajectories: the reference to follow, legs of one gear each, and reverse gear."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ MAX_GAP_US = 1_000_000
 @made_quickly
 @dataclass(frozen=True, eq=False)
 class PlannedTrajectory:
-    """Where a planner wants to be when.
+    """A planned trajectory: poses with times.
 
     Attributes:
         times_us: [N] int64, increasing [us].
-        poses: [N, 3] float64, x, y [m], yaw [rad], world.
-        is_clear: whether it is known already to lead forwards.
+        poses: [N, 3] float64, x, y [m], yaw [rad], world frame.
+        is_clear: whether it is already known to lead forwards.
     """
 
     times_us: NDArray[np.int64]
@@ -61,7 +61,7 @@ class PlannedTrajectory:
     def of(
         times_us: Sequence[int], poses: Sequence[Pose], frame: Pose | None = None
     ) -> PlannedTrajectory:
-        """The trajectory through poses of a frame, given by its pose in the world; None: world."""
+        """The trajectory from poses in a frame, whose world pose is given; None for the world."""
         numbers, is_clear = np.array(poses, np.float64), False
         if frame is not None:
             numbers, is_clear = placed_poses(numbers, frame, CLEARLY)
@@ -69,7 +69,7 @@ class PlannedTrajectory:
 
     @cached_property
     def leads_forwards(self) -> bool:
-        """Whether no pose lies behind the one before, as both head."""
+        """Whether no pose is behind its predecessor along their mean heading."""
         if len(self.poses) < 2:
             return False
         return (
@@ -77,7 +77,7 @@ class PlannedTrajectory:
         )
 
     def after(self, t_us: int) -> PlannedTrajectory:
-        """What of it is still to come: its end, at once, where all of it is over."""
+        """The part after ``t_us``; the last pose, immediately, if all of it has passed."""
         if t_us < self.times_us.item(0):
             return self
         over = int(np.searchsorted(self.times_us, t_us, side="right"))
@@ -87,8 +87,10 @@ class PlannedTrajectory:
 
 
 def _leads_ahead(poses: Float) -> bool:
-    """Whether a plan of a few poses clearly goes along its headings everywhere, as nearly all do:
-    without the arrays of :func:`ways_along`, which take twice as long."""
+    """Quick test whether a short plan clearly leads forwards, as nearly all plans do.
+
+    Twice as fast as the arrays of :func:`ways_along`.
+    """
     if len(poses) > FEW:
         return False
     x, y, yaw = poses[0].tolist()
@@ -102,7 +104,7 @@ def _leads_ahead(poses: Float) -> bool:
 
 
 def ways_along(poses: Float) -> Float:
-    """[..., N - 1] way from each of poses [..., N, 3] to the next along their mean heading [m]."""
+    """[..., N - 1] distances between consecutive poses [..., N, 3] along their mean heading [m]."""
     x, y, yaw = poses[..., 0], poses[..., 1], poses[..., 2]
     cos, sin = np.cos(yaw), np.sin(yaw)
     dx, dy = x[..., 1:] - x[..., :-1], y[..., 1:] - y[..., :-1]
@@ -111,10 +113,10 @@ def ways_along(poses: Float) -> Float:
 
 
 class SinglePose(NamedTuple):
-    """The only pose of a plan, in the world; the next plan of one pose goes on from it.
+    """The pose of a single-pose plan, world frame; start of the next single-pose plan.
 
     Attributes:
-        at_us: when the vehicle is to be there [us].
+        at_us: target time [us].
         x, y: [m].
         yaw: [rad].
     """
@@ -126,28 +128,33 @@ class SinglePose(NamedTuple):
 
     @staticmethod
     def of(trajectory: PlannedTrajectory) -> SinglePose | None:
-        """That of a plan, if it has one only."""
+        """The pose of a plan if it has only one, else None."""
         if len(trajectory.poses) != 1:
             return None
         return SinglePose(int(trajectory.times_us[0]), *trajectory.poses[0].tolist())
 
     def before(self, start_us: int, at_us: int) -> tuple[float, float, float, float]:
-        """As :func:`..driving.plan_curve` takes it for a plan that begins at ``start_us`` and whose
-        pose is for ``at_us``; none where it is too old to say how fast that plan goes."""
+        """The ``before`` argument of :func:`..driving.plan_curve`, for a plan from ``start_us``.
+
+        ``at_us`` is the time of that plan's pose. ``NO_POSE`` if this one is too old to give a
+        speed.
+        """
         if not 0 < at_us - self.at_us <= MAX_GAP_US:
             return NO_POSE
         return (self.at_us - start_us) * 1e-6, self.x, self.y, self.yaw
 
     def speed_to(self, at_us: int, pose: Float) -> float | None:
-        """Mean speed along the headings [m/s] to the pose [3] of the next plan; None where that is
-        not one to go on to."""
+        """Mean speed along the headings [m/s] to the pose [3] of the next plan.
+
+        None if that pose does not continue this one.
+        """
         if not 0 < at_us - self.at_us <= MAX_GAP_US:
             return None
         way = ways_along(np.array([self[1:], pose]))
         return way.item() / ((at_us - self.at_us) * 1e-6)
 
     def put_back(self, seam: LoopTransform) -> SinglePose:
-        """For a vehicle that was put back over the seam."""
+        """The pose after a loop reset of the vehicle."""
         return SinglePose(self.at_us, *seam.poses(np.array([self[1:]]))[0].tolist())
 
 
@@ -163,14 +170,14 @@ class ReferenceTrajectory:
         spec: EgoSpec,
         before: SinglePose | None = None,
     ) -> None:
-        """The curve of a vehicle that is in ``motion`` at ``start_us``.
+        """The curve for a vehicle in ``motion`` at ``start_us``.
 
         Args:
-            motion: of the vehicle.
-            start_us: now [us].
-            trajectory: after ``start_us``.
-            spec: of the vehicle.
-            before: what a trajectory of a single pose goes on from.
+            motion: vehicle motion.
+            start_us: current time [us].
+            trajectory: trajectory after ``start_us``.
+            spec: vehicle specification.
+            before: pose of the previous plan, for single-pose trajectories.
         """
         goes_on = NO_POSE
         if before is not None and len(trajectory.poses) == 1:
@@ -184,20 +191,20 @@ class ReferenceTrajectory:
 
     @property
     def end(self) -> float:
-        """Time of the last pose, from the start [s]."""
+        """Time of the last pose, relative to the start [s]."""
         return float(self._curve[0][-1, 0])
 
     @property
     def last_pose(self) -> Pose:
-        """x, y [m], yaw [rad] in the world."""
+        """x, y [m], yaw [rad], world frame."""
         _, x, y, yaw, _, _ = self._curve[0][-1].tolist()
         return x, y, yaw
 
     def put_back(self, seam: LoopTransform) -> ReferenceTrajectory:
-        """The curve of a vehicle that was put back over the seam."""
+        """The curve after a loop reset of the vehicle."""
         knots = self._curve[0].copy()
         knots[:, 1:4] = seam.poses(knots[:, 1:4])
-        # The tangents turn, and have no place.
+        # Tangents are only rotated.
         vx, vy, cos, sin = knots[:, 4], knots[:, 5], math.cos(seam.turn), math.sin(seam.turn)
         knots[:, 4:6] = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
         moved = copy.copy(self)
@@ -205,12 +212,14 @@ class ReferenceTrajectory:
         return moved
 
     def control_law(self, kind: int) -> ControlLaw:
-        """Follows the plan by PURSUIT, LQR or ILQR."""
+        """The law that follows the plan by PURSUIT, LQR or ILQR."""
         return ControlLaw(kind, *self._curve)
 
     def at(self, t: float) -> tuple[float, float, float, float, float]:
-        """x, y [m], velocity x, y [m/s] and planned heading [rad] in the world, ``t`` >= 0 seconds
-        after the start."""
+        """x, y [m], velocity x, y [m/s] and planned heading [rad], world frame.
+
+        ``t`` >= 0 is the time since the start [s].
+        """
         x, y, vx, vy, yaw = curve_at(self._curve, float(t))
         return x, y, vx, vy, yaw
 
@@ -234,13 +243,13 @@ wherever the vehicle is [m/s]."""
 @made_quickly
 @dataclass(frozen=True, eq=False)
 class Leg:
-    """A part of a plan.
+    """A part of a plan in one gear.
 
     Attributes:
         backwards: whether it leads against the headings of its poses.
-        trajectory: its poses after its beginning.
-        begin_us: absolute time of its beginning [us]; None for that of the plan.
-        cusp: x, y [m], yaw [rad] where it begins; None where the vehicle is.
+        trajectory: its poses after the start of the leg.
+        begin_us: absolute start time [us]; None for the start of the plan.
+        cusp: x, y [m], yaw [rad] of its start; None for the vehicle pose.
     """
 
     backwards: bool
@@ -252,8 +261,10 @@ class Leg:
 def legs_of(
     trajectory: PlannedTrajectory, motion: Motion, before: SinglePose | None = None
 ) -> tuple[Leg, ...]:
-    """The legs of a plan for a vehicle; one where it leads forwards all the way. ``before``: what
-    a plan of a single pose goes on from."""
+    """The legs of a plan for a vehicle; one leg if it leads forwards throughout.
+
+    ``before``: pose of the previous plan, for single-pose plans.
+    """
     poses = trajectory.poses
     if len(poses) == 1:
         at_us = int(trajectory.times_us[0])
@@ -280,10 +291,10 @@ def legs_of(
 
 
 def may_lead_backwards(plans: Float) -> NDArray[np.bool_]:
-    """[W] bool, whether any part of a plan goes against its headings.
+    """[W] bool, whether any part of each plan leads against its headings.
 
     Args:
-        plans: [W, N, 3] poses x, y [m], yaw [rad], each in the frame of its vehicle.
+        plans: [W, N, 3] poses x, y [m], yaw [rad], vehicle frame.
     """
     if plans.shape[1] == 1:
         x, y, yaw = plans[:, 0].T
@@ -294,7 +305,7 @@ def may_lead_backwards(plans: Float) -> NDArray[np.bool_]:
 
 
 def _turns(along: Float, *, backwards: bool) -> list[tuple[int, bool]]:
-    """Where each leg begins, and whether it leads backwards. ``backwards``: the gear before."""
+    """Start of each leg and whether it leads backwards. ``backwards``: the current gear."""
     way, farthest, place = 0.0, 0.0, 0
     turns = [(0, backwards)]
     for k, step in enumerate(along.tolist(), start=1):
@@ -322,10 +333,10 @@ def _is_behind(pose: Float, motion: Motion) -> bool:
 
 # --- Reverse gear --------------------------------------------------------------------------------
 
-# A vehicle turned by half a turn, with speeds, accelerations and steering angles of opposite sign,
-# obeys the same equations on its rear axle. Dynamics and trackers therefore only know forward
-# driving. The gear changes at rest only and has its own top speed; commands still in the actuators
-# belong to the gear in which they were given.
+# A vehicle rotated by pi, with negated speeds, accelerations and steering angles, obeys the same
+# equations at its rear axle. Dynamics and trackers therefore only implement forward driving. The
+# gear changes only at rest and reverse has its own top speed; pending commands belong to the gear
+# in which they were given.
 
 SHIFT_BRAKING = 6.0
 """Deceleration of a vehicle that still rolls on when its plan has turned back already, where it can
@@ -336,7 +347,7 @@ SHIFT_LOOK_US = 10_000
 
 
 def can_reverse(spec: EgoSpec) -> bool:
-    """Whether a vehicle has a reverse gear: a speed for it, and a model that goes backwards."""
+    """Whether a vehicle can reverse: it has a reverse speed and its model supports reversing."""
     return spec.max_reverse_speed > 0 and VEHICLE_MODELS[spec.dynamics].backwards is not None
 
 
@@ -347,7 +358,7 @@ def backwards_spec(spec: EgoSpec) -> EgoSpec:
     model = VEHICLE_MODELS[spec.dynamics].backwards
     change: dict[str, Any] = {"max_speed": spec.max_reverse_speed, "dynamics": model}
     if model != spec.dynamics:
-        # Tyres that slip set a limit which wheels that only roll do not know.
+        # Tyre friction limits the acceleration; the kinematic model has no such limit.
         grip = spec.vehicle.friction * GRAVITY
         change["max_acceleration"] = min(spec.max_acceleration, grip)
         change["max_braking"] = min(spec.max_braking, grip)
@@ -355,11 +366,11 @@ def backwards_spec(spec: EgoSpec) -> EgoSpec:
 
 
 def mirrored(motion: Motion, half_turn: float = math.pi) -> Motion:
-    """The mirror image of a vehicle, which drives forwards where that drives backwards.
+    """The mirror image of a vehicle, which drives forwards if the vehicle drives backwards.
 
     Args:
-        motion: of the vehicle.
-        half_turn: pi, and minus pi for the way back.
+        motion: vehicle motion.
+        half_turn: pi, or -pi for the inverse.
     """
     return motion._replace(
         yaw=motion.yaw + half_turn,
@@ -384,12 +395,12 @@ def advance_in_gear(
     """The vehicle ``dt_us`` later under a law of one gear.
 
     Args:
-        motion: now.
-        law: in the frame of that gear: of the mirror image where it leads backwards.
-        spec: of a vehicle with a reverse gear.
-        dt_us: how far to go [us].
-        since: time since the law's plan began [s].
-        backwards: whether the gear is the reverse one.
+        motion: current motion.
+        law: law in the frame of that gear; mirrored for the reverse gear.
+        spec: specification of a vehicle with a reverse gear.
+        dt_us: duration [us].
+        since: time since the start of the law's plan [s].
+        backwards: whether the law is for the reverse gear.
     """
     end_us = dt_us
     at_us = 0
@@ -409,7 +420,7 @@ def advance_in_gear(
 def command_in_gear(
     motion: Motion, law: ControlLaw, spec: EgoSpec, *, since: float, backwards: bool
 ) -> Command:
-    """What a law of one gear would do, as :func:`advance_in_gear` takes it; along the heading."""
+    """The command of a law of one gear, along the heading; see :func:`advance_in_gear`."""
     if not backwards:
         return commanded(motion, law, spec, since=since)
     return _mirrored_command(commanded(mirrored(motion), law, backwards_spec(spec), since=since))
@@ -418,7 +429,7 @@ def command_in_gear(
 def _advanced(
     motion: Motion, law: ControlLaw, spec: EgoSpec, dt_us: int, *, since: float
 ) -> Motion:
-    """By a law of the gear that is engaged."""
+    """Advance with a law of the engaged gear."""
     if not motion.reversing:
         return advance_motion(motion, law, spec, dt_us, since=since)
     image = advance_motion(mirrored(motion), law, backwards_spec(spec), dt_us, since=since)
@@ -426,8 +437,11 @@ def _advanced(
 
 
 def _braking(law: ControlLaw, motion: Motion, spec: EgoSpec) -> ControlLaw:
-    """Brakes in the gear that is engaged. A held command, which is in the frame of the other one,
-    does by its own strength and steers; else the wheels stay as they are."""
+    """The law that brakes in the engaged gear, before a gear change.
+
+    A HOLD command of the other gear brakes with its own magnitude and steers; otherwise the
+    steering is held.
+    """
     if law.kind == HOLD:
         return constant_law(Command(-abs(law.hold[0]), -law.hold[1]))
     steering = -motion.steering if motion.reversing else motion.steering
@@ -435,13 +449,13 @@ def _braking(law: ControlLaw, motion: Motion, spec: EgoSpec) -> ControlLaw:
 
 
 def _in_gear_of_its_motion(motion: Motion) -> Motion:
-    """What pushed a vehicle backwards, or forwards again, has changed its gear."""
+    """Set the gear to the direction of motion, after an impact has reversed it."""
     backwards = motion.speed < 0.0
     return _shifted(motion) if motion.speed and backwards != motion.reversing else motion
 
 
 def _shifted(motion: Motion) -> Motion:
-    """In the other gear: what brakes goes on braking, and what drives is let go."""
+    """Change the gear: pending braking remains, pending acceleration is dropped."""
 
     def kept(acceleration: float) -> float:
         brakes = acceleration > 0.0 if motion.reversing else acceleration < 0.0
@@ -458,5 +472,5 @@ def _mirrored_command(command: Command) -> Command:
 
 
 def _negative(value: float) -> float:
-    """Never minus zero, which would show on the wire."""
+    """The negated value, without negative zero, which would show on the wire."""
     return 0.0 - value

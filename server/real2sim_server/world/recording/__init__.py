@@ -1,1 +1,1 @@
-"""Episodes as files: recorded, replayed, exported."""
+"""Recording, replay and export of episodes."""

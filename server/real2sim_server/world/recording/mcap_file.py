@@ -1,7 +1,7 @@
-"""An episode as an MCAP file, for Foxglove, Rerun and other readers.
+"""Export of an episode to an MCAP file, for Foxglove, Rerun and other readers.
 
-Messages are JSON, with Foxglove's well-known schemas where they exist. The recording itself is
-attached, so nothing is lost: :func:`recording_in` reads it back.
+Messages are JSON and use Foxglove's well-known schemas where available. The recording itself is
+attached; read it back with :func:`recording_in`.
 
 Needs the ``mcap`` extra.
 """
@@ -41,7 +41,7 @@ AXES = ("x", "y", "z")
 
 
 def cloud_document(cloud: Cloud) -> dict[str, Any]:
-    """What a recording keeps of a cloud, in the order of its columns."""
+    """The recorded form of a point cloud, in the order of its columns."""
     return {
         "frame": cloud.frame,
         "compensated": cloud.compensated,
@@ -53,16 +53,17 @@ def cloud_document(cloud: Cloud) -> dict[str, Any]:
 
 
 def foxglove_cloud(data: bytes, where: str, stamp: dict[str, int]) -> dict[str, Any]:
-    """The foxglove.PointCloud of a kept cloud: points in the frame of the sensor (or vehicle), and
-    ``pose``, where that is in the world.
+    """The foxglove.PointCloud of a recorded cloud.
+
+    Points are in the sensor (or vehicle) frame; ``pose`` is the pose of that frame in the world.
 
     Args:
-        data: as kept.
-        where: its file in the recording, for messages.
-        stamp: its instant.
+        data: recorded bytes.
+        where: file name in the recording, for error messages.
+        stamp: timestamp.
 
     Raises:
-        RecordingError: it is no cloud.
+        RecordingError: invalid data.
     """
     try:
         kept = decode(data, max_bytes=MAX_CLOUD_BYTES)
@@ -83,7 +84,7 @@ def foxglove_cloud(data: bytes, where: str, stamp: dict[str, int]) -> dict[str, 
 def _packed(
     columns: list[tuple[str, NDArray[Any]]],
 ) -> tuple[list[dict[str, Any]], NDArray[Any]]:
-    """Fields of foxglove.PointCloud, and a record of each point."""
+    """Fields of foxglove.PointCloud, and the packed point records."""
     parts: list[tuple[str, NDArray[Any]]] = []
     for name, column in columns:
         if column.ndim == 1:
@@ -146,7 +147,7 @@ def save_mcap(recording: Recording, path: Path) -> Path:
 
 
 def mcap_bytes(recording: Recording) -> bytes:
-    """The file; the same bytes for the same episode. Raises RecordingError like save_mcap()."""
+    """The content of the file; deterministic. Raises RecordingError like save_mcap()."""
     writer_class = _mcap("writer").Writer
     file = io.BytesIO()
     writer = writer_class(file)
@@ -166,10 +167,10 @@ def mcap_bytes(recording: Recording) -> bytes:
 
 
 def recording_in(path: Path) -> Recording:
-    """The recording that an MCAP file of ours holds.
+    """Read the recording attached to an MCAP file of this package.
 
     Raises:
-        RecordingError: there is none in it, or the ``mcap`` extra is not installed.
+        RecordingError: the file has no recording, or the ``mcap`` extra is not installed.
         OSError: the file cannot be read.
     """
     reader_module = _mcap("reader")
@@ -183,7 +184,7 @@ def recording_in(path: Path) -> Recording:
                 ),
                 None,
             )
-        # Damage shows as almost any error, depending on where it is.
+        # A damaged file can raise almost any error.
         except Exception as error:
             raise RecordingError(f"{path} is no MCAP file, or is broken: {error}") from error
     if found is None:
@@ -236,7 +237,7 @@ def _frames_by_step(frames: Mapping[str, bytes]) -> dict[int, list[tuple[str, st
 
 
 def stamp_of(t_us: int) -> dict[str, int]:
-    """A time as Foxglove's schemas have it."""
+    """A time [us] as a timestamp of Foxglove's schemas."""
     return {"sec": t_us // 1_000_000, "nsec": t_us % 1_000_000 * 1000}
 
 
@@ -340,7 +341,7 @@ def _colour(colour: tuple[float, float, float]) -> dict[str, float]:
 
 
 def json_channel(writer: Any, name: str, schema: str, example: dict[str, Any]) -> int:
-    """A topic whose JSON schema says what its first message shows."""
+    """Register a topic with a JSON schema inferred from its first message."""
     described = _described(example) | {"title": schema}
     if schema in {IMAGE_SCHEMA, CLOUD_SCHEMA}:
         described["properties"]["data"]["contentEncoding"] = "base64"

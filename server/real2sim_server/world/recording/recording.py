@@ -1,17 +1,17 @@
-"""An episode as one file: requests, committed states, and enough to score it again.
+"""Recordings: an episode in one file, with requests, committed states and score inputs.
 
 The file is a zip archive:
 
-- ``episode.json``: format, scene and hash, scenario, versions of scores, scores, and what the
-  seed drew for the start and for objects;
-- ``log.msgpack``: entries of the session from its reset on (kind, step, payload);
-- ``instants.msgpack``: what the scores need of every step, and a digest of its observation;
-- ``context.msgpack``: what stays the same for the scores;
-- ``state.msgpack``: how the scenario differed from the scene, where it began from one;
-- ``frames/<camera>/<modality>/<step>.jpg`` and ``.png``: images, where requested, and
+- ``episode.json``: format, scene and its hash, scenario, scores and their versions, and values
+  sampled for the start and the objects;
+- ``log.msgpack``: entries of the session from its reset (kind, step, payload);
+- ``instants.msgpack``: score inputs of every step, and a digest of its observation;
+- ``context.msgpack``: constants of the scores;
+- ``state.msgpack``: differences between scenario and scene, if the episode started from a scenario;
+- ``frames/<camera>/<modality>/<step>.jpg`` and ``.png``: requested images, and
   ``frames/<sensor>/lidar|radar/<step>.cloud``: point clouds (msgpack).
 
-Everything but the frames is the same bytes for the same episode.
+All parts except the frames are byte-identical for the same episode.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ from .replay import KINDS, Entry, Replayer, recorded_spec
 
 # --- Plain values --------------------------------------------------------------------------------
 
-# Everything is checked here where it is read: the kernels that score check no index, so shapes,
-# lengths and values must be right before.
+# All values are validated on reading: scoring kernels do not check indices, so shapes, lengths and
+# values must be right.
 
 MAX_WAY_M = 1e6
 """Length of a route or lane [m]: they are cut into pieces of less than a metre."""
@@ -98,7 +98,7 @@ def read_instant(row: Mapping[str, Any]) -> tuple[Instant, str]:
     """Inverse of :func:`instant_row`.
 
     Raises:
-        ValueError, KeyError, TypeError: it is none.
+        ValueError, KeyError, TypeError: invalid row.
     """
     ids = tuple(_string(name) for name in _list(row["ids"]))
     count = len(ids)
@@ -129,10 +129,10 @@ def read_instant(row: Mapping[str, Any]) -> tuple[Instant, str]:
 
 
 def read_context(fields: Mapping[str, Any]) -> ScoringContext:
-    """The context that :meth:`ScoringContext.fields` gave.
+    """Inverse of :meth:`ScoringContext.fields`.
 
     Raises:
-        ValueError, KeyError, TypeError: it gave none like that.
+        ValueError, KeyError, TypeError: invalid fields.
     """
     for name in ("dt", "rear_overhang", "ego_mass", "corridor", "lane", "start_s", "route_end_s"):
         _number(fields[name], name)
@@ -196,8 +196,10 @@ def _plan(value: Any) -> PlannedTrajectory:
 
 
 def _numbers(value: Any, shape: tuple[int | None, ...], what: str) -> Float:
-    """Float64 of a shape; None goes for any length. A copy: kernels are compiled anew for arrays
-    that must not be written to."""
+    """Float64 array of a shape, where None stands for any length.
+
+    Always a writable copy: kernels would be recompiled for read-only arrays.
+    """
     array: NDArray[np.float64] = np.array(value, dtype=np.float64)
     fits = len(shape) == array.ndim and all(
         wanted in (None, given) for wanted, given in zip(shape, array.shape, strict=True)
@@ -241,7 +243,7 @@ _FRAME = re.compile(r"frames/[^/]+/[^/]+/[0-9]{1,9}\.[a-z0-9]{1,8}")
 
 
 class RecordingError(ValueError):
-    """A file that is no recording, or one that this version does not read."""
+    """An invalid recording, or one that this version cannot read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,18 +251,18 @@ class Recording:
     """One episode.
 
     Attributes:
-        scene, scene_hash: what it ran on.
-        scenario_id, scenario_revision: what it began from; None for the bare scene.
-        entries: of the session, its reset first.
-        context: of the scores.
-        instants: of every committed state, step 0 first.
-        digests: SHA-256 of every observation without images, by instant.
-        scores: at the end, as they were when it was recorded.
+        scene, scene_hash: the scene.
+        scenario_id, scenario_revision: the scenario; None for the scene without one.
+        entries: entries of the session, its reset first.
+        context: constants of the scores.
+        instants: one per committed state, step 0 first.
+        digests: SHA-256 of each observation without images, by instant.
+        scores: final scores at recording time.
         metrics: versions of the scores.
-        state: the objects that it began with, see :func:`~real2sim_server.edit.pack_state`; None
-            for the bare scene.
+        state: objects at the start, see :func:`~real2sim_server.edit.pack_state`; None for the
+            scene without a scenario.
         frames: file names in the archive by camera and step, for images.
-        drawn: what the seed drew for the start and for objects, by name.
+        drawn: values sampled for the start and the objects, by name.
     """
 
     scene: str
@@ -278,15 +280,15 @@ class Recording:
     drawn: Mapping[str, float] = field(default_factory=dict)
 
     def replayer(self, scene: Scene, assets: AssetLookup | None = None) -> Replayer:
-        """The session before its first entry.
+        """A replayer of the session, before its first entry.
 
         Args:
-            scene: that it ran on.
-            assets: finds those that its scenario shows.
+            scene: scene of the recording.
+            assets: finds the assets of the scenario.
 
         Raises:
             EditError: UNKNOWN_ASSET.
-            RecordingError: it began from a scenario, and an old file does not hold its state.
+            RecordingError: the recording started from a scenario whose state an old file lacks.
         """
         initial = ScenarioState.of(scene, assets=assets)
         if self.state is not None:
@@ -299,7 +301,7 @@ class Recording:
         return Replayer.on(scene, initial)
 
     def rescore(self) -> list[Score]:
-        """Scores by the metrics of this version, from the recorded instants alone."""
+        """Scores by the current metrics, computed from the recorded instants alone."""
         return scoring.scores_of(self.accumulators()[-1], self.context)
 
     def accumulators(self) -> list[MetricAccumulator]:
@@ -313,7 +315,7 @@ class Recording:
 
 
 def digest(world: World) -> str:
-    """SHA-256 of everything that a world lets be observed, apart from images."""
+    """SHA-256 of the observation of a world, without images."""
     fields = world.observe().obs_fields()
     fields["agents"] = [
         world.agents.positions,
@@ -333,14 +335,14 @@ def record(
     state: ScenarioState | None = None,
     no_action_impact: float | None = None,
 ) -> Recording:
-    """The recording of an episode, by replaying it.
+    """Create the recording of an episode by replaying it.
 
     Args:
-        replayer: fresh, on the episode's scene.
-        entries: of the episode, its reset first; returns to snapshots cut off what they undo.
-        scene_hash: of the scene's bundle.
+        replayer: new replayer on the episode's scene.
+        entries: entries of the episode, its reset first; snapshot restores drop what they undo.
+        scene_hash: hash of the scene's bundle.
         scenario: id and revision.
-        state: of that scenario.
+        state: state of that scenario.
         no_action_impact: for NeuroNCAP, see :func:`~.replay.no_action_impact`.
     """
     instants: list[Instant] = []
@@ -349,7 +351,7 @@ def record(
         world = replayer.apply(entry)
         if entry.kind == "snapshot":
             continue
-        # A step adds an instant; what changes the present one replaces it; a return cuts off.
+        # A step appends an instant, an edit replaces the last one, and a restore drops later ones.
         del instants[world.steps :], digests[world.steps :]
         instants.append(world.instant)
         digests.append(digest(world))
@@ -407,7 +409,7 @@ def to_bytes(recording: Recording) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, data in parts.items():
-            # A fixed date, so that the same episode is the same file.
+            # A fixed date, so that the file is deterministic.
             info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
             packed = zipfile.ZIP_STORED if name.startswith("frames/") else zipfile.ZIP_DEFLATED
             archive.writestr(info, data, compress_type=packed)
@@ -422,10 +424,10 @@ def save_recording(recording: Recording, path: Path) -> Path:
 
 
 def load_recording(path: Path) -> Recording:
-    """The recording in a file.
+    """Read a recording from a file.
 
     Raises:
-        RecordingError: no recording, broken, too large, or of a newer version.
+        RecordingError: the file is no recording, damaged, too large, or of a newer version.
         OSError: the file cannot be read.
     """
     with path.open("rb") as file:
@@ -433,7 +435,7 @@ def load_recording(path: Path) -> Recording:
 
 
 def recording_of_bytes(data: bytes, where: str) -> Recording:
-    """The recording in the content of a file; ``where`` names it in messages.
+    """Read a recording from the content of a file; ``where`` names it in error messages.
 
     Raises:
         RecordingError: as :func:`load_recording`.
@@ -447,7 +449,7 @@ def _read_recording(file: IO[bytes], where: str) -> Recording:
             return _of_parts(read_entries(archive, max_bytes=MAX_BYTES))
     except RecordingError as error:
         raise RecordingError(f"{where}: {error}") from error
-    # Damage shows as almost any error, depending on where it is.
+    # A damaged file can raise almost any error.
     except Exception as error:
         raise RecordingError(
             f"{where} is no episode recording, or is broken: {error or type(error).__name__}"
@@ -491,7 +493,7 @@ def _of_parts(parts: Mapping[str, bytes]) -> Recording:
 
 
 def _younger_context(entries: Sequence[Entry]) -> dict[str, Any]:
-    """What the scores take from the reset today; old files hold it there alone."""
+    """Context fields that old files only have in the reset."""
     if not entries or entries[0].kind != "reset":
         return {}
     spec = recorded_spec(entries[0])
@@ -516,18 +518,18 @@ def _text(about: Mapping[str, Any], key: str) -> str:
 
 
 def first_difference(recording: Recording, replayer: Replayer) -> int | None:
-    """The first step at which its replay differs; None where all bits are the same.
+    """The first step at which the replay differs; None if it is bitwise identical.
 
-    Of an episode with scores of other versions poses and velocities are compared: what else was
-    observed holds scores.
+    If the recording has scores of other versions, only poses and velocities are compared, because
+    observations contain scores.
 
     Args:
-        recording: of the episode.
-        replayer: fresh, on the same scene.
+        recording: recording of the episode.
+        replayer: new replayer on the same scene.
 
     Raises:
-        RecordingError: an entry that cannot be applied.
-        WorldError, EditError: one that never took effect.
+        RecordingError: an entry cannot be applied.
+        WorldError, EditError: an entry is rejected.
     """
     same_scores = recording.metrics == metrics_version()
     then = recording.digests if same_scores else [_motion(i) for i in recording.instants]
@@ -545,7 +547,7 @@ def first_difference(recording: Recording, replayer: Replayer) -> int | None:
 
 
 def _motion(instant: Instant) -> str:
-    """SHA-256 of where ego and objects are at an instant, and how they move."""
+    """SHA-256 of the poses and velocities of ego and objects at an instant."""
     others = instant.others
     fields = {
         "clock": [instant.step, instant.t_us],
@@ -561,7 +563,7 @@ def _applied(replayer: Replayer, entry: Entry, number: int) -> World:
         return replayer.apply(entry)
     except (WorldError, EditError):
         raise
-    # What an entry holds is looked at where it is applied.
+    # The payload is validated on application.
     except Exception as error:
         raise RecordingError(
             f"entry {number} ({entry.kind}, step {entry.step}) is damaged: {error}"

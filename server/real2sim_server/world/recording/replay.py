@@ -1,4 +1,4 @@
-"""An episode as a log of requests, replayed bit for bit."""
+"""Episode logs and their bitwise replay."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..world import World
 
 # --- Stored specs --------------------------------------------------------------------------------
 
-# Logs of earlier versions are read too.
+# Also reads logs of earlier versions.
 
 BEFORE: Mapping[str, Any] = {
     "ego": {
@@ -47,23 +47,23 @@ adds a member whose default changes an episode names here what keeps its bits.
 
 
 def stored_spec(fields: Mapping[str, Any]) -> ResetSpec:
-    """The spec of a log, with the meaning that it had when it was written.
+    """The spec stored in a log, with the semantics of the version that wrote it.
 
     Raises:
-        ValueError: it is no spec.
+        ValueError: invalid spec.
     """
     completed = _completed(fields, BEFORE)
     if isinstance(board := completed.get("storyboard"), Mapping):
         completed["storyboard"] = stored_storyboard(board)
     spec = ResetSpec.model_validate(completed)
     if fields.get("horizon") is None:
-        # To the end of the log, also where the episode could have gone on.
+        # Ends with the log, even if the episode could continue beyond it.
         return spec.model_copy(update={"horizon": None})
     return spec
 
 
 def _completed(fields: Mapping[str, Any], absent: Mapping[str, Any]) -> dict[str, Any]:
-    """``fields`` with members of ``absent`` where it has none."""
+    """``fields``, with missing members taken from ``absent``."""
     found = dict(fields)
     for name, value in absent.items():
         if isinstance(value, Mapping):
@@ -95,17 +95,17 @@ class Entry:
 
 
 def reset_payload(spec: ResetSpec) -> bytes:
-    """Of the beginning of an episode."""
+    """Payload of a reset."""
     return encode({"spec": spec.model_dump(mode="json")})
 
 
 def plan_payload(plan: Plan | None) -> bytes:
-    """Of a plan; None goes on with the one before. Equal plans have equal bytes."""
+    """Payload of a plan; None keeps the previous one. Equal plans have equal bytes."""
     return encode({"plan": None if plan is None else vars(plan)})
 
 
 def action_payload(plan: Plan | None, *, latency_us: int = 0, missed: bool = False) -> bytes:
-    """Of a step: its plan, how long that took to make, whether it missed its deadline."""
+    """Payload of a step: plan, planning time, and whether it missed its deadline."""
     fields: dict[str, Any] = {"plan": None if plan is None else vars(plan)}
     if latency_us:
         fields["latency_us"] = latency_us
@@ -115,25 +115,25 @@ def action_payload(plan: Plan | None, *, latency_us: int = 0, missed: bool = Fal
 
 
 def edit_payload(operations: Sequence[Operation]) -> bytes:
-    """Of an edit."""
+    """Payload of an edit."""
     return encode({"operations": [o.model_dump(mode="json") for o in operations]})
 
 
 def agent_payload(
     object_id: str, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]
 ) -> bytes:
-    """Of a plan for an externally driven object."""
+    """Payload of a plan for an externally driven object."""
     fields = {"object_id": object_id, "times_us": list(times_us), "poses": [list(p) for p in poses]}
     return encode(fields)
 
 
 def name_payload(name: str) -> bytes:
-    """Of a snapshot or of the return to one."""
+    """Payload of a snapshot or of its restore."""
     return encode({"name": name})
 
 
 def stop_payload(reason: str) -> bytes:
-    """Of an end that no step brought about."""
+    """Payload of a stop without a step."""
     return encode({"reason": reason})
 
 
@@ -146,8 +146,8 @@ class Replayer:
     """A session replayed from its entries.
 
     Attributes:
-        begin: makes the world of an episode.
-        world: after the entries so far; None before the first reset. Never changed in place.
+        begin: creates the world of an episode.
+        world: world after the entries so far; None before the first reset. Never modified in place.
         snapshots: by name.
     """
 
@@ -157,15 +157,15 @@ class Replayer:
 
     @classmethod
     def on(cls, scene: Scene, state: ScenarioState) -> Replayer:
-        """A session on a scene, with objects as they were at its creation."""
+        """A replayer on a scene, with the objects at session creation."""
         return cls(lambda spec: World(scene, state, spec))
 
     def apply(self, entry: Entry) -> World:
         """The world after one more entry.
 
         Raises:
-            ValueError: the entries do not fit together, or an entry of an unknown kind.
-            WorldError, EditError: an entry that never took effect.
+            ValueError: inconsistent entries, or an entry of an unknown kind.
+            WorldError, EditError: the entry is rejected.
         """
         fields = decode(entry.payload)
         if entry.kind == "reset":
@@ -185,7 +185,7 @@ class Replayer:
 
 
 def recorded_spec(reset: Entry) -> ResetSpec:
-    """How a recorded episode runs, see :func:`stored_spec`."""
+    """The spec of a recorded episode, see :func:`stored_spec`."""
     return stored_spec(decode(reset.payload)["spec"])
 
 
@@ -210,14 +210,13 @@ def _apply_entry(world: World, kind: str, fields: dict[str, Any]) -> None:
 
 
 def no_action_impact(replayer: Replayer, entries: Sequence[Entry]) -> float:
-    """Relative speed [m/s] at the first contact of a run in which the ego keeps to the recorded
-    drive whatever is in the way; 0 where it touches nothing. v_r of NeuroNCAP.
+    """Relative speed [m/s] at the first contact if the ego follows the recorded drive.
 
-    Everything but plans is as in ``entries``: edits, other agents.
+    v_r of NeuroNCAP; 0 without contact. Edits and other agents are as in ``entries``.
 
     Args:
-        replayer: fresh, on the same scene.
-        entries: of the episode, its reset first.
+        replayer: new replayer on the same scene.
+        entries: entries of the episode, its reset first.
     """
     first, *rest = entries
     spec = recorded_spec(first)
@@ -237,6 +236,6 @@ def no_action_impact(replayer: Replayer, entries: Sequence[Entry]) -> float:
 
 
 def last_episode(entries: Sequence[Entry]) -> list[Entry]:
-    """Entries from the last reset on."""
+    """The entries from the last reset."""
     resets = [k for k, e in enumerate(entries) if e.kind == "reset"]
     return list(entries[resets[-1] :]) if resets else []

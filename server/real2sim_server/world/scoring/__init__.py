@@ -1,6 +1,6 @@
-"""Versioned metrics of episodes: the same code scores running episodes and recordings.
+"""Versioned metrics of episodes, for running episodes and recordings alike.
 
-:mod:`.metric` is the registry, :mod:`.metrics` has the metrics of the field.
+:mod:`.metric` has the registry, :mod:`.metrics` the metrics.
 """
 
 from .instant import ContactRecord, EgoSample, Instant, ObjectSamples, ScoringContext

@@ -1,4 +1,4 @@
-"""How a drive feels, how its plans follow one another, and whether a car could have moved so."""
+"""Comfort of a drive, consistency of successive plans, and kinematic feasibility."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ ROOM = 8
 
 
 class Window(Generic[T]):
-    """The last entries of a growing sequence, newest last.
+    """The last entries of a growing sequence, newest last; immutable.
 
-    A window never changes for who holds it: :meth:`pushed` gives a new one. The two share their
-    entries, as long as it is the first that goes on from this one; a second one, of a world that
-    was forked here, begins with a copy.
+    :meth:`pushed` returns a new window that shares its entries with this one. A second push from
+    the same window (in a forked world) copies them.
     """
 
     __slots__ = ("_end", "_entries", "_length", "_unclaimed")
@@ -63,7 +62,7 @@ class Window(Generic[T]):
         return found
 
     def mapped(self, change: Callable[[T], T]) -> Window[T]:
-        """With every entry changed."""
+        """The window with ``change`` applied to every entry."""
         return Window(*(change(entry) for entry in self))
 
     def _own(self, entries: list[T], length: int) -> None:
@@ -73,10 +72,10 @@ class Window(Generic[T]):
 
 
 class RowWindow:
-    """The same of rows of numbers, which kernels take as one array.
+    """Like :class:`Window`, for rows of numbers that kernels take as one array.
 
     Attributes:
-        rows: [n, C] float64, newest last; nobody writes into it.
+        rows: [n, C] float64, newest last; read-only.
     """
 
     __slots__ = ("_buffer", "_end", "_unclaimed", "rows")
@@ -123,7 +122,7 @@ SHORTEST_OVERLAP = 6
 
 @kernel
 def windowed_sum(values, value, window):
-    """Values [n] with one more at their end, the last ``window`` of them; and their sum."""
+    """Append a value to values [n]; return the last ``window`` of them and their sum."""
     kept = min(len(values), window - 1)
     found = np.empty(kept + 1)
     for k in range(kept):
@@ -158,8 +157,7 @@ def derivatives(weights, samples):
 
 @kernel
 def make_continuous(poses):
-    """Add whole turns to the yaws of poses [N, 3] (x, y, yaw [rad]), so that none is more than
-    half a turn from the one before, as ``np.unwrap``."""
+    """Unwrap the yaws of poses [N, 3] (x, y, yaw [rad]) in place, like ``np.unwrap``."""
     before, added = poses[0, 2], 0.0
     for k in range(1, len(poses)):
         step = poses[k, 2] - before
@@ -174,15 +172,17 @@ def make_continuous(poses):
 
 @kernel
 def plans_alike(times_a, poses_a, times_b, poses_b):
-    """Whether two plans feel alike where both say something: RMS differences of acceleration,
-    jerk, yaw rate and yaw acceleration, by finite differences in steps of 0.1 s.
+    """Whether two plans are consistent in comfort where they overlap in time.
+
+    Compares RMS differences of acceleration, jerk, yaw rate and yaw acceleration, by finite
+    differences in steps of 0.1 s.
 
     Args:
         times_a, times_b: [N] int64, increasing [us].
         poses_a, poses_b: [N, 3] float64, x, y [m], yaw [rad].
 
     Returns:
-        1 for alike, 0 for not, -1 where they overlap for less than 0.5 s.
+        1 if consistent, 0 if not, -1 if they overlap for less than 0.5 s.
     """
     first, last = max(times_a[0], times_b[0]), min(times_a[-1], times_b[-1])
     count = int((last - first) * 1e-6 / PLAN_STEP + 1e-6) + 1
@@ -207,7 +207,7 @@ def plans_alike(times_a, poses_a, times_b, poses_b):
 
 @kernel
 def _differentiate(times, poses, first, speeds, rates):
-    """Write speeds and yaw rates [T] of a plan between times in steps of 0.1 s from ``first``."""
+    """Write speeds and yaw rates [T] of a plan, in steps of 0.1 s from ``first``."""
     k = 1
     x = y = yaw = 0.0
     for i in range(len(speeds) + 1):
@@ -258,8 +258,11 @@ HUGSIM_LON_JERK = 8.37
 
 
 class ComfortSample(NamedTuple):
-    """What passengers feel at one time: SI units, as the bounds. ``lon_acceleration`` is that in
-    the direction of the gear: below 0 a vehicle brakes, backwards too."""
+    """Motion that passengers feel at one time, in SI units.
+
+    ``lon_acceleration`` is in the direction of the gear: negative values are braking, also in
+    reverse.
+    """
 
     lon_acceleration: float
     lat_acceleration: float
@@ -299,14 +302,14 @@ class ComfortSample(NamedTuple):
 class ComfortAccumulator:
     """Comfort of a drive so far.
 
-    Derivatives are those of cubics through the last 1.5 s (Savitzky & Golay 1964), taken in the
-    middle of that window; so the first and last 0.75 s of a drive are not evaluated.
+    Derivatives come from a cubic fit over a window of 1.5 s (Savitzky & Golay 1964), evaluated at
+    its centre. The first and last 0.75 s of a drive are therefore not evaluated.
 
     Attributes:
         window: rows of speed [m/s] and continuous yaw [rad] of the last 1.5 s.
         comfortable: whether all bounds held so far.
-        worst: greatest magnitudes so far, in the order of :class:`ComfortSample`.
-        newest: in the middle of the newest window; None before there is one.
+        worst: largest magnitudes so far, in the order of :class:`ComfortSample`.
+        newest: sample at the centre of the newest window; None before the first full window.
     """
 
     window: RowWindow = field(default_factory=lambda: RowWindow(np.zeros((0, 2))))
@@ -320,7 +323,7 @@ class ComfortAccumulator:
         return self.window.rows
 
     def begun_anew(self) -> ComfortAccumulator:
-        """With the same samples and no verdict yet."""
+        """The accumulator with the same samples and reset results."""
         return ComfortAccumulator(self.window)
 
     def updated(self, speed: float, yaw: float, dt: float) -> ComfortAccumulator:
@@ -330,10 +333,13 @@ class ComfortAccumulator:
     def updated_beside(
         self, other: ComfortAccumulator, speed: float, yaw: float, dt: float
     ) -> tuple[ComfortAccumulator, ComfortAccumulator]:
-        """This one and another that has got the same samples since this one began: after one more
-        clock step. What both hold is kept, and looked at, once."""
+        """This accumulator and another one after one more clock step.
+
+        The other one has received the same samples since this one began; the shared samples are
+        stored and evaluated once.
+        """
         window, sample = _newest(self.window, speed, yaw, dt)
-        # A window that is full has room for nothing older.
+        # A full window holds no older samples.
         shared = other.window is self.window or sample is not None
         after = other._with(window, sample) if shared else other.updated(speed, yaw, dt)
         return self._with(window, sample), after
@@ -351,7 +357,7 @@ class ComfortAccumulator:
 def _newest(
     window: RowWindow, speed: float, yaw: float, dt: float
 ) -> tuple[RowWindow, ComfortSample | None]:
-    """Samples with one more at their end, and what they say once the window is full."""
+    """The samples with one more, and the comfort sample once the window is full."""
     full = comfort_window(dt)
     window = window.pushed((speed, yaw), full)
     return window, comfort_sample(window.rows, dt) if len(window) == full else None
@@ -359,7 +365,7 @@ def _newest(
 
 @lru_cache(maxsize=16)
 def comfort_window(dt: float) -> int:
-    """Samples in a window; odd, at least five."""
+    """Number of samples in a window; odd, at least five."""
     return max(2 * round(WINDOW_S / dt / 2) - 1, 5) if dt < WINDOW_S / 4 else 5
 
 
@@ -367,8 +373,7 @@ def comfort_window(dt: float) -> int:
 def _coefficients(window: int, dt: float) -> Float:
     """Weights [3, window] of value, first and second derivative in the middle.
 
-    They reproduce polynomials up to the order, with the least sum of squares; to the bit those of
-    ``scipy.signal.savgol_coeffs``, which takes a second to load, in the midst of a step.
+    Bitwise equal to ``scipy.signal.savgol_coeffs``, whose import would delay a step by a second.
     """
     exponents = np.arange(min(ORDER, window - 2) + 1)
     places = np.arange(-(window // 2), window // 2 + 1, dtype=np.float64)
@@ -394,10 +399,9 @@ def comfort_sample(samples: Float, dt: float) -> ComfortSample:
 
 
 def plans_agree(before: PlannedTrajectory, now: PlannedTrajectory) -> bool | None:
-    """Whether two successive plans feel alike where both say something.
+    """Whether two successive plans are consistent in comfort, see :func:`plans_alike`.
 
-    RMS differences of acceleration, jerk, yaw rate and yaw acceleration over the overlap, by
-    finite differences of the plans in steps of 0.1 s. None where they overlap for less than 0.5 s.
+    None if they overlap for less than 0.5 s.
     """
     alike: int = plans_alike(before.times_us, before.poses, now.times_us, now.poses)
     return None if alike < 0 else bool(alike)
@@ -435,13 +439,13 @@ Samples = Window[tuple[EgoSample, float]]
 @made_quickly
 @dataclass(frozen=True, eq=False)
 class Feasibility:
-    """The motion of the ego so far.
+    """Kinematic feasibility of the ego's motion so far.
 
     Attributes:
-        samples: of the last second, newest last, each with the way driven until then [m].
-        pushed: whether an impact moved the ego and it slides still; nobody can blame it then.
-        steps: that no car could have made.
-        first: number of the first of them; None without.
+        samples: samples of the last second, newest last, each with the distance driven so far [m].
+        pushed: whether the ego is still sliding after an impact; such steps count as feasible.
+        steps: number of infeasible steps.
+        first: index of the first infeasible step, or None.
     """
 
     samples: Samples = field(default_factory=Window)
@@ -450,7 +454,7 @@ class Feasibility:
     first: int | None = None
 
     def updated(self, instant: Instant, way: float, context: ScoringContext) -> Feasibility:
-        """After one more clock step; ``way``: driven so far [m]."""
+        """After one more clock step; ``way``: distance driven so far [m]."""
         ego = instant.ego
         pushed = bool(instant.contacts) and any(c.impulse != (0.0, 0.0) for c in instant.contacts)
         if pushed or (self.pushed and not _settled(ego)):
@@ -501,5 +505,5 @@ def _follows(before: EgoSample, now: EgoSample, h: float) -> bool:
     sideways = (before.lateral_speed + now.lateral_speed) / 2 * h
     if abs(aside - sideways) > reach / 4 + SLIP * abs(ahead) + PLACE_NOISE:
         return False
-    # A vehicle that is put to its places has the speed of the step before.
+    # A teleported vehicle has the speed of the previous step.
     return abs(ahead - before.speed * h) <= reach + PLACE_NOISE

@@ -1,4 +1,4 @@
-"""Inputs of the scores: samples of an instant, context of the episode, time to collision, fault."""
+"""Score inputs: samples of an instant, episode context, time to collision and fault."""
 
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
@@ -33,7 +33,7 @@ Lines = tuple[Float, NDArray[np.int64]]
 
 
 class EgoSample(NamedTuple):
-    """The ego at one instant: rear axle [m], [rad], velocities of it [m/s], [rad/s], [m/s^2]."""
+    """The ego at one instant, at its rear axle; SI units."""
 
     x: float
     y: float
@@ -56,10 +56,10 @@ class ObjectSamples:
 
     Attributes:
         ids, categories: by row.
-        centres: [K, 3] float64, of their boxes, world [m].
+        centres: [K, 3] float64, box centres, world frame [m].
         yaws: [K] float64 [rad].
         sizes: [K, 3] float64, (length, width, height) [m].
-        velocities: [K, 2] float64, world [m/s].
+        velocities: [K, 2] float64, world frame [m/s].
     """
 
     ids: tuple[str, ...]
@@ -72,16 +72,16 @@ class ObjectSamples:
 
 @dataclass(frozen=True)
 class ContactRecord:
-    """A contact of the ego that began in this step, or went on with momentum.
+    """A contact of the ego that began in this step, or continued to exchange momentum.
 
     Attributes:
-        object_id: None for the background.
-        category: of the object; ``background``.
-        side: of the ego.
-        relative_speed, ego_speed, object_speed: when the contact began [m/s].
-        impulse: on the ego [N s]; zeros where no momentum is exchanged.
+        object_id: id of the object; None for the background.
+        category: category of the object, or ``background``.
+        side: side of the ego that was hit.
+        relative_speed, ego_speed, object_speed: at the start of the contact [m/s].
+        impulse: impulse on the ego [N s]; zero without collision response.
         begun: whether the contact began in this step.
-        since: when it did, as a fraction of the step.
+        since: its start as a fraction of the step.
     """
 
     object_id: str | None
@@ -101,15 +101,15 @@ class Instant:
     """One committed instant.
 
     Attributes:
-        step, t_us: which one.
+        step, t_us: clock step and time [us].
         ego: the controlled vehicle.
         others: all objects.
-        contacts: of the step that led here.
-        secondary: contacts between objects that began in it.
-        plan: that the step was made with; None where there was no new trajectory.
-        seam: over which the ego was put back before it moved; places of the instant before are
-            where it takes them. None where it was not.
-        signals: traffic signals of the storyboard, and what they show.
+        contacts: ego contacts of the last step.
+        secondary: new contacts between objects in the last step.
+        plan: new trajectory used for the last step, or None.
+        seam: loop reset before the last move, to be applied to positions of the previous instant;
+            None without a reset.
+        signals: traffic signals of the storyboard with their states.
     """
 
     step: int
@@ -125,27 +125,27 @@ class Instant:
 
 @dataclass(frozen=True, eq=False)
 class ScoringContext:
-    """What stays the same over an episode.
+    """Constants of an episode.
 
     Attributes:
-        dt: clock step [s].
-        horizon: steps.
+        dt: time step [s].
+        horizon: number of steps.
         ego_size: (length, width, height) [m].
-        rear_overhang: rear axle to the rear end of the box [m].
+        rear_overhang: distance from the rear axle to the rear end of the box [m].
         ego_mass: [kg].
-        route: [R, 2] float64, the recorded way [m].
-        lanes: polylines [N, 2] of recorded vehicles, whose strips are drivable too.
-        corridor, lane: half widths along route and lanes [m].
+        route: [R, 2] float64, recorded path [m].
+        lanes: polylines [N, 2] of recorded vehicles, whose corridors are drivable too.
+        corridor, lane: half widths of the route and of the lanes [m].
         speed_limit: [m/s] or None.
-        start_s, route_end_s: along the route at the start, and where the log is at the horizon.
-        expert_s: where the log is along the route at each step [m]; ``horizon`` + 1 of them.
-        history: (speed, yaw) of the log before the start, one a clock step, oldest first.
-        warmup_steps: steps in which the ego moved as recorded; they do not count.
-        background: whether walls and poles of the background can be hit.
-        reactive: whether any other road user sees the ego.
-        no_action_impact: impact speed of a run in which the ego does not react [m/s]; None while
-            it is not known, 0 where nothing is hit.
-        road_map: of the scene; None: corridor and lanes come from the recorded drive.
+        start_s, route_end_s: route position of the log at the start and at the horizon [m].
+        expert_s: route position of the log at each step [m]; ``horizon`` + 1 values.
+        history: (speed, yaw) of the log before the start, one per clock step, oldest first.
+        warmup_steps: steps in which the ego replays the recording; not scored.
+        background: whether the ego can hit walls and poles of the background.
+        reactive: whether any other road user reacts to the ego.
+        no_action_impact: impact speed of a run in which the ego does not react [m/s]; None if
+            unknown, 0 without an impact.
+        road_map: road map of the scene; if None, corridor and lanes come from the recorded drive.
     """
 
     dt: float
@@ -175,7 +175,7 @@ class ScoringContext:
 
     @cached_property
     def _route_points(self) -> Lines:
-        """Points of the route; straight on beyond both ends."""
+        """Points of the route, extended straight beyond both ends."""
         return _lines([_extended(self.route)])
 
     @cached_property
@@ -188,8 +188,10 @@ class ScoringContext:
         return self._route_points, self._lane_points
 
     def off_road(self, ego: EgoSample) -> tuple[float, int]:
-        """How far the worst corner of the ego box is off the road [m], 0 and less on it; and how
-        many of its quarters, 0 to 4, have their middle on the road."""
+        """Distance of the worst corner of the ego box from the road [m], at most 0 on the road.
+
+        Also the number of box quarters, 0 to 4, whose centres are on the road.
+        """
         ahead = self.centre_ahead
         x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
         if self.road_map is not None:
@@ -204,8 +206,7 @@ class ScoringContext:
         return beyond, quarters
 
     def in_lane(self, ego: EgoSample) -> bool:
-        """Whether the middle of the ego box is in its own lane, or in one that others drove in the
-        ego's direction."""
+        """Whether the box centre is in the ego's lane or in a recorded lane of its direction."""
         if self.road_map is not None:
             return self.road_map.in_lane(ego, self.centre_ahead)
         if abs(ego.offset) <= self.lane:
@@ -215,19 +216,20 @@ class ScoringContext:
         return bool(in_lane((x, y, ego.path_yaw), self._lane_points, self.lane))
 
     def lane_offset(self, ego: EgoSample) -> float:
-        """Distance from the middle of the lane [m], positive to the left: of the map's, else of the
-        route."""
+        """Offset from the centre of the map lane, else of the route, positive left [m]."""
         return ego.offset if self.road_map is None else self.road_map.lane_offset(ego)
 
     def way_against(self, ego: EgoSample, way: float, gain: float) -> float:
-        """How much of the ``way`` [m] of a step went against traffic: in oncoming lanes of the map,
-        else what it lost along the route."""
+        """Distance driven against traffic in a step of length ``way`` [m].
+
+        With a map, the distance in oncoming lanes; otherwise the loss of route progress.
+        """
         if self.road_map is None:
             return max(-gain, 0.0)
         return way if self.road_map.is_against(ego, self.centre_ahead) else 0.0
 
     def limit_at(self, ego: EgoSample) -> float | None:
-        """The speed limit that holds for the ego [m/s]: that of the request, else of the map."""
+        """The speed limit of the ego [m/s]: that of the request, else of the map."""
         if self.speed_limit is not None or self.road_map is None:
             return self.speed_limit
         return self.road_map.speed_limit(ego)
@@ -239,7 +241,7 @@ class ScoringContext:
         return self.speed_limit is not None or known
 
     def fields(self) -> dict[str, Any]:
-        """Plain values, for a recording; without a map there is no word of one."""
+        """Plain values for a recording; map fields are omitted without a map."""
         plain = {k: getattr(self, k) for k in self.__dataclass_fields__}
         road_map = plain.pop("road_map")
         if road_map is not None:
@@ -254,7 +256,7 @@ class ScoringContext:
 
     @classmethod
     def from_fields(cls, fields: dict[str, Any]) -> ScoringContext:
-        """The context that :meth:`fields` gave."""
+        """Inverse of :meth:`fields`."""
         road_map = fields.get("road_map")
         return cls(
             **fields
@@ -291,7 +293,7 @@ def _dense(line: Float) -> Float:
 
 # --- Hazards -------------------------------------------------------------------------------------
 
-# Time to collision, side and fault of contacts, and red lights that the ego crossed.
+# Time to collision, side and fault of contacts, and red light violations.
 
 HORIZON, STEP = 3.0, 0.1
 STEPS = 31
@@ -303,20 +305,20 @@ AHEAD, BEHIND = math.radians(30), math.radians(150)
 
 @kernel
 def first_overlap_step(ego, size, centre_ahead, everywhere, others, ignored):
-    """The first step of 0.1 s up to 3 s at which the ego box overlaps that of an object.
+    """The first 0.1 s step, up to 3 s, at which the ego box overlaps that of an object.
 
     Args:
-        ego: x, y [m], yaw [rad], speed, lateral speed [m/s] of the rear axle, height of the
-            ground z [m].
+        ego: x, y [m], yaw [rad], speed, lateral speed [m/s] of the rear axle, ground height z [m].
         size: (length, width, height) of its box [m].
-        centre_ahead: rear axle to the middle of the box [m].
-        everywhere: whether all objects count that are not behind the ego; else those ahead.
+        centre_ahead: distance from the rear axle to the box centre [m].
+        everywhere: whether to include all objects that are not behind the ego; else only those
+            ahead.
         others: centres [K, 3] [m], yaws [K] [rad], sizes [K, 3] [m], velocities [K, 2] [m/s] of
-            the objects, float64, world.
-        ignored: [K] bool, objects that do not count.
+            the objects, float64, world frame.
+        ignored: [K] bool, objects to ignore.
 
     Returns:
-        Number of steps; -1 where they do not overlap.
+        Number of steps; -1 without overlap.
     """
     x, y, yaw, forward, lateral, z = ego
     centres, yaws, sizes, velocities = others
@@ -351,7 +353,7 @@ def first_overlap_step(ego, size, centre_ahead, everywhere, others, ignored):
 
 @kernel
 def _closest(x, y, vx, vy):
-    """Smallest distance [m] within the horizon of a point at (x, y) [m] that moves [m/s]."""
+    """Smallest distance [m] to the origin, within the horizon, of a point moving from (x, y)."""
     squared = max(vx * vx + vy * vy, 1e-12)
     t = min(max(-(x * vx + y * vy) / squared, 0.0), HORIZON)
     return math.hypot(x + vx * t, y + vy * t)
@@ -359,8 +361,10 @@ def _closest(x, y, vx, vy):
 
 @kernel
 def _overlap(x, y, yaw, size, other_yaw, other_size):
-    """Whether two boxes overlap on the plane, the second's middle being (x, y) off: separating
-    axes."""
+    """Whether two boxes overlap in the plane (separating axes).
+
+    (x, y) is the centre of the second box relative to the first.
+    """
     cos_a, sin_a = math.cos(yaw), math.sin(yaw)
     cos_b, sin_b = math.cos(other_yaw), math.sin(other_yaw)
     turn = other_yaw - yaw
@@ -383,17 +387,16 @@ NEVER = math.inf
 def time_to_collision(
     instant: Instant, context: ScoringContext, *, off_lane: bool, hit: frozenset[str]
 ) -> float:
-    """First time [s] in steps of 0.1 s up to 3 s at which the ego box overlaps an object's.
+    """Time to collision [s] at constant velocities, in steps of 0.1 s up to 3 s.
 
-    All keep their velocities. Objects ahead count, or behind an ego that drives backwards; when
-    the ego is in several lanes or off the road, all that are not on its other side (nuPlan,
-    NAVSIM).
+    Considers objects in the driving direction. If the ego is in several lanes or off the road, all
+    objects except those behind it count (nuPlan, NAVSIM).
 
     Args:
-        instant: now.
-        context: the ego's size.
+        instant: current instant.
+        context: provides the ego's size.
         off_lane: whether the ego is in several lanes or off the road.
-        hit: objects it is in contact with already, which do not count.
+        hit: objects already in contact, which are ignored.
     """
     ego, others = instant.ego, instant.others
     if not others.ids or math.hypot(ego.speed, ego.lateral_speed) < STANDSTILL:
@@ -401,7 +404,7 @@ def time_to_collision(
     moving = (ego.x, ego.y, ego.yaw, ego.speed, ego.lateral_speed, ego.z)
     ahead = context.centre_ahead
     if ego.speed < -STANDSTILL:
-        # The mirror image, for which what lies where it drives to is ahead.
+        # Mirrored, so that objects in the driving direction are ahead.
         moving = (ego.x, ego.y, ego.yaw + math.pi, -ego.speed, -ego.lateral_speed, ego.z)
         ahead = -ahead
     step: int = first_overlap_step(
@@ -433,10 +436,9 @@ def side_of_contact(
     Args:
         ego_box, box: centre x, y [m], yaw [rad], length, width [m].
         ego_speed, speed: before the contact, along and across [m/s].
-        axle: from the middle of the ego box back to the rear axle, from which what is behind is
-            seen [m].
-        reversing: whether the ego drives in reverse gear: its tail is then what runs into things,
-            as its front does otherwise.
+        axle: distance from the centre of the ego box back to the rear axle, the reference for
+            objects behind [m].
+        reversing: whether the ego is in reverse gear; its tail is then its front.
     """
     if abs(ego_speed) <= STOPPED:
         return "stopped_ego"
@@ -477,7 +479,10 @@ def _segment_intersects(
 
 
 def ego_at_fault(record: ContactRecord, off_lane: bool) -> bool:
-    """Whether the ego is at fault (nuPlan): it ran into something, or left its lane for it."""
+    """Whether the ego is at fault (nuPlan).
+
+    It is in a front contact or with a stopped vehicle, and in a lateral one outside its lane.
+    """
     if record.side in {"front", "stopped_track"}:
         return True
     return record.side == "lateral" and off_lane
@@ -498,7 +503,7 @@ LAMPS = {"on", "off", "flashing", "counting"}
 
 
 class StopLineAt(NamedTuple):
-    """Where vehicles stop: middle, world [m], their heading there [rad], half its width [m]."""
+    """A stop line: centre [m] and heading of traffic [rad], world frame; half its width [m]."""
 
     x: float
     y: float
@@ -508,12 +513,12 @@ class StopLineAt(NamedTuple):
 
 @dataclass(frozen=True)
 class TrafficLights:
-    """What traffic lights showed an ego, and which it ran; immutable.
+    """Traffic light states so far and red light violations; immutable.
 
     Attributes:
-        shown: at the newest instant.
+        shown: states at the newest instant.
         ran: signals whose stop line the ego's front crossed while they were red.
-        placed, unplaced: signals so far whose stop line is known, and others.
+        placed, unplaced: signals so far with a known stop line, and without.
     """
 
     shown: tuple[ShownSignal, ...] = ()
@@ -523,7 +528,7 @@ class TrafficLights:
 
     @property
     def seen(self) -> bool:
-        """Whether there were any."""
+        """Whether there were any signals."""
         return bool(self.placed or self.unplaced)
 
     def updated(
@@ -531,12 +536,11 @@ class TrafficLights:
     ) -> TrafficLights:
         """One instant later.
 
-        A line counts as run where the signal was red at both ends of the step: what it showed
-        between them is not known.
+        Crossing a line is a violation if the signal was red at both ends of the step.
 
         Args:
-            before: the ego at the instant before; None at the first.
-            instant, context: as of all scores.
+            before: the ego at the previous instant; None at the first.
+            instant, context: current instant and context of the scores.
         """
         if not instant.signals and not self.shown:
             return self
@@ -562,8 +566,11 @@ NO_LIGHTS = TrafficLights()
 
 
 def shows_red(state: str) -> bool:
-    """Whether a state bids vehicles stop: ``red``, also beside others (``red;amber``), ``stop``, or
-    lamps of which the first is on (``on;off;off``, red first as in OpenDRIVE)."""
+    """Whether a signal state means stop.
+
+    Stop states are ``red``, also in combination (``red;amber``), ``stop``, and lamp lists with the
+    first lamp on (``on;off;off``, red first as in OpenDRIVE).
+    """
     words = re.findall(r"[a-z]+", state.lower())
     if words and set(words) <= LAMPS:
         return len(words) > 1 and words[0] == "on"
@@ -571,8 +578,11 @@ def shows_red(state: str) -> bool:
 
 
 def stop_lines(signal: ShownSignal, context: ScoringContext) -> Iterator[StopLineAt]:
-    """Where vehicles stop for a signal: as the storyboard says, as wide as a lane, else as the map
-    does: at its stop line, or at the ends of its lanes. None where neither knows."""
+    """Stop lines of a signal.
+
+    Uses the line of the storyboard, as wide as a lane, else the stop line of the map, else the
+    ends of the signal's lanes. Empty if none is known.
+    """
     graph = None if context.road_map is None else context.road_map.graph
     if signal.stop_line is not None:
         x, y, heading = signal.stop_line
@@ -597,7 +607,7 @@ def _of_map(signal: Signal, graph: LaneGraph) -> Iterator[StopLineAt]:
     across = math.atan2(last[1] - first[1], last[0] - first[0])
     x, y = ((first + last) / 2).tolist()
     ruled = lanes or [graph.lanes[name] for name in line.lanes]
-    # Without lanes: traffic comes towards the face of the signal.
+    # Without lanes, traffic approaches the front of the signal.
     way = float(ruled[0].headings[-1]) if ruled else signal.heading + math.pi
     turned = across + math.pi / 2
     heading = turned if math.cos(turned - way) > 0 else turned + math.pi
@@ -605,7 +615,7 @@ def _of_map(signal: Signal, graph: LaneGraph) -> Iterator[StopLineAt]:
 
 
 def _crossed(line: StopLineAt, before: EgoSample, now: EgoSample, context: ScoringContext) -> bool:
-    """Whether the middle of the ego's front crossed a line in its direction within a step."""
+    """Whether the centre of the ego's front crossed a line in its direction within a step."""
     if math.cos(now.yaw - line.heading) <= ALONG:
         return False
     (s0, d0), (s1, d1) = (_front(line, ego, context) for ego in (before, now))
@@ -615,7 +625,7 @@ def _crossed(line: StopLineAt, before: EgoSample, now: EgoSample, context: Scori
 
 
 def _front(line: StopLineAt, ego: EgoSample, context: ScoringContext) -> tuple[float, float]:
-    """The middle of the ego's front: beyond the line, and to the left of its middle [m]."""
+    """The centre of the ego's front: distance beyond the line and left of its centre [m]."""
     ahead = context.ego_size[0] - context.rear_overhang
     x = ego.x + ahead * math.cos(ego.yaw) - line.x
     y = ego.y + ahead * math.sin(ego.yaw) - line.y

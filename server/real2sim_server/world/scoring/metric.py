@@ -1,4 +1,4 @@
-"""The metric registry, and the accumulator from which every metric is computed.
+"""The metric registry and the accumulator.
 
 A metric is a function of the accumulator, registered under a name and a version.
 """
@@ -41,45 +41,47 @@ from .instant import (
 
 @dataclass(frozen=True, eq=False)
 class MetricAccumulator:
-    """Counts and extremes of an episode so far; immutable. One way to make them serves both the
-    running episode and a recording.
+    """Counts and extremes of an episode so far; immutable.
+
+    Running episodes and recordings build it with the same code.
 
     Attributes:
-        steps: made; those of the warm-up do not count, here and below.
-        start_s: along the route where the scores begin [m].
-        distance: driven [m].
-        outside: part of it beside all lanes that go the ego's way [m].
-        tail_first: way along the route that was made facing against it, in reverse gear [m].
-        cut: way along the route that was left out by meeting it again elsewhere [m].
-        s, furthest: along the route: now and at most; the latter less what was tail first or left
-            out [m].
-        offset: from the route now [m].
+        steps: number of steps; warm-up steps are excluded, here and below.
+        start_s: route position at which scoring starts [m].
+        distance: distance driven [m].
+        outside: part of it outside all lanes of the ego's direction [m].
+        tail_first: route distance covered in reverse gear, facing against the route [m].
+        cut: route distance skipped by a short cut [m].
+        s, furthest: current and maximum route position [m]; ``furthest`` excludes ``tail_first``
+            and ``cut``.
+        offset: current offset from the route [m].
         at_fault: at-fault contacts of the ego, by kind: vehicle, vru, object.
-        contacts: contacts begun, by category.
+        contacts: number of new contacts, by category.
         off_road, far_off_road: whether a corner ever left the corridor; by more than 0.3 m.
-        ttc: time to collision now [s].
-        min_ttc: smallest so far [s].
-        comfort, comfort_with_history: of the drive; with the log before the start prepended.
-        backward: [n] float64, ways made against the route in the steps of the last second [m];
-            empty while there were none.
-        oncoming: longest way against the route within a second [m].
-        lane_run: how long the offset has been too large [s].
-        left_lane: whether it was so for 2 s.
-        plan: the newest one.
-        plans_compared, plans_disagree: successive plans compared; whether any two differ.
-        overspeed: integral of speed above the limit [m].
-        hugsim: sum of HUGSIM's score of the steps.
-        feasibility: whether a car could have moved so.
-        first_impact: ego speed relative to what it hit first, there [m/s]; None without contact.
-        impact_position: of the ego at the first contact.
-        pushes: impulse of the steps of the last 0.2 s [N s], of contacts that go on, by name.
-        impulse: on the ego, lengths summed over objects and steps [N s].
-        delta_v: greatest change of the ego's velocity by one impact [m/s].
-        secondary: contacts begun after the first, of the ego or between objects.
+        ttc: current time to collision [s].
+        min_ttc: smallest time to collision so far [s].
+        comfort, comfort_with_history: comfort of the drive, without and with the log before the
+            start.
+        backward: [n] float64, distances driven against the route in each step of the last second
+            [m]; empty if there are none.
+        oncoming: longest distance against the route within one second [m].
+        lane_run: time for which the lane offset has been too large [s].
+        left_lane: whether that ever lasted 2 s.
+        plan: newest plan.
+        plans_compared, plans_disagree: number of compared plan pairs; whether any pair differs.
+        overspeed: integral of the speed above the limit [m].
+        hugsim: sum of HUGSIM's step scores.
+        feasibility: kinematic feasibility of the drive.
+        first_impact: relative speed at the first contact [m/s]; None without contact.
+        impact_position: ego position at the first contact.
+        pushes: impulses of the steps of the last 0.2 s [N s], of ongoing contacts, by name.
+        impulse: magnitudes of the impulses on the ego, summed over objects and steps [N s].
+        delta_v: largest velocity change of the ego by one impact [m/s].
+        secondary: number of contacts after the first, of the ego or between objects.
         hit: objects in contact so far.
-        lights: what traffic lights showed, and which were run.
-        ego: at the newest instant.
-        states: what single metrics accumulate themselves, by name; see :class:`.metric.Metric`.
+        lights: traffic light states and violations.
+        ego: ego sample at the newest instant.
+        states: states of single metrics, by name; see :class:`.metric.Metric`.
     """
 
     steps: int = 0
@@ -122,7 +124,7 @@ class MetricAccumulator:
 
     @property
     def collisions(self) -> int:
-        """Contacts of the ego begun so far."""
+        """Number of contacts of the ego so far."""
         return sum(self.contacts.values())
 
 
@@ -132,7 +134,7 @@ also where it is short: standing still where somebody drove is no progress."""
 
 
 def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Way of the recorded drive along the route in the same time [m]."""
+    """Route progress of the recorded drive in the same time [m]."""
     last = len(context.expert_s) - 1
     begin = min(context.warmup_steps, last)
     step = min(begin + accumulator.steps, last)
@@ -174,8 +176,10 @@ NOT_NOTICED = 2.0
 def cannot_see(
     sees: frozenset[Aspect], accumulator: MetricAccumulator, context: ScoringContext
 ) -> str:
-    """One sentence: what a score that looks at ``sees`` does not see in an episode like this, and
-    what it left uncounted of what happened."""
+    """One sentence on the blind spots of a score that considers ``sees``.
+
+    Names effects that this episode does not simulate, and events that the score did not count.
+    """
     blind = [phrase for aspect, phrase in UNSEEN.items() if aspect not in sees]
     blind += _seen_in_part(sees, accumulator, context)
     seconds, most = accumulator.steps * context.dt, context.horizon * context.dt
@@ -195,7 +199,7 @@ def cannot_see(
 def _seen_in_part(
     sees: frozenset[Aspect], accumulator: MetricAccumulator, context: ScoringContext
 ) -> list[str]:
-    """Of what the score looks at, what this episode does not show."""
+    """Inputs of the score that this episode does not simulate."""
     found = []
     if "progress" in sees and expert_progress(accumulator, context) < MIN_ROUTE:
         found.append("progress (the recorded drive stands still)")
@@ -224,7 +228,7 @@ def _seen_in_part(
 def _uncounted(
     sees: frozenset[Aspect], accumulator: MetricAccumulator, context: ScoringContext
 ) -> list[str]:
-    """What happened in the episode and does not change the score."""
+    """Events of the episode that do not change the score."""
     found = []
     if "progress" not in sees and accumulator.distance < NOT_NOTICED:
         recorded = expert_progress(accumulator, context)
@@ -280,13 +284,13 @@ class Score(NamedTuple):
 
 
 class MetricValue(NamedTuple):
-    """What a metric is worth.
+    """Result of a metric.
 
     Attributes:
-        value: None where ``missing`` says what it would take.
-        terms: that it is made of, by name.
-        assumed: what is taken for granted.
-        missing: what is not known.
+        value: the value; None if inputs are ``missing``.
+        terms: terms of the value, by name.
+        assumed: assumptions made.
+        missing: missing inputs.
     """
 
     value: float | None
@@ -304,19 +308,19 @@ NO_STEP = "a step that counts"
 
 @dataclass(frozen=True)
 class Metric:
-    """One member of the family.
+    """A registered metric.
 
     Attributes:
-        name: on the wire and in recordings.
-        version: raised when a value may change for the same episode.
-        formula: of the accumulator; must not depend on anything else.
-        running: the value of the formula alone, without what it is made of: it is part of every
-            observation; None for a metric that is not.
-        begin, update: where the accumulator lacks something: ``begin(instant, context)`` makes
-            state of the metric's own where the scores begin, ``update(state, instant, context)`` a
-            new state one step later; ``accumulator.states[name]`` has it. Both or neither.
-        sees: what it looks at beside contact, for the sentence that says what it cannot see; None
-            leaves that out.
+        name: name on the wire and in recordings.
+        version: increased when a value may change for the same episode.
+        formula: function of the accumulator and the context only.
+        running: function that returns the value alone, for every observation; None if the metric
+            is not streamed.
+        begin, update: optional state of the metric, for data that the accumulator lacks.
+            ``begin(instant, context)`` creates it at the first scored instant, ``update(state,
+            instant, context)`` returns the state one step later, and ``accumulator.states[name]``
+            holds it. Set both or neither.
+        sees: inputs besides contacts, for the sentence on blind spots; None omits that sentence.
     """
 
     name: str
@@ -336,7 +340,7 @@ class Metric:
         """The score of an episode so far."""
         found = self.formula(accumulator, context)
         if not accumulator.steps:
-            # Nothing was driven that any formula could be about.
+            # No step was scored.
             found = MetricValue(None, {}, missing=(NO_STEP,))
         blind = "" if self.sees is None else cannot_see(self.sees, accumulator, context)
         return Score(
@@ -364,8 +368,9 @@ def metric(
     update: Callable[[Any, Instant, ScoringContext], Any] | None = None,
     sees: Iterable[Aspect] | None = None,
 ) -> Callable[[Formula], Formula]:
-    """Register a formula as a metric; see :class:`Metric` for the arguments, of which ``streamed``
-    stands for a ``running`` that is the value of the formula.
+    """Register a formula as a metric; see :class:`Metric` for the arguments.
+
+    ``streamed`` sets ``running`` to the value of the formula.
 
     Raises:
         ValueError: the name is taken, or only one of ``begin`` and ``update`` is given.
@@ -409,10 +414,9 @@ def metrics_version() -> str:
 
 
 def put_back(accumulator: MetricAccumulator, seam: LoopTransform) -> MetricAccumulator:
-    """The accumulator beyond the seam, so that no step is longer or turns more than it was driven.
+    """The accumulator after a loop reset, so that the reset does not count as motion.
 
-    Distances along the route go on and need nothing; the plan before the seam is not compared with
-    the next one, for the route bends differently there.
+    Route distances continue. The plan before the reset is not compared with the next one.
     """
     assert accumulator.ego is not None
     position, found = accumulator.impact_position, accumulator.feasibility
@@ -466,7 +470,7 @@ def begin_accumulator(instant: Instant, context: ScoringContext) -> MetricAccumu
 def _begun(
     instant: Instant, context: ScoringContext, with_history: ComfortAccumulator
 ) -> MetricAccumulator:
-    """The accumulator at the instant from which on steps count."""
+    """The accumulator at the first scored instant."""
     ego = instant.ego
     comfort = ComfortAccumulator().updated(ego.speed, ego.yaw, context.dt)
     if len(with_history.samples):
@@ -490,7 +494,7 @@ def _begun(
 def update_accumulator(
     accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
 ) -> MetricAccumulator:
-    """The accumulator one step later; steps of the warm-up leave nothing but comfort's history."""
+    """The accumulator one step later; warm-up steps only extend the comfort history."""
     if instant.seam is not None:
         accumulator = put_back(accumulator, instant.seam)
     if instant.step <= context.warmup_steps:
@@ -550,8 +554,10 @@ def update_accumulator(
 
 
 def _against_route(backward: Float, way: float, dt: float) -> tuple[Float, float]:
-    """Ways made against the route within a second, one more of which is ``way``, and their sum [m].
-    Nothing is kept while there is none: what lies before the first adds nothing."""
+    """Append ``way`` to the distances driven against the route within a second; also their sum [m].
+
+    Empty until the first of them.
+    """
     if not way and not len(backward):
         return backward, 0.0
     backward, total = windowed_sum(backward, way, max(round(ONCOMING_WINDOW_S / dt), 1))
@@ -559,15 +565,14 @@ def _against_route(backward: Float, way: float, dt: float) -> tuple[Float, float
 
 
 def _left_out(gain: float, way: float) -> float:
-    """What of a step's gain along the route [m] was not driven, but left out by a short cut; below
-    0 where the ego has come back over one."""
+    """Part of a step's route progress [m] that a short cut skipped; negative on the way back."""
     return gain - math.copysign(way, gain) if abs(gain) > BEND * way + SHORT_CUT else 0.0
 
 
 def _updated_states(
     accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
 ) -> Mapping[str, Any]:
-    """What single metrics accumulate themselves."""
+    """Updated states of the metrics that have one."""
     states = accumulator.states
     if not states:
         return states
@@ -576,7 +581,7 @@ def _updated_states(
 
 
 def _in_several_lanes(ego: EgoSample, context: ScoringContext) -> bool:
-    """Whether the ego reaches out of its lane, whose middle is the route."""
+    """Whether the ego box extends beyond its lane, which is centred on the route."""
     return abs(ego.offset) + context.ego_size[1] / 2 > context.lane
 
 
@@ -640,8 +645,10 @@ def _was_off_lane(
 def _with_pushes(
     accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
 ) -> MetricAccumulator:
-    """With what impacts do to the ego's velocity: impulse by mass, within the time of a crash. A
-    contact that lasts, in which an engine may push against a wall, adds no more."""
+    """Update velocity changes by impacts: impulse over mass, within the duration of a crash.
+
+    Later impulses of a lasting contact, such as pushing against a wall, do not count.
+    """
     pushing = [c for c in instant.contacts if c.impulse != (0.0, 0.0)]
     if not pushing:
         return copy_with(accumulator, pushes={}) if accumulator.pushes else accumulator
@@ -661,7 +668,7 @@ def _with_pushes(
 def _compared_plans(
     accumulator: MetricAccumulator, plan: PlannedTrajectory | None
 ) -> dict[str, Any]:
-    """The newest plan, and how successive ones compare so far."""
+    """The newest plan and the results of comparing successive plans."""
     compared, disagree = accumulator.plans_compared, accumulator.plans_disagree
     if plan is not None and accumulator.plan is not None:
         agree = plans_agree(accumulator.plan, plan)

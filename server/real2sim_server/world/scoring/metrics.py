@@ -1,4 +1,4 @@
-"""The metrics of the field: NAVSIM, nuPlan, HUGSIM, NeuroNCAP, CARLA, AlpaSim, Waymax."""
+"""Standard metrics: NAVSIM, nuPlan, HUGSIM, NeuroNCAP, CARLA, AlpaSim, Waymax."""
 
 from __future__ import annotations
 
@@ -27,14 +27,13 @@ NO_MAP = "no map: corridor and lanes come from the recorded drive"
 
 
 def progress_along_route(accumulator: MetricAccumulator) -> float:
-    """Way along the route [m]; not what was driven tail first, which is no way to drive there, nor
-    what was left out by a short cut."""
+    """Progress along the route [m], without reverse driving and distance skipped by short cuts."""
     driven = accumulator.s - accumulator.tail_first - accumulator.cut
     return max(driven - accumulator.start_s, 0.0)
 
 
 def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Fraction of the recorded way, at most 1; 1 where the recorded drive stands still."""
+    """Progress as a fraction of the recorded drive, at most 1; 1 if that is stationary."""
     expert = expert_progress(accumulator, context)
     if expert < MIN_ROUTE:
         return 1.0
@@ -42,15 +41,17 @@ def relative_progress(accumulator: MetricAccumulator, context: ScoringContext) -
 
 
 def whole_route(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """Way of the recorded drive along the route up to the horizon [m]."""
+    """Route progress of the recorded drive up to the horizon [m]."""
     return context.route_end_s - accumulator.start_s
 
 
 def route_completion(
     accumulator: MetricAccumulator, context: ScoringContext, fraction: float = 1.0
 ) -> float:
-    """How much of a ``fraction`` of the recorded way up to the horizon was reached; 1 where the
-    recorded drive stands still."""
+    """Progress relative to ``fraction`` of the recorded drive up to the horizon.
+
+    1 if the recorded drive is stationary.
+    """
     whole = whole_route(accumulator, context)
     if whole < MIN_ROUTE:
         return 1.0
@@ -58,7 +59,7 @@ def route_completion(
 
 
 def assumed_progress(accumulator: MetricAccumulator, context: ScoringContext) -> tuple[str, ...]:
-    """What is taken for granted where the recorded drive is short; nothing where it is not."""
+    """Assumption made if the recorded drive is too short to measure progress."""
     expert = expert_progress(accumulator, context)
     if expert < MIN_ROUTE:
         return (f"progress 1: the recorded drive stands still ({expert:.1f} m)",)
@@ -71,7 +72,7 @@ def assumed_progress(accumulator: MetricAccumulator, context: ScoringContext) ->
 
 
 def assumed_route(accumulator: MetricAccumulator, context: ScoringContext) -> tuple[str, ...]:
-    """What is taken for granted where the recorded drive up to the horizon stands still."""
+    """Assumption made if the recorded drive up to the horizon is stationary."""
     whole = whole_route(accumulator, context)
     if whole >= MIN_ROUTE:
         return ()
@@ -79,7 +80,7 @@ def assumed_route(accumulator: MetricAccumulator, context: ScoringContext) -> tu
 
 
 def roads(context: ScoringContext) -> tuple[str, ...]:
-    """What is assumed of the road: that of the scene's map, or what was driven."""
+    """Assumption on the road: the scene's map or the driven area."""
     if context.road_map is None:
         return (NO_MAP,)
     graph = context.road_map.graph
@@ -88,15 +89,14 @@ def roads(context: ScoringContext) -> tuple[str, ...]:
 
 
 def driven_lanes(context: ScoringContext) -> tuple[str, ...]:
-    """What is assumed of lanes."""
+    """Assumption on lanes."""
     if context.road_map is None:
         return ("lanes are those that were driven in the recording",)
     return roads(context)
 
 
 def lights(accumulator: MetricAccumulator, context: ScoringContext) -> str:
-    """What is assumed of traffic lights: a map tells where they stand, a storyboard what they
-    show."""
+    """Assumption on traffic lights: positions come from the map, states from the storyboard."""
     seen = accumulator.lights
     signals = () if context.road_map is None else context.road_map.graph.signals.values()
     mapped = {signal.signal_id for signal in signals if signal.kind == "traffic_light"}
@@ -133,13 +133,15 @@ def nuplan_no_collision(accumulator: MetricAccumulator) -> float:
 
 
 def light_compliance(accumulator: MetricAccumulator) -> float:
-    """TLC of NAVSIM v2: 0 once the ego's front has crossed a stop line while its signal was red,
-    else 1; 1 where there are no signals with phases."""
+    """TLC of NAVSIM v2: 0 once the ego's front has crossed a stop line at red, else 1.
+
+    1 if no signals have phases.
+    """
     return float(not accumulator.lights.ran)
 
 
 def direction(accumulator: MetricAccumulator) -> float:
-    """DDC: 1 below 2 m of way against the route within a second, 0.5 below 6 m, else 0."""
+    """DDC: 1 for less than 2 m against the route within a second, 0.5 for less than 6 m, else 0."""
     return 1.0 if accumulator.oncoming < 2.0 else 0.5 if accumulator.oncoming < 6.0 else 0.0
 
 
@@ -159,7 +161,7 @@ def nuplan_progress(accumulator: MetricAccumulator, context: ScoringContext) -> 
 
 
 def speed_limits(accumulator: MetricAccumulator, context: ScoringContext) -> float:
-    """SL of nuPlan; 1 where no limit is known."""
+    """SL of nuPlan; 1 if no limit is known."""
     if not context.knows_limits:
         return 1.0
     seconds = max(accumulator.steps * context.dt, context.dt)
@@ -167,24 +169,24 @@ def speed_limits(accumulator: MetricAccumulator, context: ScoringContext) -> flo
 
 
 def feasible(accumulator: MetricAccumulator) -> float:
-    """1 while a car could have moved so, else 0; no score counts what no car can do."""
+    """1 if the motion so far is kinematically feasible, else 0; a factor of all scores."""
     return float(not accumulator.feasibility.steps)
 
 
 def hugsim_mean(accumulator: MetricAccumulator) -> float:
-    """Mean of HUGSIM's score of the steps."""
+    """Mean of HUGSIM's step scores."""
     return accumulator.hugsim / accumulator.steps if accumulator.steps else 1.0
 
 
 def lane_share(accumulator: MetricAccumulator) -> float:
-    """Fraction of the way in lanes that were driven in the ego's direction (CARLA leaderboard)."""
+    """Fraction of the distance driven in lanes of the ego's direction (CARLA leaderboard)."""
     if accumulator.distance <= 0:
         return 1.0
     return max(1 - accumulator.outside / accumulator.distance, 0.0)
 
 
 def infractions(accumulator: MetricAccumulator) -> dict[str, int]:
-    """Contacts begun, by kind (CARLA leaderboard)."""
+    """Number of contacts, by kind (CARLA leaderboard)."""
     counts = {"vru": 0, "vehicle": 0, "object": 0}
     for category, n in accumulator.contacts.items():
         counts[fault_class(category)] += n
@@ -192,7 +194,7 @@ def infractions(accumulator: MetricAccumulator) -> dict[str, int]:
 
 
 def carla_penalty(accumulator: MetricAccumulator) -> float:
-    """Product of the penalties, and the share of the way in lanes."""
+    """Product of the penalties and the fraction of the distance in lanes."""
     lanes = lane_share(accumulator)
     if not accumulator.contacts:
         return lanes
@@ -201,7 +203,7 @@ def carla_penalty(accumulator: MetricAccumulator) -> float:
 
 
 def ttc_within_bound(accumulator: MetricAccumulator) -> float:
-    """1 while no time to collision was 0.95 s or less."""
+    """1 if the time to collision has always been above 0.95 s, else 0."""
     return float(accumulator.min_ttc > TTC_BOUND)
 
 
@@ -218,8 +220,10 @@ def pdms_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> floa
 
 @metric("pdms", version="5", running=pdms_so_far, sees=NAVSIM_SEES)
 def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """F NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the drive as driven; F
-    is :func:`feasible`, as in all scores below."""
+    """F NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the executed drive.
+
+    F is :func:`feasible`, as in all scores below.
+    """
     terms = {
         "feasible": feasible(accumulator),
         "NC": no_collision(accumulator),
@@ -313,7 +317,7 @@ def hugsim_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> fl
     sees=("progress", "comfort", "near_misses", "road"),
 )
 def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """F RC mean_t[NC DAC (5 TTC + 2 C) / 7] (Zhou et al. 2024, HUGSIM), on the drive as driven."""
+    """F RC mean_t[NC DAC (5 TTC + 2 C) / 7] (Zhou et al. 2024, HUGSIM), on the executed drive."""
     terms = {
         "feasible": feasible(accumulator),
         "RC": route_completion(accumulator, context, 0.9),
@@ -327,8 +331,8 @@ def hugsim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVal
 def neuroncap(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F times 5 without collision, else 4 max(0, 1 - v_i/v_r) (Ljungbergh et al. 2024, NeuroNCAP).
 
-    v_i is the relative speed at first contact, v_r that of a run in which the ego keeps to the
-    recorded drive whatever happens.
+    v_i is the relative speed at first contact, v_r the same in a run in which the ego follows the
+    recorded drive without reacting.
     """
     possible = feasible(accumulator)
     if accumulator.first_impact is None:
@@ -349,9 +353,11 @@ def carla_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> flo
 
 @metric("carla_ds", version="4", running=carla_so_far, sees=("progress", "lane"))
 def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """F times route completion in percent times the product of penalties (CARLA leaderboard), with
-    those infractions that need no map: pedestrian 0.5, vehicle 0.6, static 0.65, and the share of
-    the way in lanes."""
+    """F times route completion in percent times the product of penalties (CARLA leaderboard).
+
+    Only infractions that need no map: pedestrian 0.5, vehicle 0.6, static 0.65, and the fraction
+    of the distance in lanes.
+    """
     counts = infractions(accumulator)
     terms = {
         "feasible": feasible(accumulator),
@@ -372,8 +378,7 @@ def carla(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValu
 
 @metric("alpasim", version="5", sees=("progress", "road", "fault"))
 def alpasim(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """0 if at fault, off the road or as no car moves, else min(progress / 0.8, 1) (AlpaSim scene
-    score)."""
+    """0 if at fault, off the road or infeasible, else min(progress / 0.8, 1) (AlpaSim)."""
     progress, possible = relative_progress(accumulator, context), feasible(accumulator)
     clear = not accumulator.at_fault and not accumulator.off_road
     value = possible * min(progress / 0.8, 1.0) if clear else 0.0
@@ -388,9 +393,11 @@ def feasible_so_far(accumulator: MetricAccumulator, _context: ScoringContext) ->
 
 @metric("feasible", version="2", running=feasible_so_far, sees=())
 def feasible_drive(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
-    """1 if a car could have driven every step: acceleration and curvature as in Waymax, the way as
-    its speed and heading say, no faster backwards than a reverse gear; else 0. Every other score
-    is multiplied by it."""
+    """1 if every step is kinematically feasible, else 0; a factor of every other score.
+
+    Limits: acceleration and curvature as in Waymax, displacement consistent with speed and
+    heading, and reverse speed within that of a reverse gear.
+    """
     found = accumulator.feasibility
     terms = {"infeasible_steps": float(found.steps)}
     if found.first is not None:
@@ -402,14 +409,17 @@ def feasible_drive(accumulator: MetricAccumulator, context: ScoringContext) -> M
 def kinematic_infeasibility(
     accumulator: MetricAccumulator, _context: ScoringContext
 ) -> MetricValue:
-    """1 if any step has |a| > 10.4 m/s^2, |curvature| > 0.3 1/m (Waymax), or another way than its
-    speed and heading, else 0."""
+    """1 if any step is infeasible, else 0.
+
+    A step is infeasible if |a| > 10.4 m/s^2 or |curvature| > 0.3 1/m (Waymax), or if its
+    displacement contradicts its speed and heading.
+    """
     return MetricValue(1.0 - feasible(accumulator), {})
 
 
 @metric("delta_v", version="2", sees=())
 def delta_v(accumulator: MetricAccumulator, _context: ScoringContext) -> MetricValue:
-    """Greatest change of the ego's velocity by one impact [m/s], with what else physics says."""
+    """Largest velocity change of the ego by one impact [m/s], with other impact figures."""
     terms = {
         "feasible": feasible(accumulator),
         "impulse": accumulator.impulse,
@@ -425,7 +435,7 @@ def delta_v(accumulator: MetricAccumulator, _context: ScoringContext) -> MetricV
 
 
 def running_metrics(accumulator: MetricAccumulator, context: ScoringContext) -> dict[str, float]:
-    """What is streamed with every observation; all finite."""
+    """Values of all streamed metrics, part of every observation; all finite."""
     found = {
         "distance": accumulator.distance,
         "route_progress": accumulator.s - accumulator.cut - accumulator.start_s,

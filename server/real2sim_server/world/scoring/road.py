@@ -1,4 +1,4 @@
-"""The road as scores see it: how far a box is off it, its surface, lanes, directions and limits."""
+"""Road geometry for scoring: off-road distance, lanes, directions and speed limits."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ MAX_SPACING = DENSITY * (1 + 1e-9)
 
 @kernel
 def off_road(middle, size, route, lanes, half_widths):
-    """How far a box is off the road, and how many of its quarters have their middle on it.
+    """Off-road distance of a box, and the number of its quarters on the road.
 
-    The road is all that lies within half a width of a line.
+    The road is the area within half a width of any line. A quarter is on the road if its centre is.
 
     Args:
-        middle: x, y [m], yaw [rad] of the box.
-        size: (length, width, height) of it [m].
-        route: points [R, 2] float64 and their ends [n] int64: line k has the points from the end
-            before to ``ends[k]``, each at most ``DENSITY`` from the one before [m].
-        lanes: other lines in the same form; there may be none.
-        half_widths: along the route and along the lanes [m].
+        middle: centre x, y [m], yaw [rad] of the box.
+        size: (length, width, height) of the box [m].
+        route: points [R, 2] float64 and their ends [n] int64: line k has points ``ends[k - 1]`` to
+            ``ends[k]``, at most ``DENSITY`` apart [m].
+        lanes: other lines in the same form; may be empty.
+        half_widths: half widths of the route and of the lanes [m].
 
     Returns:
-        How far its worst corner is off the road [m], 0 and less on it; 0 to 4 quarters.
+        Distance of the worst corner from the road [m], at most 0 on the road; and 0 to 4 quarters.
     """
     x, y, yaw = middle
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -61,12 +61,12 @@ def off_road(middle, size, route, lanes, half_widths):
 
 @kernel
 def in_lane(place, lines, half_width):
-    """Whether a place lies within half a width [m] of a line that goes on in its direction.
+    """Whether a pose is within half a width [m] of a line that runs in its direction.
 
     Args:
         place: x, y [m], yaw [rad].
-        lines: as in :func:`off_road`; there may be none.
-        half_width: of each lane [m].
+        lines: as in :func:`off_road`; may be empty.
+        half_width: half width of each lane [m].
     """
     points, ends = lines
     x, y, yaw = place
@@ -85,7 +85,7 @@ def in_lane(place, lines, half_width):
 
 @kernel
 def _narrow(beyond, places, lines, half_width):
-    """Lower ``beyond`` [P] [m] to how far places [P, 2] [m] are off the strips along lines."""
+    """Lower ``beyond`` [P] [m] to the distances of points [P, 2] [m] from the strips of lines."""
     distance = math.inf
     for k in range(len(places)):
         x, y = places[k, 0], places[k, 1]
@@ -111,8 +111,8 @@ def _rough_distance(x, y, points):
 def _distance(x, y, lines, bound):
     """Distance [m] from (x, y) to the nearest point of lines, which is at most ``bound``.
 
-    Where a point is farther away than the nearest one so far, as many of those after it are
-    skipped as cannot be nearer, since each is at most ``DENSITY`` from the one before.
+    Points are at most ``DENSITY`` apart, so after a far point the search skips those that cannot
+    be nearer than the best one.
     """
     points, ends = lines
     best, k = bound, 0
@@ -133,7 +133,7 @@ ALONG = 0.5
 
 
 class EgoPose(Protocol):
-    """What is asked of an ego: rear axle in the world [m], heading [rad], offset from the route."""
+    """State of an ego: rear axle, world frame [m], heading [rad], offset from the route [m]."""
 
     @property
     def x(self) -> float:
@@ -154,25 +154,27 @@ class EgoPose(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RoadMap:
-    """The lanes of a scene as scores ask them.
+    """Lane queries of the scores.
 
     Attributes:
-        graph: in the world frame.
+        graph: lane graph, world frame.
     """
 
     graph: LaneGraph
 
     @classmethod
     def of(cls, graph: LaneGraph | None) -> RoadMap | None:
-        """Of a map; None without one. Lanes made of the recorded drive alone are none: they know of
-        no surface beside what was driven, and scores have that from the recording itself."""
+        """The road map of a lane graph.
+
+        None without a graph, or if its lanes come from the recorded drive only: the scores use the
+        recording itself then.
+        """
         return None if graph is None or graph.source == "log" else cls(graph)
 
     def off_road(
         self, middle: tuple[float, float, float], size: tuple[float, float, float]
     ) -> tuple[float, int]:
-        """As :func:`.off_road`: how far the worst corner of a box is off the road
-        [m], and how many of its quarters have their middle on it."""
+        """Off-road distance [m] and number of quarters on the road, as :func:`.off_road`."""
         x, y, yaw = middle
         cos, sin = math.cos(yaw), math.sin(yaw)
         turn = np.array([[cos, sin], [-sin, cos]])
@@ -191,25 +193,27 @@ class RoadMap:
         return max(abs(found.offset) - half, MIN_BEYOND_M)
 
     def in_lane(self, ego: EgoPose, ahead: float) -> bool:
-        """Whether the middle of the ego box is in a lane that runs its way, or in a junction."""
+        """Whether the centre of the ego box is in a lane of its direction or in a junction."""
         return self._along(ego, ahead, 1.0) or self._in_junction(ego, ahead)
 
     def lane_offset(self, ego: EgoPose) -> float:
-        """Distance of the rear axle from the middle of the nearest lane [m]; 0 in junctions, where
-        nobody keeps one, and the offset from the route beside all lanes."""
+        """Offset of the rear axle from the centre of the nearest lane [m].
+
+        0 in junctions; outside all lanes, the offset from the route.
+        """
         found = self.graph.nearest(ego.x, ego.y, ego.yaw)
         if found is None:
             return ego.offset
         return 0.0 if self.graph.lanes[found.lane_id].junction is not None else found.offset
 
     def is_against(self, ego: EgoPose, ahead: float) -> bool:
-        """Whether the middle of the ego box is in a lane of oncoming traffic alone."""
+        """Whether the centre of the ego box is only in lanes of oncoming traffic."""
         if self._in_junction(ego, ahead) or self._along(ego, ahead, 1.0):
             return False
         return self._along(ego, ahead, -1.0)
 
     def speed_limit(self, ego: EgoPose) -> float | None:
-        """Of the lane that the ego drives in [m/s]; None where none is known."""
+        """Speed limit of the ego's lane [m/s]; None if unknown."""
         found = self.graph.nearest(ego.x, ego.y, ego.yaw, within=5.0)
         return None if found is None else self.graph.lanes[found.lane_id].speed_limit
 
@@ -219,7 +223,7 @@ class RoadMap:
         return any(lane.speed_limit is not None for lane in self.graph.lanes.values())
 
     def _along(self, ego: EgoPose, ahead: float, sign: float) -> bool:
-        """Whether the middle lies inside a lane whose direction, times ``sign``, is the ego's."""
+        """Whether the centre is in a lane whose direction, times ``sign``, is the ego's."""
         x, y = ego.x + ahead * math.cos(ego.yaw), ego.y + ahead * math.sin(ego.yaw)
         heading = ego.yaw if sign > 0 else ego.yaw + math.pi
         found = self.graph.nearest(x, y, heading)
@@ -235,12 +239,12 @@ class RoadMap:
         )
 
     def fields(self) -> dict[str, Any]:
-        """Plain values, for a recording."""
+        """Plain values for a recording."""
         return lane_document(self.graph, with_roads=False).model_dump(mode="json")
 
     @classmethod
     def from_fields(cls, fields: dict[str, Any]) -> RoadMap:
-        """What :meth:`fields` gave. Raises ValueError for anything else."""
+        """Inverse of :meth:`fields`. Raises ValueError for invalid values."""
         return cls(graph_of(SceneLanes.model_validate(fields)))
 
 

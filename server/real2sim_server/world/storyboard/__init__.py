@@ -1,5 +1,6 @@
-"""Storyboards: what entities of an episode do, and when.
+"""Storyboards: triggered actions of entities, after OpenSCENARIO XML.
 
-:mod:`.program` is a prepared storyboard, :mod:`.run` a running one, :mod:`.progress` its steps.
-:mod:`.view` has the entities, moved by :mod:`.motion`; :mod:`.roads` has roads and trajectories.
+:mod:`.program` prepares a storyboard, :mod:`.run` runs it, and :mod:`.progress` steps it.
+:mod:`.view` has the entities, :mod:`.motion` moves them, and :mod:`.roads` has roads and
+trajectories.
 """

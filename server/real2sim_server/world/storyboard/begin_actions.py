@@ -1,4 +1,4 @@
-"""Private actions begin: each gives its entity the controller that moves it from now on."""
+"""Start of private actions: each one assigns a motion controller to its entity."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ SLOWEST_DESIRED = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Beginning:
-    """What an action may know when it begins.
+    """Inputs of an action at its start.
 
     Attributes:
-        view: the instant.
-        places: resolves positions then.
-        token: of the action.
-        version: of the storyboard.
+        view: current instant.
+        places: resolves positions at that instant.
+        token: token of the action.
+        version: version of the storyboard.
     """
 
     view: View
@@ -71,10 +71,10 @@ class Beginning:
 
 
 def begun(actor: EntityState, action: Any, at: Beginning) -> EntityState:
-    """The entity with an action of the storyboard begun; one that takes no time is finished.
+    """The entity with a started action; instantaneous actions are already finished.
 
     Raises:
-        WorldError: INVALID_REQUEST, a place, lane or form that it cannot go to.
+        WorldError: INVALID_REQUEST for an unreachable position, lane or shape.
     """
     return _BEGIN[type(action)](actor, action, at)
 
@@ -84,15 +84,14 @@ def _done(actor: EntityState, at: Beginning, **changes: Any) -> EntityState:
 
 
 def _dynamics(dynamics: Dynamics, at: Beginning) -> Dynamics:
-    """With the magnitude of a rate: some write braking as a negative one."""
+    """Dynamics with a positive rate: some files use negative rates for braking."""
     if at.version < 2 or dynamics.dimension != "rate":
         return dynamics
     return dynamics.model_copy(update={"value": abs(float(dynamics.value))})
 
 
 def _freed(actor: EntityState) -> EntityState:
-    """Off a trajectory whose times ruled its speed, which it goes on along at its own; off one
-    that only rules its place nothing changes."""
+    """Replace a timed trajectory by its path, along which the entity keeps its own speed."""
     if actor.trajectory is None or actor.trajectory.timing is None:
         return actor
     course = actor.trajectory.course
@@ -102,7 +101,7 @@ def _freed(actor: EntityState) -> EntityState:
 
 
 def _on_lane(actor: EntityState, at: Beginning) -> EntityState:
-    """Off its trajectory, on the lane where it is."""
+    """Drop the trajectory and continue on the current lane."""
     if actor.trajectory is None:
         return actor
     return copy_with(actor, trajectory=None).on_lane(at.view.network)
@@ -127,8 +126,10 @@ def _speed(actor: EntityState, action: SpeedAction, at: Beginning) -> EntityStat
 
 
 def _speed_duration(dynamics: Dynamics, start: float, end: float) -> float:
-    """How long it takes [s]. All forms have the mean of both speeds as their mean, which tells
-    the time that a way takes."""
+    """Duration of a speed change [s].
+
+    All shapes have the mean of both speeds as their mean, so a distance determines the duration.
+    """
     if dynamics.dimension != "distance" or dynamics.shape == "step":
         return duration(dynamics, end - start)
     mean = (start + end) / 2
@@ -213,7 +214,7 @@ def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) ->
         if action.continuous and acceleration is None:
             return copy_with(actor, lateral=FollowOffset(at.token, action.relative_to, value))
         value += lane_offset(at.view.entities[action.relative_to], at.view)
-    # Who was straight on beside the road or on a route counts from its lane's middle now.
+    # An entity off the road or on a route is measured from the centre of its lane from now on.
     actor = actor.on_lane(at.view.network)
     if action.continuous and acceleration is None:
         return copy_with(actor, lateral=HoldOffset(at.token, value))
@@ -305,9 +306,9 @@ def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> Enti
 
 
 def _is_beside(place: Place, route: Way) -> bool:
-    """Whether a place is one to drive a route from."""
+    """Whether a place is near enough to a route, and roughly along it, to start driving it."""
     near = route.path.nearest(place.x, place.y)
-    # Headings of a route turn between its places, which may be far apart: its points tell more.
+    # Use points of the route: its headings change between places that may be far apart.
     (x0, y0, *_), (x1, y1, *_) = (route.path.at(near.s + ds) for ds in (-0.5, 0.5))
     turn = math.remainder(math.atan2(y1 - y0, x1 - x0) - place.h, math.tau)
     away = math.dist((place.x, place.y), near.position[:2])

@@ -1,4 +1,4 @@
-"""How entities move: transitions, what moves them sideways and along, and a short time of it."""
+"""Motion of entities: transition shapes, lateral and longitudinal controllers, integration."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CURVIEST = {"cubic": 6.0, "sinusoidal": math.pi**2 / 2, "quintic": 10.0 / math.s
 
 
 def progress(shape: Shape, u: float) -> float:
-    """f(u): 0 to 1 while u goes from 0 to 1, see :class:`Dynamics`."""
+    """f(u): 0 to 1 for u from 0 to 1, see :class:`Dynamics`."""
     if shape == "step" or u >= 1.0:
         return 1.0
     u = max(u, 0.0)
@@ -42,7 +42,7 @@ def progress(shape: Shape, u: float) -> float:
 
 
 def integral(shape: Shape, u: float) -> float:
-    """F(u), the integral of f from 0 to u; beyond 1 that of the constant 1."""
+    """F(u), the integral of f from 0 to u; f is 1 beyond u = 1."""
     if shape == "step":
         return u
     if u >= 1.0:
@@ -58,7 +58,7 @@ def integral(shape: Shape, u: float) -> float:
 
 
 def duration(dynamics: Dynamics, change: float) -> float:
-    """How long a change takes by time or rate [s]; 0 at once. Not for the dimension 'distance'."""
+    """Duration of a change by time or rate [s]; 0 for a step. Not for the dimension 'distance'."""
     value = float(dynamics.value)
     if dynamics.shape == "step" or change == 0.0:
         return 0.0
@@ -68,7 +68,7 @@ def duration(dynamics: Dynamics, change: float) -> float:
 
 
 def gentle_duration(shape: Shape, change: float, acceleration: float | None) -> float:
-    """How long a change takes whose second derivative is not to be higher [s]; 0 at once."""
+    """Duration of a change with a limited second derivative [s]; 0 for a step."""
     if shape == "step" or acceleration is None or change == 0.0:
         return 0.0
     return math.sqrt(CURVIEST[shape] * abs(change) / max(acceleration, 1e-6))
@@ -80,7 +80,7 @@ AT_PLACE = 0.01
 
 @dataclass(frozen=True)
 class OffsetChange:
-    """From one offset to another in a form of time, or of the way."""
+    """Changes the offset with a shape over time or distance."""
 
     token: int
     shape: Shape
@@ -91,7 +91,7 @@ class OffsetChange:
     done: float = 0.0
 
     def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
-        """``h`` seconds and ``way`` metres on."""
+        """The change after ``h`` seconds and ``way`` metres."""
         done = self.done + (abs(way) if self.by_way else h)
         u = done / self.extent
         offset = self.start + (self.end - self.start) * progress(self.shape, u)
@@ -100,39 +100,39 @@ class OffsetChange:
 
 @dataclass(frozen=True)
 class FollowOffset:
-    """Goes on being so far beside where another is in its lane."""
+    """Keeps a lateral distance to the lane offset of another entity."""
 
     token: int
     other: str
     value: float
 
     def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
-        """``h`` seconds and ``way`` metres on."""
+        """The change after ``h`` seconds and ``way`` metres."""
         return Shifted(self.value + lane_offset(view.entities[self.other], view), self)
 
 
 @dataclass(frozen=True)
 class HoldOffset:
-    """Goes on being so far beside the middle of its lane."""
+    """Keeps its offset from the lane centre."""
 
     token: int
     value: float
 
     def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
-        """``h`` seconds and ``way`` metres on."""
+        """The change after ``h`` seconds and ``way`` metres."""
         return Shifted(self.value, self)
 
 
 @dataclass(frozen=True)
 class KeepAside:
-    """Keeps a distance sideways from another, within limits of speed and acceleration."""
+    """Keeps a lateral distance to another entity, within limits of speed and acceleration."""
 
     token: int
     action: LateralDistanceAction
     side: float
 
     def step(self, actor: EntityState, view: View, way: float, h: float) -> Shifted:
-        """``h`` seconds and ``way`` metres on."""
+        """The change after ``h`` seconds and ``way`` metres."""
         other, limits = view.entities[self.action.entity], self.action.limits
         distance = float(self.action.distance)
         if self.action.freespace:
@@ -142,7 +142,7 @@ class KeepAside:
         error = self.side * distance - now
         speed = math.inf if limits.speed is None else float(limits.speed)
         if limits.acceleration is not None:
-            # What can still be braked away before it is there, and what can be gained by now.
+            # Limited by braking before the target and by the acceleration so far.
             gain = float(limits.acceleration)
             speed = min(speed, math.sqrt(2.0 * gain * abs(error)), abs(actor.drift) + gain * h)
         step = min(max(error, -speed * h), speed * h)
@@ -151,7 +151,7 @@ class KeepAside:
 
 
 def lane_offset(actor: EntityState, view: View) -> float:
-    """How far an entity is to the left of the middle of its lane, as it drives [m]."""
+    """Offset of an entity from its lane centre, positive left in driving direction [m]."""
     if actor.way is not None and actor.way.lane:
         return actor.offset
     on_lane = actor.on_lane(view.network)
@@ -170,7 +170,7 @@ SLOWEST_MASTER = 0.05
 
 @dataclass(frozen=True)
 class SpeedChange:
-    """From one speed to another in a form of time."""
+    """Changes the speed with a shape over time."""
 
     token: int
     shape: Shape
@@ -180,7 +180,7 @@ class SpeedChange:
     elapsed: float = 0.0
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
-        """``h`` seconds on; the way is the integral of the speed."""
+        """The motion after ``h`` seconds; the distance is the integral of the speed."""
         before, after = self.elapsed / self.duration, (self.elapsed + h) / self.duration
         change = self.end - self.start
         covered = integral(self.shape, after) - integral(self.shape, before)
@@ -192,14 +192,14 @@ class SpeedChange:
 
 @dataclass(frozen=True)
 class SpeedCourse:
-    """Through speeds at times since it began, linearly between them."""
+    """Follows speeds at times since its start, linear in between."""
 
     token: int
     points: tuple[tuple[float, float], ...]
     elapsed: float = 0.0
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
-        """``h`` seconds on."""
+        """The motion after ``h`` seconds."""
         t0, t1 = self.elapsed, self.elapsed + h
         inner = [t for t, _ in self.points if t0 < t < t1]
         times = [t0, *inner, t1]
@@ -220,7 +220,7 @@ class SpeedCourse:
 
 @dataclass(frozen=True)
 class FollowSpeed:
-    """Goes on having the speed of another, plus or times something, no faster than by a rate."""
+    """Follows the speed of another entity, with an offset or factor and a rate limit."""
 
     token: int
     other: str
@@ -229,7 +229,7 @@ class FollowSpeed:
     rate: float
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
-        """``h`` seconds on."""
+        """The motion after ``h`` seconds."""
         speed = view.entities[self.other].speed
         wanted = speed + self.value if self.relation == "delta" else speed * self.value
         change = min(max(wanted - actor.speed, -self.rate * h), self.rate * h)
@@ -238,21 +238,21 @@ class FollowSpeed:
 
 @dataclass(frozen=True)
 class KeepDistance:
-    """Keeps a distance, or a gap in time, along the road to another."""
+    """Keeps a distance or time gap along the road to another entity."""
 
     token: int
     action: LongitudinalDistanceAction
     leading: bool
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
-        """``h`` seconds on, as fast as the limits let it be there and stay."""
+        """The motion after ``h`` seconds, as fast as the limits allow without overshoot."""
         other = view.entities[self.action.entity]
         ahead = ahead_on_way(actor, other.x, other.y, view.network)
         error = ahead - self._wanted(actor, other)
         closing = error + other.speed * h
         limits = self.action.limits
         if limits.acceleration is None and limits.deceleration is None:
-            # As fast as it takes: there at the end of the step.
+            # Unlimited: reach the target at the end of the step.
             most = math.inf if limits.speed is None else float(limits.speed)
             way = min(max(closing, 0.0), most * h)
             speed = min(other.speed, most) if abs(way - closing) < DONE else way / h
@@ -263,7 +263,7 @@ class KeepDistance:
         return Moved(way, speed, self._then(left, speed - other.speed))
 
     def _wanted(self, actor: EntityState, other: EntityState) -> float:
-        """How far ahead of it the other is to be: negative for who leads."""
+        """Target distance of the other entity ahead; negative if this one leads."""
         aim = self.action
         if aim.distance is not None:
             distance = float(aim.distance)
@@ -281,10 +281,10 @@ class KeepDistance:
 
 
 def _approach(speed: float, other: float, error: float, h: float, limits: SpeedLimits) -> float:
-    """Speed after ``h`` seconds of who is to close ``error`` metres to someone with a speed."""
+    """Speed after ``h`` seconds that closes a gap ``error`` [m] to another entity."""
     gain = float(limits.acceleration) if limits.acceleration is not None else 10.0
     loss = float(limits.deceleration) if limits.deceleration is not None else 10.0
-    # The difference that the other limit can still take back in time; linear when nearly there.
+    # The speed difference that the opposite limit can still remove in time; linear near the target.
     back = loss if error > 0 else gain
     excess = min(math.sqrt(2.0 * 0.8 * back * abs(error)), abs(error) * 2.0)
     wanted = max(other + math.copysign(excess, error), 0.0)
@@ -295,11 +295,11 @@ def _approach(speed: float, other: float, error: float, h: float, limits: SpeedL
 
 @dataclass(frozen=True)
 class Synchronize:
-    """Arrives at its place when another arrives at its own, solved anew in every step.
+    """Arrives at its target position when the master arrives at its own; solved in every step.
 
-    Without a final speed by a constant acceleration a = 2 (d - v T) / T^2, with one by a linear
-    one: a(0) = 6 d / T^2 - (4 v + 2 v_f) / T, over the way and time that are left before the steady
-    part; who stands waits until a constant one does.
+    Without a final speed the acceleration is constant, a = 2 (d - v T) / T^2. With a final speed it
+    is linear, a(0) = 6 d / T^2 - (4 v + 2 v_f) / T, over the remaining distance and time before the
+    steady part; a stationary entity waits until a constant acceleration suffices.
     """
 
     token: int
@@ -313,7 +313,7 @@ class Synchronize:
     limits: SpeedLimits
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
-        """``h`` seconds on."""
+        """The motion after ``h`` seconds."""
         master = view.entities[self.master]
         to_go = _left(master, self.master_target, view)
         left = _left(actor, self.target, view)
@@ -338,7 +338,7 @@ class Synchronize:
     def _towards_final(
         self, actor: EntityState, left: float, time: float, final: float, h: float
     ) -> Moved:
-        """With a final speed: a linear acceleration to it, then steadily on."""
+        """With a final speed: a linear acceleration to it, then constant speed."""
         v, (distance, seconds) = actor.speed, self.steady
         if seconds > 0.0:
             distance = seconds * final
@@ -368,7 +368,7 @@ class Synchronize:
         """Constant acceleration to arrive in time."""
         rate = 2 * (d - v * time) / time**2
         if v + rate * time < 0.0:
-            # It would have to come back: it stops at its place and waits.
+            # It would overshoot and return: it stops at its target instead.
             return -v * v / (2 * max(d, DONE))
         return rate
 
@@ -386,7 +386,7 @@ class Synchronize:
 
 
 def _left(actor: EntityState, target: Place, view: View) -> float:
-    """Way that is left to a place [m]."""
+    """Remaining distance to a place [m]."""
     if actor.trajectory is not None:
         return actor.trajectory.ahead(target.x, target.y)
     return ahead_on_way(actor, target.x, target.y, view.network)
@@ -394,7 +394,7 @@ def _left(actor: EntityState, target: Place, view: View) -> float:
 
 @dataclass(frozen=True)
 class FollowIdm:
-    """The intelligent driver model behind whoever is ahead on its way."""
+    """The intelligent driver model behind the leader on its path."""
 
     token: int
     spec: IdmDriver
@@ -402,7 +402,7 @@ class FollowIdm:
     rate: float = 0.0
 
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
-        """``h`` seconds on; the leader is looked for once in a step of the clock."""
+        """The motion after ``h`` seconds; the leader is searched once per clock step."""
         rate = self._rate(actor, view) if view.first else self.rate
         way, speed = advance_along(0.0, actor.speed, rate, h)
         return Moved(way, speed, replace(self, rate=rate))
@@ -427,7 +427,7 @@ class FollowIdm:
 
 
 def advanced(actor: EntityState, view: View, h: float) -> EntityState:
-    """An entity ``h`` seconds on, moved by what its actions say; the planner's ego as it goes."""
+    """An entity ``h`` seconds later, moved by its actions; a planner's ego keeps its motion."""
     if not actor.scripted:
         return coasting(actor, h)
     control = actor.longitudinal

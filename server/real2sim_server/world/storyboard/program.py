@@ -1,4 +1,4 @@
-"""A storyboard prepared for running: a flat list of elements, and numbered conditions."""
+"""Preparation of a storyboard: a flat list of elements and numbered conditions."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ class Element:
     """One element of the stories.
 
     Attributes:
-        number: its place in the list.
-        type: what it is.
-        path: names from the story down to its own.
-        spec: its model.
-        children: what it is made of.
-        entities: whom its actions are of.
-        start, stop: triggers; None: it has none.
+        number: index in the list of elements.
+        type: element type.
+        path: names from the story down to this element.
+        spec: its wire model.
+        children: child elements.
+        entities: actors of its actions.
+        start, stop: triggers, or None.
     """
 
     number: int
@@ -90,7 +90,7 @@ class Element:
         return "::".join(self.path)
 
     def within(self) -> Iterator[Element]:
-        """Itself, then all that it is made of."""
+        """The element, then all its descendants."""
         yield self
         for child in self.children:
             yield from child.within()
@@ -98,14 +98,14 @@ class Element:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """What runs.
+    """A storyboard prepared for running.
 
     Attributes:
-        board: with the values of its parameters.
-        init: what holds when the episode begins, in the order in which it is done.
+        board: storyboard with parameter values filled in.
+        init: init actions, in order of execution.
         stories: top elements.
-        elements: all of them by number.
-        stop: of the whole.
+        elements: all elements by number.
+        stop: stop trigger of the storyboard.
     """
 
     board: Storyboard
@@ -115,16 +115,16 @@ class Program:
     stop: Start | None
 
     def named(self, type_: str, name: str) -> list[Element]:
-        """Elements of a type with a name, or with names joined by '::' at the end of theirs."""
+        """Elements of a type with a name; names joined by '::' match the end of their paths."""
         wanted = tuple(name.split("::"))
         return [e for e in self.elements if e.type == type_ and e.path[-len(wanted) :] == wanted]
 
 
 def program_of(board: Storyboard) -> Program:
-    """The program of a storyboard whose parameters have their values.
+    """The program of a storyboard with resolved parameters.
 
     Raises:
-        WorldError: INVALID_REQUEST, entities are placed relative to each other.
+        WorldError: INVALID_REQUEST if entities are placed relative to each other in a cycle.
     """
     maker = _Maker(board.version)
     stories = tuple(maker.story(story) for story in board.stories)
@@ -140,13 +140,16 @@ _SPEEDING = frozenset({"speed", "speed_profile"})
 
 
 def _in_order(entries: Sequence[InitAction]) -> tuple[InitAction, ...]:
-    """In the order of the file, but after what they refer to: a place relative to an entity comes
-    after that entity's place, a speed relative to another's after that speed."""
+    """Init actions in the order of the file, but after those that they depend on.
+
+    A position relative to an entity comes after that entity's position, a relative speed after the
+    speed that it refers to.
+    """
     waiting, done = list(entries), list[InitAction]()
     while waiting:
         ready = next((e for k, e in enumerate(waiting) if _is_ready(e, waiting, k)), None)
         if ready is None:
-            # Who keeps a distance to somebody need not wait for them.
+            # Keeping a distance does not depend on the speed of the other entity.
             ready = next((e for e in waiting if e.action.kind not in PLACING | _SPEEDING), None)
         if ready is None:
             names = " and ".join(repr(e) for e in dict.fromkeys(e.entity for e in waiting))
@@ -184,7 +187,7 @@ class _Maker:
         return Start(trigger, tuple(numbers))
 
     def _begin(self, trigger: Trigger | None) -> Trigger | None:
-        """A start trigger without conditions lets its element begin with its parent."""
+        """The start trigger; without conditions, its element starts with its parent."""
         asked = trigger is not None and (trigger.groups or self._version < 2)
         return trigger if asked else None
 
@@ -245,10 +248,10 @@ def shown_at(
     """State of each signal, and phase of each controller.
 
     Args:
-        board: has them.
-        elapsed: since the episode began [s].
-        starts: when the cycle of a controller began that an action has set [s].
-        overrides: states that actions have set.
+        board: storyboard with signals and controllers.
+        elapsed: time since the start of the episode [s].
+        starts: cycle start times of controllers set by actions [s].
+        overrides: signal states set by actions.
     """
     states = {head.signal_id: head.state for head in board.signals}
     phases = {}
@@ -265,7 +268,7 @@ def shown_at(
 
 
 def phase_start(controller: SignalController, phase: str, elapsed: float) -> float:
-    """When the cycle would have begun of a controller that begins a phase now [s]."""
+    """Cycle start time of a controller that enters a phase now [s]."""
     before = 0.0
     for each in controller.phases:
         if each.name == phase:
@@ -300,9 +303,9 @@ class ShownSignal(NamedTuple):
     """A traffic signal at one instant.
 
     Attributes:
-        signal_id: of it.
-        state: what it shows.
-        stop_line: x, y [m], heading [rad] where vehicles are to stop, world; None: not known.
+        signal_id: id of the signal.
+        state: current state.
+        stop_line: x, y [m], heading [rad] of the stop line, world frame; None if unknown.
     """
 
     signal_id: str
@@ -325,10 +328,9 @@ class ConditionState(NamedTuple):
     """State of a condition between instants.
 
     Attributes:
-        before: outcome of its test at the last one; None: it is new.
-        past: times at which what counts has changed, with what it became, as far back as its delay
-            looks.
-        since: of each entity, a figure of the test's own.
+        before: result of its test at the previous instant; None for a new condition.
+        past: times of result changes and the new results, as far back as its delay.
+        since: test-specific number of each entity.
     """
 
     before: bool | None = None
@@ -338,16 +340,16 @@ class ConditionState(NamedTuple):
 
 @dataclass(eq=False)
 class ConditionContext:
-    """What conditions are evaluated on, at one instant.
+    """Inputs of conditions at one instant.
 
     Attributes:
         view: entities and roads.
         places: resolves positions.
-        states: state of an element: (type, name, state) -> whether one is in it.
+        states: ``states(type, name, state)``, whether any such element is in that state.
         variables: parameters and variables.
         signals: state of each traffic signal.
         phases: phase of each controller.
-        condition_states: of conditions, by their number; written into.
+        condition_states: states of the conditions by number; updated.
     """
 
     view: View
@@ -362,8 +364,10 @@ class ConditionContext:
 def is_triggered(
     trigger: Trigger, numbers: tuple[tuple[int, ...], ...], context: ConditionContext
 ) -> bool:
-    """Whether a trigger fires: all conditions of one of its groups hold. Evaluates every condition,
-    so that none misses an edge."""
+    """Whether a trigger fires: all conditions of any of its groups hold.
+
+    Evaluates every condition, so that no edge is missed.
+    """
     outcomes = [
         [
             _counts(condition, number, context)
@@ -432,7 +436,7 @@ def _lasting(
     since: Mapping[str, float],
     holds: Callable[[EntityState], bool],
 ) -> Outcome:
-    """What has held for `duration`; ``since`` is when it began for each entity."""
+    """Whether a test has held for ``duration``; ``since`` is its start for each entity."""
     now, began, outcomes = context.view.elapsed, dict(since), []
     for name in test.entities:
         if not holds(context.view.entities[name]):
@@ -560,7 +564,7 @@ def _collision(test: Collision, context: ConditionContext, since: Mapping[str, f
 def _others(
     actor: EntityState, category: str | None, context: ConditionContext
 ) -> list[list[tuple[float, float]]]:
-    """Outlines of entities as they are now, and of all other objects at the start of the step."""
+    """Current outlines of entities, and outlines of all other objects at the start of the step."""
     entities = context.view.entities
     found = [
         corners(other)

@@ -47,9 +47,9 @@ class ElementChange(NamedTuple):
     """An element that has started, ended, been stopped or been skipped.
 
     Attributes:
-        t_us: when [us].
+        t_us: time of the change [us].
         element: names from the story down, joined by '::'.
-        type: of the element.
+        type: type of the element.
         change: 'start', 'end', 'stop' or 'skip'.
     """
 
@@ -63,15 +63,15 @@ class ProgressState(NamedTuple):
     """State of a storyboard between steps, apart from its entities.
 
     Attributes:
-        status: of each element.
-        times: that each event has begun.
-        running: tokens of the actions that run: by number of the element, of each entity.
-        conditions: state of each.
+        status: status of each element.
+        times: number of starts of each event.
+        running: tokens of running actions by element number and entity.
+        conditions: state of each condition.
         variables: parameters and variables.
-        signal_starts, signal_states: what actions have set of traffic signals.
-        token: of the next action.
-        over: whether the whole has been stopped.
-        fresh: changes of elements that conditions have not been asked about yet.
+        signal_starts, signal_states: traffic signal settings made by actions.
+        token: token of the next action.
+        over: whether the storyboard has been stopped.
+        fresh: element changes that conditions have not seen yet.
     """
 
     status: tuple[int, ...]
@@ -87,13 +87,13 @@ class ProgressState(NamedTuple):
 
 
 class Progress:
-    """One step of a storyboard: made for the step and read at its end.
+    """One step of a storyboard; created for the step and read at its end.
 
     Args:
-        program: what runs.
+        program: the prepared storyboard.
         entities, state: before the step.
-        network: roads.
-        surroundings: of the step.
+        network: road network.
+        surroundings: surroundings of the step.
     """
 
     def __init__(
@@ -132,14 +132,14 @@ class Progress:
         )
 
     def initialise(self, t_us: int, elapsed: float) -> None:
-        """Do what the storyboard says of the beginning."""
+        """Execute the init actions."""
         for action in self._program.board.global_init:
             self._global(action, t_us, elapsed)
         for entry in self._program.init:
             self._begin_private(entry.entity, entry.action, elapsed, first=True)
 
     def pass_instant(self, t_us: int, elapsed: float, *, first: bool) -> None:
-        """Let elements begin and end at an instant."""
+        """Start and end elements at an instant."""
         self._fresh, self._now = set(), t_us
         self._end_actions()
         if not self._over:
@@ -149,7 +149,7 @@ class Progress:
         self._before = frozenset(self._fresh)
 
     def move(self, elapsed: float, h: float, *, first: bool) -> None:
-        """Move all entities on by ``h`` seconds, each by where the others are now."""
+        """Move all entities by ``h`` seconds, each based on the current poses of the others."""
         view = self._view(elapsed, first=first)
         self.entities = {name: advanced(a, view, h) for name, a in self.entities.items()}
 
@@ -224,7 +224,7 @@ class Progress:
             self._begin_private(name, action.spec, self._elapsed, where=action.label)
 
     def _end_actions(self, event: Element | None = None) -> None:
-        """Actions whose entities are moved by them no more are over; so are events of theirs."""
+        """End actions that no longer move their entities, and the events of these actions."""
         events = [event] if event is not None else [
             e for e in self._program.elements if e.type == "event"
         ]  # fmt: skip
@@ -267,7 +267,7 @@ class Progress:
             self._change(element, COMPLETE, "end")
 
     def _stop(self, element: Element, *, again: bool = False) -> None:
-        """Stop an element and all that it is made of."""
+        """Stop an element and all its descendants."""
         for each in element.within():
             tokens = set(self._running.pop(each.number, {}).values())
             if tokens:
@@ -362,7 +362,7 @@ class Progress:
 
 
 def _without(actor: EntityState, tokens: set[int], network: RoadNetwork) -> EntityState:
-    """An entity that actions move no more; it keeps its speed, and goes on from where it is."""
+    """The entity without the given actions; it keeps its speed and continues from its position."""
     changes: dict[str, Any] = {}
     if actor.longitudinal is not None and actor.longitudinal.token in tokens:
         changes["longitudinal"] = None

@@ -1,4 +1,4 @@
-"""Roads, lanes and curves of a storyboard: positions, routes and trajectories."""
+"""Road networks and curves of storyboards: positions, routes and trajectories."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ..traffic.driver import STRAIGHT, lane_beside
 
 
 class Place(NamedTuple):
-    """Somewhere: x, y [m], heading [rad], height [m] or None: on the ground."""
+    """A place: x, y [m], heading [rad], height [m] (None for the ground)."""
 
     x: float
     y: float
@@ -40,11 +40,11 @@ class Place(NamedTuple):
 
 
 class RoadPoint(NamedTuple):
-    """Where something is on a road.
+    """A position on a road.
 
     Attributes:
-        road, lane: ids; the lane that it is in.
-        s, t: along the reference line, and left of it [m].
+        road, lane: ids of the road and lane.
+        s, t: distance along the reference line, and offset to its left [m].
         h: heading of the reference line [rad].
     """
 
@@ -56,14 +56,14 @@ class RoadPoint(NamedTuple):
 
 
 class Way(NamedTuple):
-    """A lane to drive along.
+    """A path to drive along: a lane or an assigned route.
 
     Attributes:
-        road, lane: ids; lane 0 is none: straight on beside the road.
-        along: in the direction of the reference line.
-        path: its middle, in the direction of driving.
-        length: where it ends along the path [m]; infinite where it does not.
-        assigned: whether it is a route that was assigned, and no lane.
+        road, lane: ids; lane 0 is a straight path off the road.
+        along: whether it runs in the direction of the reference line.
+        path: centre line, in driving direction.
+        length: its end along the path [m]; infinite if it does not end.
+        assigned: whether it is an assigned route.
     """
 
     road: str
@@ -75,39 +75,39 @@ class Way(NamedTuple):
 
 
 class RoadNetwork(Protocol):
-    """Roads of one scene. Never changes."""
+    """Road network of a scene; immutable."""
 
     def locate(self, x: float, y: float, h: float) -> RoadPoint | None:
-        """Where a place with a heading is on the roads; None beside all lanes."""
+        """The road position of a place with a heading; None outside all lanes."""
 
     def place(self, road: str, s: float, t: float) -> Place:
-        """The place beside a reference line, with its heading. Raises WorldError: no such road."""
+        """The place at (s, t) of a road, with its heading. Raises WorldError: no such road."""
 
     def middle(self, road: str, lane: int, s: float) -> float:
-        """t of the middle of a lane. Raises WorldError: no such lane there."""
+        """t of a lane centre at ``s``. Raises WorldError: no such lane there."""
 
     def drives_along(self, road: str, lane: int) -> bool:
-        """Whether traffic of a lane goes in the direction of the reference line."""
+        """Whether traffic of a lane drives in the direction of the reference line."""
 
     def way(self, road: str, lane: int, s: float, *, along: bool) -> Way:
-        """The lane as a way to drive from ``s`` on. Raises WorldError: no such lane there."""
+        """The path along a lane from ``s``. Raises WorldError: no such lane there."""
 
     def neighbour(self, road: str, lane: int, s: float, lanes: int) -> int:
-        """Id of the lane so many in the direction of +t. Raises WorldError: no such lane."""
+        """Id of the lane ``lanes`` further in +t direction. Raises WorldError: no such lane."""
 
     def route(self, places: list[Place]) -> LoggedPath:
-        """The way along lanes through places. Raises WorldError: there is none."""
+        """The path along lanes through places. Raises WorldError: no such path."""
 
 
 @dataclass(frozen=True, eq=False)
 class RouteNetwork:
-    """Lanes beside the ego's route, straight on before and behind it.
+    """Lanes parallel to the ego's route, extended straight beyond its ends.
 
     Attributes:
         spec: widths and numbers of lanes.
-        route: of the ego.
-        reference: the reference line, in the direction of the route.
-        ways: made so far, by lane and direction; each is the same whenever it is made.
+        route: route of the ego.
+        reference: reference line, in the direction of the route.
+        ways: cache of paths by lane and direction.
     """
 
     spec: RouteLanes
@@ -123,7 +123,7 @@ class RouteNetwork:
 
     @property
     def _shift(self) -> float:
-        """Of s along ``reference`` against s of the road [m]."""
+        """Difference between s along ``reference`` and s of the road [m]."""
         return STRAIGHT - self.spec.s
 
     def locate(self, x: float, y: float, h: float) -> RoadPoint | None:  # noqa: D102
@@ -171,21 +171,21 @@ class RouteNetwork:
 
 
 def skipping_zero(lane: int, lanes: int) -> int:
-    """Id of the lane so many in the direction of +t; there is no lane 0."""
+    """Id of the lane ``lanes`` further in +t direction; there is no lane 0."""
     found = lane + lanes
     crossed = (lane < 0) != (found < 0) or found == 0
     return found + (1 if lanes > 0 else -1) if crossed and lanes else found
 
 
 def straight(x: float, y: float, h: float, *, z: float = 0.0) -> LoggedPath:
-    """The straight way on from a place."""
+    """The straight path from a place."""
     ahead = [x + math.cos(h), y + math.sin(h), z]
     ups = np.array([[0.0, 0.0, 1.0]] * 2)
     return LoggedPath.through(np.array([[x, y, z], ahead]), np.array([h, h]), ups)
 
 
 def path_through(places: list[Place]) -> LoggedPath:
-    """Straight from place to place, heading along; two places at least that differ."""
+    """The polyline through places, of which at least two must differ."""
     points = np.array([(p.x, p.y, p.z or 0.0) for p in places])
     steps = np.diff(points[:, :2], axis=0)
     kept = np.concatenate([[True], np.hypot(steps[:, 0], steps[:, 1]) > 1e-6])
@@ -208,12 +208,11 @@ REACH = 2000.0
 
 @dataclass(frozen=True, eq=False)
 class GraphNetwork:
-    """Roads with numbered lanes, of a map in OpenDRIVE. Where a road forks, a way goes on along
-    the lane that turns least.
+    """Roads of an OpenDRIVE map; at forks, paths follow the lane that turns least.
 
     Attributes:
-        graph: in the frame of the world.
-        ways: made so far, by lane and direction; each is the same whenever it is made.
+        graph: lane graph, world frame.
+        ways: cache of paths by lane and direction.
     """
 
     graph: LaneGraph
@@ -269,8 +268,10 @@ class GraphNetwork:
         return path_through([Place(x, y, 0.0) for x, y, _ in np.concatenate(pieces).tolist()])
 
     def _between(self, names: tuple[str, ...], start: float, end: float) -> Float:
-        """Points along lanes from ``start`` on the first to ``end`` on the last; a change of lanes
-        goes straight to the neighbour's middle."""
+        """Points along lanes from ``start`` on the first to ``end`` on the last.
+
+        A lane change is a straight line to the centre of the neighbouring lane.
+        """
         lanes = [self.graph.lane(name) for name in names]
         parts = list[Float]()
         for k, lane in enumerate(lanes):
@@ -287,7 +288,7 @@ class GraphNetwork:
             raise _refused(error) from error
 
     def _part(self, road: str, lane: int, s: float) -> tuple[str, float]:
-        """Id of a lane of the graph, and t of its middle."""
+        """Id of a lane of the graph, and t of its centre."""
         found = self._road(road)
         held = min(max(s, 0.0), found.length)
         try:
@@ -338,14 +339,14 @@ MAX_SAMPLES = 100_000
 
 @dataclass(frozen=True, eq=False)
 class SampledCurve:
-    """A curve as places along it.
+    """A sampled curve.
 
     Attributes:
-        s: [N] way from the start, not decreasing [m].
+        s: [N] distance from the start, not decreasing [m].
         x, y: [N] [m].
-        h: [N] heading at each, continuous [rad].
-        times: [N] when to be there [s], or None.
-        turns: whether headings change between places; else each holds up to the next.
+        h: [N] continuous heading [rad].
+        times: [N] target times [s], or None.
+        turns: whether headings are interpolated; else each one holds up to the next sample.
     """
 
     s: Float
@@ -357,11 +358,11 @@ class SampledCurve:
 
     @property
     def length(self) -> float:
-        """From start to end [m]."""
+        """Length [m]."""
         return float(self.s[-1])
 
     def at(self, s: float) -> Place:
-        """The place at a way from the start."""
+        """The place at a distance from the start."""
         x, y = float(np.interp(s, self.s, self.x)), float(np.interp(s, self.s, self.y))
         if self.turns:
             return Place(x, y, float(np.interp(s, self.s, self.h)))
@@ -369,12 +370,12 @@ class SampledCurve:
         return Place(x, y, float(self.h[min(max(k, 0), len(self.h) - 1)]))
 
     def way_at(self, time: float) -> float:
-        """Way from the start at a time; the curve has times."""
+        """Distance from the start at a time; the curve must have times."""
         assert self.times is not None
         return float(np.interp(time, self.times, self.s))
 
     def nearest(self, x: float, y: float) -> float:
-        """Way from the start to where the curve is nearest to a place."""
+        """Distance from the start to the point of the curve nearest to (x, y)."""
         dx, dy = np.diff(self.x), np.diff(self.y)
         square = np.maximum(dx * dx + dy * dy, 1e-18)
         u = np.clip(((x - self.x[:-1]) * dx + (y - self.y[:-1]) * dy) / square, 0.0, 1.0)
@@ -385,14 +386,14 @@ class SampledCurve:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """An entity on a course; immutable.
+    """Motion of an entity along a curve; immutable.
 
     Attributes:
-        token: of the action.
-        course: that it follows.
-        timing: how the course's times are meant; None: at the entity's own speed.
-        s: way along it [m].
-        elapsed: since it began, or since the simulation did [s].
+        token: token of the action.
+        course: the curve.
+        timing: interpretation of the curve's times; None for the entity's own speed.
+        s: distance along the curve [m].
+        elapsed: time since the start of the action, or of the simulation [s].
     """
 
     token: int
@@ -402,12 +403,14 @@ class Trajectory:
     elapsed: float
 
     def ahead(self, x: float, y: float) -> float:
-        """How far ahead a place is along it [m]."""
+        """Distance ahead to a place along the curve [m]."""
         return self.course.nearest(x, y) - self.s
 
     def step(self, way: float, h: float) -> tuple[float, Trajectory | None]:
-        """Way made in ``h`` seconds, by its times or as given, and itself then; None: at its
-        end."""
+        """Distance covered in ``h`` seconds, by its times or as given, and the new state.
+
+        The state is None at the end of the curve.
+        """
         if self.timing is None:
             s = self.s + way
             over = s >= self.course.length - 1e-9
@@ -420,22 +423,22 @@ class Trajectory:
         return s - self.s, None if over else replace(self, s=s, elapsed=elapsed)
 
     def begun(self) -> bool:
-        """Whether its first time has come."""
+        """Whether its first time has been reached."""
         if self.timing is None or self.course.times is None:
             return True
         time = self.elapsed * float(self.timing.scale) + float(self.timing.offset)
         return bool(time >= self.course.times[0] - 1e-9)
 
     def place(self) -> Place:
-        """Where the entity is."""
+        """Current place of the entity."""
         return self.course.at(self.s)
 
 
 def course_of(curve: Curve, resolve: Callable[[Any], Place]) -> SampledCurve:
-    """The course of a curve, whose positions ``resolve`` turns into places.
+    """Sample a curve; ``resolve`` turns its positions into places.
 
     Raises:
-        WorldError: INVALID_REQUEST, a curve that leads nowhere.
+        WorldError: INVALID_REQUEST for a curve without length.
     """
     if isinstance(curve, Polyline):
         course = _polyline(curve, resolve)
@@ -488,7 +491,7 @@ def _clothoid(curve: Clothoid, start: Place) -> SampledCurve:
         found: Float = start.h + curvature * way + rate * way * way / 2
         return found
 
-    # Gauss-Legendre with three nodes a piece: exact to far below a micrometre.
+    # Gauss-Legendre with three nodes per piece: error far below a micrometre.
     nodes, weights = np.polynomial.legendre.leggauss(3)
     step = length / count
     at = s[:-1, None] + step * (nodes + 1) / 2

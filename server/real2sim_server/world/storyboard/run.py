@@ -1,4 +1,4 @@
-"""A storyboard that runs: its entities and elements at one instant of an episode."""
+"""A running storyboard: entities and elements at one instant of an episode."""
 
 from __future__ import annotations
 
@@ -45,11 +45,12 @@ TRIES = 1000
 
 
 def drawn_values(board: Storyboard, draws: Draws | None) -> tuple[Storyboard, Mapping[str, float]]:
-    """The storyboard with sampled values of the parameters that have a stochastic distribution, and
-    those that are numbers by name. Without ``draws`` as it is.
+    """The storyboard with sampled values for its stochastic parameters.
+
+    Also returns the sampled numbers by name. Without ``draws`` the storyboard is unchanged.
 
     Raises:
-        WorldError: INVALID_REQUEST, a range in which nothing falls.
+        WorldError: INVALID_REQUEST for a range without samples.
     """
     stochastic = {k: d for k, d in board.distributions.items() if isinstance(d, DRAWN)}
     if draws is None or not stochastic:
@@ -93,7 +94,7 @@ def _unbounded(distribution: Normal | Poisson, what: str, draws: Draws, attempt:
             distribution.mean + math.sqrt(distribution.variance) * (draws.normal(what, attempt)[0])
         )
         return math.exp(value) if distribution.log else value
-    # By the sum of waiting times (Knuth 1969), in pieces that do not underflow.
+    # Sum of waiting times (Knuth 1969), in parts that do not underflow.
     left, count, number = distribution.mean, 0, 0
     while True:
         u = draws.uniform(what, attempt, number)[0]
@@ -138,8 +139,10 @@ Vector = tuple[float, float, float]
 
 
 def box_of(entity: Entity, subject: ObjectState | None, ego_size: Vector) -> tuple[Vector, Vector]:
-    """Size of an entity's box and where its middle is from the reference point [m]: as it says, of
-    the object or ego that it is, or by its category."""
+    """Size of an entity's box, and its centre relative to the reference point [m].
+
+    From the entity itself, its object, the ego, or its category.
+    """
     if entity.kind == "ego":
         return ego_size, (ego_size[0] / 2 - REAR_OVERHANG, 0.0, ego_size[2] / 2)
     if entity.box is not None:
@@ -154,8 +157,10 @@ def box_of(entity: Entity, subject: ObjectState | None, ego_size: Vector) -> tup
 
 
 def own_centre(ego: Entity, ego_size: Vector) -> Vector | None:
-    """Where the middle of the ego's box is from its reference point [m], as the storyboard says of
-    a vehicle of that size; None: it speaks of another vehicle, or of none."""
+    """Box centre of the ego relative to its reference point [m], from the storyboard.
+
+    None if the storyboard describes no vehicle, or one of another size.
+    """
     if ego.box is None or not np.allclose([float(v) for v in ego.box.size], ego_size, atol=1e-6):
         return None
     x, y, z = (float(v) for v in ego.box.centre)
@@ -165,11 +170,13 @@ def own_centre(ego: Entity, ego_size: Vector) -> Vector | None:
 def subjects_of(
     entities: Iterable[Entity], state: ScenarioState, scene: Scene
 ) -> dict[str, ObjectState]:
-    """The object of each entity but the ego, by name; new ones look like objects of ``scene``.
+    """The object of each entity except the ego, by name.
+
+    New entities use the appearance of objects in ``scene``.
 
     Raises:
-        WorldError: UNKNOWN_OBJECT for an object or look that the world lacks, UNKNOWN_ASSET,
-            INVALID_REQUEST where nobody could be looked like, or an id is taken.
+        WorldError: UNKNOWN_OBJECT for a missing object or appearance, UNKNOWN_ASSET, or
+            INVALID_REQUEST if no object can provide the appearance or an id is taken.
     """
     found, number = dict[str, ObjectState](), MAX_OBJECTS
     for entity in entities:
@@ -191,7 +198,7 @@ def subjects_of(
 
 
 def object_ids_of(name: str) -> tuple[str, str]:
-    """The id of the object of a new entity, and the one where that is taken."""
+    """The object id of a new entity, and the alternative if it is taken."""
     object_id = "".join(c if c.isalnum() or c in "_.-" else "_" for c in name)[:80]
     return object_id, f"{object_id[:72]}.story"
 
@@ -238,7 +245,7 @@ def _new(entity: Entity, state: ScenarioState, scene: Scene, instance_id: int) -
 
 
 def _look(entity: Entity, state: ScenarioState, size: Vector) -> ObjectState:
-    """Whom it looks like: who is named, else who is most like it in category, then in size."""
+    """The object with the appearance of an entity: the named one, else by category and size."""
     if entity.look is not None:
         return _known(state, entity.look, f"the look of {entity.name!r}")
     candidates = list(state.visible)
@@ -260,8 +267,10 @@ def _look(entity: Entity, state: ScenarioState, size: Vector) -> ObjectState:
 
 
 def _fitted(size: Vector, of: Vector, *, walks: bool) -> dict[str, Vector]:
-    """Size before its scale, and scale, of whoever has the box ``size`` and looks like something of
-    size ``of``: stretched to it, or as a person only made taller."""
+    """Unscaled size and scale of an object of box ``size`` with the appearance of size ``of``.
+
+    Pedestrians are scaled uniformly to their height, all others are stretched.
+    """
     if not walks:
         return {"size": of, "scale": (size[0] / of[0], size[1] / of[1], size[2] / of[2])}
     scale = size[2] / of[2]
@@ -275,19 +284,19 @@ TICK_US = 10_000
 
 @dataclass(frozen=True, eq=False)
 class StoryboardRun:
-    """A storyboard at one instant. Immutable: a step makes a new one.
+    """A storyboard at one instant. Immutable: a step returns a new one.
 
     Attributes:
-        program: what runs.
-        network: roads.
+        program: prepared storyboard.
+        network: road network.
         entities: entities by name.
         state: elements, conditions, variables.
-        drivers: of the objects that it moves, by object id.
-        changes: of elements, in the step that led here.
-        ego_put: whether it has put the ego somewhere at the start.
-        ego: name of the ego among the entities; None: it takes no part.
-        elapsed: time since the episode began [s].
-        sampled: what the seed has sampled, by name.
+        drivers: drivers of the objects that it moves, by object id.
+        changes: element changes of the last step.
+        ego_put: whether it has placed the ego at the start.
+        ego: name of the ego among the entities, or None.
+        elapsed: time since the start of the episode [s].
+        sampled: sampled values by name.
     """
 
     program: Program
@@ -312,18 +321,18 @@ class StoryboardRun:
         network: RoadNetwork | None = None,
         draws: Draws | None = None,
     ) -> StoryboardRun:
-        """At the start of an episode, after what it says of the beginning.
+        """The storyboard at the start of an episode, after its init actions.
 
         Args:
-            board: with or without expressions.
-            subjects: object of each entity but the ego, by name.
-            surroundings: the start, the ego as it was recorded.
-            ego_size: of its box [m].
-            network: roads; None: lanes along the route.
-            draws: of the episode; None: parameters are as they are written.
+            board: storyboard, with or without expressions.
+            subjects: object of each entity except the ego, by name.
+            surroundings: the start instant, with the recorded ego.
+            ego_size: size of its box [m].
+            network: road network; None for lanes along the route.
+            draws: random numbers of the episode; None to keep parameters as written.
 
         Raises:
-            WorldError: INVALID_REQUEST, what it asks for cannot be.
+            WorldError: INVALID_REQUEST if the storyboard cannot be executed.
         """
         board, sampled = drawn_values(board, draws)
         board = _resolved(board)
@@ -355,8 +364,11 @@ class StoryboardRun:
         return run._with_drivers(surroundings)
 
     def advance(self, surroundings: Surroundings) -> StoryboardRun:
-        """One step later. Elements begin and end every 10 ms, at which the planner's ego is taken
-        to go straight on as it does at the start of the step."""
+        """The storyboard one step later.
+
+        Elements start and end on a 10 ms grid. Within the step, a planner's ego is extrapolated
+        from its motion at the start of the step.
+        """
         entities = dict(self.entities)
         if self.ego is not None and not entities[self.ego].scripted:
             dt = surroundings.dt if self.elapsed > 0.0 else 0.0
@@ -381,8 +393,7 @@ class StoryboardRun:
 
     @property
     def over(self) -> bool:
-        """Whether it has been stopped; without a stop trigger, whether all its stories are
-        complete."""
+        """Whether it has been stopped or, without a stop trigger, all stories are complete."""
         program, status = self.program, self.state.status
         if self.state.over or (program.stop is not None and program.board.version >= 2):
             return self.state.over
@@ -394,7 +405,7 @@ class StoryboardRun:
         return self.ego is not None and self.program.board.drives_ego
 
     def ego_motion(self, before: Motion) -> Motion:
-        """The ego as the storyboard has it; ``before``: a step ago."""
+        """The ego motion of the storyboard; ``before``: motion one step earlier."""
         assert self.ego is not None
         actor = self.entities[self.ego]
         turned = math.remainder(actor.h - before.yaw, math.tau)
@@ -402,7 +413,7 @@ class StoryboardRun:
         return Motion(x, y, before.yaw + turned, actor.speed, actor.acceleration)
 
     def signals(self) -> tuple[ShownSignal, ...]:
-        """What traffic signals show now."""
+        """Current states of the traffic signals."""
         board = self.program.board
         if not board.signals and not board.controllers:
             return ()
@@ -445,8 +456,10 @@ def _first(
     board: Storyboard,
     ego_size: tuple[float, float, float],
 ) -> EntityState:
-    """An entity before the storyboard has put it anywhere: the ego and objects of the scene where
-    they were recorded, others not in the world."""
+    """An entity before the init actions.
+
+    The ego and objects of the scene are at their recorded poses; others are not in the world.
+    """
     size, centre = box_of(entity, subject, ego_size)
     if entity.kind == "ego" and board.version >= 2:
         centre = own_centre(entity, size) or centre
@@ -487,17 +500,17 @@ def _nothing_yet(program: Program) -> ProgressState:
 def begin_storyboard(
     spec: ResetSpec, state: ScenarioState, surroundings: Surroundings, scene: Scene, draws: Draws
 ) -> StoryboardRun:
-    """The run of the storyboard that a reset has.
+    """Start the storyboard of a reset.
 
     Args:
-        spec: with a storyboard.
+        spec: reset with a storyboard.
         state: objects of the scenario.
-        surroundings: the start, the ego as it was recorded.
-        scene: that it runs on.
-        draws: of the episode.
+        surroundings: the start instant, with the recorded ego.
+        scene: the scene.
+        draws: random numbers of the episode.
 
     Raises:
-        WorldError: INVALID_REQUEST where it does not go together with other options or cannot be;
+        WorldError: INVALID_REQUEST if it conflicts with other options or cannot be executed;
             UNKNOWN_OBJECT, UNKNOWN_ASSET.
     """
     board = spec.storyboard
@@ -532,7 +545,7 @@ def begin_storyboard(
 
 
 def _network(board: Storyboard, scene: Scene) -> RoadNetwork | None:
-    """Roads of the scene's map where the storyboard is for a map; None: lanes along the route."""
+    """Road network of the scene's map if the storyboard uses one; None for route lanes."""
     if not isinstance(board.roads, MapRoads):
         return None
     graph: LaneGraph | None = getattr(scene, "lanes", None)

@@ -1,4 +1,4 @@
-"""Entities of a storyboard at an instant: what moves them, what they know, and their positions."""
+"""Entities of a storyboard at an instant: controllers, queries and positions."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SLOW = 0.5
 
 
 class Moved(NamedTuple):
-    """Way made [m], speed at the end [m/s], and what goes on changing it; None: done."""
+    """Distance covered [m], final speed [m/s], and the continuing controller (None if done)."""
 
     way: float
     speed: float
@@ -46,30 +46,30 @@ class Moved(NamedTuple):
 
 
 class Longitudinal(Protocol):
-    """Changes a speed. Immutable; ``token`` is of the action that it belongs to."""
+    """Longitudinal controller. Immutable; ``token`` identifies its action."""
 
     @property
     def token(self) -> int: ...  # noqa: D102
 
     def step(self, actor: EntityState, view: Any, h: float) -> Moved:
-        """``h`` seconds on."""
+        """The motion after ``h`` seconds."""
 
 
 class Shifted(NamedTuple):
-    """Offset from the way [m], and what goes on changing it; None: done."""
+    """Lateral offset [m], and the continuing controller (None if done)."""
 
     offset: float
     then: Lateral | None
 
 
 class Lateral(Protocol):
-    """Changes an offset. Immutable; ``token`` is of the action that it belongs to."""
+    """Lateral controller. Immutable; ``token`` identifies its action."""
 
     @property
     def token(self) -> int: ...  # noqa: D102
 
     def step(self, actor: EntityState, view: Any, way: float, h: float) -> Shifted:
-        """``h`` seconds and ``way`` metres on."""
+        """The change after ``h`` seconds and ``way`` metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,24 +77,23 @@ class EntityState:
     """An entity at one instant. Immutable.
 
     Attributes:
-        name: of the entity.
-        category: of the entity.
-        subject: the object that it is; None for the ego.
-        size: of its box [m].
-        centre: of its box from the reference point [m].
+        name, category: name and category of the entity.
+        subject: its object; None for the ego.
+        size: size of its box [m].
+        centre: box centre relative to the reference point [m].
         x, y, h: reference point [m], heading [rad].
-        z: of the reference point [m]; None: on the ground.
-        speed: along its way [m/s].
-        drift: sideways, positive to the left [m/s].
-        acceleration: along its way [m/s^2].
-        way: lane that it follows; None: of an ego that the planner drives.
-        s, offset: along and beside the way [m].
-        travelled: way since the episode began [m].
+        z: height of the reference point [m]; None for the ground.
+        speed: speed along its path [m/s].
+        drift: lateral speed, positive left [m/s].
+        acceleration: along its path [m/s^2].
+        way: path that it follows; None for an ego driven by a planner.
+        s, offset: distance along the path, and offset from it [m].
+        travelled: distance travelled since the start of the episode [m].
         visible: whether it is in the world.
         scripted: whether the storyboard moves it.
-        longitudinal, lateral: what changes its speed and offset now; None: nothing.
-        trajectory: what it follows instead of its way.
-        finished: tokens of actions that have come to their end.
+        longitudinal, lateral: active controllers, or None.
+        trajectory: trajectory that it follows instead of its path, or None.
+        finished: tokens of finished actions.
     """
 
     name: str
@@ -122,26 +121,26 @@ class EntityState:
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Of its box seen from above [m]."""
+        """Box centre in the plane [m]."""
         cos, sin = math.cos(self.h), math.sin(self.h)
         cx, cy, _ = self.centre
         return self.x + cx * cos - cy * sin, self.y + cx * sin + cy * cos
 
     @property
     def axle(self) -> tuple[float, float]:
-        """Of the ego: the middle of its rear axle [m], which need not be its reference point."""
+        """Rear axle centre of the ego [m]; may differ from the reference point."""
         ahead, left = self._axle
         cos, sin = math.cos(self.h), math.sin(self.h)
         return self.x + ahead * cos - left * sin, self.y + ahead * sin + left * cos
 
     @property
     def _axle(self) -> tuple[float, float]:
-        """Of the ego: its rear axle from the reference point, ahead and to the left [m]."""
+        """Rear axle of the ego relative to the reference point, ahead and to the left [m]."""
         return self.centre[0] - (self.size[0] / 2 - REAR_OVERHANG), self.centre[1]
 
     @property
     def velocity(self) -> tuple[float, float]:
-        """Of its reference point, world [m/s]."""
+        """Velocity of its reference point, world frame [m/s]."""
         yaw = self.h
         if self.way is not None and self.trajectory is None:
             yaw = self.way.path.at(self.s)[3]
@@ -149,20 +148,19 @@ class EntityState:
         return self.speed * cos - self.drift * sin, self.speed * sin + self.drift * cos
 
     def tokens(self) -> set[int]:
-        """Of the actions that move it now."""
+        """Tokens of the actions that currently move it."""
         moving = (self.longitudinal, self.lateral, self.trajectory)
         return {m.token for m in moving if m is not None}
 
     def put(self, place: Place, network: RoadNetwork) -> EntityState:
-        """At a place, on the lane that is there or going straight on; its speed is left as it
-        is."""
+        """The entity at a place, on the lane there or a straight path, at the same speed."""
         put = copy_with(
             self, x=place.x, y=place.y, h=place.h, z=place.z, drift=0.0, trajectory=None
         )
         return put.on_lane(network)
 
     def on_lane(self, network: RoadNetwork) -> EntityState:
-        """On the lane that is where it is, if it heads along it; else straight on."""
+        """The entity on the lane at its position if it heads along it, else on a straight path."""
         found = network.locate(self.x, self.y, self.h)
         turn = math.remainder(self.h - found.h, math.tau) if found is not None else 0.0
         if found is None or min(abs(turn), math.pi - abs(turn)) > ACROSS:
@@ -173,17 +171,17 @@ class EntityState:
         return self.on_way(way)
 
     def on_way(self, way: Way) -> EntityState:
-        """On another way, as far beside it as it is."""
+        """The entity on another path, at its current offset from it."""
         near = way.path.nearest(self.x, self.y)
         s, offset = near.s, near.offset
         if near.s <= 0.0 or near.s >= way.path.length:
-            # Beyond the ends the nearest point is the end, and the way goes straight on.
+            # Paths continue straight beyond their ends, but the nearest point is the end itself.
             dx, dy = self.x - near.position[0], self.y - near.position[1]
             s += dx * math.cos(near.yaw) + dy * math.sin(near.yaw)
         return copy_with(self, way=way, s=s, offset=offset)
 
     def placed(self) -> EntityState:
-        """Where its way, s and offset say, turned by its drift."""
+        """The entity at its path, s and offset, rotated by its drift."""
         assert self.way is not None
         x, y, _, yaw = self.way.path.at(self.s)
         turn = math.atan2(self.drift, self.speed) if abs(self.speed) > SLOW and self.drift else 0.0
@@ -195,7 +193,7 @@ class EntityState:
         )
 
     def pose(self, ground: Ground) -> AgentPose:
-        """Of its box, standing level."""
+        """Pose of its box, level."""
         x, y = self.middle
         z = ground.height(x, y) + self.size[2] / 2 if self.z is None else self.z + self.centre[2]
         return AgentPose(
@@ -205,8 +203,7 @@ class EntityState:
 
 
 def observed(actor: EntityState, ego: ObservedEgo, dt: float) -> EntityState:
-    """The ego as the planner has moved it in the step of ``dt`` seconds that led here; ``actor``
-    is as it was taken to be."""
+    """The ego after a planner's step of ``dt`` seconds; ``actor`` is its extrapolated state."""
     axle_ahead, left = actor._axle
     ahead = ego.front - ego.length / 2 + axle_ahead
     cos, sin = math.cos(ego.yaw), math.sin(ego.yaw)
@@ -216,7 +213,7 @@ def observed(actor: EntityState, ego: ObservedEgo, dt: float) -> EntityState:
 
 
 def coasting(actor: EntityState, h: float) -> EntityState:
-    """The ego ``h`` seconds on, as it goes now."""
+    """The ego extrapolated by ``h`` seconds."""
     way = actor.speed * h
     return copy_with(
         actor,
@@ -237,11 +234,11 @@ class View:
     """One instant.
 
     Attributes:
-        elapsed: time since the episode began [s].
-        first: whether it is the first of its step, whose surroundings are exact.
+        elapsed: time since the start of the episode [s].
+        first: whether it is the first instant of its step, for which surroundings are exact.
         entities: entities by name.
-        network: roads.
-        surroundings: of the step.
+        network: road network.
+        surroundings: surroundings of the step.
     """
 
     elapsed: float
@@ -252,8 +249,7 @@ class View:
 
 
 def ahead_on_way(actor: EntityState, x: float, y: float, network: RoadNetwork) -> float:
-    """How far ahead a place is along the way of an entity; straight on where it is not beside it
-    [m]."""
+    """Distance ahead to a place along an entity's path [m]; along its heading if off the path."""
     way = actor.way if actor.trajectory is None else None
     if way is None:
         way = actor.on_lane(network).way
@@ -281,7 +277,7 @@ def across(h: float, dx: float, dy: float) -> float:
 def offsets(
     actor: EntityState, place: Place, frame: Frame, network: RoadNetwork
 ) -> tuple[float, float]:
-    """A place from an entity: ahead and to the left [m], in its own frame, or in its lane's."""
+    """A place relative to an entity: ahead and to the left [m], entity or lane coordinates."""
     dx, dy = place.x - actor.x, place.y - actor.y
     if frame == "entity":
         return along(actor.h, dx, dy), across(actor.h, dx, dy)
@@ -297,7 +293,7 @@ def distance_to(
     actor: EntityState, other: EntityState | Place, measure: Measure, frame: Frame, *,
     freespace: bool, network: RoadNetwork,
 ) -> float:  # fmt: skip
-    """Distance of an entity from another, or from a place [m], never negative."""
+    """Distance of an entity to another one or to a place [m], at least 0."""
     if measure == "euclidean":
         if not freespace:
             return math.hypot(other.x - actor.x, other.y - actor.y)
@@ -311,7 +307,7 @@ def distance_to(
         h = here.h
     own, others = _extent(corners(actor), h, number), _extent(_outline(other), h, number)
     if frame != "entity":
-        # Along a bend the way counts; boxes reach as far as they do where they are.
+        # Along a curve, the distance follows the path; boxes keep their extents.
         between = offsets(actor, place, frame, network)[number]
         sense = 1.0 if math.cos(actor.h - h) >= 0.0 else -1.0
         pick = along if number == 0 else across
@@ -322,7 +318,7 @@ def distance_to(
 
 
 def closing_speed(actor: EntityState, other: EntityState | Place, measure: Measure) -> float:
-    """Speed at which the distance shrinks [m/s]."""
+    """Rate at which the distance decreases [m/s]."""
     vx, vy = actor.velocity
     ox, oy = other.velocity if isinstance(other, EntityState) else (0.0, 0.0)
     dx, dy = other.x - actor.x, other.y - actor.y
@@ -334,7 +330,7 @@ def closing_speed(actor: EntityState, other: EntityState | Place, measure: Measu
 
 
 def corners(actor: EntityState) -> list[tuple[float, float]]:
-    """Of its box seen from above, in turn [m]."""
+    """Corners of its box in the plane, in order [m]."""
     x, y = actor.middle
     return box_corners_of(x, y, actor.h, actor.size[0], actor.size[1])
 
@@ -342,7 +338,7 @@ def corners(actor: EntityState) -> list[tuple[float, float]]:
 def box_corners_of(
     x: float, y: float, h: float, length: float, width: float
 ) -> list[tuple[float, float]]:
-    """Corners of a rectangle in turn [m]."""
+    """Corners of a rectangle, in order [m]."""
     cos, sin = math.cos(h), math.sin(h)
     half, side = length / 2, width / 2
     return [
@@ -352,7 +348,7 @@ def box_corners_of(
 
 
 def box_distance(a: list[tuple[float, float]], b: list[tuple[float, float]]) -> float:
-    """Between two convex outlines [m]; 0 where they touch or overlap."""
+    """Distance between two convex outlines [m]; 0 if they touch or overlap."""
     if overlapping(a, b):
         return 0.0
     pairs = [(p, edge) for p in a for edge in _edges(b)]
@@ -361,7 +357,7 @@ def box_distance(a: list[tuple[float, float]], b: list[tuple[float, float]]) -> 
 
 
 def overlapping(a: list[tuple[float, float]], b: list[tuple[float, float]]) -> bool:
-    """Whether two convex outlines have a place in common (separating axes)."""
+    """Whether two convex outlines overlap (separating axes)."""
     for outline in (a, b):
         for (x0, y0), (x1, y1) in _edges(outline):
             nx, ny = y1 - y0, x0 - x1
@@ -399,12 +395,12 @@ def _to_segment(p: tuple[float, float], a: tuple[float, float], b: tuple[float, 
 
 
 class PositionResolver:
-    """Turns positions into places at one instant.
+    """Resolves positions to places at one instant.
 
     Attributes:
-        entities: entities by name, as they are now.
-        network: roads.
-        origin: x, y [m] and heading [rad] of the map's frame in the world.
+        entities: current entities by name.
+        network: road network.
+        origin: x, y [m] and heading [rad] of the map frame in the world.
     """
 
     def __init__(
@@ -419,8 +415,8 @@ class PositionResolver:
         """The place of a position.
 
         Raises:
-            WorldError: INVALID_REQUEST for a road or lane that there is not, or an entity beside
-                all lanes that a position is relative to.
+            WorldError: INVALID_REQUEST for a road or lane that does not exist, or a position
+                relative to an entity outside all lanes.
         """
         found: Place = _RESOLVE[type(position)](self, position)
         return found
@@ -488,7 +484,7 @@ class PositionResolver:
         return place._replace(h=self._heading(orientation, place.h, driving))
 
     def _where(self, entity: str) -> tuple[RoadPoint, float]:
-        """Where an entity is on the road; 1 where it drives in its direction, else -1."""
+        """Road position of an entity; and 1 if it drives along the reference line, else -1."""
         actor = self.entities[entity]
         here = self.network.locate(actor.x, actor.y, actor.h)
         if here is None:

@@ -1,4 +1,4 @@
-"""Other road users: a driver for each kind of motion, behind one Protocol (:mod:`.driver`)."""
+"""Other road users and their drivers, which implement one Protocol (:mod:`.driver`)."""
 
 from .driver import AgentDriver, AgentPose, ObservedEgo, Surroundings
 from .traffic import DRIVERS, Traffic, begin_driver

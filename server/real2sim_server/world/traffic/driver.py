@@ -1,4 +1,4 @@
-"""Drivers of other road users: their Protocol, replay, external plans, storyboards, and IDM."""
+"""Drivers of other road users: the Protocol, replay, external plans, storyboards and IDM."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from ..path import Float, LoggedPath, PathPoint, next_in_strip, previous_in_stri
 
 
 class AgentPose(NamedTuple):
-    """Where an object is and how it moves.
+    """Pose and velocity of an object.
 
     Attributes:
-        position: box centre, world [m].
+        position: box centre, world frame [m].
         quaternion: wxyz, object to world.
         yaw: heading [rad].
-        velocity: world [m/s].
+        velocity: world frame [m/s].
     """
 
     position: tuple[float, float, float]
@@ -54,9 +54,9 @@ class ObservedEgo:
         yaw: heading [rad].
         speed: along its heading [m/s].
         length, width: of its box [m].
-        s: where its rear axle is along the route [m].
-        offset: of its rear axle from the route, positive on the left [m].
-        front: from the rear axle to the front end of its box [m].
+        s: position of its rear axle along the route [m].
+        offset: offset of its rear axle from the route, positive left [m].
+        front: distance from the rear axle to the front end of its box [m].
     """
 
     x: float
@@ -71,7 +71,7 @@ class ObservedEgo:
 
     @classmethod
     def of(cls, motion: Motion, near: PathPoint, size: tuple[float, float, float]) -> Self:
-        """The ego in motion, ``near`` a point of its route; ``size`` of its box [m]."""
+        """The ego with its motion, nearest route point and box size [m]."""
         length, width, _ = size
         ahead = length / 2 - REAR_OVERHANG
         return cls(
@@ -89,19 +89,19 @@ class ObservedEgo:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What an agent may know when it decides: the committed instant before the step.
+    """Inputs of an agent's decision: the committed instant before the step.
 
     Attributes:
-        t_us: now [us].
-        start_us: of the episode [us].
-        dt_us: the step to be made [us].
+        t_us: current time [us].
+        start_us: start time of the episode [us].
+        dt_us: time step [us].
         ego: the controlled vehicle.
-        others: all objects, the agent itself among them.
-        route: the recorded way of the ego.
-        ground: what everybody stands on.
-        lanes: of the scene's map; None without one.
-        aims: way x, y that objects have left to the middle of the lane that they change to [m], by
-            id: what indicators tell.
+        others: all objects, including the agent itself.
+        route: the recorded path of the ego.
+        ground: ground of the scene.
+        lanes: lanes of the scene's map; None without a map.
+        aims: remaining displacement x, y of lane-changing objects to the centre of their target
+            lane [m], by id; corresponds to turn indicators.
     """
 
     t_us: int
@@ -116,13 +116,15 @@ class Surroundings:
 
     @property
     def dt(self) -> float:
-        """The step to be made [s]."""
+        """The time step [s]."""
         return self.dt_us * 1e-6
 
     @cached_property
     def bodies(self) -> Float:
-        """[B, 7] float64: middle x, y [m], yaw [rad], length, width [m], velocity x, y [m/s] of all
-        objects in their order, then of the ego."""
+        """[B, 7] float64: all objects in order, then the ego.
+
+        Columns: centre x, y [m], yaw [rad], length, width [m], velocity x, y [m/s].
+        """
         others, ego = self.others, self.ego
         bodies = np.empty((len(others.objects) + 1, 7))
         bodies[:-1, :2], bodies[:-1, 3:5] = others.positions[:, :2], others.sizes[:, :2]
@@ -133,7 +135,7 @@ class Surroundings:
 
     @cached_property
     def bodies_as_meant(self) -> Float:
-        """``bodies``, with those that change lanes where they are going to be aside."""
+        """``bodies``, with lane-changing objects at the lateral position of their target lane."""
         if not self.aims:
             return self.bodies
         bodies = self.bodies.copy()
@@ -149,14 +151,15 @@ class Surroundings:
 
     @property
     def elapsed(self) -> float:
-        """Time since the episode began [s]."""
+        """Time since the start of the episode [s]."""
         return (self.t_us - self.start_us) * 1e-6
 
 
 class AgentDriver(Protocol):
-    """Moves one object. Immutable: a step makes a new one, so that a copied world goes on alike.
+    """Moves one object. Immutable: a step returns a new driver, so worlds can be forked.
 
-    The same surroundings always lead to the same place: drivers know no clock and no chance.
+    Deterministic: the same surroundings lead to the same pose. Drivers use no clock and no random
+    numbers.
     """
 
     @property
@@ -165,18 +168,18 @@ class AgentDriver(Protocol):
 
     @property
     def pose(self) -> AgentPose:
-        """Where it is now."""
+        """Current pose."""
 
     @property
     def present(self) -> bool:
-        """Whether it is in the world; False once it has left it."""
+        """Whether the object is in the world; False once it has left."""
 
     def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
 
 
 def level_quaternion(yaw: float) -> tuple[float, float, float, float]:
-    """wxyz of an object that stands level with that heading; w >= 0."""
+    """wxyz of a level object with a heading [rad]; w >= 0."""
     half = math.remainder(yaw, math.tau) / 2
     return (math.cos(half), 0.0, 0.0, math.sin(half))
 
@@ -184,14 +187,14 @@ def level_quaternion(yaw: float) -> tuple[float, float, float, float]:
 def pose_on_path(
     path: LoggedPath, s: float, speed: float, *, offset: float = 0.0, drift: float = 0.0
 ) -> AgentPose:
-    """An object that drives along a path.
+    """The pose of an object that drives along a path.
 
     Args:
-        path: in the world.
-        s: along it [m].
-        speed: along it [m/s].
-        offset: from it, positive on the left [m].
-        drift: rate at which the offset grows [m/s].
+        path: path, world frame.
+        s: distance along it [m].
+        speed: speed along it [m/s].
+        offset: lateral offset from it, positive left [m].
+        drift: rate of change of the offset [m/s].
     """
     x, y, z, yaw = path.at(s)
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -205,11 +208,13 @@ def pose_on_path(
 
 
 def pose_put_back(pose: AgentPose, route: LoggedPath, way: float) -> AgentPose:
-    """The pose ``way`` metres back along a route: beside it and turned against it as before; its
-    height is left as it is."""
+    """The pose moved ``way`` metres back along a route, with the same offset and relative heading.
+
+    The height is unchanged.
+    """
     x, y, z = pose.position
     near = route.nearest(x, y)
-    # Beyond the ends of the route it goes straight on, where the nearest point is the end.
+    # The route continues straight beyond its ends, but the nearest point there is the end itself.
     beyond = (x - near.position[0]) * math.cos(near.yaw)
     beyond += (y - near.position[1]) * math.sin(near.yaw)
     px, py, _, yaw = route.at(near.s + beyond - way)
@@ -227,7 +232,7 @@ def pose_put_back(pose: AgentPose, route: LoggedPath, way: float) -> AgentPose:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Moves along its trajectory in time and is in the world while that lasts; observes nothing."""
+    """Replays its trajectory in time, and is present while that lasts; ignores surroundings."""
 
     subject: ObjectState
     pose: AgentPose
@@ -235,7 +240,7 @@ class Replay:
 
     @classmethod
     def begin(cls, subject: ObjectState, _spec: ReplayDriver, surroundings: Surroundings) -> Replay:
-        """From where the trajectory is now, which it must cover."""
+        """Start at the current time, which the trajectory must cover."""
         return cls(subject, recorded_pose(subject, surroundings.t_us))
 
     def advance(self, surroundings: Surroundings) -> Self:
@@ -248,7 +253,7 @@ class Replay:
 
 @dataclass(frozen=True, eq=False)
 class ConstantVelocity:
-    """Goes on as it moved when it began, at its height and with its heading; observes nothing."""
+    """Keeps its initial velocity, height and heading; ignores surroundings."""
 
     subject: ObjectState
     pose: AgentPose
@@ -258,7 +263,7 @@ class ConstantVelocity:
     def begin(
         cls, subject: ObjectState, _spec: ConstantVelocityDriver, surroundings: Surroundings
     ) -> ConstantVelocity:
-        """From how the object moves now."""
+        """Start from the current motion of the object."""
         pose = recorded_pose(subject, surroundings.t_us)
         vx, vy, _ = pose.velocity
         return cls(subject, pose._replace(velocity=(vx, vy, 0.0)))
@@ -271,7 +276,7 @@ class ConstantVelocity:
 
 
 def recorded_pose(subject: ObjectState, t_us: int) -> AgentPose:
-    """Where the object's trajectory is at ``t_us``, with its velocity there.
+    """Pose and velocity of the object's trajectory at ``t_us``.
 
     Raises:
         TimeOutOfRangeError: outside the trajectory.
@@ -286,13 +291,13 @@ def recorded_pose(subject: ObjectState, t_us: int) -> AgentPose:
 
 @dataclass(frozen=True, eq=False)
 class External:
-    """Follows the newest plan it was given, exactly; then goes straight on as it moved last.
+    """Follows the newest client plan exactly, then continues straight at its last velocity.
 
     Attributes:
         subject: the object.
         pose, present: see :class:`~.driver.AgentDriver`.
-        times_us: [N] of the plan; empty before the first one [us].
-        poses: [N] x, y [m], yaw [rad], world.
+        times_us: [N] times of the plan [us]; empty before the first plan.
+        poses: [N] x, y [m], yaw [rad], world frame.
     """
 
     subject: ObjectState
@@ -305,13 +310,13 @@ class External:
     def begin(
         cls, subject: ObjectState, _spec: ExternalDriver, surroundings: Surroundings
     ) -> External:
-        """From how the object moves now."""
+        """Start from the current motion of the object."""
         return cls(subject, recorded_pose(subject, surroundings.t_us))
 
     def with_plan(
         self, t_us: int, times_us: Sequence[int], poses: Sequence[tuple[float, float, float]]
     ) -> External:
-        """The driver with a new plan; it leads there from where the object is at ``t_us``."""
+        """The driver with a new plan, which starts at the object's pose at ``t_us``."""
         x, y, _ = self.pose.position
         here = (x, y, self.pose.yaw)
         return replace(self, times_us=(t_us, *times_us), poses=(here, *poses))
@@ -343,8 +348,7 @@ class External:
 
 @dataclass(frozen=True, eq=False)
 class ScriptedEntity:
-    """Where a storyboard has an object. It is moved with the others of its storyboard, and not by
-    itself.
+    """An object that a storyboard moves, together with the other entities of that storyboard.
 
     Attributes:
         subject, pose, present: see :class:`~.driver.AgentDriver`.
@@ -355,16 +359,16 @@ class ScriptedEntity:
     present: bool = True
 
     def advance(self, surroundings: Surroundings) -> Self:
-        """Itself: its storyboard makes the next one."""
+        """Returns itself; its storyboard creates the next one."""
         return self
 
 
 class Script(Protocol):
-    """Moves several objects together. Immutable, as drivers are."""
+    """Moves several objects together. Immutable, like drivers."""
 
     @property
     def drivers(self) -> Mapping[str, ScriptedEntity]:
-        """Of the objects, by id."""
+        """Drivers of the objects, by id."""
 
     def advance(self, surroundings: Surroundings) -> Script:
         """The script one step later."""
@@ -372,11 +376,11 @@ class Script(Protocol):
 
 # --- Intelligent driver model --------------------------------------------------------------------
 
-# IDM on a path behind a leading object, and MOBIL, which decides lane changes.
+# IDM on a path behind a lead vehicle, and MOBIL lane changes.
 
 
 class Leader(NamedTuple):
-    """The nearest body ahead: bumper to bumper [m], and its speed along the path [m/s]."""
+    """The nearest body ahead: bumper-to-bumper gap [m], and its speed along the path [m/s]."""
 
     gap: float
     speed: float
@@ -392,14 +396,14 @@ def leading_agent(
     object_id: str,
     surroundings: Surroundings,
 ) -> Leader | None:
-    """The body that is next in the strip an object sweeps along a path.
+    """The next body ahead in the strip that an object sweeps along a path.
 
     Args:
-        path: of the object.
-        s, offset: of its centre along the path, and from it [m].
-        length, width: of its box [m].
-        object_id: of the object, which is not its own leader.
-        surroundings: everybody.
+        path: path of the object.
+        s, offset: its centre along the path, and its offset from it [m].
+        length, width: size of its box [m].
+        object_id: id of the object itself, which is excluded.
+        surroundings: all bodies.
     """
     box = (float(offset), float(length), float(width))
     gap, speed = next_in_strip(
@@ -409,7 +413,7 @@ def leading_agent(
 
 
 class Neighbours(NamedTuple):
-    """Who is next before and behind something in a lane; None where nobody is within 80 m."""
+    """Leader and follower in a lane; None if nobody is within 80 m."""
 
     leader: Leader | None
     follower: Leader | None
@@ -424,15 +428,16 @@ def neighbours(
     object_id: str,
     surroundings: Surroundings,
 ) -> Neighbours:
-    """Leader and follower that a box would have in the middle of a lane, those among them who have
-    begun to change into it.
+    """Leader and follower of a box at the centre of a lane.
+
+    Objects that have started to change into the lane count as being in it.
 
     Args:
-        path: of the lane.
-        s: of the middle of the box along it [m].
-        length, width: of the box [m].
-        object_id: of the object, which is neither.
-        surroundings: everybody.
+        path: centre line of the lane.
+        s: position of the box centre along it [m].
+        length, width: size of the box [m].
+        object_id: id of the object itself, which is excluded.
+        surroundings: all bodies.
     """
     box, own = (0.0, float(length), float(width)), surroundings.rows.get(object_id, -1)
     now = surroundings.bodies
@@ -449,7 +454,7 @@ STRAIGHT = 600.0
 
 
 def lane_beside(route: LoggedPath, offset: float, *, oncoming: bool = False) -> LoggedPath:
-    """The lane ``offset`` metres to the left of a route; ``oncoming``: against it."""
+    """The lane ``offset`` metres to the left of a route; ``oncoming`` reverses its direction."""
     (x, y, z), (ex, ey, ez) = route.positions[0].tolist(), route.positions[-1].tolist()
     first, last = float(route.yaws[0]), float(route.yaws[-1])
     start = [x - STRAIGHT * math.cos(first), y - STRAIGHT * math.sin(first), z]
@@ -463,7 +468,7 @@ def lane_beside(route: LoggedPath, offset: float, *, oncoming: bool = False) -> 
 
 
 def lane_of(route: LoggedPath, x: float, y: float, yaw: float) -> LoggedPath:
-    """The lane beside a route in which something is at x, y [m], the way it faces: ``yaw``."""
+    """The lane parallel to a route through x, y [m], in the direction of ``yaw``."""
     near = route.nearest(x, y)
     return lane_beside(route, near.offset, oncoming=math.cos(yaw - near.yaw) < 0.0)
 
@@ -483,20 +488,20 @@ SLOWEST_DESIRED = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Idm:
-    """Keeps to its recorded path, at a desired speed or behind its leader.
+    """Intelligent driver model on the recorded path, with a desired speed and a lead vehicle.
 
     a = a_max [1 - (v/v0)^4 - (s*/s)^2] with s* = s0 + max(0, v T + v dv / (2 sqrt(a_max b)))
-    (Treiber, Hennecke & Helbing 2000, Phys. Rev. E 62, eqs. 1 to 3). In bends v0 is what the
-    lateral acceleration allows. It leaves the world at the end of its path.
+    (Treiber, Hennecke & Helbing 2000, Phys. Rev. E 62, eqs. 1 to 3). In curves the lateral
+    acceleration limits v0. The object leaves the world at the end of its path.
 
     Attributes:
         subject: the object.
-        spec: parameters.
-        path: recorded, of its box centre.
-        desired: speed on a free and straight road [m/s].
-        s, offset, speed: along and beside the path [m], [m/s].
+        spec: IDM parameters.
+        path: recorded path of its box centre.
+        desired: desired speed on a free, straight road [m/s].
+        s, offset, speed: position along the path, offset from it [m], speed [m/s].
         pose, present: see :class:`~.driver.AgentDriver`.
-        along_route: whether the path is a lane beside the ego's route, at no height of its own.
+        along_route: whether the path is a lane parallel to the ego's route, without height.
     """
 
     subject: ObjectState
@@ -512,7 +517,7 @@ class Idm:
 
     @classmethod
     def begin(cls, subject: ObjectState, spec: IdmDriver, surroundings: Surroundings) -> Idm:
-        """From where and how the object moves now."""
+        """Start from the current pose and motion of the object."""
         now = recorded_pose(subject, surroundings.t_us)
         if spec.path == "recorded":
             return cls.from_pose(subject, now, spec, LoggedPath(subject.trajectory))
@@ -523,7 +528,7 @@ class Idm:
     def from_pose(
         cls, subject: ObjectState, now: AgentPose, spec: IdmDriver, path: LoggedPath
     ) -> Idm:
-        """From a pose beside its path."""
+        """Start from a pose near its path."""
         near = path.nearest(now.position[0], now.position[1])
         vx, vy, _ = now.velocity
         speed = max(vx * math.cos(near.yaw) + vy * math.sin(near.yaw), 0.0)
@@ -534,19 +539,22 @@ class Idm:
     def in_lane(
         cls, subject: ObjectState, spec: IdmDriver, lane: LoggedPath, s: float, *, speed: float
     ) -> Idm:
-        """In the middle of a lane beside the ego's route, ``s`` metres along it at ``speed``
-        [m/s]; ``spec`` holds the desired speed."""
+        """Start at the centre of a lane parallel to the ego's route.
+
+        ``s`` is the position along the lane [m] and ``speed`` the initial speed [m/s]; ``spec``
+        holds the desired speed.
+        """
         pose, desired = pose_on_path(lane, s, speed), desired_speed(subject, spec)
         return cls(subject, spec, lane, desired, s, 0.0, speed, pose, along_route=True)
 
     def on(self, ground: Ground) -> Self:
-        """The driver with its object standing on the ground."""
+        """The driver with its object on the ground."""
         x, y, _ = self.pose.position
         z = ground.height(x, y) + self.subject.scaled_size[2] / 2
         return replace(self, pose=self.pose._replace(position=(x, y, z)))
 
     def put_back(self, route: LoggedPath, way: float, ground: Ground) -> Self:
-        """The driver ``way`` metres back along the route: beside it and turned as it is now."""
+        """The driver moved ``way`` metres back along the route, with its offset and heading."""
         pose = pose_put_back(self.pose, route, way)
         near = self.path.nearest(pose.position[0], pose.position[1])
         return replace(self, s=near.s, offset=near.offset, pose=pose).on(ground)
@@ -580,7 +588,7 @@ class Idm:
 
 
 def acceleration(spec: IdmParameters, speed: float, desired: float, leader: Leader | None) -> float:
-    """IDM acceleration [m/s^2], no harder than brakes can."""
+    """IDM acceleration [m/s^2], limited to the braking capability."""
     free = 1.0 - (speed / max(desired, STANDSTILL)) ** 4
     if leader is None:
         return max(spec.acceleration * free, -HARDEST)
@@ -594,21 +602,21 @@ def acceleration(spec: IdmParameters, speed: float, desired: float, leader: Lead
 
 
 def advance_along(s: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
-    """Place and speed after ``dt`` seconds; braking ends at rest."""
+    """Position and speed after ``dt`` seconds; braking ends at rest."""
     if acceleration < 0 and speed + acceleration * dt <= 0:
         return s + speed * speed / (-2 * acceleration), 0.0
     return s + (speed + acceleration * dt / 2) * dt, speed + acceleration * dt
 
 
 def desired_speed(subject: ObjectState, spec: IdmParameters) -> float:
-    """Speed on a free, straight road [m/s]: what the spec says, else the highest recorded one."""
+    """Desired speed on a free, straight road [m/s]: from the spec, else the highest recorded."""
     if spec.desired_speed is not None:
         return spec.desired_speed
     return max(highest_speed(subject.trajectory), SLOWEST_DESIRED)
 
 
 def highest_speed(trajectory: Trajectory) -> float:
-    """Highest recorded speed [m/s], over half a second against noise."""
+    """Highest recorded speed [m/s], averaged over half a second."""
     times = trajectory.times_us * 1e-6
     if len(times) == 1:
         return 0.0
@@ -627,15 +635,16 @@ def incentive(
     here: tuple[Neighbours, float],
     there: tuple[Neighbours, float],
 ) -> float | None:
-    """What a change of lanes gains, beyond the threshold [m/s^2]; None where it is not safe.
+    """MOBIL incentive of a lane change beyond the threshold [m/s^2]; None if it is unsafe.
 
-    Others are taken to drive by the same parameters, at least as fast as they do now.
+    Assumes that others use the same parameters, with a desired speed of at least their current
+    speed.
 
     Args:
-        spec: of the driver.
+        spec: parameters of the driver.
         speed: its speed [m/s].
-        length: of its vehicle [m].
-        here, there: neighbours in a lane, and the desired speed in it [m/s].
+        length: length of its vehicle [m].
+        here, there: neighbours in the current and target lane, and the desired speed there [m/s].
     """
     (now, desired_here), (then, desired_there) = here, there
     me = speed
@@ -654,8 +663,7 @@ def incentive(
 def _with_and_without(
     spec: LaneDriver, speed: float, length: float, lane: Neighbours, desired: float
 ) -> tuple[float, float]:
-    """Acceleration of the one behind in a lane without the driver, and with it; 0 where nobody is
-    behind."""
+    """Acceleration of the follower in a lane, without and with the driver; 0 without follower."""
     behind, ahead = lane.follower, lane.leader
     if behind is None:
         return 0.0, 0.0

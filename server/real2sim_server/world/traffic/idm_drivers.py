@@ -1,4 +1,4 @@
-"""Drivers based on IDM: along the lanes of a map with MOBIL, and adversarial ones."""
+"""Drivers based on IDM: lane following with MOBIL lane changes, and adversarial drivers."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ AHEAD, BEHIND = 600.0, 100.0
 
 @dataclass(frozen=True, eq=False)
 class LaneWay:
-    """Lanes one after the other, where they fork those that turn least.
+    """A chain of consecutive lanes; at forks, the lane that turns least.
 
     Attributes:
-        path: along their centre lines.
-        lanes: in their order.
-        starts: where each begins along the path [m].
-        goes_on: whether there are more lanes behind its end.
+        path: path along their centre lines.
+        lanes: the lanes, in order.
+        starts: start of each lane along the path [m].
+        goes_on: whether more lanes follow its end.
     """
 
     path: LoggedPath
@@ -66,7 +66,7 @@ class LaneWay:
     goes_on: bool
 
     def lane_at(self, s: float) -> Lane:
-        """The lane at a place along the path [m]."""
+        """The lane at a distance along the path [m]."""
         return self.lanes[max(bisect_right(self.starts, s) - 1, 0)]
 
 
@@ -74,7 +74,7 @@ _WAYS: WeakKeyDictionary[LaneGraph, dict[str, LaneWay]] = WeakKeyDictionary()
 
 
 def way_through(graph: LaneGraph, lane_id: str) -> LaneWay:
-    """The way through a lane; each is made once for a graph. Raises SceneError."""
+    """The lane chain through a lane, cached per graph. Raises SceneError."""
     known = _WAYS.setdefault(graph, {})
     if lane_id not in known:
         known[lane_id] = _made(graph, lane_id)
@@ -102,7 +102,7 @@ def _made(graph: LaneGraph, lane_id: str) -> LaneWay:
 def _chain(
     graph: LaneGraph, lane: Lane, reach: float, names: Callable[[Lane], Iterable[str]]
 ) -> list[Lane]:
-    """Lanes one after the other from one on, without it, none twice."""
+    """The lanes that follow one lane, without it and without repetition."""
     found, length, at = list[Lane](), 0.0, lane
     while length < reach:
         onward = [n for n in _travelled(graph, names(at)) if n is not lane and n not in found]
@@ -135,21 +135,20 @@ RENEWED = 200.0
 
 @dataclass(frozen=True, eq=False)
 class LaneChanger:
-    """Keeps to lanes of the map, at the lane's speed or behind its leader; changes to a neighbour
-    where that gains more than others lose.
+    """Follows map lanes with IDM and changes lanes with MOBIL.
 
-    Where lanes fork it takes the one that turns least; a lane that ends beside one that goes on is
-    left for that. It leaves the world at the end of the map. Signals and rights of way are not
-    known to it.
+    At forks it takes the lane that turns least. It merges out of a lane that ends next to a
+    continuing one. It leaves the world at the end of the map. It ignores traffic signals and right
+    of way.
 
     Attributes:
         subject: the object.
-        spec: parameters.
-        way: along lanes.
-        s, offset, speed: along and beside it [m], [m/s].
+        spec: IDM and MOBIL parameters.
+        way: lane chain that it follows.
+        s, offset, speed: position along it, offset from it [m], speed [m/s].
         pose, present: see :class:`~.driver.AgentDriver`.
-        changing: offset at which a change of lanes began, and for how long it has gone on [s].
-        settled: time since the last one [s].
+        changing: offset at the start of the current lane change [m], and time since then [s].
+        settled: time since the last lane change [s].
     """
 
     subject: ObjectState
@@ -167,8 +166,7 @@ class LaneChanger:
     def begin(
         cls, subject: ObjectState, spec: LaneDriver, surroundings: Surroundings
     ) -> AgentDriver:
-        """From where and how the object moves now; one that is in no lane keeps to its recorded
-        path by the same parameters."""
+        """Start from the current motion; outside all lanes, follow the recorded path with IDM."""
         now, graph = recorded_pose(subject, surroundings.t_us), surroundings.lanes
         x, y, _ = now.position
         place = None
@@ -185,7 +183,7 @@ class LaneChanger:
 
     @property
     def aim(self) -> tuple[float, float]:
-        """Way x, y that is left to the middle of its lane [m]."""
+        """Remaining displacement x, y to the centre of its lane [m]."""
         yaw = self.way.path.at(self.s)[3]
         return self.offset * math.sin(yaw), -self.offset * math.cos(yaw)
 
@@ -208,7 +206,7 @@ class LaneChanger:
     # --- changes of lanes -------------------------------------------------------------------------
 
     def _in_the_better_lane(self, surroundings: Surroundings) -> Self:
-        """The driver as it begins to change, where that pays; the left one where both pay alike."""
+        """The driver at the start of a lane change, if that pays; the left lane wins ties."""
         graph, lane = surroundings.lanes, self.way.lane_at(self.s)
         ready = self.changing is None and self.settled >= SETTLES and self.speed > SLOWEST
         if graph is None or not (ready and self.spec.changes and self._decides(surroundings)):
@@ -230,15 +228,17 @@ class LaneChanger:
         return best
 
     def _decides(self, surroundings: Surroundings) -> bool:
-        """Whether this is the step of the present second in which it thinks of a change."""
+        """Whether the driver considers lane changes in this step; once per second."""
         steps = max(round(DECIDES_EVERY / surroundings.dt), 1)
         step = (surroundings.t_us - surroundings.start_us) // surroundings.dt_us
         number, phase = divmod(step, steps)
         return crc32(f"{self.subject.object_id} {number}".encode()) % steps == phase
 
     def _seen(self, surroundings: Surroundings, beside: list[Self]) -> Neighbours:
-        """Neighbours in the middle of its lane; the end of a lane stands in the way, where one
-        beside it goes on."""
+        """Neighbours at the centre of its lane.
+
+        The end of the lane counts as a stationary leader if a neighbouring lane continues.
+        """
         length, width, _ = self.subject.scaled_size
         found = neighbours(
             self.way.path,
@@ -287,7 +287,7 @@ class LaneChanger:
         )
 
     def _acceleration(self, surroundings: Surroundings) -> float:
-        """Behind whoever is next where it is, in its lane, and at the end of that."""
+        """Minimum over the leaders at its position, in its lane and at the end of the lane."""
         length, width, _ = self.subject.scaled_size
         path, lane = self.way.path, self.way.lane_at(self.s)
         bend = path.sharpest_turn(self.s, 2.0 * self.speed)
@@ -308,7 +308,7 @@ class LaneChanger:
         return min(acceleration(self.spec, self.speed, desired, leader) for leader in leaders)
 
     def _beside(self, surroundings: Surroundings, lane: Lane) -> list[Self]:
-        """The same in the neighbour lanes; only asked near the end of the way."""
+        """The driver in the neighbouring lanes; only needed near the end of the lane chain."""
         graph = surroundings.lanes
         if graph is None or self.way.goes_on or self.way.path.length - self.s > RENEWED:
             return []
@@ -329,9 +329,9 @@ def _eased(progress: float) -> float:
 
 # --- Adversarial drivers -------------------------------------------------------------------------
 
-# They cut in, brake or cross, after the side, front and stationary scenarios of NeuroNCAP
-# (Ljungbergh et al. 2024) and the attacking agents of HUGSIM (Zhou et al. 2024), with closed rules
-# instead of sampled trajectories.
+# Cut-in, hard braking and crossing, modelled on the side, front and stationary scenarios of
+# NeuroNCAP (Ljungbergh et al. 2024) and the attacking agents of HUGSIM (Zhou et al. 2024), with
+# closed-form rules instead of sampled trajectories.
 
 PACE = 1.0
 """Time constant with which a car beside the ego closes up to its place [s]."""
@@ -342,12 +342,12 @@ CUT_BRAKING = 3.0
 
 @dataclass(frozen=True, eq=False)
 class CutIn:
-    """Keeps its place beside the ego's route ahead of the ego, then swerves in front of it.
+    """Drives next to the ego's route ahead of the ego, then cuts in.
 
     Attributes:
         subject, spec: the object and its parameters.
-        s, offset, speed: along and beside the ego's route [m], [m/s].
-        began: offset and speed when it began to move in, and for how long it has [s]; or None.
+        s, offset, speed: position along the ego's route, offset from it [m], speed [m/s].
+        began: offset and speed at the start of the cut-in, and time since then [s]; or None.
         pose, present: see :class:`~.driver.AgentDriver`.
     """
 
@@ -362,7 +362,7 @@ class CutIn:
 
     @classmethod
     def begin(cls, subject: ObjectState, spec: CutInDriver, surroundings: Surroundings) -> CutIn:
-        """Beside the ego, ``gap`` ahead of it and as fast."""
+        """Start ``gap`` ahead of the ego, at its speed."""
         s = surroundings.ego.s + surroundings.ego.front + spec.gap + subject.scaled_size[0] / 2
         speed = surroundings.ego.speed
         pose = _on_route(surroundings, subject, (s, spec.offset), (speed, 0.0))
@@ -396,13 +396,13 @@ class CutIn:
 
 @dataclass(frozen=True, eq=False)
 class HardBrake:
-    """Drives its recorded path as recorded, until it brakes to a stop in front of the ego.
+    """Replays its recorded drive, then brakes to a stop in front of the ego.
 
     Attributes:
         subject, spec: the object and its parameters.
-        path: recorded.
-        s, speed: along it [m], [m/s].
-        braking: whether it has begun to.
+        path: recorded path.
+        s, speed: position and speed along it [m], [m/s].
+        braking: whether it has started to brake.
         pose, present: see :class:`~.driver.AgentDriver`.
     """
 
@@ -419,7 +419,7 @@ class HardBrake:
     def begin(
         cls, subject: ObjectState, spec: HardBrakeDriver, surroundings: Surroundings
     ) -> HardBrake:
-        """From where and how the object moves now."""
+        """Start from the current pose and motion of the object."""
         path, now = LoggedPath(subject.trajectory), recorded_pose(subject, surroundings.t_us)
         near = path.nearest(now.position[0], now.position[1])
         speed = math.hypot(now.velocity[0], now.velocity[1])
@@ -443,11 +443,11 @@ class HardBrake:
         return replace(self, s=s, speed=speed, pose=pose, braking=braking)
 
     def _near(self, surroundings: Surroundings) -> bool:
-        """Whether the ego is behind, in the same lane, within the distance that triggers."""
+        """Whether the ego follows in the same lane within the trigger distance."""
         ego, (x, y, _), yaw = surroundings.ego, self.pose.position, self.pose.yaw
         dx, dy = x - ego.x, y - ego.y
         ahead_of = dx * math.cos(yaw) + dy * math.sin(yaw)
-        # The path may begin here; then the line straight back from it counts.
+        # The path may begin here; it is extended straight backwards then.
         aside = abs(self.path.nearest(ego.x, ego.y).offset)
         gap = ahead_of - (self.subject.scaled_size[0] + ego.length) / 2
         return aside < 3.0 and 0.0 <= gap <= self.spec.gap
@@ -455,14 +455,14 @@ class HardBrake:
 
 @dataclass(frozen=True, eq=False)
 class JunctionCrossing:
-    """Crosses the ego's route on a straight line, timed so that both are there at once.
+    """Crosses the ego's route on a straight line, timed to arrive together with the ego.
 
     Attributes:
         subject, spec: the object and its parameters.
-        crossing_s: of the crossing point along the route [m].
-        crossing: the point x, y [m].
-        heading: of its line [rad].
-        left: way to the crossing point, negative beyond it [m].
+        crossing_s: crossing point along the route [m].
+        crossing: crossing point x, y [m].
+        heading: heading of its line [rad].
+        left: distance to the crossing point, negative beyond it [m].
         speed: [m/s].
         pose, present: see :class:`~.driver.AgentDriver`.
     """
@@ -481,7 +481,7 @@ class JunctionCrossing:
     def begin(
         cls, subject: ObjectState, spec: JunctionCrossingDriver, surroundings: Surroundings
     ) -> JunctionCrossing:
-        """As far from the crossing as it goes at its speed in the time the ego needs."""
+        """Start at the distance that it covers in the ego's time to the crossing point."""
         crossing_s = surroundings.ego.s + spec.ahead
         x, y, _, yaw = surroundings.route.at(crossing_s)
         eta = (spec.ahead - surroundings.ego.front) / max(surroundings.ego.speed, 1.0)
@@ -528,12 +528,12 @@ def _on_route(
     place: tuple[float, float],
     moving: tuple[float, float],
 ) -> AgentPose:
-    """An object beside the ego's route, standing on the ground.
+    """The pose of an object relative to the ego's route, on the ground.
 
     Args:
-        surroundings: has the route.
+        surroundings: provides route and ground.
         subject: the object.
-        place: along the route and to its left [m].
+        place: distance along the route, and offset to its left [m].
         moving: speed along it and to its left [m/s].
     """
     s, offset = place
@@ -544,5 +544,5 @@ def _on_route(
 
 
 def _towards(speed: float, wanted: float, most: float, dt: float) -> float:
-    """Acceleration [m/s^2] to a wanted speed within a limit."""
+    """Acceleration [m/s^2] towards a target speed within a limit."""
     return min(max((wanted - speed) / dt, -most), most)

@@ -1,4 +1,4 @@
-"""Road users that come and go along the ego's route."""
+"""Spawning and removal of road users along the ego's route."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ SLOWEST = 3.0
 
 
 class Lane(NamedTuple):
-    """A lane in which road users come and go.
+    """A lane in which objects are spawned.
 
     Attributes:
-        path: along which they drive.
-        oncoming: whether it leads against the route.
-        looks: objects that they look like.
+        path: centre line.
+        oncoming: whether it runs against the route.
+        looks: objects whose appearance spawned objects use.
     """
 
     path: LoggedPath
@@ -50,7 +50,7 @@ class Lane(NamedTuple):
 
 
 class Neighbour(NamedTuple):
-    """A body in a lane: middle along it [m], half its length [m], speed along it [m/s]."""
+    """A body in a lane: centre along it [m], half its length [m], speed along it [m/s]."""
 
     s: float
     half: float
@@ -59,15 +59,15 @@ class Neighbour(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Spawner:
-    """Lets objects appear and leave. Immutable: a step makes a new one.
+    """Spawns and removes objects. Immutable: a step returns a new one.
 
     Attributes:
-        spec: how many, where.
-        lanes: where they drive.
-        desired: speed that theirs are sampled around [m/s].
-        draws: of the episode.
-        ground: what they stand on.
-        number: how many have appeared so far.
+        spec: density and range of spawned traffic.
+        lanes: lanes of spawned objects.
+        desired: mean of their sampled desired speeds [m/s].
+        draws: random numbers of the episode.
+        ground: ground of the scene.
+        number: number of objects spawned so far.
     """
 
     spec: SpawnSpec
@@ -87,18 +87,18 @@ class Spawner:
         route: LoggedPath,
         ego: Trajectory,
     ) -> Spawner:
-        """At the start of an episode.
+        """The spawner at the start of an episode.
 
         Args:
-            spec: how many, where.
-            state: whose objects they look like.
-            draws: of the episode.
-            route: of the ego, going on beyond the recorded drive.
+            spec: density and range of spawned traffic.
+            state: objects that provide the appearance.
+            draws: random numbers of the episode.
+            route: route of the ego, continued beyond the recorded drive.
             ego: the recorded drive.
 
         Raises:
-            WorldError: UNKNOWN_OBJECT for a look of an object that does not exist;
-                INVALID_REQUEST where nobody could be looked like.
+            WorldError: UNKNOWN_OBJECT if an appearance refers to a missing object;
+                INVALID_REQUEST if no object can provide the appearance.
         """
         looks = _looks(spec, state)
         desired = spec.driver.desired_speed
@@ -108,7 +108,7 @@ class Spawner:
         return cls(spec, lanes, max(desired, SLOWEST), draws, state.ground)
 
     def filled(self, agents: Agents, surroundings: Surroundings) -> tuple[Spawner, list[Idm]]:
-        """The stretch around the ego as dense as it is to be, at the start."""
+        """Fill the range around the ego to the requested density, at the start."""
         spawner, added = self, list[Idm]()
         for number, lane in enumerate(self.lanes):
             bodies = list(_bodies_in(lane.path, agents, surroundings))
@@ -125,7 +125,7 @@ class Spawner:
         return spawner, added
 
     def gone(self, drivers: Mapping[str, AgentDriver], surroundings: Surroundings) -> set[str]:
-        """Ids of spawned objects that leave: at the end of the lane, or far from the ego."""
+        """Ids of spawned objects to remove: at the end of their lane, or too far from the ego."""
         ego, leave = surroundings.ego, set[str]()
         for name, driver in drivers.items():
             if not name.startswith(PREFIX):
@@ -141,11 +141,11 @@ class Spawner:
     def advance(
         self, drivers: Mapping[str, AgentDriver], agents: Agents, surroundings: Surroundings
     ) -> tuple[Spawner, list[Idm]]:
-        """Who appears in this step: one in each lane that is emptier than it is to be.
+        """Spawn one object in each lane below the requested density.
 
         Args:
-            drivers: of all objects.
-            agents: where all objects are.
+            drivers: drivers of all objects.
+            agents: poses of all objects.
             surroundings: the instant before the step.
         """
         active = [d for i, d in drivers.items() if i.startswith(PREFIX)]
@@ -164,7 +164,7 @@ class Spawner:
         return spawner, added
 
     def sampled(self, made: Idm) -> dict[str, float]:
-        """What was sampled for a spawned object, by name."""
+        """Values sampled for a spawned object, by name."""
         name = f"agents.{made.subject.object_id}"
         return {f"{name}.desired_speed": made.desired, f"{name}.lane_position": made.s}
 
@@ -177,7 +177,7 @@ class Spawner:
         surroundings: Surroundings,
         active: list[AgentDriver],
     ) -> Idm | None:
-        """One at the edge of the stretch from which it comes into it, or at the other one."""
+        """An object at the edge of the range from which it drives into it, else at the other."""
         lane = self.lanes[number]
         bodies = list(_bodies_in(lane.path, agents, surroundings))
         here = lane.path.nearest(surroundings.ego.x, surroundings.ego.y).s
@@ -199,7 +199,7 @@ class Spawner:
         bodies: list[Neighbour],
         active: list[Idm] | list[AgentDriver],
     ) -> Idm | None:
-        """The next one, at ``s`` of a lane; None where the way is not free there."""
+        """The next object, at ``s`` of a lane; None if there is no free space."""
         lane = self.lanes[number]
         look = lane.looks[int(self._draw("look", 0.0, len(lane.looks)))]
         half = look.scaled_size[0] / 2
@@ -227,7 +227,7 @@ class Spawner:
         return self.desired * self._draw("speed", 1.0 - spread, 1.0 + spread)
 
     def _reach(self, lane: Lane) -> tuple[float, float]:
-        """How far the stretch goes behind and ahead of the ego, along the lane [m]."""
+        """Extent of the range behind and ahead of the ego, along the lane [m]."""
         ahead, behind = self.spec.ahead, self.spec.behind
         return (ahead, behind) if lane.oncoming else (behind, ahead)
 
@@ -239,7 +239,7 @@ class Spawner:
 def begin_spawner(
     spec: AgentsSpec, state: ScenarioState, draws: Draws, *, route: LoggedPath, ego: Trajectory
 ) -> Spawner | None:
-    """The spawner of an episode; None where nobody appears. Raises as :meth:`Spawner.begin`."""
+    """The spawner of an episode, or None. Raises the errors of :meth:`Spawner.begin`."""
     if spec.spawn is None:
         return None
     return Spawner.begin(spec.spawn, state, draws, route=route, ego=ego)
@@ -252,8 +252,10 @@ def _lane(spec: LaneSpec, route: LoggedPath, looks: tuple[ObjectState, ...]) -> 
 
 
 def _faces_along(subject: ObjectState, path: LoggedPath) -> bool:
-    """Whether an object was recorded heading along the path: then its look is known from where
-    the ego will see it."""
+    """Whether an object was recorded heading along the path.
+
+    Its appearance is known then from the viewpoints of the ego.
+    """
     x, y, _ = subject.trajectory.positions[0].tolist()
     yaw = float(quaternion_yaw(subject.trajectory.quaternions[0]))
     return math.cos(yaw - path.nearest(x, y).yaw) > 0.5
@@ -282,7 +284,7 @@ def _looks(spec: SpawnSpec, state: ScenarioState) -> tuple[ObjectState, ...]:
 
 
 def _bodies_in(path: LoggedPath, agents: Agents, surroundings: Surroundings) -> Iterator[Neighbour]:
-    """Objects and ego that reach into a lane of a car's width."""
+    """Objects and ego that overlap a lane of a car's width."""
     ego = surroundings.ego
     rows = np.column_stack(
         [agents.positions[:, :2], agents.sizes[:, :2], agents.velocities[:, :2]]
@@ -307,7 +309,7 @@ def _safe_speed(spec: IdmDriver, desired: float, gap: float, leader: float) -> f
 
 
 def _free_instance_id(active: list[Idm] | list[AgentDriver]) -> int:
-    """From the top of what instance images can tell apart, so that edits find theirs free."""
+    """The highest free instance id; edits use ids from the bottom."""
     taken = {d.subject.instance_id for d in active}
     return next(i for i in range(MAX_OBJECTS, 0, -1) if i not in taken)
 

@@ -1,4 +1,4 @@
-"""All road users but the ego: their drivers and their poses."""
+"""All road users except the ego: their drivers and poses."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ DRIVERS: dict[type[Any], BeginDriver] = {
 
 
 def begin_driver(subject: ObjectState, spec: DriverSpec, surroundings: Surroundings) -> AgentDriver:
-    """The driver that a spec names, beginning at the instant of ``surroundings``."""
+    """The driver of a spec, starting at the instant of ``surroundings``."""
     return DRIVERS[type(spec)](subject, spec, surroundings)
 
 
@@ -78,28 +78,28 @@ NOTHING_SAMPLED: Mapping[str, float] = MappingProxyType({})
 
 
 class RandomizedDrivers(Protocol):
-    """Draws parameters of IDM drivers."""
+    """Samples parameters of IDM drivers."""
 
     def driver_of(
         self, subject: ObjectState, spec: IdmDriver
     ) -> tuple[IdmDriver, dict[str, float]]:
-        """The parameters of an object's driver, and those that were sampled by name."""
+        """The driver parameters of an object, and the sampled values by name."""
 
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Objects of an episode at one instant. Immutable; objects without a driver repeat the log.
+    """Objects of an episode at one instant. Immutable; objects without a driver replay the log.
 
     Attributes:
-        spec: driver by object.
-        drivers: by object id; of objects that have appeared.
+        spec: driver specifications.
+        drivers: drivers of the objects that have appeared, by object id.
         agents: poses of all objects.
-        reacting: whether objects that repeated the log have begun to drive by IDM.
-        spawner: lets objects appear and leave; None where nobody does.
-        randomized: draws parameters of drivers; None where nothing is sampled.
-        sampled: all that has been sampled for objects so far, by name.
-        edits_drive: whether an edit has said who drives an object.
-        storyboard: moves entities of its own; None where the episode has none.
+        reacting: whether replayed objects have switched to IDM.
+        spawner: spawns and removes objects; or None.
+        randomized: samples parameters of drivers; or None.
+        sampled: values sampled for objects so far, by name.
+        edits_drive: whether an edit has assigned a driver.
+        storyboard: moves its entities; or None.
     """
 
     spec: AgentsSpec
@@ -128,14 +128,14 @@ class Traffic:
         Args:
             tracks: all objects.
             spec: their drivers.
-            surroundings: the start; its ``others`` are where the log has them.
-            spawner: lets objects appear and leave.
-            randomized: draws parameters of drivers.
-            storyboard: moves entities of its own, from the start on.
+            surroundings: the start instant, with ``others`` as recorded.
+            spawner: spawns and removes objects.
+            randomized: samples parameters of drivers.
+            storyboard: moves its entities from the start.
 
         Raises:
             WorldError: UNKNOWN_OBJECT for a driver of an object that does not exist;
-                INVALID_REQUEST for drivers on lanes where the scene has none.
+                INVALID_REQUEST for lane-following drivers in a scene without lanes.
         """
         unknown = sorted(set(spec.drivers) - {o.object_id for o in tracks.objects})
         if unknown:
@@ -171,9 +171,9 @@ class Traffic:
 
         Args:
             tracks: objects after all edits.
-            t_us: the instant after the step [us].
-            surroundings: of the instant before, whose ``others`` are ``agents``; only called
-                where an object has a driver.
+            t_us: time after the step [us].
+            surroundings: returns the previous instant, with ``agents`` as ``others``; only called
+                if an object has a driver.
         """
         base = tracks.at(t_us)
         if not (self.drivers or self.spawner or self.storyboard or self._assigns_drivers):
@@ -184,7 +184,7 @@ class Traffic:
         drivers = {i: d.advance(before) for i, d in self.drivers.items()}
         storyboard = self.storyboard and self.storyboard.advance(before)
         if storyboard is not None:
-            # What an impact has taken over is moved by the physics from then on.
+            # Objects taken over by an impact are moved by the physics.
             drivers |= {
                 i: d
                 for i, d in storyboard.drivers.items()
@@ -196,7 +196,7 @@ class Traffic:
 
     @property
     def _aims(self) -> dict[str, tuple[float, float]]:
-        """Of those that change lanes, see :class:`~.driver.Surroundings`."""
+        """``aims`` of lane-changing objects, see :class:`~.driver.Surroundings`."""
         return {
             i: d.aim
             for i, d in self.drivers.items()
@@ -204,7 +204,7 @@ class Traffic:
         }
 
     def edited(self, tracks: PackedTracks[ObjectState], surroundings: Surroundings) -> Traffic:
-        """Objects after an edit: drivers of objects whose trajectory was edited begin anew."""
+        """Objects after an edit; drivers of objects with edited trajectories restart."""
         objects = {o.object_id: o for o in tracks.objects}
         kept = {
             i: d
@@ -224,14 +224,16 @@ class Traffic:
     def with_reacting_agents(
         self, tracks: PackedTracks[ObjectState], surroundings: Surroundings
     ) -> Traffic:
-        """Objects that repeat the log drive by IDM from now on."""
+        """Switch objects that replay the log to IDM."""
         return replace(self, reacting=True)._with_new_drivers(
             tracks.at(surroundings.t_us), surroundings
         )
 
     def recorded_movers(self, objects: Iterable[ObjectState]) -> frozenset[str]:
-        """Ids of those that move as the recording has it or as a driver of the episode does: not
-        those that an edit has put there, that a client drives, or that physics has taken over."""
+        """Ids of moving objects that replay the recording or have a driver of the episode.
+
+        Excludes objects placed by edits, driven by clients or under physics control.
+        """
         return frozenset(
             o.object_id
             for o in objects
@@ -243,14 +245,14 @@ class Traffic:
     def put_back(
         self, tracks: PackedTracks[ObjectState], surroundings: Surroundings, way: float
     ) -> Traffic:
-        """Objects after the ego was put back by ``way`` metres along its route: those that drive
-        along the route come along, drivers of recorded objects begin anew, and ``tracks`` names
-        those that stay.
+        """Objects after a loop reset of the ego by ``way`` metres along its route.
+
+        Objects that drive along the route move with the ego. Drivers of recorded objects restart.
 
         Args:
-            tracks: without the objects that have left.
-            surroundings: before the ego was put back.
-            way: along the route [m].
+            tracks: tracks of the remaining objects.
+            surroundings: instant before the reset.
+            way: distance along the route [m].
         """
         here = {o.object_id for o in tracks.objects}
         route, ground = surroundings.route, surroundings.ground
@@ -271,10 +273,10 @@ class Traffic:
         times_us: Sequence[int],
         poses: Sequence[tuple[float, float, float]],
     ) -> Traffic:
-        """Objects after an externally driven one got a plan.
+        """Objects with a new plan for an externally driven object.
 
         Raises:
-            WorldError: INVALID_ACTION when it is not driven externally, or its plan is over.
+            WorldError: INVALID_ACTION if the object is not driven externally or the plan has ended.
         """
         driver = self.drivers.get(object_id)
         if not isinstance(driver, External):
@@ -294,7 +296,7 @@ class Traffic:
         return self.with_drivers({object_id: driver.with_plan(t_us, times_us, poses)}, self.agents)
 
     def with_drivers(self, drivers: Mapping[str, AgentDriver], base: Agents) -> Traffic:
-        """Objects with other drivers for some of them, placed anew on top of ``base``."""
+        """Objects with replaced drivers, whose poses override those of ``base``."""
         merged = MappingProxyType({**self.drivers, **drivers})
         return replace(self, drivers=merged, agents=_with_driver_poses(base, merged))
 
@@ -312,7 +314,7 @@ class Traffic:
         return placed._with_sampled(sampled)
 
     def _with_comers_and_goers(self, base: Agents, before: Surroundings) -> Traffic:
-        """After spawned objects have left and others have appeared; ``before``: the step."""
+        """Remove and spawn objects; ``before``: surroundings before the step."""
         assert self.spawner is not None
         gone = self.spawner.gone(self.drivers, before)
         kept = {i: d for i, d in self.drivers.items() if i not in gone}
@@ -346,7 +348,7 @@ class Traffic:
     def _driver_for(
         self, subject: ObjectState, surroundings: Surroundings, sampled: dict[str, float]
     ) -> AgentDriver | None:
-        """The driver of an object that has just appeared; its draws are added to ``sampled``."""
+        """The driver of a new object; adds its sampled values to ``sampled``."""
         spec = self.spec.drivers.get(subject.object_id, subject.driver)
         if spec is None:
             spec = self._default_for(subject)
@@ -386,7 +388,7 @@ def _moves(subject: ObjectState) -> bool:
 
 
 def _with_driver_poses(base: Agents, drivers: Mapping[str, AgentDriver]) -> Agents:
-    """``base`` with the objects that have drivers where those have brought them."""
+    """``base`` with the poses of driven objects replaced by those of their drivers."""
     if not drivers:
         return base
     rows = rows_of(base)

@@ -1,1 +1,1 @@
-"""The CPU backend: blocks of the grid as Numba kernels on all cores."""
+"""The CPU backend: Numba kernels on grid blocks, on all cores."""

@@ -1,4 +1,4 @@
-"""The CPU backend: Numba kernels on all cores, same bits for any number of them."""
+"""The CPU backend: Numba kernels on all cores, bitwise independent of the number of threads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .particle import COLUMNS, NODES, TILE, ParticleState, StepParameters, Works
 
 @dataclass(frozen=True, eq=False)
 class _Saved:
-    """All that changes, bit by bit; layouts are never written to and may be shared."""
+    """The complete mutable state; layouts are immutable and may be shared."""
 
     state: ParticleState
     blocks: Int
@@ -50,7 +50,7 @@ class WorkspaceShapes(NamedTuple):
 
 
 class BlockSimulation:
-    """A model in motion. Particles are kept sorted by block; see ``layout``."""
+    """A running simulation. Particles are sorted by block; see ``layout``."""
 
     def __init__(self, model: Model, colliders: Sequence[Collider]) -> None:
         self._model = model
@@ -70,9 +70,9 @@ class BlockSimulation:
         self._substeps(0, self._dtype(0))
 
     def _substeps(self, steps: int, dt: Any) -> tuple[int, bool]:
-        """Make up to ``steps`` substeps; how many, and whether particles must be sorted now.
+        """Make up to ``steps`` substeps; return their number, and whether sorting is needed.
 
-        No steps at all find the stress and energy of the particles as they stand.
+        With 0 steps, compute stress and energy of the current particles.
         """
         raise NotImplementedError
 
@@ -81,19 +81,19 @@ class BlockSimulation:
         raise NotImplementedError
 
     def _load_state(self, state: ParticleState) -> ParticleState:
-        """The state where the backend computes."""
+        """The state on the backend's device."""
         raise NotImplementedError
 
     def _sort_state(self, state: ParticleState, xi: Any, order: Int) -> ParticleState:
-        """The state with other positions from the host, in another order."""
+        """The state in another order, with new positions from the host."""
         raise NotImplementedError
 
     def _copy_state(self, state: ParticleState) -> ParticleState:
-        """A copy where the backend computes."""
+        """A copy on the backend's device."""
         raise NotImplementedError
 
     def _fetch(self, array: Any) -> Any:
-        """An array on the host; not to be written to."""
+        """An array on the host; read-only."""
         raise NotImplementedError
 
     def _make_work(self, layout: Layout) -> Workspace:
@@ -101,11 +101,11 @@ class BlockSimulation:
         raise NotImplementedError
 
     def _allocate(self, size: int) -> Any:
-        """Uninitialised numbers [size] where the backend computes."""
+        """Uninitialised numbers [size] on the backend's device."""
         raise NotImplementedError
 
     def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
-        """Make ``steps`` substeps; sorts particles whenever one has left its block's reach."""
+        """Make ``steps`` substeps; sort particles whenever one leaves its block's reach."""
         if any(c.moving for c in colliders):
             for step in range(steps):
                 self._follow([c.after(step * dt) for c in colliders], dt)
@@ -122,14 +122,14 @@ class BlockSimulation:
                 self._arrange(colliders)
 
     def _follow(self, colliders: Sequence[Collider], dt: float) -> None:
-        """Take over new poses; arrange anew before a collider is out of the margin."""
+        """Update collider poses; rebuild the layout before a collider leaves its margin."""
         self._set_params(colliders)
         self._moved += dt * max(c.fastest_point for c in colliders)
         if self._moved > COLLIDER_MARGIN / 2 * self._model.dx:
             self._arrange(colliders)
 
     def measure(self) -> Measure:
-        """Sums in float64, added up in the order of blocks."""
+        """Sums in float64, in the order of blocks."""
         layout, bodies = self._layout, self._model.bodies
         rows, block = self._measure_blocks()
         # The middle one of the fields around a block is its own.
@@ -186,7 +186,7 @@ class BlockSimulation:
         )
 
     def restore(self, saved: _Saved) -> None:
-        """Go back, to the bit."""
+        """Restore a saved state bitwise."""
         self._state = self._copy_state(saved.state)
         self._blocks, self._order = saved.blocks.copy(), saved.order
         self._layout = saved.layout
@@ -199,7 +199,7 @@ class BlockSimulation:
             if kept.size:
                 held[:] = kept
         self._totals = (saved.totals[0].copy(), saved.totals[1].copy())
-        # Where colliders stood when the layout was made is not kept, so count from its margin.
+        # Collider poses at layout construction are not saved, so count from its margin.
         self._moved = np.inf
 
     def _load(self, start: ParticleArrays) -> None:
@@ -234,7 +234,7 @@ class BlockSimulation:
         if hasattr(self, "_work"):
             self._flush()
         shift = _block_of(at)
-        # More than a few blocks in one go is no motion but a solver that diverges.
+        # Moving more than a few blocks at once means that the solver diverges.
         if np.abs(shift).max() > 1 << 10:
             raise SolverDiverged
         xi = (at - (shift * BLOCK).astype(self._dtype)).astype(self._dtype)
@@ -261,7 +261,7 @@ class BlockSimulation:
         )
 
     def _array(self, name: str, shape: tuple[int, ...]) -> Any:
-        """Uninitialised work space that is kept from layout to layout."""
+        """Uninitialised work space, reused across layouts."""
         size = int(np.prod(shape))
         held = self._space.get(name)
         if held is None or held.size < size:
@@ -331,7 +331,7 @@ class CpuSolverBackend:
 
 
 class CpuSimulation(BlockSimulation):
-    """A model in motion on the cores of this machine."""
+    """A running simulation on the CPU cores."""
 
     def _substeps(self, steps: int, dt: Any) -> tuple[int, bool]:
         with self._threads():
@@ -340,7 +340,7 @@ class CpuSimulation(BlockSimulation):
 
     @contextmanager
     def _threads(self) -> Iterator[None]:
-        """No more threads than there is work for; the bits do not depend on it."""
+        """Limit threads to the available work; results do not depend on it."""
         before = numba.get_num_threads()
         wanted = len(self._state.mass) // PARTICLES_PER_THREAD
         numba.set_num_threads(min(max(wanted, 1), before))

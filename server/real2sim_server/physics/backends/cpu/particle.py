@@ -1,4 +1,4 @@
-"""What happens to one particle, on any device: transfer, deformation, and what it adds to sums."""
+"""Functions of one particle for all devices: transfer, deformation and contributions to sums."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ParticleState(NamedTuple):
         v: [N, 3] [m/s].
         L: [N, 9] velocity gradient [1/s].
         F: [N, 9] elastic deformation gradient.
-        F_total: [N, 9], or [0, 9] where nothing is plastic and F says it all.
+        F_total: [N, 9], or [0, 9] if no material is plastic, so that F_total equals F.
         tau: [N, 6] Kirchhoff stress [Pa].
         energy: [N] stored energy per rest volume [J/m^3].
         history: [N].
@@ -94,7 +94,7 @@ class Workspace(NamedTuple):
 
 
 class StepParameters(NamedTuple):
-    """What holds for the whole run.
+    """Constants of a run.
 
     Attributes:
         table: [K, MATERIAL_ROW] materials, in the state's precision.
@@ -135,9 +135,9 @@ def particle_position(block: Any, p: Any, xi: Any, dx: Any) -> Any:
 def obstructed(
     p: Any, v: Any, block: Any, dt: Any, state: Any, layout: Any, params: Any, totals: Any
 ) -> Any:
-    """Velocity of a particle of a block once the thin colliders near by have had their say.
+    """Velocity of a particle of a block after contact with nearby thin colliders.
 
-    Between two of them it may be pushed from one to the other, so they are asked twice.
+    With several colliders, two passes are made: one may push the particle into another.
 
     Args:
         totals: [S, TOTALS] rows to add to.
@@ -167,13 +167,13 @@ def first_node(x: Any) -> Any:
 
 @device_function
 def tile_node(i: Any, j: Any, k: Any) -> Any:
-    """Number on the tile of a node of the block; tiles start one cell below the block."""
+    """Index in the tile of a node of the block; tiles start one cell below the block."""
     return ((i + 1) * SIDE + j + 1) * SIDE + k + 1
 
 
 @device_function
 def place(p: Any, xi: Any) -> Any:
-    """First of a particle's nodes on the tile, and its distance from it (3) [cells]."""
+    """First node of a particle in the tile, and the distance from it (3) [cells]."""
     i, fx = first_node(xi[p, 0])
     j, fy = first_node(xi[p, 1])
     k, fz = first_node(xi[p, 2])
@@ -182,7 +182,7 @@ def place(p: Any, xi: Any) -> Any:
 
 @device_function
 def momentum(p: Any, dt: Any, dx: Any, f: Any, state: Any) -> Any:
-    """What a particle gives to its nodes: start (3) and slopes along x, y and z (3 each) [kg m/s].
+    """Momentum of a particle for its nodes: start (3) and slopes along x, y, z (3 each) [kg m/s].
 
     A node at offset (i, j, k) from the first gets its weight times start + i qx + j qy + k qz:
     m v + Q (x_i - x_p) with Q = m L - dt V 4 / dx^2 tau (MLS-MPM, Hu et al. 2018).
@@ -218,9 +218,9 @@ def velocity_gradient(g: Any, dx: Any, f: Any) -> Any:
 
 @device_function
 def move(p: Any, dt: Any, dx: Any, v: Any, L: Any, state: Any) -> Any:
-    """Give a particle its new velocity and gradient and move it; whether it left its block's reach.
+    """Set velocity and gradient of a particle and move it.
 
-    NaN fails both comparisons, so it has left.
+    Returns whether it left its block's reach; NaN counts as having left.
     """
     stride = dt / dx
     stays = True
@@ -244,7 +244,7 @@ def nine(a: Any, p: Any) -> Any:
 
 @device_function
 def deform(p: Any, dt: Any, state: Any, row: Any) -> None:
-    """Advance one particle's deformation by its velocity gradient and find its stress."""
+    """Advance one particle's deformation by its velocity gradient and compute its stress."""
     L = nine(state.L, p)
     trial = advance_gradient(nine(state.F, p), L, dt)
     F, tau, energy, history = stress_update(trial, state.history[p], row, dt)
@@ -286,7 +286,7 @@ def add_motion(p: Any, block: Any, state: Any, dx: Any, out: Any) -> None:
     out[SPIN + 1] += m * (x[2] * v[0] - x[0] * v[2]) + affine * (L[2] - L[6])
     out[SPIN + 2] += m * (x[0] * v[1] - x[1] * v[0]) + affine * (L[3] - L[1])
     out[KINETIC] += 0.5 * (m * square + affine * gradient_square)
-    # Comparisons that NaN fails keep NaN out of maxima, so it is added instead.
+    # Maxima ignore NaN, so it is added instead.
     out[SPEED_SQUARE] = max(out[SPEED_SQUARE], square) + (square - square)
 
 

@@ -1,1 +1,1 @@
-"""The CUDA backend: kernels of our own by NVRTC, laws and contact from the source of the CPU."""
+"""The CUDA backend: NVRTC kernels that share constitutive laws and contact with the CPU."""

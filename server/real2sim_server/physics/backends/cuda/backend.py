@@ -1,9 +1,9 @@
 """The CUDA backend: particles, their order, the grid and all sums stay on an NVIDIA GPU.
 
-Between two checks of the solver the host queues launches that do not depend on what particles do,
-and reads one report. A particle that leaves its tile stops the substeps that follow on the device;
-the host finds that in the report, has all sorted, and goes on from there. Mostly it need not: from
-the last report it knows how far particles can come, and has them sorted before.
+Between two checks of the solver, the host queues launches that are independent of particle motion
+and reads one report. A particle that leaves its tile stops the remaining substeps on the device;
+the host sees that in the report, sorts all particles and continues. This is rare: the host bounds
+particle motion from the last report and sorts in time.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ class CudaSolverBackend:
     """Solver for NVIDIA GPUs.
 
     Args:
-        launcher: of the device for a precision; default: torch's current CUDA device.
+        launcher: creates the device launcher for a precision; default: torch's current CUDA device.
 
     Raises:
-        SolverError: where there is none that works.
+        SolverError: without a usable device.
     """
 
     name = "cuda"
@@ -73,7 +73,7 @@ class CudaSolverBackend:
 
 @dataclass(frozen=True, eq=False)
 class _Saved:
-    """Particles and totals on the device, and what was read of them."""
+    """Particles and totals on the device, and the data read from them."""
 
     particles: Tensor
     totals: Tensor
@@ -81,7 +81,7 @@ class _Saved:
 
 
 class CudaSimulation:
-    """A model in motion on the device."""
+    """A running simulation on the device."""
 
     def __init__(self, launcher: Launcher, model: Model, colliders: Sequence[Collider]) -> None:
         self._launcher, self._model = launcher, model
@@ -103,11 +103,11 @@ class CudaSimulation:
         return self._memory.sizes
 
     def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
-        """Make ``steps`` substeps, INTERVAL of them with one wait; see ``Simulation``.
+        """Make ``steps`` substeps, with one wait per INTERVAL; see ``Simulation``.
 
         Raises:
-            SolverDiverged: particles left the numbers, or went over many blocks at once.
-            ParticleError: they left the reach of the grid.
+            SolverDiverged: particles became non-finite, or crossed many blocks at once.
+            ParticleError: particles left the reach of the grid.
         """
         for first in range(0, steps, INTERVAL):
             later = [c.after(first * dt) for c in colliders] if first else colliders
@@ -122,7 +122,7 @@ class CudaSimulation:
             done = self._launch(self._planned(done, steps, dt, fastest), steps)
 
     def measure(self) -> Measure:
-        """Sums and bounds as the device had them at the end of the last substep."""
+        """Sums and bounds at the end of the last substep."""
         sums = self._memory.measured(self._report)
         mass = sums[:, 0]
         return Measure(
@@ -178,20 +178,20 @@ class CudaSimulation:
         return by_collider.copy(), by_body.copy()
 
     def counts(self) -> dict[str, int]:
-        """Particles, blocks and fields of the present layout."""
+        """Number of particles, blocks and fields of the current layout."""
         held = self._memory.held(self._report)
         named = {name: int(held[name]) for name in ("blocks", "fields")}
         return {"particles": self._sizes.particles, **named}
 
     def save(self) -> _Saved:
-        """Copy all that changes, on the device."""
+        """Copy the mutable state, on the device."""
         memory = self._memory
         return _Saved(memory.sets[self._current].clone(), memory.report.clone(), self._report)
 
     def restore(self, saved: _Saved) -> None:
-        """Go back, to the bit. Lists are made anew with particles in the blocks that they had."""
+        """Restore a saved state bitwise; rebuilds lists with the particles in the same blocks."""
         memory, first = self._memory, records.HELD.itemsize
-        # The device goes on with the set that it had current last.
+        # The device continues with its last current set.
         memory.sets[self._current].copy_(saved.particles)
         memory.report[first:].copy_(saved.totals[first:])
         current = self._current
@@ -204,7 +204,7 @@ class CudaSimulation:
         return int(self._memory.held(self._report)["current"])
 
     def _planned(self, done: int, steps: int, dt: float, fastest: float) -> list[Launch]:
-        """Launches of the substeps from ``done`` on, with sorting where it may be needed."""
+        """Launches of the substeps from ``done``, with sorting where it may be needed."""
         speed = math.sqrt(_largest(self._memory.measured(self._report)[:, 12]))
         stride = CAUTION * speed * dt / self._model.dx
         reach = float(self._memory.measured(self._report)[:, records.REACH].max())
@@ -232,7 +232,7 @@ class CudaSimulation:
         return launches
 
     def _launch(self, launches: list[Launch], steps: int) -> int:
-        """Have launches done and measured; how many substeps are done."""
+        """Run launches and measure; return the number of completed substeps."""
         ending = [*measuring(self._sizes), *flushing(self._sizes)]
         self._launcher.run((*launches, *ending), self._memory.space)
         self._report = self._memory.read_report()
@@ -299,7 +299,7 @@ class CudaSimulation:
 
 
 def _largest(values: Float) -> float:
-    """NaN where there is one."""
+    """Maximum; NaN if any value is NaN."""
     return float(values.max())
 
 

@@ -71,16 +71,16 @@ HELD = np.dtype(
 
 
 def compiled_kernels(precision: str, architecture: str) -> bytes:
-    """The cubin for ``single`` or ``double`` and an architecture (``sm_90``), kept on the disk.
+    """The cubin for ``single`` or ``double`` and an architecture (``sm_90``), cached on disk.
 
     Raises:
-        SolverError: it does not compile; the message has NVRTC's words.
+        SolverError: compilation failed; the message includes NVRTC's log.
     """
     return _source(precision).kept(architecture)
 
 
 def compile_kernels(precision: str, architecture: str) -> tuple[bytes, dict[str, Usage]]:
-    """Cubin, which is kept on the disk, and what each kernel takes.
+    """The cubin, cached on disk, and the resource usage of each kernel.
 
     Raises:
         SolverError: see :func:`compiled_kernels`.
@@ -123,7 +123,7 @@ class Launcher(Protocol):
     """A device that runs kernels, one after the other, for one precision.
 
     Attributes:
-        device: on which its memory lies.
+        device: device of its memory.
     """
 
     device: torch.device
@@ -132,13 +132,13 @@ class Launcher(Protocol):
         """Queue a sequence of launches.
 
         Args:
-            launches: which; the same sequence again costs the host next to nothing.
+            launches: the launches; repeating a sequence costs the host almost nothing.
             space: address of a Space on the device.
         """
         ...
 
     def pointer(self, tensor: Tensor) -> int:
-        """Address of what a contiguous tensor on the device holds."""
+        """Address of the data of a contiguous tensor on the device."""
         ...
 
     def host_memory(self, nbytes: int) -> Tensor:
@@ -163,9 +163,8 @@ def _loaded_kernels(precision: str, index: int) -> dict[str, Any]:
 class CudaLauncher:
     """The current CUDA device of torch, on torch's current stream.
 
-    A sequence is launched one by one when it is new, and captured into a CUDA graph when it comes
-    again: what a solver asks for between two checks is the same each time, whatever its particles
-    do.
+    A new sequence is launched kernel by kernel; a repeated one is captured into a CUDA graph. The
+    launches between two checks of a solver are always the same.
 
     Args:
         precision: ``single`` or ``double``.
@@ -197,7 +196,7 @@ class CudaLauncher:
                     self._graphs[key] = self._captured(device, launches, space)
                 self._graphs[key].launch(stream)
         except Exception as error:
-            # In the words of torch, by which a worker knows that its device is lost.
+            # In torch's wording, by which a worker detects a lost device.
             raise RuntimeError(f"CUDA error at the solver's launches: {error}") from error
         self._graphs.move_to_end(key)
         if len(self._graphs) > GRAPHS:

@@ -1,4 +1,4 @@
-"""Memory of one simulation on the device, and the sequences of kernels that work on it."""
+"""Device memory of one simulation, and the kernel sequences that use it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ...model import TOTALS, Model
 from . import launcher as records
 from .launcher import Launch, Launcher
 
-# Sequences of kernel launches; they do not depend on what particles do.
+# Sequences of kernel launches, independent of particle motion.
 
 KEY_BYTES = 8
 
@@ -27,10 +27,10 @@ class Sizes:
 
     Attributes:
         particles, bodies, colliders: numbers of each.
-        obstructed: whether there are thin colliders, which particles touch themselves.
-        laws: how many constitutive laws its particles follow.
-        sort_blocks: blocks of threads that share the list of particles when it is sorted.
-        blocks, fields, contacts, pairs, thins: room on the device, see ``kernels/space.h``.
+        obstructed: whether there are thin colliders, which contact particles directly.
+        laws: number of constitutive laws in use.
+        sort_blocks: thread blocks that share the particle list for sorting.
+        blocks, fields, contacts, pairs, thins: capacities on the device, see ``kernels/space.h``.
     """
 
     particles: int
@@ -52,12 +52,12 @@ class Sizes:
 
 
 def arranging(sizes: Sizes, *, keep: bool, step: int) -> list[Launch]:
-    """Sort particles and make all lists, for colliders as they stand in a substep.
+    """Sort particles and build all lists, for the collider poses of a substep.
 
     Args:
-        sizes: of the simulation.
-        keep: particles stay in the blocks that they are in.
-        step: number of the substep.
+        sizes: sizes of the simulation.
+        keep: whether particles stay in their current blocks.
+        step: index of the substep.
     """
     by_particle = _groups(sizes.particles)
     launches = [Launch("find_keys", by_particle, int(keep))]
@@ -108,7 +108,7 @@ def advancing(sizes: Sizes, does: int) -> list[Launch]:
 
 
 def flushing(sizes: Sizes) -> list[Launch]:
-    """Bring what contacts did to the totals of bodies."""
+    """Add contact sums to the totals of bodies."""
     rows = sizes.contacts + sizes.pairs + sizes.thins
     totals = sizes.bodies * (sizes.bodies + sizes.colliders)
     return [
@@ -145,9 +145,9 @@ class SolverMemory:
     """Device memory of a simulation.
 
     Attributes:
-        sizes: what there is room for.
+        sizes: capacities.
         pitch: length of the array of one number of all particles.
-        numbers: of a particle.
+        numbers: number of values per particle.
         sets: [bytes] uint8 each, see ``kernels/space.h``.
         report: [bytes] uint8, Held, sums of bodies, and totals of contacts.
     """
@@ -203,7 +203,7 @@ class SolverMemory:
         return self._launcher.pointer(self._space)
 
     def grow(self, wanted: dict[str, int]) -> None:
-        """Make room for so many of each, and a quarter more; lists must be made anew."""
+        """Grow capacities to ``wanted`` plus a quarter; lists must be rebuilt."""
         held = {name: getattr(self.sizes, name) for name in records.CAPACITIES}
         more: dict[str, Any] = {n: c + c // 4 for n, c in wanted.items() if c > held[n]}
         self.sizes = replace(self.sizes, **more)
@@ -212,7 +212,7 @@ class SolverMemory:
         self._describe()
 
     def upload(self, target: Tensor, values: NDArray[Any]) -> None:
-        """Copy an array over; the device need not be waited for."""
+        """Copy an array to the device, asynchronously."""
         if values.nbytes == 0:
             return
         if len(self._staged) < values.nbytes:
@@ -223,7 +223,7 @@ class SolverMemory:
         target[: values.nbytes].copy_(self._staged[: values.nbytes], non_blocking=True)
 
     def upload_step(self, dt: float, moving: bool, rows: Float) -> None:
-        """What the next substeps take, in one copy from memory of its own."""
+        """Upload the parameters of the next substeps in one copy."""
         step = np.zeros(1, records.STEP)
         step["dt"], step["moving"] = dt, moving
         nbytes = records.STEP.itemsize + rows.nbytes
@@ -234,7 +234,7 @@ class SolverMemory:
         self._spaces["step"][:nbytes].copy_(self._step_staged[:nbytes], non_blocking=True)
 
     def read_report(self) -> NDArray[np.uint8]:
-        """The report, in one copy; waits for all that was queued."""
+        """The report, in one copy; waits for all queued work."""
         self._host_report.copy_(self.report, non_blocking=True)
         self._launcher.wait()
         return self._host_report.numpy().copy()
@@ -313,7 +313,7 @@ class SolverMemory:
         }
 
     def _describe(self) -> None:
-        """Tell the device where everything is."""
+        """Write the addresses of all arrays to the device."""
         space = np.zeros(1, records.SPACE)
         at = self._launcher.pointer
         for name, held in self._spaces.items():
