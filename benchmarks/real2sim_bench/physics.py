@@ -18,9 +18,8 @@ from real2sim_server.physics.colliders import Box, Plane
 from real2sim_server.physics.materials import FixedCorotated, Material, NeoHookean
 from real2sim_server.physics.solver import Solver, SolverOptions
 from real2sim_server.simulation.body import DeformableBody
-from real2sim_server.simulation.presets import preset_of
 from real2sim_server.simulation.simulator import STEP, HybridSimulator
-from real2sim_server.simulation.structure import GRAVITY, vehicle_structure
+from real2sim_server.simulation.structure import GRAVITY, preset_of, vehicle_structure
 from real2sim_server.simulation.tyres import Tyres
 
 from .peers import PEERS, PeerBlock, missing_reason, start_peer

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from ..scene import Scene
     from ..simulation.calibration import ObjectCalibration
     from ..simulation.experiments import Experiment
-    from ..simulation.playback import PlacedObjects
-    from ..simulation.presets import ObjectPhysics
-    from ..simulation.result import SimulationResult
+    from ..simulation.result import PlacedObjects, SimulationResult
+    from ..simulation.structure import ObjectPhysics
 
 
 # --- simulate -------------------------------------------------------------------------------------
@@ -83,10 +82,10 @@ def simulate(
     """Simulate collisions and deformation of a scene's objects; write film and curves."""
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
-    from ..simulation.ego import EGO, with_ego
     from ..simulation.experiments import FilmPlan, draw_curves, set_up, views, write_film
-    from ..simulation.playback import Playback
+    from ..simulation.result import Playback
     from ..simulation.rollout import simulate
+    from ..simulation.spawn import EGO, with_ego
 
     values = values_of(physics or [])
     loaded = load_scene(scene)
@@ -177,7 +176,7 @@ def values_of(given: list[str]) -> dict[str, PhysicsValues]:
 
 def changed(setup: Experiment, values: dict[str, PhysicsValues]) -> dict[str, ObjectPhysics]:
     """What takes part, with what was given for all and for each."""
-    from ..simulation.presets import with_values
+    from ..simulation.structure import with_values
 
     objects = setup.options.objects
     unknown = sorted(values.keys() - objects.keys() - {"*"})
@@ -198,8 +197,8 @@ def continue_driving(
     import numpy as np
 
     from ..simulation.experiments import Experiment, scene_road
-    from ..simulation.presets import ObjectPhysics
     from ..simulation.rollout import SimulateOptions
+    from ..simulation.structure import ObjectPhysics
 
     if not objects:
         raise CommandError("choose objects with --object, or an --experiment")

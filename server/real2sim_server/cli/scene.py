@@ -232,10 +232,9 @@ def film(
     """Render film.mp4 and strip.png of a finished simulation again."""
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
-    from ..simulation.ego import EGO, with_ego
     from ..simulation.experiments import FilmPlan, views, write_film
-    from ..simulation.playback import PlacedObjects, Playback
-    from ..simulation.result import SimulationResult
+    from ..simulation.result import PlacedObjects, Playback, SimulationResult
+    from ..simulation.spawn import EGO, with_ego
 
     names = {"near": ["near"], "scene": ["scene"], "both": ["scene", "near"]}
     if view not in names:

@@ -27,8 +27,7 @@ from real2sim_proto.operations import Duplicate, Operation, Translate
 from ..console import StatusLine, console, print_figures, write_json
 from ..geometry.box import box_corners
 from ..geometry.transform import transform_from
-from ..render.images import write_png
-from ..render.video import video_file
+from ..render.images import video_file, write_png
 from ..scene.io import DEMO_SCENE as SCENE
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..geometry.transform import quaternion_yaw
 from ..render import RasterOptions, render_cameras, select_backend
-from ..render.video import video_file
+from ..render.images import video_file
 from ..scene import Scene
 from ..world import World
 from ..world.recording.recording import Recording, load_recording

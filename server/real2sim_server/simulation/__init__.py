@@ -1,11 +1,9 @@
 """Simulation of a scene's objects as rigid, deforming and resting bodies."""
 
-from .fill import Filling, fill_object
-from .playback import Playback
-from .presets import PRESETS, ObjectPhysics
-from .result import ContactRecord, ObjectResult, SimulationResult
+from .particles import Filling, fill_object
+from .result import ContactRecord, ObjectResult, Playback, SimulationResult
 from .rollout import SimulateOptions, simulate
-from .structure import CLASS_MASSES, default_mass
+from .structure import CLASS_MASSES, PRESETS, ObjectPhysics, default_mass
 
 __all__ = [
     "CLASS_MASSES",

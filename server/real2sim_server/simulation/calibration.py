@@ -26,12 +26,11 @@ from ..physics.materials import Foam, Material, Snow
 from ..render import render_cameras
 from ..scene import Camera, Scene, Trajectory
 from .body import DeformableBody
-from .embedding import Embedding
-from .playback import PlacedObject, PlacedObjects, Playback
-from .presets import GRID_MIN, ObjectPhysics, preset_of
-from .result import ObjectResult, SimulationResult
+from .particles import Embedding
+from .result import ObjectResult, PlacedObject, PlacedObjects, Playback, SimulationResult
 from .rollout import SimulateOptions, simulate_bodies, solid_background
 from .spawn import spawn_bodies
+from .structure import GRID_MIN, ObjectPhysics, preset_of
 
 IMAGE_WIDTH = 96
 """Images are compared at this width or below [px]."""

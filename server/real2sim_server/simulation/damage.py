@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..geometry.transform import Float
 from ..scene import GaussianCloud
 from .breakage import Part, in_wheels, parts_of
-from .embedding import Deformed, Embedding, deform_cloud, replaced_rows
+from .particles import Deformed, Embedding, deform_cloud, replaced_rows
 
 # Crumpled sheet: flat facets between sharp ridges, in an irregular pattern.
 #

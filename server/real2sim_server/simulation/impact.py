@@ -22,9 +22,8 @@ from ..physics.materials import Material
 from ..physics.solver import Solver, SolverOptions
 from ..scene import GaussianCloud
 from .body import DeformableBody, DeformedShape
-from .fill import fill_object
-from .presets import preset_of
-from .structure import VEHICLES
+from .particles import fill_object
+from .structure import VEHICLES, preset_of
 
 PARTICLES = 1000
 """Of one body, about: half the time of twice as many, with residual crush within a fifth and less

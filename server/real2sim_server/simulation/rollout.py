@@ -16,11 +16,10 @@ from ..scene import Scene
 from .background import BACKGROUND, Cleared, background_colliders, described
 from .body import BodyMode, DeformableBody
 from .breakage import Breakage, BreakageLog, Part
-from .playback import PlacedObject, PlacedObjects
-from .presets import ObjectPhysics, preset_of
-from .result import ObjectResult, SimulationResult
+from .result import ObjectResult, PlacedObject, PlacedObjects, SimulationResult
 from .simulator import STEP, HybridSimulator, energies
 from .spawn import spawn_bodies, starts_of
+from .structure import ObjectPhysics, preset_of
 
 # Frames as the simulation advances.
 

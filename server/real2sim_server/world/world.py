@@ -45,8 +45,15 @@ from .episode import (
     randomized_start,
     takes_effect_us,
 )
-from .evaluation import PendingStep, ego_sample, object_samples, scoring_context
-from .observation import LanePiece, Observation, lanes_around
+from .observation import (
+    LanePiece,
+    Observation,
+    PendingStep,
+    ego_sample,
+    lanes_around,
+    object_samples,
+    scoring_context,
+)
 from .path import Float, LoggedPath, LoopTransform, PathPoint, command_ahead, route_ahead
 from .ranging import MotionHistory, MotionSegment, Mounted, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from real2sim_server.render import video as video_module
-from real2sim_server.render.video import VideoError, video_file
+from real2sim_server.render import images as video_module
+from real2sim_server.render.images import VideoError, video_file
 
 FRAMES = [np.full((48, 64, 3), (40 * k, 0, 200), np.uint8) for k in range(5)]
 

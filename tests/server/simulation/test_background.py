@@ -14,7 +14,7 @@ from real2sim_server.scene.io import read_packed
 from real2sim_server.simulation import ObjectPhysics, Playback, SimulateOptions, simulate
 from real2sim_server.simulation.background import Cleared, background_colliders, ground_collider
 from real2sim_server.simulation.body import BodyMode
-from real2sim_server.simulation.ego import EGO, with_ego
+from real2sim_server.simulation.spawn import EGO, with_ego
 
 CRATE = (2.0, 1.2, 1.2)
 TURN = 0.4

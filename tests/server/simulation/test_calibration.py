@@ -24,10 +24,10 @@ from real2sim_server.simulation.calibration import (
     drawn,
     observations_of,
 )
-from real2sim_server.simulation.embedding import Embedding
-from real2sim_server.simulation.playback import Playback
-from real2sim_server.simulation.presets import ObjectPhysics
+from real2sim_server.simulation.particles import Embedding
+from real2sim_server.simulation.result import Playback
 from real2sim_server.simulation.rollout import SimulateOptions, simulate
+from real2sim_server.simulation.structure import ObjectPhysics
 from tests.server.conftest import box_cloud, make_tiny_scene, standing
 
 SIZE = (0.8, 0.6, 0.6)

@@ -10,9 +10,9 @@ import pytest
 from real2sim_server.edit import ScenarioState
 from real2sim_server.physics import Plane
 from real2sim_server.scene import SceneObject
-from real2sim_server.simulation.presets import ObjectPhysics
 from real2sim_server.simulation.rollout import SimulateOptions, simulate
 from real2sim_server.simulation.simulator import ContactLog
+from real2sim_server.simulation.structure import ObjectPhysics
 from tests.server.conftest import box_cloud, make_tiny_scene, standing
 
 MASS, GRAVITY, DT = 1000.0, np.array([0.0, 0.0, -9.81]), 0.01

@@ -29,9 +29,8 @@ from real2sim_server.simulation.damage import (
     DamagedVehicle,
     crumple,
 )
-from real2sim_server.simulation.embedding import Embedding, deform_cloud
-from real2sim_server.simulation.playback import Playback
-from real2sim_server.simulation.result import ObjectResult, SimulationResult
+from real2sim_server.simulation.particles import Embedding, deform_cloud
+from real2sim_server.simulation.result import ObjectResult, Playback, SimulationResult
 from real2sim_server.simulation.rollout import find_breakages
 
 SIZE = (4.6, 1.8, 1.5)

@@ -12,12 +12,7 @@ from real2sim_server.physics import Body, FixedCorotated, Solver, SolverOptions,
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.simulation.damage import _split
-from real2sim_server.simulation.embedding import (
-    Deformed,
-    Embedding,
-    deform_cloud,
-    replaced_rows,
-)
+from real2sim_server.simulation.particles import Deformed, Embedding, deform_cloud, replaced_rows
 from real2sim_server.simulation.rigid import rotation_of
 
 

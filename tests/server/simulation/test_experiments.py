@@ -17,7 +17,7 @@ from real2sim_server.physics import PhysicsError
 from real2sim_server.simulation.experiments import FilmPlan, set_up, views
 from real2sim_server.simulation.experiments.film import FilmView, draw, look_at, obstacle_cloud
 from real2sim_server.simulation.experiments.setups import visibility_of
-from real2sim_server.simulation.playback import Playback
+from real2sim_server.simulation.result import Playback
 from real2sim_server.simulation.rollout import simulate
 
 PARTICLES = 5000

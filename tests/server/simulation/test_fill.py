@@ -8,7 +8,7 @@ import torch
 
 from real2sim_server.physics import ParticleError, box_particles
 from real2sim_server.scene import GaussianCloud
-from real2sim_server.simulation.fill import fill_object
+from real2sim_server.simulation.particles import fill_object
 from real2sim_server.simulation.structure import default_mass
 
 SIZE = (2.0, 1.0, 0.8)

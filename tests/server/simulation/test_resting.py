@@ -8,10 +8,10 @@ import pytest
 from real2sim_server.physics import Box, Foam, Plane, box_particles
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
-from real2sim_server.simulation.presets import preset_of
 from real2sim_server.simulation.resting import RestingContacts
 from real2sim_server.simulation.rigid import rotation_of
 from real2sim_server.simulation.simulator import STEP, HybridSimulator
+from real2sim_server.simulation.structure import preset_of
 from real2sim_server.simulation.tyres import Tyres
 
 SIDE = 0.6

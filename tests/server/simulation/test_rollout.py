@@ -8,9 +8,9 @@ import pytest
 from real2sim_server.physics import FixedCorotated, PhysicsError, Plane, box_particles
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.simulation.body import BodyMode, DeformableBody
-from real2sim_server.simulation.presets import ObjectPhysics
 from real2sim_server.simulation.result import SimulationResult
 from real2sim_server.simulation.rollout import SimulateOptions, simulate_bodies
+from real2sim_server.simulation.structure import ObjectPhysics
 
 SOFT = FixedCorotated(young=2e5, poisson=0.3, viscosity=150.0)
 

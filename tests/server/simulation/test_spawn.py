@@ -10,9 +10,9 @@ import pytest
 from real2sim_server.edit.state import ScenarioState
 from real2sim_server.physics import PhysicsError, Plane
 from real2sim_server.physics.validation.check import placed as at
-from real2sim_server.simulation.presets import ObjectPhysics, preset_of
 from real2sim_server.simulation.rollout import SimulateOptions, simulate
 from real2sim_server.simulation.spawn import object_particles, spaced_for, spawn_bodies
+from real2sim_server.simulation.structure import ObjectPhysics, preset_of
 from real2sim_server.simulation.tyres import track_of
 
 GROUND = Plane(name="ground", friction=0.7)

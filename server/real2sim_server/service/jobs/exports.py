@@ -28,7 +28,7 @@ from ...geometry.transform import Float
 from ...render import Backend, Instance, RenderOutput
 from ...render.backend import RasterRequest
 from ...render.cast import CastRequest, Echo, select_caster
-from ...render.video import VideoError, VideoFile
+from ...render.images import VideoError, VideoFile
 from ...scene import Scene
 from ..engine import Engine, Priority, QueueFullError
 from ..http.responses import ServiceError

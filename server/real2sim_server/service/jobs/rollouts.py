@@ -51,12 +51,11 @@ from ...simulation.calibration import (
     calibrate_object,
     observations_of,
 )
-from ...simulation.ego import EGO, with_ego
 from ...simulation.experiments.setups import set_up
-from ...simulation.playback import PlacedObjects, Playback
-from ...simulation.presets import ObjectPhysics, with_values
-from ...simulation.result import ENERGIES, SimulationResult
+from ...simulation.result import ENERGIES, PlacedObjects, Playback, SimulationResult
 from ...simulation.rollout import SimulateOptions, simulate
+from ...simulation.spawn import EGO, with_ego
+from ...simulation.structure import ObjectPhysics, with_values
 from ..http.requests import IdempotentRequest
 from ..http.responses import ServiceError
 from ..library.scenes import SceneCache

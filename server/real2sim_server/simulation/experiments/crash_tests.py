@@ -25,10 +25,9 @@ from ...physics.materials import FixedCorotated
 from ...physics.validation.check import Check, ReferenceCurve, placed
 from ..body import BodyMode, DeformableBody
 from ..impact import vehicle_body
-from ..presets import ObjectPhysics, preset_of
 from ..result import ObjectResult, SimulationResult
 from ..rollout import SimulateOptions, simulate_bodies
-from ..structure import GRAVITY, vehicle_structure
+from ..structure import GRAVITY, ObjectPhysics, preset_of, vehicle_structure
 from ..tyres import Tyres
 
 MALIBU_MASS = 1651.0

@@ -17,12 +17,10 @@ from ...geometry.transform import Float, apply_transform, matrix_to_quaternion
 from ...physics.colliders import Box, Plane
 from ...physics.errors import PhysicsError
 from ...render import Instance, RasterOptions, render_cameras
-from ...render.images import write_png
-from ...render.video import video_file
+from ...render.images import video_file, write_png
 from ...scene import Camera, GaussianCloud
 from ..body import BodyMode
-from ..playback import Playback
-from ..result import ENERGIES, SimulationResult
+from ..result import ENERGIES, Playback, SimulationResult
 from .setups import Experiment
 
 # The film's plan, stored next to the result.

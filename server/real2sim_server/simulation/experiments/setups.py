@@ -14,11 +14,10 @@ from ...physics.errors import PhysicsError
 from ...physics.materials import FixedCorotated
 from ...scene import Camera, Scene
 from ..background import ground_collider
-from ..playback import PlacedObject, PlacedObjects
-from ..presets import ObjectPhysics, preset_of
+from ..result import PlacedObject, PlacedObjects
 from ..rollout import SimulateOptions
 from ..spawn import object_particles, spaced_for
-from ..structure import VEHICLES
+from ..structure import VEHICLES, ObjectPhysics, preset_of
 
 # Viewpoints of the recording vehicle: sides that no camera saw cannot be shown.
 

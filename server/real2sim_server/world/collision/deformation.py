@@ -31,7 +31,7 @@ from ...scene import GaussianCloud, Scene
 from ...simulation import impact as crash
 from ...simulation.breakage import Breakage, BreakageLog, Part, fragment_cloud
 from ...simulation.damage import HANGS_STILL, DamagedVehicle
-from ...simulation.embedding import Deformed, Embedding, deform_cloud, replaced_rows, stretched
+from ...simulation.particles import Deformed, Embedding, deform_cloud, replaced_rows, stretched
 from ...simulation.structure import VEHICLES
 from .bodies import BodyState, Impact, ImpactParticipant
 

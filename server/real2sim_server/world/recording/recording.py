@@ -39,7 +39,7 @@ from ...scene import Scene
 from .. import scoring
 from ..common import WorldError
 from ..ego.plan import PlannedTrajectory
-from ..evaluation import reactive
+from ..observation import reactive
 from ..path import LoopTransform
 from ..scoring import (
     ContactRecord,
