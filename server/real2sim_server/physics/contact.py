@@ -6,7 +6,7 @@ act on particles: the kernel follows a particle's path through the substep to th
 removes the velocity that would move it further inside, independently of the grid.
 """
 
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations
