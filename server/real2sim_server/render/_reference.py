@@ -89,7 +89,7 @@ def blend(splats: Blended, alpha: Tensor, size: tuple[int, ...]) -> tuple[Tensor
 # Cameras with lenses and rolling shutters
 
 STEP = 1e-5
-"""Of finite differences, relative to the distance."""
+"""Step of finite differences, relative to the distance."""
 ROUNDS = 4
 """In which the row of a centre and its time settle."""
 ROWS = 8

@@ -490,7 +490,7 @@ def warm_up_lenses(backend: str | Backend = "auto") -> None:
 # Labels: colour, depth and object of each pixel in one pass, also for objects without occluders
 
 FRONT = 0.2
-"""Transmittance at which the front of a pixel lies, of what labels show."""
+"""Transmittance that defines the front of a pixel for labels."""
 
 
 @runtime_checkable

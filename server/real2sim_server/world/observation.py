@@ -21,7 +21,7 @@ from .path import Command, Float
 from .storyboard.program import ShownSignal
 
 RADIUS = 60.0
-"""Places of centre lines are shown so far from the vehicle [m]."""
+"""Maximum distance of centre line points from the vehicle [m]."""
 SPACING = 5.0
 """Between places along a lane, at most [m]."""
 MAX_LANES, MAX_PLACES = 32, 32
