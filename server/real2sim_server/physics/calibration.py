@@ -20,14 +20,14 @@ from .fitting import COARSER, continued
 from .solver import Solver
 
 PARAMETERS = ("stiffness", "yield_stress", "viscosity", "friction", "speed")
-"""What may be fitted: factors on what the solver was given, all positive."""
+"""Parameters that can be fitted: positive factors on the initial values of the solver."""
 DAMPING = 1e-3
-"""Of the first step, as a fraction of each parameter's own curvature (Marquardt 1963)."""
+"""Damping of the first step, as a fraction of each parameter's own curvature (Marquardt 1963)."""
 DAMPING_MIN = 1e-12
 CALMER, BOLDER = 5.0, 0.2
-"""What damping is multiplied by after a step that was rejected, and after one that was kept."""
+"""Factors on the damping after a rejected and after an accepted step."""
 MAX_STEP = 0.5
-"""Of the logarithm of a factor, in one step."""
+"""Maximum change of the logarithm of a factor in one step."""
 PATIENCE = 3
 """Rejected steps in a row after which slopes are taken over a wider span."""
 SPANS = (0.1, 0.03, 0.01)

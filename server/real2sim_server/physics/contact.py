@@ -6,7 +6,7 @@ act on particles: the kernel follows a particle's path through the substep to th
 removes the velocity that would move it further inside, independently of the grid.
 """
 
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations
@@ -499,9 +499,9 @@ SINK = 0.5
 TOUCHING = 1e-3
 """A particle nearer to where it stops than this touches, in halves of its spacing."""
 LOOKS = 12
-"""Times that a particle looks ahead on one way, each as far as nothing can be in between."""
+"""Maximum number of sphere tracing steps along a particle's path."""
 MISSES = 2.0
-"""In place of the fraction of a way, where a particle does not touch."""
+"""Fraction of a path that stands for no contact."""
 
 
 @device_function

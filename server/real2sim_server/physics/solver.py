@@ -22,9 +22,9 @@ CHECK_INTERVAL = 16
 VISCOUS_STEP = 0.2
 """dt <= VISCOUS_STEP rho dx^2 / eta keeps explicit viscosity stable."""
 ENERGY_SLACK = 0.01
-"""Energy may rise by this fraction of what is moving or stored before substeps are taken back."""
+"""Fraction of kinetic and stored energy by which energy may rise before a rollback."""
 DT_SCALE_MIN = 2.0**-12
-"""The solver gives up when substeps are this fraction of what should be stable."""
+"""The solver gives up at this fraction of the stable substep."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The plain torch rasterizer: slow, obvious, differentiable. The oracle of the others.
+"""The plain torch rasterizer: slow, simple and differentiable; the oracle for other backends.
 
 Semantics are those of gsplat 1.5.3 ``rasterization`` (classic EWA splatting, Zwicker et al. 2001;
 Kerbl et al. 2023), except that depths are compared after rounding the float64 depth to float32.
@@ -89,7 +89,7 @@ def blend(splats: Blended, alpha: Tensor, size: tuple[int, ...]) -> tuple[Tensor
 # Cameras with lenses and rolling shutters
 
 STEP = 1e-5
-"""Of finite differences, relative to the distance."""
+"""Step of finite differences, relative to the distance."""
 ROUNDS = 4
 """In which the row of a centre and its time settle."""
 ROWS = 8

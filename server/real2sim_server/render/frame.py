@@ -37,9 +37,9 @@ from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .select import select_backend
 from .types import Instance, LabelOutput, RasterOptions, RenderError, RenderOutput, Sky, Window
 
-# Uncertainty: a pass with uncertainties in place of colours. Gaussians, sky and blending are those
-# of the colour image, so a pixel is the mean over its Gaussians, weighted by their share; merged
-# Gaussians of small images have the mean of their members. Backends treat it as a colour.
+# Uncertainty is a pass with uncertainties instead of colours, so a pixel is the mean over its
+# Gaussians, weighted by their contribution. Merged Gaussians of small images have the mean of their
+# members. Backends treat it as a colour.
 
 UNCERTAINTY = "uncertainty"
 """Name of the modality."""
@@ -490,7 +490,7 @@ def warm_up_lenses(backend: str | Backend = "auto") -> None:
 # Labels: colour, depth and object of each pixel in one pass, also for objects without occluders
 
 FRONT = 0.2
-"""Transmittance at which the front of a pixel lies, of what labels show."""
+"""Transmittance that defines the front of a pixel for labels."""
 
 
 @runtime_checkable

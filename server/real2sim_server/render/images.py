@@ -157,7 +157,7 @@ EXACT_CODECS = ("raw", "png")
 DEPTH_PNG_UNIT = 1 / 256
 """Metres of one level of a depth png, as in KITTI: 4 mm steps up to 255.99 m."""
 UNCERTAINTY_PNG_UNIT = 1 / 65535
-"""Of one level of an uncertainty png."""
+"""Step of one level of an uncertainty png."""
 PNG_COMPRESSION = 1
 """zlib level; higher ones are several times slower and shrink pictures little more. With runs alone
 and one filter for all rows (Paeth's) pictures take two thirds of the time, and less room."""
@@ -382,7 +382,7 @@ __all__ = ["write_png"]
 
 Light = NDArray[np.float32]
 STEPS = 1 << 14
-"""Of the table that gives display values to light."""
+"""Size of the table from linear light to display values."""
 
 
 def with_effects(

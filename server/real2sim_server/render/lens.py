@@ -28,9 +28,9 @@ NODE = 8
 STEADY = 18 / CELLS
 """The bend of a node holds this far around it, on a face."""
 BEYOND = np.radians(5.0)
-"""What lies farther beyond the image is put where a straight continuation leads."""
+"""Positions further outside the image are extrapolated linearly."""
 STEP = 1e-4
-"""Of finite differences, on a face."""
+"""Step of finite differences, on a face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +239,7 @@ def _largest_around(cells: Float, reach: float) -> Float:
 # Background pixels that show the ground
 
 TOLERANCE = 0.15
-"""What is nearer to the ground's height than this shows it [m]."""
+"""Points nearer to the ground height than this count as ground [m]."""
 
 
 def back_projected(

@@ -184,7 +184,7 @@ LEVELS_SHARE = 0.8
 """Memory of levels over that of their cloud, a little more than measured."""
 
 SMALL_IMAGE_KERNELS = 5
-"""That :func:`warm_up_small_images` makes ready."""
+"""Number of kernels that :func:`warm_up_small_images` compiles."""
 
 
 def kernels_of_small_images_on_disk() -> bool:

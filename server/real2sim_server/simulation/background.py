@@ -38,17 +38,17 @@ THIN = 0.4
 FILLED = 0.6
 """A broader part fits when this fraction of the cells of its box is occupied."""
 DEPTH = 0.5
-"""Sides that were seen are made as thick as this, away from the recorded way [m]."""
+"""Depth of boxes behind visible sides, away from the recorded path [m]."""
 NARROW = 0.12
 """Boxes are at least so wide [m]."""
 TRIM = 0.02
 """Fraction of a part's Gaussians that may lie before and behind its box, and above it."""
 AROUND = 0.2
-"""Around objects that take part nothing stands when they start [m]."""
+"""Clearance around simulated objects at the start [m]."""
 BEYOND = 0.06
-"""Boxes reach so far beyond the outermost centres of Gaussians along them [m]."""
+"""Extent of boxes beyond the outermost Gaussian centres [m]."""
 BOXES_MAX = 200
-"""Of all that there are the nearest are taken."""
+"""Maximum number of boxes; the nearest ones are used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,10 +245,10 @@ def _upright(name: str, rectangle: _Rectangle, ground: Ground, high: Float) -> B
 # The ground.
 
 GROUND = "ground"
-"""Name of the collider; tyres roll on what has it."""
+"""Name of the ground collider, which supports tyres."""
 
 MARGIN = 40.0
-"""The collider reaches this far around what it is for [m]."""
+"""Margin of the ground collider around the given positions [m]."""
 
 
 def ground_collider(

@@ -39,9 +39,9 @@ SURFACE_POINTS = 600
 BESIDE = 1.3
 """Particles of a lattice that are nearer than this many spacings are side by side."""
 NEAR_MAX = 4.0
-"""How far away boxes still count where the gap to the nearest collider is asked for [m]."""
+"""Maximum distance of solids in gap queries [m]."""
 CORNER = 0.87
-"""From a particle to the corners of its cube [spacings]."""
+"""Distance from a particle to the corners of its cube [spacings]."""
 RIGID_STEP = 0.0025
 """Longest step of rigid motion [s]."""
 SETTLED_SPEED = 0.06

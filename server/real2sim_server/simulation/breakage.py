@@ -158,7 +158,7 @@ OUTER = 0.75
 """Quantile of the way in that counts: half of what is around a lamp is behind it."""
 MIN_PARTICLES = 3
 NEAR = 0.6
-"""Particles within so many spacings of a part's box carry it."""
+"""Distance from a part's box within which particles carry it [spacings]."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class BreakageLog:
             if len(near) >= MIN_PARTICLES:
                 self._carried.append((part, near))
         self.broken: dict[str, float] = {}
-        """How far each part's limit was passed at most; 1 and more is broken."""
+        """Maximum strain over limit of each part; broken at 1 and above."""
 
     def follow(self, displacements: Float) -> list[Part]:
         """Parts that break in a frame in which particles are displaced [N, 3] [m] from rest."""
@@ -258,11 +258,11 @@ Heights = Callable[[Float], Float]
 
 GRAVITY = 9.81
 REBOUND, KEPT, BOUNCES = 0.3, 0.6, 3
-"""Of the speed up, of the speed along the road, in a bounce; and how often."""
+"""Vertical and horizontal restitution of a bounce, and number of bounces."""
 SLIDING = 0.6
 """Friction on the road."""
 SPIN = 18.0
-"""Of tumbling fragments [rad/s]."""
+"""Angular speed of tumbling fragments [rad/s]."""
 SH_0 = 0.28209479177387814
 
 
@@ -422,7 +422,7 @@ SHADOW, SILLS = 0.1, 0.3
 FLOOR = 0.2
 """Height of a floor over the road [m]."""
 INSET = (0.16, 0.06)
-"""Of the floor from the ends and from the sides [m]."""
+"""Inset of the floor from the ends and from the sides [m]."""
 ROUNDED = 4.0
 """Exponent of its outline, which has no corners where bumpers are round."""
 PITCH, THICK = 0.07, 0.012

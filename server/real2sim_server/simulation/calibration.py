@@ -401,7 +401,7 @@ def _decoded(seen: ObservedImage, k: int) -> NDArray[np.uint8]:
 # The fit.
 
 PARAMETERS = ("stiffness", "yield_stress", "viscosity", "friction", "speed")
-"""What may be fitted: factors on what the object was given, all positive."""
+"""Parameters that can be fitted: positive factors on the initial values of the object."""
 CRUSH_MOST = 0.9
 """Of critical compression, as a strain."""
 

@@ -101,15 +101,15 @@ def _piecewise(places: Float, corners: Float) -> tuple[Float, Float]:
 # are shaded like folds. A bonnet has one fold at half its length, by design.
 
 WAVELENGTHS = (0.36, 0.17)
-"""Of folds and of the creases between them, along the sheet [m]."""
+"""Wavelengths of folds and of the creases between them, along the sheet [m]."""
 SHARES = (0.8, 0.35)
-"""Of the shortening that each takes up."""
+"""Fraction of the shortening that each takes up."""
 IRREGULAR = 1.7
 """By how much folds wander from straight lines [rad]."""
 ELASTIC = 0.03
 """Shortening that leaves no fold."""
 KEPT = 0.5
-"""Of the largest shortening so far that stays folded when the body behind it springs back."""
+"""Fraction of the largest shortening that stays folded when the body springs back."""
 STEEPEST = 0.75
 """Largest shortening by folds: flanks at 66 degrees."""
 SKIN = (0.25, 0.7)
@@ -373,19 +373,19 @@ LAMP_DARKER, LAMP_SHARE = 0.6, 0.6
 LAMP_LEFT, PANE_LEFT = 0.22, 0.35
 """Light that comes from the hole where a lamp or a pane was."""
 CRACKED = np.array([0.62, 0.67, 0.68])
-"""What laminated glass shows where it is crazed."""
+"""Colour of crazed laminated glass."""
 CRAZED = 0.55
-"""Of a cracked windscreen that is crazed."""
+"""Fraction of a cracked windscreen that is crazed."""
 BARE, SMEAR = np.array([0.55, 0.56, 0.57]), np.array([0.1, 0.1, 0.1])
 """Metal under scraped paint; rubber, plastic and dirt that scraping leaves."""
 DROOP, DROOP_TIME = 0.16, 0.35
-"""Angle by which a loose bumper hangs down at one end [rad], and in what time [s]."""
+"""Droop angle of a loose bumper at one end [rad], and its duration [s]."""
 HANGS_STILL = 3 * DROOP_TIME
 """After so long a loose bumper has come to rest [s]: it would sink by less than 0.1 mm more."""
 LOOSE = 0.25
 """How far its loose end stands off, against how far it hangs down."""
 CLEARANCE = 0.04
-"""Of a loose bumper above the road [m]."""
+"""Clearance of a loose bumper above the road [m]."""
 MIN_DISPLACEMENT = 8e-3
 """Particles that have moved less than this leave Gaussians where they are [m]: a body hit hard
 bends elastically by several millimetres all along, and the slowest impact that deforms at all

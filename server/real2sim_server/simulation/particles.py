@@ -29,7 +29,7 @@ NEIGHBOURS = 20
 FLAT = 0.05
 """Second moments below this times spacing^2 say nothing about the gradient along their axis."""
 STRETCH_LIMITS = (0.2, 2.0)
-"""Bounds on what a Gaussian is stretched by: across a tear it must not become a sheet."""
+"""Stretch limits of a Gaussian, so that it does not become a sheet across a tear."""
 TURNED = 1e-3
 """Smallest rotation, as matrix entry, for which colours are turned."""
 

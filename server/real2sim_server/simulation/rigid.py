@@ -1,6 +1,6 @@
 """Rigid motion, conversion to and from deforming bodies, and distances to colliders."""
 
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from .tyres import Tyres, track_of
 EGO = "ego"
 """Id of the ego as an object of a simulation."""
 REAR_OVERHANG = 0.95
-"""From the rear axle to the rear end of its box [m], as the closed loop has it."""
+"""Distance from the rear axle to the rear end of its box [m], as in the closed loop."""
 STEP = 0.07
 """Between Gaussians over its surface [m]."""
 PAINT, GLASS, RUBBER, LAMP = (0.16, 0.27, 0.42), (0.05, 0.06, 0.08), (0.03,) * 3, (0.75, 0.74, 0.68)

@@ -1,6 +1,6 @@
 """Tyres: four contact patches with suspension and friction, and rigid motion on them."""
 
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ from .world import World
 
 TRACKERS = tuple(name for name, kind in KINDS.items() if kind not in PLANNING_AHEAD)
 FREE = frozenset({"seed", "start_us", "dt_us", "horizon", "sensors", "privileged", "scoring"})
-"""Fields of a reset that may be anything; cameras are drawn by who steps the batch."""
+"""Fields of a reset without restrictions; the caller of the batch renders cameras."""
 CHECKED = frozenset({"ego", "action", "agents", "contact"})
 """Fields of which only a part is known here."""
 

@@ -156,7 +156,7 @@ corner of the ego box is off the road [m]."""
 PLACES = 7
 
 STANDS, GOES, MOVED = 0, 1, 2
-"""What becomes of a world in a step."""
+"""Status of a world in a step."""
 
 
 @kernel(parallel=PARALLEL_LOOPS, nogil=True)

@@ -148,7 +148,7 @@ def heading(quaternion):
 # exceeds ``d``, so time advances by gap / speed until the gap is closed.
 
 WAY = 5
-"""Columns of a way: fraction of the step, centre x, y [m], yaw [rad], height of the bottom [m]."""
+"""Columns of a box motion: fraction of the step, centre x, y [m], yaw [rad], bottom height [m]."""
 
 MIN_OVERLAP = 1e-9
 """Boxes that overlap by no more than this only touch [m]."""

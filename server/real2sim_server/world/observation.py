@@ -174,7 +174,7 @@ def _named(objects: tuple[ObjectState, ...]) -> tuple[tuple[str, ...], tuple[str
 
 
 RADIUS = 60.0
-"""Places of centre lines are shown so far from the vehicle [m]."""
+"""Maximum distance of centre line points from the vehicle [m]."""
 SPACING = 5.0
 """Between places along a lane, at most [m]."""
 MAX_LANES, MAX_PLACES = 32, 32

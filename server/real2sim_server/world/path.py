@@ -27,7 +27,7 @@ REACH = 80
 """The leading object is searched for in as many metres, at points one metre apart."""
 
 SIDE = 0.3
-"""Clearance beside a box that counts as in the way [m]."""
+"""Lateral clearance of a box that counts as blocked [m]."""
 
 
 @kernel
@@ -450,7 +450,7 @@ class LoopTransform(NamedTuple):
 # --- Route ---------------------------------------------------------------------------------------
 
 ROUTE_SPACING, ROUTE_POINTS = 1.0, 4096
-"""Of a whole route: way from point to point [m], and how many points it has at most."""
+"""Point spacing of a whole route [m], and its maximum number of points."""
 
 Command = Literal["straight", "left", "right"]
 

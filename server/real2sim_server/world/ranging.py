@@ -188,7 +188,7 @@ def _on(pose: Float, velocity: Float, yaw_rate: float, seconds: Float) -> Float:
 KEPT_LIDARS = 32
 """Sensors whose rays are cached for later episodes."""
 MAX_SWEEP_US = 1_000_000
-"""Of sweeps; what happened before is forgotten."""
+"""Maximum duration of a sweep [us]."""
 
 
 @dataclass(frozen=True, eq=False)

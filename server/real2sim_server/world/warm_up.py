@@ -33,7 +33,7 @@ DEFORMED_AFTER_US = 20_000
 STEPS = 20
 """More than fill the window of the comfort metrics."""
 STEP_KERNELS = 28
-"""That :func:`warm_up` makes ready."""
+"""Number of kernels that :func:`warm_up` compiles."""
 
 
 @cache

@@ -1,10 +1,10 @@
 """The CPU backend: Numba kernels on all cores.
 
-One camera at a time: every cluster is projected where it lies, the records are sorted by depth,
-dealt to tiles and blended. Work space grows to what was needed and is kept.
+Cameras are drawn one at a time: clusters are projected in place, records are sorted by depth,
+assigned to tiles and blended. Work space grows on demand and is reused.
 
-A request that may be interrupted is worked on in pieces; what is drawn in between has a work space
-of its own. The pieces change no bit: tiles and rows know nothing of each other.
+Interruptible requests are processed in pieces; requests drawn in between use a separate work space.
+Results are bitwise equal, because tiles and rows are independent.
 """
 
 from __future__ import annotations

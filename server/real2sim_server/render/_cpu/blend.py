@@ -7,7 +7,7 @@ The innermost step is explicit vector code over eight pixels. Their state is PLA
 transmittance (negative once finished), red, green, blue, depth, instance, median depth.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

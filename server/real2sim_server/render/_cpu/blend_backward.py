@@ -11,7 +11,7 @@ rows and are summed once at the end. Each entry of a tile list writes to a slot 
 number of threads gives the same bits.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Levels of detail of a cloud: merged Gaussians for small images, built once and kept.
+"""Levels of detail of a cloud: merged Gaussians for small images, built once and cached.
 
-Space is cut into cells along a Z curve, so cells of every size are contiguous ranges of one order.
-Each block of cells chooses its level independently; level 0 is the cloud itself, without a copy. A
-Gaussian larger than the cells of a level is not merged there.
+Space is divided into cells along a Z curve, so cells of every size are contiguous ranges of one
+order. Each block of cells selects its level independently; level 0 is the cloud itself, without a
+copy. A Gaussian larger than the cells of a level is not merged there.
 
 The Gaussians of a cell merge into one with the same moments. Each has the weight ``tau area``,
 where tau = -ln(1 - opacity) is its optical depth and ``area`` its cross section averaged over all
@@ -10,7 +10,7 @@ directions. The merged one has the mean centre, the covariance about it and the 
 optical depth is the sum of the weights divided by its own area.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """One pinhole camera on the CPU: visible chunks, kernel inputs, and drawing in pieces.
 
-Neighbours in memory are mostly neighbours in space, so whole chunks of CHUNK Gaussians lie behind a
-camera or beside its image. Boxes around their centres are computed once for each cloud. Skipped
-chunks hold only Gaussians that the projection would drop anyway, so images keep their bits.
+Neighbours in memory are mostly neighbours in space, so whole chunks of CHUNK Gaussians are behind a
+camera or outside its image. Bounding boxes of their centres are computed once per cloud. Skipped
+chunks only have Gaussians that the projection would drop, so images are bitwise unchanged.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def arrays_of(cloud: GaussianCloud) -> CloudArrays:
 
 @weak_cache
 def bounds_of(cloud: GaussianCloud) -> ChunkBounds:
-    """Bounds of the chunks of a cloud; made once, for who draws it more than once."""
+    """Bounds of the chunks of a cloud, cached."""
     arrays = arrays_of(cloud)
     table = np.empty((-(-len(cloud) // CHUNK), 7))
     bound_chunks(arrays.means, arrays.scales, table)
@@ -167,7 +167,7 @@ NO_TONES = np.zeros(0, np.float32)
 
 
 class Workspace:
-    """Uninitialised arrays by name that grow to what was needed and are kept."""
+    """Uninitialised arrays by name, which grow on demand and are reused."""
 
     def __init__(self) -> None:
         self._held: dict[str, NDArray[Any]] = {}

@@ -1,12 +1,12 @@
 """Passes of the CPU backend that carry gradients.
 
-The forward pass uses the kernels of every other pass and keeps the records and the tile lists of
-each camera. The backward pass prepares the pixels, walks the tiles front to back once more, sums
-the gradients of the tiles for each Gaussian and chains them through projection and colour. Torch
-derives the gradients of poses and cameras from the few numbers of each placement.
+The forward pass uses the same kernels as other passes and stores the records and tile lists of each
+camera. The backward pass prepares the pixels, traverses the tiles front to back again, sums the
+tile gradients of each Gaussian and applies the chain rule through projection and colour. Torch
+computes the gradients of poses and cameras from those of the placements.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Colours and labels of one camera in one walk over the tiles.
+"""Colours and labels of one camera in one pass over the tiles.
 
-Besides its colour each pixel learns which record is its front; within the windows of objects it
-also learns the front of each object as if that object stood alone. Where others have finished a
-pixel, the walk goes on with the records of objects. Depth, object and class follow from the front,
-once for each pixel. Colours use the same operations as :mod:`.blend`, so their bits are the same.
+In addition to its colour, each pixel gets the record of its front and, within the windows of
+objects, the front of each object without occluders. After a pixel is finished, the pass continues
+with the records of objects only. Depth, object and class are derived from the front, once per
+pixel. Colours use the same operations as :mod:`.blend` and are bitwise equal.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

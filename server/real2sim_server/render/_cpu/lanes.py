@@ -1,4 +1,4 @@
-"""Eight numbers side by side in a kernel under construction, so that formulas read like formulas.
+"""Vectors of eight numbers for kernel construction, with operators for readable formulas.
 
 LLVM's loop vectoriser needs checks for overlapping arrays that cost more than a row of pixels, so
 the eight lanes are spelled out as LLVM vectors. They run as one AVX register, or as two SSE or NEON

@@ -1,14 +1,14 @@
 """Projection of a cluster of Gaussians onto one image, fused with culling and colour.
 
-Nothing of the cluster is copied: each visible Gaussian becomes one record, eight at a time. Chunks
-of fixed size write to regions of their own, so the result does not depend on the thread count.
+The cluster is not copied: each visible Gaussian becomes one record, eight at a time. Chunks of
+fixed size write to separate regions, so the result does not depend on the number of threads.
 
 The steps are explicit vector code. Eight Gaussians lie in PROJECTION planes of eight float32
 numbers: the fields of a record, then properties of the Gaussian, then intermediate values. Each
 step takes a bit mask of active lanes and returns the lanes that remain.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

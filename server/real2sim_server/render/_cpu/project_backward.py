@@ -6,7 +6,7 @@ cancel. Each chunk sums the gradients of the placement on its own, in a fixed or
 of threads.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Drawing a camera with a lens or a rolling shutter: as a pinhole, with rays in place of the conic.
+"""Drawing of cameras with a lens or a rolling shutter: like pinholes, but with rays, not conics.
 
-Nothing here is compiled before such a camera is drawn. The innermost step is explicit vector code
+Compiled when the first such camera is drawn. The innermost step is explicit vector code
 over eight pixels. Their state is RAY_PLANES vectors: those of the pinhole, then the ray x, y, z and
 its time, -0.5 to 0.5 over the read-out.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

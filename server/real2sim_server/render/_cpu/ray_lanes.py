@@ -1,12 +1,12 @@
 """Projection of eight Gaussians at a time onto the image of a camera with a lens.
 
-The eight lie in RAY_PROJECTION planes of eight numbers: those of a pinhole's projection, then the
-second half of a record, then notes from one step for the next. Each step is told by bits which
-lanes are still in question and answers with those that remain.
+The eight are stored in RAY_PROJECTION planes of eight numbers: those of a pinhole projection, the
+second half of a record, and intermediate values. Each step takes a bit mask of active lanes and
+returns the lanes that remain.
 
-Which pixels a Gaussian may touch is bounded by the ellipse of the lens's derivative, enlarged by
-what perspective and lens bend over its extent. What is exact is the map that turns the Gaussian
-into a unit sphere, by which rays decide.
+The pixels that a Gaussian may touch are bounded by the ellipse of the lens derivative, enlarged by
+the nonlinearity of perspective and lens over its extent. The map of the Gaussian to a unit sphere,
+which rays use, is exact.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Projection of one cluster of Gaussians onto the image of a camera with a lens.
 
-Like :mod:`.project`, with the steps of :mod:`.ray_lanes`. Which pixels a large Gaussian may touch
-is bounded by the outline that the camera sees.
+Like :mod:`.project`, with the steps of :mod:`.ray_lanes`. The pixels that a large Gaussian may
+touch are bounded by its visible outline.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

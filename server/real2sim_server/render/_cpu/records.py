@@ -1,4 +1,4 @@
-"""Data that the CPU kernels hand to each other."""
+"""Data exchanged between the CPU kernels."""
 
 from __future__ import annotations
 

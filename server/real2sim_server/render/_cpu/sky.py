@@ -1,10 +1,10 @@
-"""The sky behind an image, forward and backward: the twin of Sky.sample in Numba.
+"""The sky behind an image, forward and backward: Sky.sample in Numba.
 
-The backward pass deals texel rows to tasks. Each task looks through all pixels for its rows in the
-same order, so no two threads add to one texel.
+The backward pass distributes texel rows over tasks. Each task scans all pixels for its rows in the
+same order, so no two threads add to the same texel.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

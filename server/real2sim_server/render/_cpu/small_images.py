@@ -1,11 +1,11 @@
-"""Small images, one by one on each core: of each cloud the level that the pixels can show.
+"""Small images in parallel, one per core, from the level of detail that fits the pixels.
 
-An image of some thousand pixels is too little work to share between cores; images are shared
-instead. What an image shows depends on nothing but its own request, so any number of threads and
-any company gives the same bits.
+An image of some thousand pixels is too little work for several cores, so whole images are
+distributed instead. Each image depends on its own request only, so results are bitwise independent
+of the number of threads and of the other images.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Data of a frame on the device: clouds that stay, tables of a request, work space, images."""
+"""Device memory of frames: cached clouds, tables of a request, work space and images."""
 
 from __future__ import annotations
 
@@ -302,7 +302,7 @@ class Images:
 
 
 class FrameMemory:
-    """Work space that grows to what was needed and is kept. For one frame at a time."""
+    """Work space that grows on demand and is reused; for one frame at a time."""
 
     def __init__(self, launcher: Launcher) -> None:
         self._launcher = launcher

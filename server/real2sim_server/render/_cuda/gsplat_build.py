@@ -275,7 +275,7 @@ def cuda_folders() -> list[Path]:
 
 
 def _compiler_version(home: Path) -> str | None:
-    """``13.0`` of the compiler there; None where there is none."""
+    """Version of the compiler there, such as ``13.0``; None without a compiler."""
     compiler = home / "bin" / "nvcc"
     if not compiler.is_file():
         return None

@@ -1,10 +1,11 @@
-"""Instance and median depth images on the GPU, which gsplat has no mode for: a walk over its
-tile lists.
+"""Instance and median depth images on the GPU, from gsplat's tile lists.
+
+gsplat has no mode for them.
 
 Needs numba-cuda. The kernel also runs in Numba's CUDA simulator, where it is tested.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

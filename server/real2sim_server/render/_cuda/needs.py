@@ -41,7 +41,7 @@ class Need:
         name: what it is.
         met: whether it is here.
         found: what was found, or what is wrong.
-        remedy: what to do; empty where it is met.
+        remedy: how to meet it; empty if it is met.
         of_device: whether only a machine with a GPU can have it.
     """
 
@@ -58,7 +58,7 @@ def cuda_needs() -> list[Need]:
 
 
 def unmet_gsplat_need(*, without_device: bool = False) -> Need | None:
-    """The first that is not met, or None where the backend can draw.
+    """The first requirement that is not met, or None if the backend is usable.
 
     Args:
         without_device: leave out what only a machine with a GPU can have.
@@ -163,7 +163,7 @@ def _nvvm_libraries() -> Iterator[Path]:
 
 
 def installed_version(distribution: str) -> str | None:
-    """Of a distribution, or None where it is not installed."""
+    """Version of a distribution, or None if it is not installed."""
     try:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
@@ -184,7 +184,7 @@ def compiler_needs() -> list[Need]:
 
 
 def unmet_nvrtc_need() -> Need | None:
-    """The first that is not met, or None where the backend can draw."""
+    """The first requirement that is not met, or None if the backend is usable."""
     return next((need for need in nvrtc_needs() if not need.met), None)
 
 

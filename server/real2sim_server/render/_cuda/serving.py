@@ -1,7 +1,7 @@
 """The backend that draws frames for serving: tables, launches, images.
 
-Cameras of several requests, of one size each, are drawn together; so are the images of sessions on
-one scene. Neither launches nor copies depend on the number of objects.
+Cameras of several requests (one size per request) and images of several sessions on one scene are
+drawn together. The number of launches and copies does not depend on the number of objects.
 """
 
 from __future__ import annotations

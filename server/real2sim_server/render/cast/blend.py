@@ -5,7 +5,7 @@ same bits. The innermost step is explicit vector code: one Gaussian against eigh
 eight rays is STATE vectors; rays are six vectors, origin and direction.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

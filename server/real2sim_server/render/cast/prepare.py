@@ -9,7 +9,7 @@ alpha = 1/255 at the scan time of its centre, widened by the sensor motion until
 scanned.
 """
 
-# Kernels take arrays by position, and Numba knows neither dataclasses nor keyword-only ones.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
 # ruff: noqa: PLR0917
 
 from __future__ import annotations

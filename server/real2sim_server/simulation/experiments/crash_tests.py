@@ -37,9 +37,9 @@ COLUMN = (0.4, 0.4)
 """Width and height of the part of it that is simulated against a wall, with its fraction of the
 mass [m]. Nothing differs across a block that meets a wall squarely."""
 CAR_SIZE = (4.87, 1.85, 1.47)
-"""Of the whole car [m]."""
+"""Size of the whole car [m]."""
 SPACING = 0.15
-"""Of the whole car's particles [m]."""
+"""Particle spacing of the whole car [m]."""
 FRAME_RATE = 500.0
 FILTER = 5
 """Frames over which a pulse is averaged: 10 ms, about what a load-cell wall resolves."""

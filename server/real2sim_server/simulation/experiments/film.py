@@ -27,14 +27,14 @@ from .setups import Experiment
 
 FILE = "film.json"
 SLAB = (0.3, 2.6, 1.2)
-"""Depth, width and height of what is shown of a virtual wall, around the focus [m]."""
+"""Depth, width and height of the visible part of a virtual wall around the focus [m]."""
 PITCH = 0.07
-"""Of Gaussians on an obstacle [m]."""
+"""Spacing of Gaussians on an obstacle [m]."""
 THIN = 0.008
-"""Of these Gaussians across their face [m]."""
+"""Thickness of these Gaussians across their face [m]."""
 CONCRETE, STEEL = (0.56, 0.55, 0.52), (0.3, 0.33, 0.34)
 SLENDER = 0.6
-"""What is narrower than this is a post of steel [m]."""
+"""Obstacles narrower than this are steel posts [m]."""
 SUN = np.array([0.4, 0.3, 0.87])
 SH_0 = 0.28209479177387814
 Obstacle = tuple[Float, Float]

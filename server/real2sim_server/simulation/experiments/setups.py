@@ -84,7 +84,7 @@ SIDEWAYS, SLANT_MIN = 2.0, 0.25
 least so far."""
 ROAD_FRICTION = 0.7
 CLEARED = 11.0
-"""What takes no part is not shown this near to what happens [m]."""
+"""Uninvolved objects closer to the experiment than this are hidden [m]."""
 FROM_AHEAD = 0.18
 """By how much a view from the side is from ahead as well."""
 
@@ -212,13 +212,13 @@ def others_near(request: Request, options: SimulateOptions, focus: Float) -> fro
 #
 
 AHEAD = 14.0
-"""From where the recording begins to where a crash takes place, along its path [m]."""
+"""Distance of the crash site from the start of the recorded path [m]."""
 GAP = 1.2
-"""To what is hit, at the start [m]."""
+"""Initial gap to the obstacle [m]."""
 BARRIER = (0.8, 2.4, 1.0)
 """Depth, width, height of the block of a frontal crash [m]."""
 POLE, POLE_HEIGHT = 0.25, 2.6
-"""Of a lamp post: width and height [m]."""
+"""Width and height of a lamp post [m]."""
 OFF_CENTRE = 0.12
 """Of the width: where a pole meets a front, beside its middle."""
 ASIDE = 0.8

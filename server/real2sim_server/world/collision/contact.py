@@ -49,7 +49,7 @@ class ContactImpulse(NamedTuple):
 
 Body = tuple[BodyState, BodyProperties]
 Bodies = tuple[Body, Body | None]
-"""Two bodies in contact; None for what cannot move."""
+"""Two bodies in contact; None for an immovable one."""
 
 
 class RelativeMotion(NamedTuple):
@@ -260,15 +260,16 @@ def contact_impulse(
 # they come closer than at its end.
 
 SPREAD = 0.5
-"""By how much wider than the place of contact a structure is that yields there [m]."""
+"""Width of the yielding structure beyond the contact width [m]."""
 KEPT = 0.38
-"""Of the largest crush that stays: 0.26 of 0.68 m in the barrier test of the 2015 Malibu."""
+"""Fraction of the maximum crush that is permanent: 0.26 of 0.68 m in the barrier test of the 2015
+Malibu."""
 SQUARE = 1e-6
 """Faces across a normal lie so well across it, as a sine."""
 MIN_LENGTH = 1.0
-"""Of a body that has been crushed [m]."""
+"""Minimum length of a crushed body [m]."""
 MIN_WIDTH = 0.1
-"""Of a place of contact [m]."""
+"""Minimum contact width [m]."""
 
 
 class Patch(NamedTuple):
@@ -453,7 +454,7 @@ def shortened(
 # Occupied cells of a grid hold walls, poles and parked cars.
 
 BREADTH = 1.0
-"""How far to the sides of a contact it is looked for how broad an obstacle is [m]."""
+"""Search distance to both sides of a contact for the breadth of an obstacle [m]."""
 
 
 @dataclass(frozen=True, eq=False)

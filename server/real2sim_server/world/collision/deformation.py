@@ -162,7 +162,7 @@ NEVER_DEFORMED = frozenset({"pedestrian", "person", "cyclist", "motorcyclist", "
 """Categories that are never shown deformed."""
 
 FRICTION = 0.4
-"""Of bodywork on bodywork."""
+"""Friction coefficient of bodywork on bodywork."""
 
 MIN_MOVED = 5e-3
 """Particles that have moved less than this leave Gaussians where they are [m]."""

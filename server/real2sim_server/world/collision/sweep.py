@@ -32,7 +32,7 @@ from .contact import ObstacleGrid, contact_manifold, corners
 # --- Overlaps at an instant ----------------------------------------------------------------------
 
 BACKGROUND = "background"
-"""Name and category of what is not an object."""
+"""Name and category of the background."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ PIECE_US = 50_000
 
 TOLERANCE = 1e-3
 COARSE = 2e-2
-"""How far bodies move from look to look where they nearly touch [m]."""
+"""Maximum motion between two checks of nearly touching bodies [m]."""
 
 
 class StepStart(NamedTuple):

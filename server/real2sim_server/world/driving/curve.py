@@ -27,11 +27,11 @@ DENSE = 0.25
 """Plans that begin within this time say where they come from, too [s]."""
 
 TRUSTED_YAW = 0.5
-"""A planned heading that differs more from the planned way is not used as its tangent [rad]."""
+"""Maximum deviation of a planned heading from the path to be used as its tangent [rad]."""
 
 
 NO_POSE = math.nan, 0.0, 0.0, 0.0
-"""Of a plan that goes on from no pose of an earlier one."""
+"""``before`` of a plan that does not continue an earlier pose."""
 
 
 class PlanCurve(NamedTuple):

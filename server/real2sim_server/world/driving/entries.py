@@ -26,7 +26,7 @@ SUBSTEP_US = 10_000
 
 _NOTHING = np.empty((0, 0))
 NO_SCHEDULE = _NOTHING, _NOTHING, _NOTHING, _NOTHING
-"""Of trackers that do not plan ahead."""
+"""Schedules of trackers that do not plan ahead."""
 
 
 @func

@@ -32,7 +32,7 @@ TIME = 0.6
 """Time scale of the regulator along the plan [s]: (r/q)^(1/4) of its weights."""
 
 HEADWAY, SHORTEST = 0.55, 2.0
-"""Length scale of the regulator across the plan: this many seconds of way, at least metres."""
+"""Length scale of the lateral regulator: distance in this time [s], and its minimum [m]."""
 
 DIFFERENCE = 0.05
 """Acceleration and curvature of the plan are taken over this time [s]."""

@@ -39,7 +39,7 @@ FEW, CLEARLY = 40, 1e-6
 
 
 MAX_GAP_US = 1_000_000
-"""A plan of a single pose goes on from the one before where their poses are this near in time."""
+"""Maximum time between the poses of single-pose plans that continue each other [us]."""
 
 
 @made_quickly
@@ -343,7 +343,7 @@ SHIFT_BRAKING = 6.0
 [m/s^2]."""
 
 SHIFT_LOOK_US = 10_000
-"""How often a vehicle that brakes for the other gear is looked at [us]."""
+"""Check interval while a vehicle brakes for a gear change [us]."""
 
 
 def can_reverse(spec: EgoSpec) -> bool:

@@ -35,7 +35,7 @@ SUFFIX = "cloud"
 MAX_CLOUD_BYTES = 64 << 20
 
 NUMERIC_TYPES = {"uint8": 1, "int8": 2, "uint16": 3, "int16": 4, "int32": 6, "float32": 7}
-"""Of foxglove.PackedElementField."""
+"""Codes of foxglove.PackedElementField."""
 
 AXES = ("x", "y", "z")
 

@@ -65,7 +65,7 @@ MAX_WAY_M = 1e6
 """Length of a route or lane [m]: they are cut into pieces of less than a metre."""
 
 MAX_NUMBER = 1e12
-"""Of any length, speed or mass in SI units."""
+"""Maximum of any length, speed or mass, SI units."""
 
 
 def instant_row(instant: Instant, digest: str) -> dict[str, Any]:
@@ -238,7 +238,7 @@ def _list(value: Any) -> list[Any]:
 FORMAT = "real2sim-episode"
 VERSION = 1
 MAX_BYTES = 2 << 30
-"""Of all parts when unpacked; hours of driving have a tenth of it."""
+"""Maximum unpacked size; hours of driving take a tenth of it."""
 _FRAME = re.compile(r"frames/[^/]+/[^/]+/[0-9]{1,9}\.[a-z0-9]{1,8}")
 
 

@@ -39,10 +39,10 @@ BEFORE: Mapping[str, Any] = {
         "weighed_by_height": False,
     },
 }
-"""How episodes ran before members had their present defaults, or before there were such members.
+"""Values for members that a log lacks, which reproduce the behaviour of earlier versions.
 
-Logs hold specs in full, so a member that is absent is one that its writer did not know. Whoever
-adds a member whose default changes an episode names here what keeps its bits.
+Logs store complete specs, so an absent member did not exist in the version that wrote the log. When
+you add a member whose default changes an episode, add the value that preserves old episodes here.
 """
 
 
@@ -138,7 +138,7 @@ def stop_payload(reason: str) -> bytes:
 
 
 KEPT_PLAN = action_payload(None)
-"""Payload of an action that goes on with the plan before it."""
+"""Payload of an action that keeps the previous plan."""
 
 
 @dataclass(eq=False)

@@ -417,7 +417,7 @@ SLOWEST_CURVATURE = 0.5
 """Below this speed curvature is noise [m/s]."""
 
 PLACE_NOISE = 0.03
-"""Of recorded places [m]."""
+"""Noise of recorded positions [m]."""
 
 SLIP = 0.05
 """Way sideways per way ahead that nobody minds, beside what the vehicle model says: the rear axle

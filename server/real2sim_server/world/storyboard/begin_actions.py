@@ -50,7 +50,7 @@ BESIDE_ROUTE = 10.0
 """An entity teleported within this distance of its assigned route keeps the route [m]."""
 
 SLOWEST_DESIRED = 3.0
-"""Desired speed of an entity that stands when its controller is activated [m/s]."""
+"""Desired speed of an entity at rest when its controller is activated [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)

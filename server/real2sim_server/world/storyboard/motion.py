@@ -24,7 +24,7 @@ STEEPEST = {"linear": 1.0, "cubic": 1.5, "sinusoidal": math.pi / 2, "quintic": 1
 """Highest slope of each form f(u), u from 0 to 1."""
 
 CURVIEST = {"cubic": 6.0, "sinusoidal": math.pi**2 / 2, "quintic": 10.0 / math.sqrt(3.0)}
-"""Highest second derivative of each form; a linear one has none that is finite."""
+"""Maximum second derivative of each shape; infinite for linear."""
 
 
 def progress(shape: Shape, u: float) -> float:
@@ -165,7 +165,7 @@ AT_PLACE, AT_SPEED = 0.05, 0.05
 """A distance is reached within these [m], [m/s]."""
 
 SLOWEST_MASTER = 0.05
-"""Of whom it is not known when they arrive [m/s]."""
+"""Minimum speed of a master with a known arrival time [m/s]."""
 
 
 @dataclass(frozen=True)

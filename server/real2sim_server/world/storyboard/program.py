@@ -319,7 +319,7 @@ EQUAL = 1e-6
 """Numbers that differ by less are equal."""
 
 STANDING = 0.01
-"""Speed of who stands [m/s]."""
+"""Maximum speed at standstill [m/s]."""
 
 INSTANT = 1e-9
 

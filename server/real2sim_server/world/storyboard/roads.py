@@ -203,7 +203,7 @@ def path_through(places: list[Place]) -> LoggedPath:
 
 
 REACH = 2000.0
-"""Ways go on so far, as long as there are lanes [m]."""
+"""Maximum length of paths along lanes [m]."""
 
 
 @dataclass(frozen=True, eq=False)

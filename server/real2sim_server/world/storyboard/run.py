@@ -41,7 +41,7 @@ from .roads import GraphNetwork, Place, RoadNetwork, RouteNetwork
 from .view import EntityState, PositionResolver, observed
 
 TRIES = 1000
-"""Of a draw that has to fall within a range."""
+"""Maximum number of draws for a value within a range."""
 
 
 def drawn_values(board: Storyboard, draws: Draws | None) -> tuple[Storyboard, Mapping[str, float]]:
@@ -279,7 +279,7 @@ def _fitted(size: Vector, of: Vector, *, walks: bool) -> dict[str, Vector]:
 
 
 TICK_US = 10_000
-"""Elements begin and end within a step of the clock at most so far apart [us]."""
+"""Maximum interval between two checks of elements within a clock step [us]."""
 
 
 @dataclass(frozen=True, eq=False)

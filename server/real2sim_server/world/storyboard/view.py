@@ -31,7 +31,7 @@ from ..traffic.driver import AgentPose, ObservedEgo, Surroundings, level_quatern
 from .roads import Place, RoadNetwork, RoadPoint, Trajectory, Way, course_of, straight
 
 ACROSS = math.radians(45.0)
-"""Who heads further away than this from either direction of its lane goes straight on instead."""
+"""Entities with a larger heading difference to their lane continue straight instead."""
 
 SLOW = 0.5
 """Below this speed a drift sideways does not turn it [m/s]."""
@@ -224,7 +224,7 @@ def coasting(actor: EntityState, h: float) -> EntityState:
 
 
 BESIDE = 8.0
-"""Places further than this from a way are not along it [m]."""
+"""Maximum distance of places from a path to be along it [m]."""
 
 CLOSED = 1e-9
 

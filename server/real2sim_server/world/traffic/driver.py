@@ -450,7 +450,7 @@ def neighbours(
 
 
 STRAIGHT = 600.0
-"""Lanes begin so far before the route and end so far behind it, straight on [m]."""
+"""Straight extension of lanes before and beyond the route [m]."""
 
 
 def lane_beside(route: LoggedPath, offset: float, *, oncoming: bool = False) -> LoggedPath:

@@ -119,7 +119,7 @@ def _travelled(graph: LaneGraph, names: Iterable[str]) -> list[Lane]:
 
 
 FARTHEST = 3.0
-"""From the middle of a lane, where a driver begins in it [m]."""
+"""Maximum distance from the centre of a lane at the start of a driver [m]."""
 HEADED = 0.7
 """Cosine of the angle to the lane from which on a vehicle drives along it."""
 SETTLES = 2.0
@@ -127,8 +127,8 @@ SETTLES = 2.0
 SLOWEST = 3.0
 """At which it changes lanes: vehicles that hardly move do not move aside [m/s]."""
 DECIDES_EVERY = 1.0
-"""Time in which it thinks of a change once, at an instant of its own: two that always did so at
-once would make way for each other for ever [s]."""
+"""Interval between lane change decisions [s]. Each driver decides at its own phase: two that always
+decide at once would yield to each other forever."""
 RENEWED = 200.0
 """Way that is left from which on a longer one is taken [m]."""
 
@@ -334,7 +334,7 @@ def _eased(progress: float) -> float:
 # closed-form rules instead of sampled trajectories.
 
 PACE = 1.0
-"""Time constant with which a car beside the ego closes up to its place [s]."""
+"""Time constant for reaching the position relative to the ego [s]."""
 PACE_ACCELERATION = 4.0
 CUT_BRAKING = 3.0
 """Acceleration limits of the car that cuts in, before and after it does [m/s^2]."""

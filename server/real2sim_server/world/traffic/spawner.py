@@ -23,13 +23,13 @@ from ..path import LoggedPath
 from .driver import AgentDriver, Idm, Surroundings, highest_speed, lane_beside, level_quaternion
 
 PREFIX = DRAWN_PREFIX
-"""Of the ids of spawned objects; no id on the wire may hold a colon, so none is taken."""
+"""Prefix of the ids of spawned objects; ids on the wire have no colon, so it cannot clash."""
 
 LOOKS = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle"})
 """Categories whose look spawned objects may have."""
 
 SIDE = 0.3
-"""Clearance beside a box that counts as in the way [m]."""
+"""Lateral clearance of a box that counts as blocked [m]."""
 
 SLOWEST = 3.0
 """Desired speed where the recorded drive hardly moved [m/s]."""

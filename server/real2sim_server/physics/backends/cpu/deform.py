@@ -8,7 +8,7 @@ bounds. What flows is turned to its principal stretches, a batch together as wel
 few, and what does not converge, go one by one.
 """
 
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
 # Numba types intrinsics without their typing context.
 # mypy: disable-error-code="call-arg, unreachable, var-annotated"

@@ -1,6 +1,6 @@
 """The substep on the CPU: blocks scatter to tiles, fields add up and touch, blocks gather."""
 
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
 # Numba types intrinsics without their typing context.
 # mypy: disable-error-code="call-arg, unreachable, var-annotated"

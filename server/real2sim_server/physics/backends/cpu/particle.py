@@ -22,7 +22,7 @@ from ...stress import (
 )
 from ..layout import BLOCK
 
-# Kernels take arrays by position, and Numba knows no keyword-only arguments.
+# Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
 
 
