@@ -377,7 +377,7 @@ class Tyres:
     ) -> tuple[RigidMotion, TyreReaction]:
         """Apply the road's forces to the body through its tyres over ``duration`` [s].
 
-        See ``rolling.press``.
+        See :func:`press`.
 
         Returns:
             The motion after it, and the reaction of the road.

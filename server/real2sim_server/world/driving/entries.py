@@ -70,7 +70,7 @@ def placed_poses(poses, frame, clearly):
 
 @kernel
 def plan_curve(state, start_us, plan, vehicle):
-    """A plan as a curve, see :class:`.curve.Curve`.
+    """A plan as a curve, see :class:`.curve.PlanCurve`.
 
     Args:
         state: nine floats of a :class:`.vehicle.PlanarState`.
