@@ -1,6 +1,6 @@
 """The edits of a scenario and of its objects.
 
-``R`` is what an edit gives: an ``OperationResult``, or in the async client an awaitable of one.
+``R`` is the return type of an edit: ``OperationResult``, or its awaitable in the async client.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class ObjectEdits(Handle, Generic[R]):
 
     @property
     def category(self) -> str:
-        """What it is, such as ``car``."""
+        """Category, such as ``car``."""
         return self.info.category
 
     @property
@@ -164,8 +164,8 @@ class ObjectEdits(Handle, Generic[R]):
         return Pose(position=tuple(mixed[:3, 3].tolist()), quaternion=quaternion_of(mixed[:3, :3]))
 
     def corners(self, t: float | None = None, *, t_us: int | None = None) -> NDArray[np.float64]:
-        """[8, 3] float64 corners of its box in the world [m]: four in front, four behind, each
-        from the upper left one clockwise as seen from behind. Times as of :meth:`pose`.
+        """[8, 3] float64 corners of its box in the world [m]: four front, then four rear, each
+        clockwise from the upper left as seen from behind. Times as in :meth:`pose`.
 
         Examples:
             >>> scenario.objects["post"].corners().shape
@@ -195,11 +195,11 @@ class ObjectEdits(Handle, Generic[R]):
         """Shift the object [m].
 
         Args:
-            x, y, z: by how much, along the axes of ``frame``.
-            frame: ``world``, or ``object``, which turns with it.
-            start_us, end_us: only in between, growing and fading smoothly; default: at all times.
-            blend_us: how long growing and fading take; default: half a second.
-            snap: put it onto the ground.
+            x, y, z: distance along the axes of ``frame``.
+            frame: ``world``, or ``object``, which rotates with the object.
+            start_us, end_us: time range of the edit, with smooth ends; default: all times.
+            blend_us: duration of each smooth end; default: half a second.
+            snap: place the object on the ground.
 
         Examples:
             >>> car.translate(x=1.5, frame="object").revision
@@ -221,16 +221,16 @@ class ObjectEdits(Handle, Generic[R]):
         blend_us: int | None = None,
         about_us: int | None = None,
     ) -> R:
-        """Turn it [rad]; times as of :meth:`translate`.
+        """Rotate the object [rad]; times as in :meth:`translate`.
 
         Args:
             angle: [rad].
             axis: of any length.
-            frame: of the axis, ``world`` or ``object``.
-            start_us, end_us, blend_us: as of :meth:`translate`.
-            about_us: turns its path with it, about where it is at this instant [us]. Without one it
-                turns in place at each pose: an object that moves then goes sideways, of which
-                ``warnings`` of the result tell.
+            frame: frame of the axis, ``world`` or ``object``.
+            start_us, end_us, blend_us: as in :meth:`translate`.
+            about_us: rotates the path too, about the object's position at this time [us]. By
+                default the object rotates in place at each pose; a moving object then drives
+                sideways, and ``warnings`` of the result report it.
 
         Examples:
             >>> result = car.rotate(angle=0.26)
@@ -242,7 +242,7 @@ class ObjectEdits(Handle, Generic[R]):
         )
 
     def scale(self, *, x: float = 1.0, y: float = 1.0, z: float = 1.0, anchor: str = "bottom") -> R:
-        """Multiply the size along the object's axes; ``anchor``: ``bottom`` or ``centre`` stays.
+        """Multiply the size along the object's axes; ``anchor`` is fixed: ``bottom`` or ``centre``.
 
         Examples:
             >>> result = car.scale(x=1.5)
@@ -270,13 +270,13 @@ class ObjectEdits(Handle, Generic[R]):
         quaternions: Sequence[Quaternion],
         snap: bool = False,
     ) -> R:
-        """Let it follow a trajectory; it exists only within these times.
+        """Make the object follow a trajectory; it only exists within these times.
 
         Args:
             times_us: [T] increasing [us].
-            positions: [T] of the centre of its box in the world [m].
-            quaternions: [T] wxyz.
-            snap: put it onto the ground at every pose.
+            positions: [T, 3] centres of its box in the world [m].
+            quaternions: [T, 4] wxyz.
+            snap: place it on the ground at every pose.
 
         Examples:
             >>> result = car.set_trajectory(
@@ -294,7 +294,7 @@ class ObjectEdits(Handle, Generic[R]):
         return self._make(SetTrajectory, trajectory=track, snap=snap)
 
     def retime(self, *, delay_us: int = 0, speed: float = 1.0) -> R:
-        """Let it do the same later (or earlier), faster or slower.
+        """Delay its motion (or advance it), or change its speed.
 
         Examples:
             >>> result = scenario.objects["car_blue"].retime(delay_us=300_000, speed=1.2)
@@ -336,17 +336,17 @@ class ObjectEdits(Handle, Generic[R]):
         restitution: float | None = None,
         grid: int | None = None,
     ) -> R:
-        """Say what it is for the physics; what is left out goes back to its default.
+        """Set physical properties; those you omit return to their defaults.
 
         Args:
             mass: [kg].
             material: ``rigid``, ``metal``, ``foam``, ``rubber``, ``jelly``, ``sand`` or ``snow``.
-            young, poisson: E [Pa] and nu of one material throughout, ``jelly`` unless named.
-            density: rho [kg/m^3] of what it is filled with; instead of ``mass``.
-            yield_stress: [Pa]; of ``metal`` (unless named) or ``foam``.
+            young, poisson: E [Pa] and nu of one material throughout; ``jelly`` if none is named.
+            density: density of the filling [kg/m^3]; instead of ``mass``.
+            yield_stress: [Pa]; of ``metal`` (the default) or ``foam``.
             friction: Coulomb coefficient.
-            restitution: 0 to 1, fraction of the approach speed that is left after a bounce.
-            grid: cells along twice its longest edge, as the paper counts them.
+            restitution: 0 to 1, fraction of the approach speed after a bounce.
+            grid: cells along twice its longest edge (the paper's definition).
 
         Examples:
             >>> result = car.set_physics(material="metal", mass=1200.0, friction=0.6)
@@ -372,7 +372,7 @@ class ObjectEdits(Handle, Generic[R]):
         angular: Vector | None = None,
         frame: str = "world",
     ) -> R:
-        """Say how fast it enters the physics [m/s, rad/s]; left out: as on its trajectory.
+        """Set its initial velocity in the physics [m/s, rad/s]; default: that of its trajectory.
 
         Examples:
             >>> result = car.set_velocity(linear=(8.0, 0.0, 0.0), frame="object")
@@ -388,17 +388,17 @@ class ObjectEdits(Handle, Generic[R]):
         width: float | None = None,
         phase: int | None = None,
     ) -> R:
-        """Say how a person of the body model walks; what is left out goes back to its own way.
+        """Set the gait of a person of the body model; values you omit return to the person's own.
 
         Args:
-            stride: factor on the length of strides, 0.5 to 1.6.
-            arms: factor on the swing of the arms.
-            lean: further lean forward [rad].
-            width: factor on the distance between the feet's tracks.
+            stride: factor on stride length, 0.5 to 1.6.
+            arms: factor on arm swing.
+            lean: additional forward lean [rad].
+            width: factor on the lateral distance between the feet.
             phase: 1 starts with the other foot.
 
         Raises:
-            InvalidOperationError: it is nobody who walks.
+            InvalidOperationError: the object is not a walking person.
 
         Examples:
             >>> info = client.assets.person("tom", build="man")
@@ -450,7 +450,7 @@ class ObjectEdits(Handle, Generic[R]):
 
 
 class ScenarioEdits(Generic[R]):
-    """The edits that belong to no object that is there already."""
+    """Edits that do not belong to an existing object."""
 
     def erase_region(
         self,
@@ -565,7 +565,7 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add a plane that objects stay above, for the physics.
+        """Add a plane for the physics; objects stay above it.
 
         Examples:
             >>> result = scenario.add_plane(point=(0, 0, 0), friction=0.9)
@@ -587,7 +587,7 @@ class ScenarioEdits(Generic[R]):
         return self._collider(checked(GroundShape, offset=offset), friction, collider_id)
 
     def set_time(self, *, start_us: int | None = None, end_us: int | None = None) -> R:
-        """Set the span in which the scenario plays; left out: as recorded.
+        """Set the time span of the scenario; default: as recorded.
 
         Examples:
             >>> result = scenario.set_time(start_us=500_000)
@@ -618,7 +618,7 @@ class ScenarioEdits(Generic[R]):
         return self._edit(checked(Restore, object_id=thing_id))
 
     def set_storyboard(self, storyboard: Storyboard | Mapping[str, Any] | None) -> R:
-        """Say what road users do in sessions of the scenario, and when; None: nothing is written.
+        """Set the storyboard of the scenario's sessions; None removes it.
 
         Args:
             storyboard: a model of ``real2sim_proto.storyboard``, or its fields.

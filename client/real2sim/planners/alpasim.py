@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 PATIENCE = 50
 """Answers without a plan at the start of a session, before it is given up."""
 WAYPOINTS, WAYPOINT_SPACING = 20, 80 / 19
-"""Of the route as AlpaSim sends it [m]; what is missing at its end is not a number."""
+"""Route points as AlpaSim sends them, and their spacing [m]; missing points are NaN."""
 ALPASIM_CAMERAS = {
     "camera_front_wide_120fov": Look(0.0, math.radians(120)),
     "camera_front_tele_30fov": Look(0.0, math.radians(30)),
@@ -54,16 +54,16 @@ ALPASIM_CAMERAS = {
     "camera_rear_right_70fov": Look(math.radians(-150), math.radians(70)),
     "camera_rear_tele_30fov": Look(math.pi, math.radians(30)),
 }
-"""The cameras that AlpaSim's drivers know; directions to some ten degrees."""
+"""Camera names of AlpaSim's drivers; directions to about ten degrees."""
 
 
 class AlpasimDriver:
-    """Asks a planner behind AlpaSim's interface.
+    """A planner behind AlpaSim's driver interface.
 
-    It is shown the cameras that it wants, under the names by which it knows them. NVIDIA's own
-    service says which these are when a session lacks them; other drivers are shown every camera
-    unless ``cameras`` says which. While a driver has no plan yet, for want of images or of a past,
-    the vehicle keeps to its route at its speed.
+    It sends the images of the cameras that the driver requires, under the driver's names. NVIDIA's
+    own service lists them when a session lacks them. Other drivers receive every camera, unless
+    ``cameras`` selects some. While a driver has no plan yet, because it needs more images or more
+    history, the vehicle follows its route at its current speed.
     """
 
     def __init__(
@@ -76,21 +76,21 @@ class AlpasimDriver:
         cameras: Mapping[str, str] | Sequence[str] = (),
         patience: int = PATIENCE,
     ) -> None:
-        """Reach a driver; it may take ``timeout`` seconds to come up, and as long for an answer.
+        """Connect to a driver; ``timeout`` limits its startup and each answer.
 
         Args:
-            target: host and port; ``?cameras=NAME:CAMERA,NAME`` behind them says what ``cameras``
-                does.
+            target: host and port; the suffix ``?cameras=NAME:CAMERA,NAME`` has the meaning of
+                ``cameras``.
             timeout: [s].
-            step_us: when it will be asked again [us]; default: what lay between the last two
+            step_us: time until the next request [us]; default: the time between the last two
                 observations.
-            seed: of the session; sent to the driver.
-            cameras: names by which the driver knows cameras; of a mapping, to the scene's.
-            patience: how many answers may lack a plan at the start of a session.
+            seed: seed of the session; sent to the driver.
+            cameras: the driver's camera names; as a mapping, to the scene's cameras.
+            patience: maximum number of answers without a plan at the start of a session.
 
         Raises:
-            PeerError: it does not come up, or the ``alpasim`` extra is not installed.
-            ValueError: an option behind the target that is unknown.
+            PeerError: it does not start in time, or the ``alpasim`` extra is not installed.
+            ValueError: an unknown option in the target.
         """
         try:
             self._grpc, self._messages = importlib.import_module("grpc"), messages()
@@ -129,10 +129,10 @@ class AlpasimDriver:
         self._begin_session(obs)
 
     def plan(self, obs: Observation) -> TrajectoryPlan:
-        """Show the driver what its cameras see, its motion and route; where it wants to be.
+        """Send the driver its images, motion and route; return its plan.
 
         Raises:
-            PeerError: it cannot be reached, ends the session, or answers with what is no way.
+            PeerError: it is unreachable, ends the session, or returns an invalid trajectory.
         """
         self._show_images(obs)
         self._call("submit_egomotion_observation", self._motion(obs))
@@ -164,7 +164,7 @@ class AlpasimDriver:
             self._channel.close()
 
     def _asked_for(self) -> tuple[str, ...]:
-        """Names of the cameras that the driver says it lacks in a session without any."""
+        """Names of the cameras that the driver reports missing in a session without cameras."""
         session = uuid.uuid4().hex
         try:
             self._call(
@@ -199,7 +199,8 @@ class AlpasimDriver:
         except _RefusalError as refusal:
             if self._in_ftheta or "f-theta" not in refusal.details:
                 raise
-            # A driver that rectifies says so at the first image, and not when a session begins.
+            # A driver that rectifies images reports this at the first image, not at the session
+            # start.
             self._in_ftheta = True
             self._end_session()
             self._begin_session(obs)
@@ -357,10 +358,10 @@ class _RefusalError(PeerError):
 
 @dataclass(frozen=True)
 class _DriverNeeds(Needs):
-    """Needs of a driver that names its cameras in its own way.
+    """Needs of a driver that has its own camera names.
 
     Attributes:
-        names: by which it knows them; empty: every camera under its own.
+        names: the driver's camera names; empty: every camera under its own name.
         given: cameras of the scene by these names.
     """
 
