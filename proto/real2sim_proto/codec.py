@@ -28,7 +28,7 @@ MAX_CLIENT_MESSAGE_BYTES = 1024 * 1024
 
 
 SMALL_ARRAY_BYTES = 4096
-"""Up to this size it takes longer to describe an array than to copy it."""
+"""Smaller arrays are copied: describing them would take longer."""
 
 _LITTLE = {np.dtype(name): name for name in ARRAY_DTYPES}
 _SENT_AS = _LITTLE | {dtype.newbyteorder(">"): name for dtype, name in _LITTLE.items()}
@@ -36,7 +36,7 @@ _SENT_AS = _LITTLE | {dtype.newbyteorder(">"): name for dtype, name in _LITTLE.i
 
 
 class CodecError(ValueError):
-    """Bytes that are not a valid message. The sentence says what was found and what is allowed."""
+    """Bytes that are not a valid message; the error states what was found and what is allowed."""
 
 
 def encode(message: dict[str, Any]) -> bytes:
@@ -87,7 +87,7 @@ def decode(data: bytes, *, max_bytes: int = DEFAULT_MAX_BYTES) -> dict[str, Any]
 
 
 def unpack(data: bytes) -> Any:
-    """What is in ``data``, for a reader that looks at every value itself; see :func:`decode`.
+    """Decode ``data`` for a reader that checks every value itself; see :func:`decode`.
 
     Raises:
         CodecError: an unknown ext type, or an array whose parts disagree.
@@ -115,7 +115,7 @@ def _pack_array(value: object) -> msgpack.ExtType:
 
 @functools.lru_cache(maxsize=256)
 def _array_head(dtype: str, shape: tuple[int, ...], size: int) -> bytes:
-    """What stands before the ``size`` bytes of an array; most are of few shapes."""
+    """Header of an array with ``size`` bytes; cached, since few shapes occur."""
     payload: bytes = msgpack.packb([dtype, shape, bytes(size)])
     return payload[: len(payload) - size]
 
@@ -156,7 +156,7 @@ def _check_values(value: Any, depth: int) -> None:
                 _check_values(item, depth - 1)
     elif kind is list:
         for item in value:
-            # Rows of numbers are most of what is sent.
+            # Rows of numbers are the most frequent lists.
             if type(item) not in _LEAVES and not (
                 depth and type(item) is list and _LEAVES.issuperset(map(type, item))
             ):

@@ -41,13 +41,13 @@ from .sensors import (
 
 # Shared memory for images, between a worker and a controller on the same machine.
 #
-# The first bytes of a file hold a marker and a secret; slots of equal size follow. A client that
-# can open the file and returns the secret is on the worker's machine, which no address proves.
+# The file starts with a marker and a secret; slots of equal size follow. A client that can open the
+# file and returns the secret must be on the worker's machine; an address would not prove that.
 
 SHM_FOLDER = "/dev/shm"
 """Where POSIX systems keep files that are memory."""
 SHM_NAME = r"^real2sim-[0-9a-f]{32}$"
-"""Names are of this form; no other file is ever opened or removed."""
+"""Pattern of the file names; no other file is opened or removed."""
 SHM_MAGIC = b"real2sim-frames1"
 SHM_SECRET_BYTES = 32
 SHM_HEADER_BYTES = 4096
@@ -82,20 +82,20 @@ def check_asked(*asked: Sequence[object]) -> None:
 
 
 class Envelope(Model):
-    """What every message has."""
+    """Members of every message."""
 
     v: Literal[1] = 1
     id: int = Field(default=0, ge=0, le=2**53)
 
 
 class ServerModel(Model):
-    """Base of what a worker says. Readers ignore unknown members: newer workers may add some."""
+    """Base of the worker's messages. Readers ignore unknown members: newer workers may add some."""
 
     model_config = ConfigDict(extra="ignore")
 
 
 class ServerEnvelope(Envelope, ServerModel):
-    """What every message from the worker has."""
+    """Members of every message from the worker."""
 
 
 # --- shared by socket and REST sessions -------------------------------------------------------
@@ -236,7 +236,7 @@ class Score(ServerModel):
 
 
 class Resume(Model):
-    """Goes on with a session whose connection was lost."""
+    """Continues a session whose connection was lost."""
 
     token: str = Field(max_length=500, description="`resume_token` of the welcome")
     last_step: int | None = Field(default=None, ge=0, description="newest observation received")
@@ -308,7 +308,7 @@ class Render(Envelope):
 
 
 class Agent(Envelope):
-    """Where an externally driven object goes from the next step on; answered by `driven`."""
+    """The trajectory of an externally driven object from the next step; answered by `driven`."""
 
     type: Literal["agent"] = "agent"
     object_id: Identifier
@@ -322,21 +322,21 @@ class Agent(Envelope):
 
 
 class Snapshot(Envelope):
-    """Keeps the present instant to return to; answered by `kept`."""
+    """Saves the current state to return to; answered by `kept`."""
 
     type: Literal["snapshot"] = "snapshot"
     name: Identifier
 
 
 class Restore(Envelope):
-    """Goes back to a snapshot; answered by its obs."""
+    """Returns to a snapshot; answered by its obs."""
 
     type: Literal["restore"] = "restore"
     name: Identifier
 
 
 class Fork(Envelope):
-    """Makes a new session that goes on from the present instant; answered by `forked`."""
+    """Creates a new session that continues from the current state; answered by `forked`."""
 
     type: Literal["fork"] = "fork"
 
@@ -382,7 +382,7 @@ class Frame(ServerModel):
 
 
 class PointCloud(ServerModel):
-    """What a LiDAR or a radar has measured: columns, one after the other in `data`."""
+    """Measurements of a LiDAR or a radar: columns, concatenated in `data`."""
 
     sensor: str
     modality: str = one_of(CloudModality)
@@ -446,7 +446,7 @@ class Attached(ServerEnvelope):
 
 
 class Obs(ServerEnvelope):
-    """What the vehicle perceives at one committed instant."""
+    """The vehicle's perception at one committed step."""
 
     type: Literal["obs"] = "obs"
     step: int
@@ -534,7 +534,7 @@ class Forked(ServerEnvelope):
 
 
 class Progress(ServerEnvelope):
-    """Long work before welcome or obs is under way."""
+    """Long work before welcome or obs is in progress."""
 
     type: Literal["progress"] = "progress"
     phase: str
@@ -542,7 +542,7 @@ class Progress(ServerEnvelope):
 
 
 class Error(ServerEnvelope):
-    """A message was refused. The session goes on unless `fatal`."""
+    """A message was refused. The session continues unless `fatal`."""
 
     type: Literal["error"] = "error"
     code: str

@@ -10,7 +10,7 @@ PROBLEM_MEDIA_TYPE = "application/problem+json"
 
 
 class ErrorCode(StrEnum):
-    """What went wrong, for programs. Codes are never renamed."""
+    """Machine-readable error codes. Codes are never renamed."""
 
     INVALID_REQUEST = "INVALID_REQUEST"
     UNAUTHORIZED = "UNAUTHORIZED"

@@ -88,7 +88,7 @@ class RoadInfo(_Part):
 
 
 class SceneLanes(_Part):
-    """All lanes of a scene and what rules them."""
+    """All lanes of a scene and their traffic rules."""
 
     format: Literal["real2sim-lanes"] = "real2sim-lanes"
     version: Literal[1] = 1

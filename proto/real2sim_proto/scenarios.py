@@ -29,7 +29,7 @@ class ScenarioRename(Model):
 
 
 class ScenarioInfo(Reply):
-    """A scenario and what it looks like after all its operations."""
+    """A scenario, and the scene after all its operations."""
 
     scenario_id: str
     name: str
@@ -147,9 +147,9 @@ class History(Reply):
 
 
 class ScenarioDocument(Reply):
-    """A whole scenario in one file: `GET .../export` gives it, `POST .../import` takes it.
+    """A whole scenario in one file, for `GET .../export` and `POST .../import`.
 
-    It names its scene by hash and its assets by id and hash; it holds no Gaussians.
+    It refers to its scene by hash and to its assets by id and hash; it contains no Gaussians.
     """
 
     format: Literal["real2sim.scenario"] = "real2sim.scenario"

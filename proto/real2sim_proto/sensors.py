@@ -123,7 +123,7 @@ class MotionBlurSpec(Model):
 
 
 class CameraEffects(Model):
-    """What a real camera does to its colour images, each off unless given; in this order."""
+    """Effects of a real camera on its colour images, applied in this order; off by default."""
 
     motion_blur: MotionBlurSpec | None = None
     vignetting: tuple[float, float, float] | None = Field(
@@ -157,7 +157,7 @@ class CameraEffects(Model):
 
     @property
     def names(self) -> list[str]:
-        """Those that are on, in their order."""
+        """Names of the enabled effects, in order."""
         return [name for name in type(self).model_fields if getattr(self, name) not in (None, 0.0)]
 
 
@@ -204,7 +204,7 @@ class SpinningBeams(Model):
 
 
 class TableBeams(Model):
-    """Every ray by itself."""
+    """Beams listed individually."""
 
     kind: Literal["table"]
     azimuth_deg: Numbers
@@ -213,7 +213,7 @@ class TableBeams(Model):
 
 
 class GridBeams(Model):
-    """A solid-state sensor that scans rows of even steps, top row first, left to right."""
+    """A solid-state sensor that scans evenly spaced rows, top row first, left to right."""
 
     kind: Literal["grid"]
     azimuth_deg: Span = Field(description="from edge to edge")
@@ -234,7 +234,7 @@ class RosetteBeams(Model):
 
 
 class DetectionSpec(Model):
-    """What a LiDAR's detector sees."""
+    """Detection model of a LiDAR."""
 
     range_m: float = Field(default=120.0, description="where `reflectivity` is just seen")
     reflectivity: float = Field(default=0.1, description="0 to 1")
@@ -273,7 +273,7 @@ Metres = Annotated[float, Field(gt=0, le=2000)]
 
 class RadarModel(Model):
     """A radar that resolves range, azimuth, elevation and radial velocity. The defaults are those
-    of a front radar of 77 GHz and middle range."""
+    of a 77 GHz mid-range front radar."""
 
     range_m: tuple[float, float] = Field(default=(0.5, 160.0), description="nearest, farthest")
     field_of_view_deg: tuple[Degrees, Degrees] = Field(

@@ -50,16 +50,16 @@ class SessionInfo(Reply):
 
 
 class SessionList(Reply):
-    """All sessions of a worker. Tokens are left empty."""
+    """All sessions of a worker. Tokens are empty."""
 
     sessions: list[SessionInfo]
 
 
 class SessionClock(Model):
-    """Body of `PUT /v1/sessions/{id}/clock`: what the clock of a driven session may do.
+    """Body of `PUT /v1/sessions/{id}/clock`: pause, resume or pace the clock of a driven session.
 
-    A held clock lets actions on the drive socket wait; nothing is lost, and nobody times out.
-    Steps by REST, and those of many sessions by one message, do not ask it.
+    While the clock is held, actions on the drive socket wait; none is lost or times out.
+    Steps by REST and batched steps of many sessions ignore it.
     """
 
     state: Literal["running", "held", "ended"] = Field(

@@ -1,8 +1,8 @@
-"""What happens in an episode: entities, and acts of events that conditions set off.
+"""Storyboard of an episode: entities, and acts of events triggered by conditions.
 
-The model keeps to OpenSCENARIO XML 1.3 (ASAM 2024): what a storyboard holds can be written as such
-a file and read again without loss, save for what OpenSCENARIO has no words for (shape ``quintic``).
-Numbers may be expressions of ``parameters``, so that a sweep sets those alone.
+The model follows OpenSCENARIO XML 1.3 (ASAM 2024). A storyboard can be written as such a file and
+read again without loss, except for features that OpenSCENARIO lacks (shape ``quintic``). Numbers
+may be expressions of ``parameters``, so a sweep only needs to set parameters.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ class BoundingBox(Model):
 
 
 class Entity(Model):
-    """Who takes part. An object of the scene, the ego, or somebody new.
+    """A participant: an object of the scene, the ego, or a new road user.
 
-    Somebody new looks like `asset_id` of the library or `look` of the scene, by default like the
-    object of the scene that is most alike in category and size, fitted to the box.
+    A new road user looks like `asset_id` of the library or `look` of the scene. By default it looks
+    like the object of the scene with the most similar category and size, scaled to the box.
     """
 
     name: Reference
@@ -86,10 +86,10 @@ class Entity(Model):
 
 
 class RouteLanes(Model):
-    """Lanes along the ego's route, where no map says otherwise.
+    """Lanes along the ego's route, for scenes without a map.
 
-    Lanes on the right of the reference line have ids -1, -2 and so on from there, those on the left
-    1, 2; right-hand traffic: the left ones are oncoming.
+    Lanes right of the reference line have ids -1, -2 and so on outwards, those on the left 1, 2 ...
+    Traffic is right-hand: the left lanes are oncoming.
     """
 
     kind: Literal["route"] = "route"
@@ -101,7 +101,7 @@ class RouteLanes(Model):
 
 
 class MapRoads(Model):
-    """Roads of the scene's map, or of a map that comes with the file."""
+    """Roads of the scene's map, or of a map included in the file."""
 
     kind: Literal["map"] = "map"
     file: str = Field(default="", max_length=1000, description="as the file names it")
@@ -122,7 +122,7 @@ class SignalHead(Model):
 
 
 class Phase(Model):
-    """What signals show for a while."""
+    """States of signals for a duration."""
 
     name: ElementName
     duration: Value = Field(description="[s]")
@@ -130,7 +130,7 @@ class Phase(Model):
 
 
 class SignalController(Model):
-    """Lets signals go through phases, over and over."""
+    """Cycles signals through phases."""
 
     name: ElementName
     delay: Value = Field(default=0.0, description="before its first phase, after `reference` [s]")
@@ -144,7 +144,7 @@ class SignalController(Model):
 
 
 class InitAction(Model):
-    """What holds when the episode begins."""
+    """Initial state of the episode."""
 
     entity: Reference
     action: PrivateAction
@@ -205,7 +205,7 @@ class Story(Model):
 
 
 class ValueSet(Model):
-    """These values, one after the other."""
+    """These values, in order."""
 
     kind: Literal["set"] = "set"
     values: list[Plain] = Field(min_length=1, max_length=100_000)
@@ -229,7 +229,7 @@ class Uniform(Model):
 
 
 class Normal(Model):
-    """Drawn normally, again until it is within the range, where there is one."""
+    """Normal distribution, truncated to the range by rejection if there is one."""
 
     kind: Literal["normal"] = "normal"
     mean: float
@@ -282,14 +282,14 @@ Distribution = Annotated[
     Field(discriminator="kind"),
 ]
 DRAWN = (Uniform, Normal, Poisson, Choice, Histogram)
-"""Distributions that the seed of an episode draws from; a sweep goes through the others."""
+"""Distributions sampled with the episode's seed; a sweep enumerates the others."""
 
 
 class Storyboard(Model):
-    """What happens in an episode.
+    """Storyboard of an episode.
 
-    Attributes that hold names are checked: an unknown entity or parameter is a ValueError. So are
-    times and distances: a negative one is refused by its name. Of rates the magnitude counts.
+    Attributes that refer to names are checked: an unknown entity or parameter is a ValueError, and
+    so is a negative time or distance. Rates use their magnitude.
     """
 
     version: Literal[1, 2] = Field(
@@ -342,7 +342,7 @@ def resolved(board: Storyboard) -> Storyboard:
     Raises:
         ValueError: an expression that has none, or leads to a value that is not allowed.
     """
-    # What holds no expression is left as it is, so that most are checked once.
+    # Content without expressions is shared, so that it is validated once.
     if not any(_has_expression(getattr(board, name)) for name in _RESOLVED):
         return board
     fields = {name: _plain(getattr(board, name)) for name in type(board).model_fields}
@@ -357,7 +357,7 @@ _RESOLVED = (
 
 
 def stored_storyboard(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a storyboard as a log or file holds them: without a version, of version 1."""
+    """Fields of a storyboard from a log or file; without a version number it is version 1."""
     return {"version": 1, **fields}
 
 

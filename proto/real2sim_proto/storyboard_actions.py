@@ -1,7 +1,7 @@
 """Positions and actions of a storyboard, after OpenSCENARIO XML 1.3 (ASAM 2024).
 
-Positions are of an entity's reference point: of vehicles the middle of the rear axle on the ground,
-as the file's bounding box says. All in metres, seconds, radians.
+Positions refer to an entity's reference point: for vehicles, the centre of the rear axle on the
+ground, as defined by the file's bounding box. Units are metres, seconds and radians.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class WorldPosition(Model):
 
 
 class RelativeWorldPosition(Model):
-    """Beside an entity, along the axes of the world."""
+    """Relative to an entity, along the axes of the world."""
 
     kind: Literal["relative_world"] = "relative_world"
     entity: Reference
@@ -50,7 +50,7 @@ class RelativeWorldPosition(Model):
 
 
 class RelativeObjectPosition(Model):
-    """Beside an entity, along its own axes."""
+    """Relative to an entity, along its own axes."""
 
     kind: Literal["relative_object"] = "relative_object"
     entity: Reference
@@ -60,7 +60,7 @@ class RelativeObjectPosition(Model):
 
 
 class RoadPosition(Model):
-    """Along a road's reference line and beside it, positive on its left."""
+    """Distance along a road's reference line and lateral offset, positive to the left."""
 
     kind: Literal["road"] = "road"
     road: str = Field(max_length=80)
@@ -70,7 +70,7 @@ class RoadPosition(Model):
 
 
 class RelativeRoadPosition(Model):
-    """Along and beside the road from where an entity is."""
+    """Relative to an entity's road position."""
 
     kind: Literal["relative_road"] = "relative_road"
     entity: Reference
@@ -80,7 +80,7 @@ class RelativeRoadPosition(Model):
 
 
 class LanePosition(Model):
-    """In a lane; without a map `road` is of no account, and lanes are those along the route."""
+    """In a lane; without a map, `road` is ignored and lanes are those along the route."""
 
     kind: Literal["lane"] = "lane"
     road: str = Field(max_length=80)
@@ -91,8 +91,8 @@ class LanePosition(Model):
 
 
 class RelativeLanePosition(Model):
-    """In the lane so many to the left (positive, in the sense of the reference line) of an
-    entity's, so far along it in the direction in which the entity drives."""
+    """In the lane `lanes` to the left (positive, in the sense of the reference line) of an
+    entity's, at a distance along it in the entity's direction of travel."""
 
     kind: Literal["relative_lane"] = "relative_lane"
     entity: Reference
@@ -118,7 +118,7 @@ PlainPlace = Annotated[PlainPosition, Field(discriminator="kind")]
 
 
 class Route(Model):
-    """The way through places, along lanes between them."""
+    """A path through waypoints, along lanes between them."""
 
     name: str = Field(default="route", max_length=200)
     closed: bool = False
@@ -126,7 +126,7 @@ class Route(Model):
 
 
 class RoutePosition(Model):
-    """Along a route, in the lane of its way there."""
+    """Along a route, in its lane there."""
 
     kind: Literal["route"] = "route"
     route: Route
@@ -139,7 +139,7 @@ class RoutePosition(Model):
 
 
 class TrajectoryPosition(Model):
-    """Along a curve, and beside it."""
+    """Along a curve, with a lateral offset."""
 
     kind: Literal["trajectory"] = "trajectory"
     curve: Curve
@@ -159,10 +159,10 @@ Shape = Literal["step", "linear", "cubic", "sinusoidal", "quintic"]
 
 
 class Dynamics(Model):
-    """How a value goes from what it is to what it is to be, f(0) = 0 to f(1) = 1.
+    """Transition of a value from its start to its target, f(0) = 0 to f(1) = 1.
 
     'linear' f = u; 'cubic' 3 u^2 - 2 u^3; 'sinusoidal' (1 - cos pi u) / 2; 'quintic' 10 u^3 -
-    15 u^4 + 6 u^5, which OpenSCENARIO does not know; 'step' at once.
+    15 u^4 + 6 u^5, which OpenSCENARIO lacks; 'step' immediately.
     """
 
     shape: Shape = "linear"
@@ -174,7 +174,7 @@ STEP = Dynamics(shape="step")
 
 
 class SpeedLimits(Model):
-    """What an action may use to reach its aim; None: as much as it takes."""
+    """Limits of the motion during an action; None: unlimited."""
 
     acceleration: Value | None = Field(default=None, description="[m/s^2]")
     deceleration: Value | None = Field(default=None, description="[m/s^2], positive")
@@ -208,7 +208,7 @@ class SpeedProfileAction(Model):
 
 
 class LaneChangeAction(Model):
-    """Into another lane: the one of an id, or so many to the left of an entity's."""
+    """Change to the lane with an id, or to a lane relative to an entity's."""
 
     kind: Literal["lane_change"] = "lane_change"
     lane: int | Value = Field(description="id; or number of lanes, positive on the left")
@@ -218,7 +218,7 @@ class LaneChangeAction(Model):
 
 
 class LaneOffsetAction(Model):
-    """Beside the middle of its lane, or so far beside where another is in its."""
+    """Lateral offset from the centre of its lane, or from an entity's offset."""
 
     kind: Literal["lane_offset"] = "lane_offset"
     offset: Value = Field(description="positive on the left [m]")
@@ -264,10 +264,10 @@ class LongitudinalDistanceAction(Model):
 
 
 class SynchronizeAction(Model):
-    """Arrives where it is to be when another arrives at its place.
+    """Arrives at its target when another entity arrives at its own.
 
-    Its acceleration is solved anew in every step: a constant one, or where it is to arrive with a
-    speed one that changes linearly.
+    The acceleration is solved in every step: constant, or linear in time if the final speed is also
+    given.
     """
 
     kind: Literal["synchronize"] = "synchronize"
@@ -302,7 +302,7 @@ class Polyline(Model):
 
 
 class Clothoid(Model):
-    """Curvature that changes linearly with the way."""
+    """Curvature that changes linearly with distance."""
 
     shape: Literal["clothoid"] = "clothoid"
     position: Position
@@ -380,21 +380,21 @@ class FollowTrajectoryAction(Model):
 
 
 class AssignRouteAction(Model):
-    """A route that it takes from now on."""
+    """Sets the route of the entity."""
 
     kind: Literal["assign_route"] = "assign_route"
     route: Route
 
 
 class AcquirePositionAction(Model):
-    """The way along lanes to a place."""
+    """Drives along lanes to a position."""
 
     kind: Literal["acquire_position"] = "acquire_position"
     position: Position
 
 
 class TeleportAction(Model):
-    """There at once."""
+    """Moves the entity to a position immediately."""
 
     kind: Literal["teleport"] = "teleport"
     position: Position
@@ -450,7 +450,7 @@ PrivateAction = Annotated[
 
 
 class AddEntityAction(Model):
-    """Lets an entity appear."""
+    """Adds an entity to the world."""
 
     kind: Literal["add_entity"] = "add_entity"
     entity: Reference
@@ -458,7 +458,7 @@ class AddEntityAction(Model):
 
 
 class DeleteEntityAction(Model):
-    """Takes an entity out of the world."""
+    """Removes an entity from the world."""
 
     kind: Literal["delete_entity"] = "delete_entity"
     entity: Reference
@@ -473,7 +473,7 @@ class SignalStateAction(Model):
 
 
 class SignalPhaseAction(Model):
-    """A controller of traffic signals goes on from the start of a phase."""
+    """Sets a controller of traffic signals to the start of a phase."""
 
     kind: Literal["signal_phase"] = "signal_phase"
     controller: Reference
@@ -481,7 +481,7 @@ class SignalPhaseAction(Model):
 
 
 class SetVariableAction(Model):
-    """A variable holds a value; or what it held plus, or times, a number."""
+    """Sets a variable, or adds to it, or multiplies it."""
 
     kind: Literal["set_variable"] = "set_variable"
     variable: Name
@@ -497,7 +497,7 @@ GlobalAction = Annotated[
     | SetVariableAction,
     Field(discriminator="kind"),
 ]
-"""Of nobody."""
+"""Actions without an entity."""
 
 AnyAction = Annotated[
     SpeedAction

@@ -24,7 +24,7 @@ Frame = Literal["entity", "lane", "road"]
 
 
 class Entities(Model):
-    """Whose conditions count: of any of them, or of all."""
+    """Triggering entities: the condition must hold for any of them, or for all."""
 
     entities: list[Reference] = Field(min_length=1, max_length=64)
     of: Literal["any", "all"] = "any"
@@ -87,7 +87,7 @@ class ReachPosition(Entities):
 
 
 class Speed(Entities):
-    """[m/s], along its heading, or sideways; `relative_to`: less that of another."""
+    """[m/s], along its heading or lateral; `relative_to` subtracts the speed of another entity."""
 
     kind: Literal["speed"] = "speed"
     rule: Rule
@@ -128,7 +128,7 @@ class StandStill(Entities):
 
 
 class Offroad(Entities):
-    """Beside every lane for so long [s]."""
+    """Outside every lane for this duration [s]."""
 
     kind: Literal["offroad"] = "offroad"
     duration: Value
@@ -220,8 +220,8 @@ Test = Annotated[
 
 
 class Condition(Model):
-    """A test, and when its outcome counts: while it holds, or when it begins or ceases to; later
-    by a delay."""
+    """A test, and when it triggers: while it is true, or on a rising or falling edge; after a
+    delay."""
 
     name: str = Field(default="", max_length=200)
     edge: Literal["none", "rising", "falling", "rising_or_falling"] = "none"
@@ -230,7 +230,7 @@ class Condition(Model):
 
 
 class ConditionGroup(Model):
-    """All of them at once."""
+    """Conditions that must all hold."""
 
     conditions: list[Condition] = Field(min_length=1, max_length=100)
 

@@ -27,7 +27,7 @@ Value = Annotated[float, Field(ge=-1e9, le=1e9)] | Expression
 """A number, or an expression of parameters such as ``$gap`` or ``${2 * $gap}``."""
 
 Plain = bool | Annotated[float, Field(ge=-1e15, le=1e15)] | Annotated[str, Field(max_length=1000)]
-"""What a parameter or variable holds."""
+"""Value of a parameter or variable."""
 
 MAX_DEPTH = 40
 """Of parentheses in an expression."""
