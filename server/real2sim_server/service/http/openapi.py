@@ -119,7 +119,7 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
     "storyboards-replace": _OF_EDITS,
     "sweeps-create": (*_OF_SCENES, C.TOO_MANY_JOBS, C.QUOTA_EXCEEDED),
 }
-"""What does not follow from parameters, by operation id."""
+"""Error codes that do not follow from the parameters, by operation id."""
 
 
 def document_errors(operation: dict[str, Any]) -> None:
@@ -266,10 +266,10 @@ FILES = {"application/xml": "scenario.xosc"}
 """A file of the caller that a sample sends, by its media type."""
 
 SAMPLE_QUERY: dict[str, tuple[str, ...]] = {"sessions-create": ("scene",)}
-"""Query parameters of a call's sample, by operation, though none of them alone is required."""
+"""Query parameters to show in an operation's sample, although none is required."""
 
 TOKEN_OF = {WORKER_SCHEME: "$REAL2SIM_TOKEN", SESSION_SCHEME: "$SESSION_TOKEN"}
-"""Variable of the shell that holds the token of a security scheme."""
+"""Shell variable with the token of each security scheme."""
 
 _published: dict[str, Any] = {}
 
@@ -307,8 +307,8 @@ def operations(made: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]
 
 
 def curl(path: str, method: str, operation: dict[str, Any]) -> str:
-    """A call of the operation for a shell, with ``$WORKER`` as its address, and with the token
-    that it wants in a variable of :data:`TOKEN_OF`."""
+    """A curl call of the operation, with the address ``$WORKER`` and the token in a variable of
+    :data:`TOKEN_OF`."""
     query, in_sample = [], SAMPLE_QUERY.get(operation["operationId"], ())
     for parameter in operation.get("parameters", ()):
         given = parameter.get("example")

@@ -53,13 +53,13 @@ class ClientDisconnectedError(Exception):
 
 
 async def cancel_on_disconnect(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """The result of ``work``, which is cancelled when the client hangs up.
+    """The result of ``work``, which is cancelled when the client disconnects.
 
-    Jobs that still wait for the engine are dropped with it, so that a client which gives up and
-    asks again does not fill the queue.
+    This also drops its jobs in the engine's queue, so a client that gives up and retries does not
+    fill the queue.
 
     Raises:
-        ClientDisconnectedError: the client has hung up.
+        ClientDisconnectedError: the client has disconnected.
     """
     working = asyncio.create_task(work)
     watching = asyncio.create_task(_wait_for_disconnect(request))
@@ -82,10 +82,10 @@ async def _wait_for_disconnect(request: Request) -> None:
 def uncancellable(
     method: Callable[P, Coroutine[Any, Any, T]],
 ) -> Callable[P, Coroutine[Any, Any, T]]:
-    """A coroutine function that goes to its end even when its caller is cancelled meanwhile.
+    """A coroutine function that runs to completion even if its caller is cancelled.
 
-    For changes that are on record before they take effect in memory: one without the other would
-    refuse every later change. The caller waits until then, and keeps its locks.
+    For changes that are stored before they take effect in memory: one without the other would make
+    every later change fail. The caller waits, and holds its locks.
     """
 
     @functools.wraps(method)
@@ -108,15 +108,15 @@ log = structlog.get_logger(__name__)
 
 
 class ServiceError(Exception):
-    """A request that is refused or failed, with its stable code.
+    """A refused or failed request, with its stable code.
 
     Args:
-        code: decides the HTTP status.
-        detail: what was given and what is allowed; sent to the client.
-        hint: what to do next.
+        code: determines the HTTP status.
+        detail: the given value and the allowed ones; sent to the client.
+        hint: how to fix it.
         errors: invalid values by JSON pointer.
         extra: further members of the problem document.
-        headers: of the answer.
+        headers: headers of the reply.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (DatasetError, ErrorCode.INVALID_REQUEST, None),
     (RecordingError, ErrorCode.INVALID_REQUEST, None),
 )
-"""Errors of other packages whose messages are sent as they are; the first that fits counts."""
+"""Errors of other packages whose messages are sent unchanged; the first match applies."""
 
 
 def service_error(error: Exception, *, log_unexpected: bool = False) -> ServiceError:
@@ -216,7 +216,7 @@ def _of_limit(error: OverLimitError) -> ServiceError:
 
 
 def _of_shortage(error: Exception) -> ServiceError | None:
-    """Of a want of space, of memory, or of what an account has left."""
+    """The error for lack of disk space, memory or account limits."""
     if isinstance(error, OverLimitError):
         return _of_limit(error)
     if isinstance(error, OSError) and is_full(error):
@@ -275,7 +275,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     """Answer every error of ``app`` with a problem document."""
 
     async def closed(_request: Request, _error: Exception) -> Response:
-        # Never sent; the number is what proxies log for it.
+        # Never sent; proxies log this number.
         return Response(status_code=499)
 
     for gone in (ClientDisconnectedError, ClientDisconnect):
@@ -323,7 +323,7 @@ def _message(error: Mapping[str, Any]) -> str:
 
 
 def _pointer(error: Mapping[str, Any], body: Any) -> str:
-    """JSON pointer (RFC 6901) into the body; parts of the request beside it keep their name."""
+    """JSON pointer (RFC 6901) into the body; other parts of the request keep their names."""
     parts = list(error["loc"])
     if error["type"] == "json_invalid":
         return ""
@@ -345,7 +345,7 @@ def _places(parts: Sequence[int | str], body: Any) -> Iterator[int | str]:
 
 
 def _allowed_methods(request: Request) -> list[str]:
-    """Methods that some route takes at the path of a request."""
+    """Methods of the routes that match a request's path."""
     allowed = []
     for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"):
         as_routed = "GET" if method == "HEAD" else method
@@ -395,16 +395,16 @@ SECURITY_HEADERS = {
 
 
 def secure(headers: MutableHeaders) -> None:
-    """Add what is missing; a page brings a policy of its own."""
+    """Add missing security headers; a page sets its own policy."""
     for name, value in SECURITY_HEADERS.items():
         headers.setdefault(name, value)
 
 
 def choose_among(offered: Sequence[str], accept: str | None, *, of: str) -> str:
-    """The one of ``offered``, best first, that the client likes best.
+    """The item of ``offered``, best first, that the client prefers.
 
     Raises:
-        ServiceError: NOT_ACCEPTABLE when it likes none; ``of`` says of what.
+        ServiceError: NOT_ACCEPTABLE if it accepts none; ``of`` names the kind of item.
     """
     ranked = [(_quality(accept or "*/*", media_type), media_type) for media_type in offered]
     best = max(quality for quality, _ in ranked)
@@ -488,7 +488,7 @@ def _q(parameters: list[str]) -> float:
 
 
 HEARTBEAT_S = 10.0
-"""Comments this far apart keep proxies from closing a stream on which nothing happens."""
+"""Interval of comments that keep proxies from closing an idle stream [s]."""
 
 
 async def event_stream(events: AsyncIterator[tuple[int, str, str]]) -> AsyncIterator[bytes]:
