@@ -44,14 +44,14 @@ MAX_VIDEO_FRAMES = 20_000
 
 @dataclass(frozen=True, eq=False)
 class VideoSource:
-    """What a video shows.
+    """Content of a video.
 
     Attributes:
-        scene: gives cameras, sky and the ego trajectory.
-        instances: what is drawn at an instant [us]; called off the event loop.
-        span: first and last instant that can be shown [us].
-        vehicle: where the cameras' vehicle is; None: as it was recorded.
-        outside: the same for who looks on from outside the ego; None where that is the same.
+        scene: provides cameras, sky and the ego trajectory.
+        instances: returns the instances at a time [us]; called off the event loop.
+        span: first and last available time [us].
+        vehicle: trajectory of the cameras' vehicle; None: as recorded.
+        outside: instances for cameras outside the ego; None if they are the same.
     """
 
     scene: Scene
@@ -154,8 +154,8 @@ def _render_request(video_source: VideoSource, sensor: SensorSpec, t_us: int) ->
 
 
 def pack(folder: Path, archive: Path, context: JobContext) -> None:
-    """Pack all files below a folder; the same bytes for the same files: without the day, the user
-    or the rights. A file that is packed goes, so that the disk holds each once.
+    """Pack all files below a folder, reproducibly: without dates, users or permissions. Each file
+    is deleted once packed, so that the disk stores it only once.
 
     Raises:
         JobCancelled: the job was cancelled.
@@ -184,19 +184,19 @@ LABELLING = 0.9
 """Share of the work that is over when all frames are labelled."""
 
 ROOM_CHECKS_S = 5.0
-"""Between two looks at the disk while frames are labelled."""
+"""Interval of disk space checks while frames are labelled [s]."""
 
 FEW_FRAMES = 12
-"""Fewer are begun without an estimate, which takes as long as three."""
+"""Smaller exports start without an estimate, which takes as long as three frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class DatasetSource:
-    """What a data set shows.
+    """Content of a data set.
 
     Attributes:
-        variants: what is labelled.
-        made_of: what else decided on it, for the manifest.
+        variants: what to label.
+        made_of: other inputs, for the manifest.
     """
 
     variants: Sequence[Variant]
@@ -205,15 +205,15 @@ class DatasetSource:
 
 @dataclass(eq=False)
 class EngineBackend:
-    """Draws on the engine, whose thread owns the device, between the work of others.
+    """Renders on the engine, whose thread owns the device, between other work.
 
     Attributes:
-        engine: that draws.
-        backend: of the engine.
-        context: of the job, whose account is charged.
-        loop: that the engine's callers await on.
-        name: of the backend that draws.
-        caster: follows the beams of LiDARs there, too.
+        engine: the engine.
+        backend: its backend.
+        context: context of the job, whose account is charged.
+        loop: event loop of the engine's callers.
+        name: name of the backend.
+        caster: traces LiDAR rays on the engine, too.
     """
 
     engine: Engine
@@ -264,7 +264,7 @@ class EngineCaster:
 
 
 def plan_of(request: DatasetRequest) -> ExportPlan:
-    """What a request asks for."""
+    """The export plan of a request."""
     return ExportPlan(
         formats=tuple(dict.fromkeys(request.formats)),
         cameras=tuple(request.cameras),
@@ -284,11 +284,11 @@ def plan_of(request: DatasetRequest) -> ExportPlan:
 
 
 def check_dataset(variants: Sequence[Variant], plan: ExportPlan, *, max_pixels: int) -> None:
-    """Refuse what cannot be exported before the job begins.
+    """Refuse invalid exports before the job begins.
 
     Raises:
-        DatasetError: formats, cameras, instants or splits that there are none of.
-        ServiceError: INVALID_REQUEST for more frames or pixels than a worker makes.
+        DatasetError: no such formats, cameras, times or splits.
+        ServiceError: INVALID_REQUEST for more frames or pixels than the worker's limit.
     """
     for name in plan.formats:
         writer_of(name)
@@ -344,7 +344,7 @@ def _export(
     context = backend.context
     context.folder.mkdir(parents=True, exist_ok=True)
     folder = context.folder / FOLDER
-    # Left half packed by a worker that died; the clips that it had finished are kept beside it.
+    # Partly packed by a worker that died; the clips that it finished are stored next to it.
     shutil.rmtree(folder, ignore_errors=True)
     frames = sum(len(clip.times_us) for clip in planned_shards(source.variants, plan))
     if frames > FEW_FRAMES:
@@ -365,7 +365,7 @@ def _export(
 
 
 class _Progress:
-    """Tells how far the job is, and ends it when it takes more disk than there is for it."""
+    """Reports the job's progress, and ends it if it exceeds the available disk space."""
 
     def __init__(self, context: JobContext, quota: Quota) -> None:
         self._context = context

@@ -47,7 +47,7 @@ USUAL_LENGTHS = {
     "motorcycle": 2.1,
     "cyclist": 1.8,
 }
-"""Usual length by category [m], for files that do not say what a unit is."""
+"""Typical length by category [m], for files without a unit."""
 
 log = structlog.get_logger(__name__)
 
@@ -91,7 +91,7 @@ class LibraryAsset:
 
     @property
     def figure(self) -> Figure | None:
-        """Of a person who walks; None for what is rigid."""
+        """Body model of a walking person; None for rigid assets."""
         return self.asset.figure
 
     @property
@@ -117,14 +117,14 @@ class LibraryAsset:
 
 
 class AssetLibrary:
-    """The assets below a folder. Safe to use on any thread; reading and writing take time.
+    """The assets in a folder. Thread-safe; reading and writing are slow.
 
-    Those that were used last stay in memory as long as the budget has room. One that a scenario
-    shows stays alive with the scenario, and counts.
+    The most recently used assets stay in memory while the budget allows. An asset in use by a
+    scenario stays in memory with the scenario, and counts.
 
     Args:
-        folder: of asset bundles; it need not exist.
-        budget: of memory, shared with scenes; without it all assets stay in memory.
+        folder: folder of asset bundles; it need not exist.
+        budget: memory budget shared with scenes; without it all assets stay in memory.
     """
 
     def __init__(self, folder: Path, budget: MemoryBudget | None = None) -> None:
@@ -149,7 +149,7 @@ class AssetLibrary:
         return [_info(summary) for summary in found if summary is not None]
 
     def info(self, asset_id: str) -> AssetInfo:
-        """What the wire says about one. Raises ServiceError: UNKNOWN_ASSET."""
+        """The info of an asset. Raises ServiceError: UNKNOWN_ASSET."""
         summary = self._summary(asset_id)
         if summary is None:
             raise _unknown(asset_id)
@@ -179,12 +179,12 @@ class AssetLibrary:
 
     @property
     def held_bytes(self) -> int:
-        """Memory of the assets that are kept or in use, and of the one that is being read."""
+        """Memory of assets that are cached, in use, or being read [bytes]."""
         with self._lock:
             return self._reserved + sum(asset.nbytes for asset in self._alive.values())
 
     def idle(self) -> Sequence[IdleItem]:
-        """Assets that are kept. One that a scenario shows frees nothing when it is dropped."""
+        """Cached assets. Dropping one that a scenario uses frees no memory."""
         with self._lock:
             return [
                 IdleItem(used_at, self._strong[asset_id].nbytes, partial(self._drop, asset_id))
@@ -203,7 +203,7 @@ class AssetLibrary:
             return self.adopt(staging / "bundle", asset.asset_id, claim=claim)
 
     def adopt(self, folder: Path, asset_id: str, *, claim: str | None = None) -> AssetInfo:
-        """Take in a whole bundle of that id, which lies on the disk of the library.
+        """Move a complete bundle from the library's disk into the library.
 
         Raises:
             ServiceError: ALREADY_EXISTS.
@@ -229,7 +229,7 @@ class AssetLibrary:
 
     @contextmanager
     def removing(self, asset_id: str) -> Iterator[None]:
-        """Hide the asset from lookups while the block runs; it stays on disk until :meth:`remove`.
+        """Hide the asset from lookups during the block; it stays on disk until :meth:`remove`.
 
         Raises:
             ServiceError: UNKNOWN_ASSET, also while it is being removed.
@@ -254,7 +254,7 @@ class AssetLibrary:
         shutil.rmtree(trash, ignore_errors=True)
 
     def bundle(self, asset_id: str) -> Path:
-        """Where the bundle of that id belongs."""
+        """Path of an asset's bundle."""
         return self.folder / f"{asset_id}{ASSET_SUFFIX}"
 
     # --- inside -----------------------------------------------------------------------------
@@ -307,12 +307,12 @@ class AssetLibrary:
         return loaded
 
     def _drop(self, asset_id: str) -> int:
-        """Stop keeping an asset; the bytes that come free, none while others use it."""
+        """Drop an asset from the cache; returns the freed bytes, 0 while others use it."""
         with self._lock:
             asset = self._strong.pop(asset_id, None)
             self._kept.pop(asset_id, None)
             nbytes = asset.nbytes if asset is not None else 0
-            # The last reference of this function: who else has one keeps it alive.
+            # The last reference in this function; other references keep the asset alive.
             asset = None
             return 0 if asset_id in self._alive else nbytes
 
@@ -374,20 +374,20 @@ def import_asset(
     quota: Quota,
     claim: str | None = None,
 ) -> AssetInfo:
-    """Add the asset in a splat file, upright, centred and at a real size.
+    """Import an asset from a splat file: upright, centred and at a real size.
 
     Args:
-        library: gets it.
-        source: the file, in a folder of its own on the library's disk, where the bundle is made.
-        upload: what was asked for.
-        asset_id: of the asset.
-        limits: of the process that reads the file.
-        quota: of the library.
-        claim: of the request, see :mod:`.imports`.
+        library: the target library.
+        source: the file, in a separate folder on the library's disk, where the bundle is created.
+        upload: the request.
+        asset_id: id of the asset.
+        limits: limits of the process that reads the file.
+        quota: quota of the library.
+        claim: claim of the request, see :mod:`.imports`.
 
     Raises:
-        ServiceError: IMPORT_FAILED with the reason, PAYLOAD_TOO_LARGE for what comes out of the
-            file, ALREADY_EXISTS, QUOTA_EXCEEDED.
+        ServiceError: IMPORT_FAILED with the reason, PAYLOAD_TOO_LARGE for the file's content,
+            ALREADY_EXISTS, QUOTA_EXCEEDED.
     """
     if (made := library.made_by(claim, asset_id)) is not None:
         return made
@@ -410,10 +410,10 @@ def import_asset(
 
 BACKDROP = (0.90, 0.91, 0.93)
 FOCAL = 1.6
-"""Of the width of the picture: a mild telephoto lens, which bends cars little."""
+"""Focal length as a fraction of the image width: a mild telephoto lens, with low distortion."""
 
 VIEW_FROM = (1.0, 0.75, 0.45)
-"""Front left, from above."""
+"""Direction of the camera: front left, from above."""
 
 
 def draw_thumbnail(asset: Asset, *, width: int, backend: Backend) -> NDArray[np.uint8]:

@@ -24,13 +24,13 @@ from .scenes import Listing
 def scene_info(
     listing: Listing, state: SceneState, *, summary: SceneSummary | None, tracks: bool
 ) -> SceneInfo:
-    """What is said about a scene.
+    """The info of a scene.
 
     Args:
-        listing: of the scene folder.
-        state: where it is on its way into memory.
-        summary: what it holds; None when it is broken.
-        tracks: whether ego path and trajectories are given.
+        listing: listing of the scene folder.
+        state: its loading state.
+        summary: its content; None if it is broken.
+        tracks: whether to include the ego path and trajectories.
     """
     if summary is None:
         return SceneInfo(scene=listing.name, state=state, reason=listing.reason)
@@ -110,7 +110,7 @@ def camera_info(camera: Camera) -> CameraInfo:
 
 
 def recorded_optics(camera: Camera) -> OpticsSpec | None:
-    """What a camera really was, as the wire has it; None where that is not known."""
+    """The real optics of a camera, as a protocol model; None if unknown."""
     known = camera.recorded
     if known is None:
         return None
@@ -146,13 +146,13 @@ Kept = TypeVar("Kept", bytes, Tensor)
 
 
 class SplatFiles:
-    """Parts of clouds as spz files, those that cover most first; what was used last is kept.
+    """Parts of clouds as spz files, sorted by decreasing coverage, with a least-recently-used
+    cache.
 
-    May be called from many threads; work is done by one at a time, since whoever asks for the
-    same part twice, or for two parts of one cloud, would do it twice.
+    Thread-safe. Work is serialized, because two requests for one cloud would repeat its sorting.
 
     Args:
-        most_bytes: of what is kept: orders and files.
+        most_bytes: size limit of the cache: orders and files.
     """
 
     def __init__(self, *, most_bytes: int = MAX_BYTES) -> None:
@@ -163,17 +163,17 @@ class SplatFiles:
 
     @property
     def held_bytes(self) -> int:
-        """Memory of what is kept [bytes]."""
+        """Size of the cache [bytes]."""
         return self._bytes
 
     def part(self, cloud: GaussianCloud, known: tuple[str, ...], first: int, count: int) -> bytes:
-        """An spz file of at most ``count`` Gaussians after the ``first`` more important ones.
+        """An spz file of at most ``count`` Gaussians after the ``first`` ones.
 
         Args:
-            cloud: all of them.
-            known: names the content of ``cloud``: another content has another name.
-            first: how many of the more important ones to skip.
-            count: at most.
+            cloud: all Gaussians.
+            known: key of the content of ``cloud``; different content has a different key.
+            first: number of Gaussians to skip.
+            count: maximum number.
         """
         with self._turn:
             return self._remembered(

@@ -115,8 +115,8 @@ async def load(
 ) -> Response:
     """Load a scene into memory.
 
-    200 when it is there, at once or within two seconds; else 202 and the job that loads it. 507
-    when the memory budget does not allow it.
+    Returns 200 if it is loaded within two seconds, else 202 and the job that loads it. Returns 507
+    if the memory budget does not allow it.
     """
     state = worker.scene_cache.state(scene)
     if state is SceneState.RESIDENT:
@@ -175,9 +175,9 @@ async def view(
     request: Request,
     accept: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """One instant of the scene from cameras anywhere, with objects where the request has them.
+    """Render one instant of the scene from any cameras, with objects at the requested poses.
 
-    Nothing is kept of it: for other programs that drive and want pictures.
+    Nothing is stored. For external simulators that need images.
     """
     modalities = [name for camera in body.cameras for name in camera.modalities]
     media_type = choose_frames_type(accept, modalities)
@@ -188,7 +188,7 @@ async def view(
 
 
 def _wait_seconds(prefer: str | None) -> float:
-    """Seconds that a client wants to wait for the end of a job."""
+    """Seconds that a client is willing to wait for the end of a job."""
     preference = (prefer or "").lower()
     if "respond-async" in preference:
         return 0.0
@@ -395,8 +395,8 @@ async def splats(
     content_hash: KnownHash = None,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """Gaussians of the background (world frame) or of one object (its box's frame), those that
-    cover most first, as an spz file; axes are kept: z is up."""
+    """Gaussians of the background (world frame) or of one object (its box's frame) as an spz file,
+    sorted by decreasing coverage; z is up."""
     resident = await worker.scene_cache.get(scene)
     headers = _caching(resident, content_hash, f"splats {object_id} {first} {count}")
     subject = None if object_id is None else resident.object(object_id)
@@ -450,7 +450,7 @@ async def sky(
 
 
 def _caching(scene: Scene, content_hash: str | None, what: str) -> dict[str, str]:
-    """Headers that say for how long an answer holds. Raises ServiceError: NOT_FOUND."""
+    """Cache headers of a response. Raises ServiceError: NOT_FOUND."""
     if content_hash is not None and content_hash != scene.content_hash:
         raise ServiceError(
             ErrorCode.NOT_FOUND,
@@ -490,9 +490,9 @@ async def object_splats(
     object_id: Annotated[Identifier, Query(description="of which, in the frame of its box")],
     t_us: Annotated[Microseconds | None, Query(description="default: its start")] = None,
 ) -> Response:
-    """The Gaussians of one object of a scenario as it is now, those that cover most first: of an
-    asset, of a person as far in walking as at ``t_us``, as large as edits have made it. An spz file
-    in the frame of its box; axes are kept: z is up."""
+    """The current Gaussians of one object of a scenario, sorted by decreasing coverage: of an
+    asset, or of a person in the pose at ``t_us``, at its edited size. An spz file in the frame of
+    its box; z is up."""
     view = await worker.scenarios.view(scenario_id)
     scene = await worker.scene_cache.get(view.row.scene)
     subject = next((o for o in view.state.visible if o.object_id == object_id), None)
