@@ -33,9 +33,8 @@ from .worker import Worker
 
 # --- Garbage collection --------------------------------------------------------------------------
 
-# A full collection takes 0.2 s, during which no session is answered. With the default thresholds
-# one is due every few thousand steps, although nearly all objects were there before the first
-# step and stay.
+# A full collection takes 0.2 s and blocks all sessions. The default thresholds trigger one every
+# few thousand steps, although nearly all objects exist before the first step and stay.
 
 YOUNG = 20_000
 """New objects between two small searches; a step makes some 200, nearly all of which go by
@@ -43,13 +42,13 @@ themselves."""
 
 
 def search_seldom() -> None:
-    """Let many steps pass between searches."""
+    """Raise the thresholds, so that collections are many steps apart."""
     gc.set_threshold(YOUNG, *gc.get_threshold()[1:])
 
 
 def spare_what_is_there() -> None:
-    """Search no more through what is there now. Once, when a worker has all that it starts with:
-    what of it becomes garbage in a cycle stays."""
+    """Exclude all current objects from collections. Call once, when a worker has started: current
+    objects that become cyclic garbage are never freed."""
     gc.collect(1)
     gc.freeze()
 
@@ -107,7 +106,8 @@ PING_INTERVAL_S = 10.0
 PING_TIMEOUT_S = 20.0
 POLL_S = 0.02
 LINGER_S = 1.5
-"""For which a worker that has handed its sessions over tells clients so, until its proxy knows."""
+"""Time for which a worker that has handed over its sessions tells clients so, until its proxy has
+noticed [s]."""
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,9 @@ class RunningWorker:
     """A worker in a thread of this process.
 
     Attributes:
-        url: where it listens, for example ``http://127.0.0.1:41234``.
-        token: what it wants from clients.
-        worker: its inside.
+        url: its address, for example ``http://127.0.0.1:41234``.
+        token: token that it requires.
+        worker: the worker object.
     """
 
     url: str
@@ -126,14 +126,14 @@ class RunningWorker:
 
 
 def run(settings: Settings) -> int:
-    """Serve until SIGINT or SIGTERM; the exit code: 1 where the device was lost.
+    """Serve until SIGINT or SIGTERM; returns the exit code: 1 if the device was lost.
 
     Raises:
-        OpenBindError: another address than loopback, and no token.
-        SceneFolderError: the folder of scenes is missing.
-        AddressError: the address is taken, or none of this machine.
-        RenderError: the backend of the settings cannot be used here.
-        StateFolderError: another worker is on the state folder, or it cannot be written to.
+        OpenBindError: an address other than loopback, without a token.
+        SceneFolderError: the scene folder is missing.
+        AddressError: the address is in use, or not of this machine.
+        RenderError: the backend of the settings is not available here.
+        StateFolderError: another worker uses the state folder, or it is not writable.
         StoreError: the store cannot be opened.
     """
     check_bind(settings.host, settings.wants_token)
@@ -160,16 +160,16 @@ def run(settings: Settings) -> int:
 
 @contextmanager
 def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[RunningWorker]:
-    """A worker in a background thread, ready to be used; for tests, demo and benches.
+    """A ready worker in a background thread; for tests, demos and benchmarks.
 
     Args:
-        settings: ``port`` 0 takes a free one.
-        timeout_s: for it to become ready.
+        settings: ``port`` 0 uses a free one.
+        timeout_s: maximum startup time.
 
     Raises:
-        OpenBindError: another address than loopback, and no token.
-        SceneFolderError: the folder of scenes is missing.
-        AddressError: the address is taken, or none of this machine.
+        OpenBindError: an address other than loopback, without a token.
+        SceneFolderError: the scene folder is missing.
+        AddressError: the address is in use, or not of this machine.
         RuntimeError: it ended, or was not ready in time; with its reasons.
     """
     check_bind(settings.host, settings.wants_token)
@@ -197,7 +197,7 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
 
 @contextmanager
 def _start_errors_told_once(worker: Worker) -> Iterator[None]:
-    """Whoever starts the worker is told what is in its way: no traceback in the log besides."""
+    """Report startup errors once, without an additional traceback in the log."""
 
     def is_news(_record: logging.LogRecord) -> bool:
         return worker.start_error is None or not is_expected(worker.start_error)
@@ -207,7 +207,7 @@ def _start_errors_told_once(worker: Worker) -> Iterator[None]:
     try:
         yield
     except SystemExit:
-        # The server's way to say that it has not started.
+        # How uvicorn reports that it has not started.
         if worker.start_error is None:
             raise
     finally:
@@ -215,11 +215,12 @@ def _start_errors_told_once(worker: Worker) -> Iterator[None]:
 
 
 class DrainingServer(uvicorn.Server):
-    """uvicorn's server; after SIGTERM it serves on for a while, not ready, before it stops.
+    """uvicorn's server; after SIGTERM it continues to serve for a while, not ready, before it
+    stops.
 
     Args:
-        config: of the server.
-        worker: drains; its settings say for how long.
+        config: config of the server.
+        worker: drains; its settings limit the duration.
     """
 
     def __init__(self, config: uvicorn.Config, worker: Worker) -> None:
@@ -246,7 +247,7 @@ class DrainingServer(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def _handed_over(self) -> bool:
-        """Whether other workers have what this one had."""
+        """Whether other workers have taken over this one's sessions."""
         try:
             return await self._worker.hand_over()
         except StoreError:
@@ -263,7 +264,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         server_header=False,
         lifespan="on",
         ws="websockets-sansio",
-        # Deflating a frame takes 20 ms and gains nothing: images do not compress.
+        # Deflating a frame takes 20 ms for nothing: images do not compress.
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
         ws_ping_interval=PING_INTERVAL_S,

@@ -62,15 +62,15 @@ log = structlog.get_logger(__name__)
 
 @dataclass(eq=False)
 class Worker:
-    """One worker: what it is made of, and whether it takes work.
+    """One worker: its parts, and whether it accepts work.
 
     Attributes:
-        device: what draws, and why.
-        waiting_for: what has to happen before the worker is ready.
-        draining: whether the worker is on its way out.
-        handed_over: whether its sessions and jobs are others' by now.
+        device: the rendering device, and the reason for its choice.
+        waiting_for: pending steps before the worker is ready.
+        draining: whether the worker is shutting down.
+        handed_over: whether other workers have its sessions and jobs.
         start_error: why it did not start.
-        on_ready: called on the event loop when all is there that the worker starts with.
+        on_ready: called on the event loop when startup is complete.
     """
 
     settings: Settings
@@ -222,7 +222,7 @@ class Worker:
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.store.watch()))
             at_exit.push_async_callback(self.scenarios.flush)
             maintenance = Maintenance(self.settings, self.store, self.jobs, self.sessions)
-            # Nobody uploads yet: what lies about now was left behind.
+            # No uploads yet: existing temporary files are abandoned.
             await asyncio.to_thread(partial(maintenance.sweep, at_start=True))
             if self.settings.demo:
                 await asyncio.to_thread(self._add_demo)
@@ -258,9 +258,9 @@ class Worker:
             yield self
 
     def readiness(self) -> Readiness:
-        """Whether the worker can work, and if not, why.
+        """Whether the worker can work, and the reason if it cannot.
 
-        A busy worker is ready: it refuses what is too much by request, and metrics tell.
+        A busy worker is ready: it refuses excess work per request, and metrics report it.
         """
         reasons = sorted(self.waiting_for)
         if WARMING_UP in reasons and (compiling := self.kernels.compiling()) is not None:
@@ -318,7 +318,7 @@ class Worker:
         return answer
 
     async def video_source(self, job_id: str) -> VideoSource:
-        """What a finished simulation or drive shows.
+        """Video source of a finished simulation or drive.
 
         Raises:
             ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED, or INVALID_REQUEST for other jobs.
@@ -327,12 +327,12 @@ class Worker:
         return await shown.video_source(job_id)
 
     def drain(self) -> None:
-        """Show that the worker is on its way out, and begin no sessions; open ones go on."""
+        """Start the shutdown: no new sessions; open ones continue."""
         self.draining = self.sessions.draining = True
 
     @asynccontextmanager
     async def _hear(self) -> AsyncIterator[None]:
-        """Word from other workers reaches who waits for it, for the length of the block."""
+        """Deliver notifications of other workers during the block."""
         settings = self.settings
         notices = Notices(settings.database_url, timeout_s=settings.store_timeout_seconds)
         if notices.can_hear:
@@ -343,7 +343,7 @@ class Worker:
             yield
 
     def _share(self, job_log: JobLog) -> None:
-        """Connect to the store of objects, where there is one."""
+        """Connect to the object store, if there is one."""
         settings = self.settings
         if settings.objects_url is None:
             return
@@ -368,11 +368,11 @@ class Worker:
         self.jobs.on_forget = partial(self.sharing.forget, "job")
 
     async def hand_over(self) -> bool:
-        """Leave sessions and jobs to other workers; False where there are none that would take
-        them: they go on when this one is back.
+        """Hand over sessions and jobs to other workers. False if none would accept them: they
+        continue when this one is back.
 
         Raises:
-            StoreError: of the database; nothing was left.
+            StoreError: from the database; nothing was handed over.
         """
         rows = await self.leases.workers()
         others = [w for w in rows if w.alive and w.worker_id != self.settings.worker_id]
@@ -418,7 +418,7 @@ class Worker:
         )
 
     def _about(self) -> dict[str, Any]:
-        """What the fleet is told about this worker."""
+        """Status of this worker for the fleet."""
         return {
             "version": version("real2sim"),
             "backend": self.backend.name,
@@ -434,7 +434,7 @@ class Worker:
         }
 
     def _held(self) -> dict[str, list[int]]:
-        """Sessions and unfinished jobs by the name of whose they are."""
+        """Sessions and unfinished jobs by name of their owner."""
         sessions, jobs = self.sessions.owned(), self.jobs.unfinished()
         return {
             name: [sessions[name], jobs[name]] for name in sorted(sessions.keys() | jobs.keys())

@@ -1,4 +1,4 @@
-"""The server itself: what it is, its health and metrics, the reference of calls, the studio."""
+"""The server: its status, health and metrics, the API reference, the studio."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ async def describe(worker: WorkerOf) -> ServerInfo:
 
 @router.get("/fleet")
 async def fleet(worker: WorkerOf) -> Fleet:
-    """The workers that share this one's store, with what each last told of itself."""
+    """The workers that share this one's store, with the last status each reported."""
     members = [
         FleetMember.model_validate({**row.document, "worker_id": row.worker_id, "alive": row.alive})
         for row in await worker.leases.workers()
@@ -141,10 +141,10 @@ IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
 
 
 def policy_of(page: str) -> str:
-    """Nothing from elsewhere: the studio works offline, and what is no part of it cannot run.
+    """Content security policy: no external content, because the studio works offline.
 
-    The map of the page's vendored modules is allowed by its hash. The renderer of Gaussians sorts
-    in WebAssembly that it carries as ``data:``, on a worker that it makes of a ``blob:``.
+    The import map of the page's vendored modules is allowed by its hash. The Gaussian renderer
+    sorts in WebAssembly loaded from ``data:``, in a web worker created from a ``blob:``.
     """
     maps = IMPORT_MAP.findall(page)
     hashes = (base64.b64encode(hashlib.sha256(m.encode()).digest()).decode() for m in maps)
@@ -179,7 +179,7 @@ async def file(name: str) -> Response:
             hint="open /ui/",
         )
     headers = {
-        # What is vendored has its version in its path.
+        # Vendored files have their version in their path.
         "Cache-Control": "public, max-age=31536000, immutable"
         if name.startswith("vendor/")
         else "no-cache",

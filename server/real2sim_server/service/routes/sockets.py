@@ -94,7 +94,7 @@ async def _serve_drive(
         resume_token=worker.sessions.resume_token(row),
     )
     try:
-        # Who has the session's token alone drives for whoever made it.
+        # A client with only the session's token drives on behalf of its owner.
         account = account or account_of_token(worker, hello.token)
         account = account or worker.accounts.of_owner(row.owner)
         act_for(socket, account)
@@ -137,10 +137,10 @@ def common_protocol(socket: WebSocket) -> str:
 
 
 def account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
-    """Whose token of the worker the handshake has; hello may carry one instead.
+    """The account of the worker's token in the handshake; hello may have one instead.
 
     Raises:
-        ServiceError: UNAUTHORIZED for a wrong one.
+        ServiceError: UNAUTHORIZED for a wrong token.
     """
     given = bearer_token(socket)
     if given is None or not worker.accounts.wants_token:
@@ -153,7 +153,7 @@ def account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
 
 
 def account_of_token(worker: Worker, token: str | None) -> Account | None:
-    """Whose token of the worker it is; None where the worker has none."""
+    """The account of a worker's token; None for other tokens."""
     return worker.accounts.of_token(token) if worker.accounts.wants_token else None
 
 
@@ -169,7 +169,7 @@ def ended_when_revoked(connection: Connection, account: Account) -> Iterator[Non
 
 
 def _end(connection: Connection, account: Account) -> None:
-    """Leave a client whose token is no more; not awaited, for it may be slow to read."""
+    """Disconnect a client whose token was removed; not awaited, because it may read slowly."""
     ending = asyncio.ensure_future(connection.end(service_error(RevokedError(account.name))))
     _ending.add(ending)
     ending.add_done_callback(_ending.discard)
@@ -191,16 +191,16 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class ViewRequest(Model):
-    """A question of the browser.
+    """A request of the browser.
 
     Attributes:
-        seq: comes back with the answer.
-        T_world_camera: 16 values, row by row: a free camera with the intrinsics of ``camera``;
-            None for the recorded place.
-        operations: applied to this picture alone: the preview of an edit in the making.
+        seq: returned with the answer.
+        T_world_camera: 16 values, row-major: a free camera with the intrinsics of ``camera``;
+            None for the recorded pose.
+        operations: applied to this picture only: preview of an unfinished edit.
         job: finished simulation to show instead of the scenario.
-        shows: what the picture is of; ``uncertainty`` comes in colours, see uncertainty_picture.
-        pick: (across, down) in shares of the picture: ask for the object there instead.
+        shows: modality of the picture; ``uncertainty`` is coloured, see uncertainty_picture.
+        pick: (across, down) in fractions of the picture: query the object there instead.
     """
 
     seq: int = 0
@@ -220,8 +220,8 @@ VIEW_REQUEST: TypeAdapter[ViewRequest] = TypeAdapter(ViewRequest)
 class ViewConnection:
     """One browser's view of one scenario.
 
-    The reader keeps one picture and one pick that wait; a newer one takes the place of the older,
-    so a slow drawing never leaves a queue behind it.
+    The reader buffers one picture and one pick request; a newer one replaces the older, so slow
+    rendering never builds up a queue.
     """
 
     def __init__(self, socket: WebSocket, worker: Worker, scenario_id: str) -> None:
@@ -238,7 +238,7 @@ class ViewConnection:
         self._revoked.set()
 
     async def serve(self) -> None:
-        """Answer until the browser leaves. Raises RevokedError: it has to."""
+        """Answer until the browser leaves. Raises RevokedError if its token is removed."""
         reader = asyncio.create_task(self._read())
         answerer = asyncio.create_task(self._answer_requests())
         tasks = {reader, answerer, asyncio.create_task(self._until_revoked())}
@@ -365,12 +365,12 @@ class ViewConnection:
 
 
 def instance_at(ids: NDArray[np.uint16], place: tuple[float, float], *, reach: int = 3) -> int:
-    """Id under a pointer; near the rim of an object the object, not the background.
+    """Id of the object under a pointer; near its edge the object, not the background.
 
     Args:
         ids: [H, W] instance image.
-        place: (across, down) in shares of the picture.
-        reach: how far beside the pointer an object may be [px].
+        place: (across, down) in fractions of the picture.
+        reach: maximum distance of an object from the pointer [px].
     """
     height, width = ids.shape
     column = min(int(place[0] * width), width - 1)
@@ -431,7 +431,7 @@ CLOSED_BY = {
     ErrorCode.TOO_MANY_REQUESTS: CLOSED_OVER_LIMIT,
 }
 
-# Not json.loads(): it follows nesting until the stack ends, and lets lone surrogates pass.
+# Not json.loads(): deep nesting overflows its stack, and it accepts lone surrogates.
 _HELLO: TypeAdapter[dict[str, object]] = TypeAdapter(dict[str, object])
 
 
@@ -439,10 +439,10 @@ view_router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"])
 
 
 class NoHelloError(Exception):
-    """A first message that lets nobody in.
+    """An invalid first message.
 
     Args:
-        code: with which the socket is closed.
+        code: close code of the socket.
         reason: sent with it.
     """
 
@@ -488,11 +488,11 @@ async def _serve_view(
 
 
 async def _check_hello(socket: WebSocket, worker: Worker) -> Account:
-    """Read `{"type": "hello", "token": ...}`; whose token it is.
+    """Read `{"type": "hello", "token": ...}`; returns the token's account.
 
     Raises:
-        NoHelloError: the token is not right.
-        OverLimitError: its holder has had their requests.
+        NoHelloError: the token is wrong.
+        OverLimitError: the account's request limit is reached.
     """
     try:
         async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):

@@ -57,7 +57,7 @@ class ScenarioView:
     can_redo: bool
 
     def info(self, *, tracks: bool = True) -> ScenarioInfo:
-        """What the wire says about it; takes milliseconds where there are many trajectories."""
+        """The info for clients; takes milliseconds with many trajectories."""
         return ScenarioInfo(
             **scenario_head(self.row, self.revision),
             can_undo=self.can_undo,
@@ -174,7 +174,7 @@ def operation_result(
 
 
 def stale_revision(scenario: Scenario, expected: int) -> ServiceError:
-    """The refusal of a change made for another revision, with what was missed."""
+    """The refusal of a change for another revision, with the missed entries."""
     entries = scenario.entries[max(0, expected) :]
     missed = [history_entry(e).model_dump(mode="json") for e in entries]
     return ServiceError(
@@ -196,7 +196,7 @@ def changed_elsewhere(scenario_id: str) -> ServiceError:
 
 
 def listed_info(row: ScenarioRow, kinds: Sequence[str]) -> ScenarioInfo:
-    """What a list says of a scenario, from the kinds of its log entries."""
+    """Info of a scenario in a list, from the kinds of its log entries."""
     done = undone = 0
     for kind in kinds:
         match kind:
@@ -232,8 +232,8 @@ def iso_time(instant_us: int) -> str:
 # A long log then replays only its end.
 
 INTERVAL = 128
-"""Revisions between snapshots: each takes a few milliseconds off the back of one edit in so many,
-and opening applies fewer than this many edits."""
+"""Revisions between snapshots. A snapshot adds a few milliseconds after one edit in this many, and
+opening a scenario applies fewer than this many edits."""
 
 FORMAT = 1
 
@@ -241,10 +241,9 @@ log = structlog.get_logger(__name__)
 
 
 class Snapshots:
-    """Snapshots of all scenarios of a worker. Belongs to the event loop.
+    """Snapshots of all scenarios of a worker, for use on the event loop.
 
-    They are a convenience: written after the answer, never waited for, and passed over when
-    anything is odd about them.
+    They are optional: written after the reply, never waited for, and ignored if invalid.
     """
 
     def __init__(self, store: Store) -> None:
@@ -256,7 +255,8 @@ class Snapshots:
     async def load(
         self, row: ScenarioRow, summary: SceneSummary, assets: AssetLookup | None
     ) -> Scenario:
-        """A scenario from its log, which is what counts, and from a snapshot where there is one."""
+        """Load a scenario from its log, which is authoritative, and from a snapshot if there is
+        one."""
         stored = await self._store.scenario_entries(row.scenario_id)
         initial = await asyncio.to_thread(ScenarioState.of, summary, assets=assets)
         known = await self._read(row.scenario_id, initial, revisions=len(stored))
@@ -291,7 +291,7 @@ class Snapshots:
     async def _read(
         self, scenario_id: str, initial: ScenarioState, *, revisions: int
     ) -> tuple[int, ScenarioState] | None:
-        """A revision and the state after it; None where there is none of use."""
+        """A revision and its state; None without a usable snapshot."""
         row = await self._store.snapshot(scenario_id) if revisions >= INTERVAL else None
         if row is None or row.made_by != self._made_by or row.revision > revisions:
             return None
@@ -315,19 +315,19 @@ class Snapshots:
 
 # --- Recorded scenes -----------------------------------------------------------------------------
 
-# A scene as it was recorded serves as a scenario that nobody can change.
+# A recorded scene is available as a read-only scenario.
 
 PREFIX = "recorded."
 """Before the content hash of a scene: the id of its recording. No other id begins like that."""
 
 
 def recorded_hash(scenario_id: str) -> str | None:
-    """Content hash of the scene whose recording has this id; None of scenarios that were made."""
+    """Content hash of the scene whose recording has this id; None for other scenarios."""
     return scenario_id.removeprefix(PREFIX) if scenario_id.startswith(PREFIX) else None
 
 
 def recorded_row(scene: str, summary: SceneSummary) -> ScenarioRow:
-    """What the store would have of it, were it stored."""
+    """The row of a recorded scenario, which is not stored."""
     return ScenarioRow(
         scenario_id=f"{PREFIX}{summary.content_hash}",
         name="",
@@ -338,7 +338,7 @@ def recorded_row(scene: str, summary: SceneSummary) -> ScenarioRow:
 
 
 def check_made(scenario_id: str) -> None:
-    """Raises ServiceError: INVALID_OPERATION for a recording, which nobody can change."""
+    """Raises ServiceError: INVALID_OPERATION for a recording, which is read-only."""
     if recorded_hash(scenario_id) is not None:
         raise ServiceError(
             ErrorCode.INVALID_OPERATION,
@@ -368,7 +368,7 @@ class CachedScenario:
 
 
 class ScenarioCache:
-    """The most recently used scenarios. Belongs to the event loop."""
+    """The most recently used scenarios, for use on the event loop."""
 
     def __init__(
         self,
@@ -389,17 +389,17 @@ class ScenarioCache:
         self._cached.pop(scenario_id, None)
 
     async def wait_for_changes(self) -> None:
-        """Wait for the changes that are under way."""
+        """Wait for the changes in progress."""
         for cached in list(self._cached.values()):
             async with cached.lock:
                 pass
 
     @asynccontextmanager
     async def locked(self, scenario_id: str) -> AsyncIterator[CachedScenario]:
-        """The scenario while nobody else changes it.
+        """The scenario, locked against other changes.
 
         Raises:
-            ServiceError: as :meth:`get`, or INVALID_OPERATION for what was recorded.
+            ServiceError: as :meth:`get`, or INVALID_OPERATION for a recording.
         """
         check_made(scenario_id)
         while True:
@@ -452,9 +452,10 @@ class ScenarioCache:
         raise _unknown(scenario_id)
 
     async def _is_current(self, scenario_id: str, cached: CachedScenario) -> bool:
-        """Whether a scenario in memory is, by now, what the log says; evicts it where it is not.
+        """Whether a cached scenario matches the log; evicts it if not.
 
-        The log is asked each time, because other workers on the same store may have written to it.
+        The log is checked each time, because other workers with the same store may have written to
+        it.
         """
         known = cached.scenario.revision
         newest = await self._store.newest_of_scenario(scenario_id)
@@ -469,7 +470,7 @@ class ScenarioCache:
             self.evict(scenario_id)
             return False
         if stored > cached.scenario.revision:
-            # What a change of our own has written takes effect before its lock is free.
+            # Our own changes take effect before their lock is released.
             async with cached.lock:
                 await self._catch_up(scenario_id, cached)
         if self._cached.get(scenario_id) is not cached:
@@ -478,7 +479,7 @@ class ScenarioCache:
         return True
 
     async def _catch_up(self, scenario_id: str, cached: CachedScenario) -> None:
-        """Apply what others have added to the log; the scenario's lock is held."""
+        """Apply entries that others have added to the log; the scenario's lock is held."""
         scenario = cached.scenario
         missed = await self._store.scenario_entries(scenario_id, after=scenario.revision)
         if missed:

@@ -1,23 +1,23 @@
-"""The step pipeline: a change of a session's world becomes an observation of it.
+"""The step pipeline: from a change of a session's world to its observation.
 
 ============  ==============  ====================================================================
-phase         runs on         what happens
+phase         runs on         purpose
 ============  ==============  ====================================================================
-``receive``   event loop      a message is read and validated (`connection`)
-``check``     event loop      role, session, lock step: is this action due (`connection`)
-``advance``   worlds, engine  a fork of the world moves, as far as images show it
-``render``    engine          deformations, then images and clouds of the sensors that are due
-``evaluate``  worlds, beside  metrics and events; the log entry is written; the observation is
-              the rendering   packed but for its images
-``encode``    encoders        images are encoded, raw ones copied into shared memory; the parts
-                              become one message
-``send``      event loop      the message is written to the socket (`connection`)
+``receive``   event loop      read and validate a message (`connection`)
+``check``     event loop      check role, session and step of the action (`connection`)
+``advance``   worlds, engine  advance a fork of the world, except for parts that images do not show
+``render``    engine          deformations, then images and clouds of the due sensors
+``evaluate``  worlds, during  metrics and events; write the log entry; pack the observation without
+              rendering       its images
+``encode``    encoders        encode images, copy raw ones into shared memory; join the parts into
+                              one message
+``send``      event loop      write the message to the socket (`connection`)
 ============  ==============  ====================================================================
 
-A world without sensors moves on a thread of its own: it needs no device, and its planner does not
-wait while other sessions are rendered. Steps that wait for a thread together pass the phases
-together: their log entries are one transaction, and where the backend can, their images are drawn
-in one go, each with the bits that it would have alone. No step waits for one that is not there yet.
+A world without sensors advances on a separate thread: it needs no device, and its planner does not
+wait while other sessions are rendered. Steps that wait for a thread at the same time are processed
+as a batch: their log entries are one transaction, and if the backend supports it, their images are
+rendered in one pass, bit-identical to separate rendering. No step waits for later ones.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ MAX_WAITING = 1024
 
 @dataclass(frozen=True, eq=False)
 class LogWrite:
-    """Entries of a session's log on their way to the store.
+    """Entries of a session's log to be stored.
 
     Attributes:
-        store: takes them.
-        claim: on the session.
-        entries: of its log.
-        instead: whether they replace what may be on record from there on.
+        store: the store.
+        claim: the claim on the session.
+        entries: the entries.
+        instead: whether they replace stored entries from there on.
     """
 
     store: Store
@@ -79,15 +79,15 @@ class LogWrite:
 
 @dataclass(frozen=True, eq=False)
 class EncodedObservation:
-    """An instant as a message.
+    """An observation as a message.
 
     Attributes:
-        world: at that instant; it is not committed by being shown.
-        frames: the images of the message.
-        message: for all who get it, whole.
-        timing_ms: by stage.
-        placed: for the client that is answered, where its images lie in shared memory.
-        clouds: of the message.
+        world: the observed world; not yet committed.
+        frames: images of the message.
+        message: complete message for all recipients.
+        timing_ms: durations by stage.
+        placed: message for the answered client, if its images are in shared memory.
+        clouds: point clouds of the message.
     """
 
     world: World
@@ -105,23 +105,23 @@ class EncodedObservation:
 
 @dataclass(eq=False)
 class Step:
-    """A change of a session's world on its way to an observation.
+    """A change of a session's world, until its observation.
 
     Attributes:
-        change: makes the new world, complete as far as images show it, and leaves the present one
-            alone; runs off the event loop.
-        cameras: of the world's sensors, by name, at the sizes they name.
-        clouds: whether those of its LiDARs and radars are made.
-        log: is written once the new world is evaluated; None where it is in the log already.
-        slot: that raw images of the answer may be written to.
-        drawn_with: the scene with whose other steps this one may be drawn; None for none.
-        timer: of the stages.
-        world: the new one, once it has moved.
-        sensors, ranging: that are due in it.
-        images, measured: of these, in their order.
-        members: of the message, without images, clouds and timing.
+        change: creates the new world, complete except for parts that images do not show, without
+            modifying the current one; runs off the event loop.
+        cameras: cameras of the world's sensors by name, at the requested sizes.
+        clouds: whether to compute clouds of its LiDARs and radars.
+        log: written once the new world is evaluated; None if it is already in the log.
+        slot: shared memory slot for raw images.
+        drawn_with: scene whose steps can be rendered in the same batch; None for no batching.
+        timer: timer of the stages.
+        world: the new world, after advancing.
+        sensors, ranging: due sensors.
+        images, measured: their results, in order.
+        members: members of the message, without images, clouds and timing.
         recorded: whether ``log`` is written.
-        error: why the step has failed.
+        error: reason for a failure.
     """
 
     change: Callable[[], World]
@@ -148,7 +148,7 @@ class Step:
 
     @contextlib.contextmanager
     def catching(self) -> Iterator[None]:
-        """A phase whose failure is this step's alone."""
+        """Assign an error of the block to this step only."""
         try:
             yield
         except Exception as error:
@@ -156,20 +156,20 @@ class Step:
 
 
 class KernelsMissingError(Exception):
-    """An image has to wait for kernels of deformation; nothing has happened."""
+    """An image has to wait for deformation kernels; the request had no effect."""
 
 
 class StepPipeline:
-    """Makes observations of changed worlds, and views of present ones.
+    """Computes observations of changed worlds, and views of current ones.
 
     Args:
-        engine: runs what is rendered.
+        engine: runs the rendering.
         renderer: renders and encodes.
-        metrics: gets durations by stage.
-        deformation: kernels that images after impacts need.
-        max_pixels: over all images of one instant.
-        max_rays: over all LiDARs and radars of one instant.
-        caster: name of the backend that casts their rays, see :func:`.cast`.
+        metrics: receives durations by stage.
+        deformation: kernels for images after impacts.
+        max_pixels: limit over all images of one step.
+        max_rays: limit over all LiDARs and radars of one step.
+        caster: name of the ray casting backend, see :func:`.cast`.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class StepPipeline:
         self._worlds.stop(drain=False)
         self._evaluators.shutdown(cancel_futures=True)
 
-    # --- what a session waits for before it begins ----------------------------------------------
+    # --- preparation before an episode begins ---------------------------------------------------
 
     def cameras(self, scene: Scene, sensors: Sequence[SensorSpec]) -> dict[str, Camera]:
         """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
@@ -211,10 +211,11 @@ class StepPipeline:
     async def ranging_ready(
         self, ranging: RangingSensors, sensors: Sequence[SensorSpec], cameras: Mapping[str, Camera]
     ) -> None:
-        """Wait until clouds of an episode can be made.
+        """Wait until clouds of an episode can be computed.
 
         Raises:
-            ServiceError: INVALID_REQUEST for too many rays, or bytes beside those of raw images.
+            ServiceError: INVALID_REQUEST for too many rays, or for bytes that exceed the message
+                size together with raw images.
         """
         size = raw_image_bytes(sensors, [cameras[sensor.camera] for sensor in sensors])
         await self._clouds.ready(ranging, image_bytes=size)
@@ -226,7 +227,7 @@ class StepPipeline:
         sensors: Sequence[SensorSpec],
         cameras: Mapping[str, Camera],
     ) -> None:
-        """Wait until small images of a scenario have what they are drawn from, off the engine.
+        """Prepare the levels of detail for small images of a scenario, off the engine.
 
         Raises:
             ServiceError: OUT_OF_MEMORY.
@@ -235,7 +236,7 @@ class StepPipeline:
         await self._renderer.ready(sensors, sizes, lambda: things_at_start(scene, state))
 
     async def edit_ready(self, world: World, cameras: Mapping[str, Camera]) -> None:
-        """The same for a world that has just been edited, by what it shows now and later."""
+        """As :meth:`levels_ready` for an edited world, for its current and later objects."""
         sensors = world.spec.sensors
 
         def shown() -> list[Instance]:
@@ -312,7 +313,8 @@ class StepPipeline:
         return [step.error for step in steps]
 
     def advance(self, steps: Sequence[Step]) -> None:
-        """Move the worlds, as far as images show them, and find the sensors that are due."""
+        """Advance the worlds, except for parts that images do not show, and find the due
+        sensors."""
         for step in steps:
             with step.catching():
                 world = step.world = step.world or step.change()
@@ -331,7 +333,7 @@ class StepPipeline:
         try:
             self._draw(drawn)
         except Exception:
-            # Each then finds out for itself: the trouble of one is not that of the others.
+            # Then render them one by one, so that one failure does not affect the others.
             for step in drawn:
                 with step.catching():
                     self._draw([step])
@@ -343,7 +345,7 @@ class StepPipeline:
                 step.timer.stage("cast")
 
     def evaluate(self, steps: Sequence[Step]) -> None:
-        """Complete the worlds by what images do not show, write the log, and describe them."""
+        """Complete the worlds, write the log, and prepare the messages."""
         moved = [step for step in steps if step.world is not None and step.error is None]
         for step in moved:
             with step.catching():
@@ -355,7 +357,7 @@ class StepPipeline:
                 step.members = pack_members(step.moved.observe().obs_fields())
 
     async def encode(self, step: Step, kind: str) -> EncodedObservation:
-        """The observation encoded; counted once the answer is on its way."""
+        """The encoded observation; counted when the reply is sent."""
         if step.images or step.measured:
             frames = await self._renderer.encode(step.images)
             pack = partial(_packed, step, kind)
@@ -372,13 +374,13 @@ class StepPipeline:
             step.images = _estimated(step.moved, images)
 
     def _require_kernels(self, world: World) -> None:
-        """Raises KernelsMissingError where images of a world would compile on the engine, which
-        belongs to all sessions."""
+        """Raises KernelsMissingError if images of a world would compile kernels on the engine,
+        which all sessions share."""
         shapes = world.deformation
         if shapes is not None and shapes.has_impacts and not self._deformation.ready:
             raise KernelsMissingError
 
-    # --- a view of a world that stays as it is --------------------------------------------------
+    # --- views of an unchanged world ------------------------------------------------------------
 
     async def view(
         self,
@@ -388,17 +390,17 @@ class StepPipeline:
         ranging: RangingSensors = NO_SENSORS,
         slot: FrameSlot | None = None,
     ) -> EncodedObservation:
-        """Images and clouds of a committed instant, from the vehicle; time does not move.
+        """Images and clouds of a committed step, from the vehicle; time does not advance.
 
         Args:
-            world: at that instant.
-            sensors: what it is seen by.
-            ranging: LiDARs and radars that look, too; all of them are due.
-            slot: that raw images of the answer may be written to.
+            world: the world at that step.
+            sensors: the cameras.
+            ranging: LiDARs and radars, all of them due.
+            slot: shared memory slot for raw images.
 
         Raises:
             ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
-            QueueFullError: too much waits for the engine.
+            QueueFullError: the engine's queue is full.
         """
         cameras = cameras_of(world.scene, sensors, max_pixels=self._max_pixels)
         things = partial(things_at_start, world.scene, world.state)
@@ -450,9 +452,9 @@ class StepPipeline:
         return await self._engine.call(cast, label="sweep")
 
     async def first_render(self, scene: Scene, state: ScenarioState) -> None:
-        """Render a scene from its first camera, to have everything compiled and in memory.
+        """Render a scene once from its first camera, to compile kernels and fill memory.
 
-        The picture is the worker's own and small: the limit of pixels is for those asked for.
+        The image is small and exempt from the pixel limit.
         """
         camera = scene.rig[scene.rig.names[0]].resized(WARM_UP_WIDTH)
         request = RenderRequest(
@@ -472,8 +474,8 @@ class StepPipeline:
 
 
 def record(steps: Sequence[Step]) -> None:
-    """Write the log entries of steps, in one transaction where that can be; the trouble of one is
-    not that of the others. Off the event loop."""
+    """Write the log entries of steps, if possible in one transaction; one failure does not affect
+    the others. Off the event loop."""
     logs = [(step, step.log) for step in steps if step.log is not None]
     if len(logs) > 1 and not any(log.instead for _, log in logs):
         with contextlib.suppress(Exception):
@@ -489,7 +491,7 @@ def record(steps: Sequence[Step]) -> None:
 
 
 def _packed(step: Step, kind: str, frames: Sequence[EncodedFrame]) -> EncodedObservation:
-    """The message of a step, and the one whose images lie in shared memory."""
+    """The messages of a step, with images included and with images in shared memory."""
     assert step.members is not None
     placed_frames = step.slot.place(frames) if step.slot is not None else None
     step.timer.stage("encode")
@@ -529,7 +531,7 @@ def _cameras(step: Step) -> list[Camera]:
 
 
 def _estimated(world: World, images: Sequence[RenderedImage]) -> Sequence[RenderedImage]:
-    """Images show where the ego is; their poses are those of its own estimate."""
+    """Images from the true ego pose, labelled with poses of the ego's estimate."""
     if world.T_world_estimate is world.T_world_body:
         return images
     believed = []

@@ -40,7 +40,7 @@ from .session import EpisodeStart, Session, session_info
 from .shared_memory import Segments
 from .step import Stepper
 
-# Recovery: sessions that an earlier run of the worker left open are rebuilt from their logs.
+# Recovery: rebuilds sessions of an earlier run of the worker from their logs.
 
 
 def entries_of(rows: Iterable[SessionEntry]) -> list[Entry]:
@@ -49,15 +49,15 @@ def entries_of(rows: Iterable[SessionEntry]) -> list[Entry]:
 
 
 async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> None:
-    """Make a new session what it was when its last entry took effect.
+    """Rebuild a session to its state after its last entry.
 
-    Everything is replayed without rendering but the last step, whose answer its client may never
-    have got: it is rendered, so that the same action sent again gets it.
+    All entries are replayed without rendering, except the last step. Its client may not have
+    received the observation, so it is rendered for a repeated action.
 
     Args:
-        session: at its beginning, its scene pinned.
+        session: at its start, with its scene pinned.
         store: has its log.
-        pipeline: moves worlds and draws.
+        pipeline: advances and renders worlds.
     """
     start = session.start
     rows = await store.session_entries(session.session_id)
@@ -144,8 +144,8 @@ def _world(replayer: Replayer) -> World:
 
 
 def _content(entry: Entry) -> bytes:
-    """What an action is compared by: its plan alone, as this version writes it. The version that
-    wrote the entry may not have known all of its members."""
+    """The bytes that identify an action: only its plan, encoded by this version. The version that
+    wrote the entry may have had fewer members."""
     fields = decode(entry.payload)["plan"]
     return plan_payload(None if fields is None else PLAN.validate_python(fields))
 
@@ -161,13 +161,13 @@ log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class SessionLimits:
-    """What the sessions of a worker may take.
+    """Limits of a worker's sessions.
 
     Attributes:
         worker_id: first part of session ids.
-        max_sessions: open at one time.
-        idle_seconds: without use and without connection, after which a session leaves the memory;
-            a later request rebuilds it from its log.
+        max_sessions: maximum number of open sessions.
+        idle_seconds: time without use and without connection after which a session leaves the
+            memory; a later request rebuilds it from its log.
     """
 
     worker_id: str
@@ -176,22 +176,22 @@ class SessionLimits:
 
 
 class Sessions:
-    """All open sessions of a worker. Belongs to the event loop.
+    """All open sessions of a worker, for use on the event loop.
 
     Args:
-        limits: how many, and for how long.
-        pipeline: draws what sessions look like.
-        kernels: what episodes wait for before they begin.
-        store: where they and their logs are written before they take effect.
-        scene_cache: keeps their scenes in memory.
-        scenarios: what they may begin from.
-        metrics: gets their number.
-        segments: in which controllers on this machine get their images.
-        leases: by which workers on one store tell which of them has which session.
-        accounts: of those who make them, each with a limit of its own.
+        limits: number and lifetime.
+        pipeline: renders sessions.
+        kernels: kernels that episodes wait for.
+        store: stores sessions and their logs before they take effect.
+        scene_cache: holds their scenes in memory.
+        scenarios: scenarios to start from.
+        metrics: receives their number.
+        segments: shared memory for controllers on this machine.
+        leases: sessions of each worker with the same store.
+        accounts: accounts of the owners, with their limits.
 
     Attributes:
-        resume_key: what tokens of controllers that come back are made with.
+        resume_key: key of the controllers' resume tokens.
     """
 
     def __init__(
@@ -241,7 +241,7 @@ class Sessions:
         return len(self._open) + self._in_creation.total() >= self._limits.max_sessions
 
     def owned(self) -> Counter[str]:
-        """How many there are by the name of their owner's token, those in creation included."""
+        """Number of sessions by name of the owner's token, including those in creation."""
         return self._in_creation + Counter(s.row.owner for s in self._open.values())
 
     @asynccontextmanager
@@ -269,18 +269,18 @@ class Sessions:
         idempotent: IdempotentRequest,
         ws_base: str,
     ) -> SessionInfo:
-        """A new session on a scene or a scenario.
+        """Create a session on a scene or a scenario.
 
         Args:
             scene, scenario: exactly one of them.
-            spec: of the episode that begins at once; None waits for a reset.
-            idempotent: what the answer is stored under.
-            ws_base: how clients reach this worker, for example ``ws://127.0.0.1:8600``.
+            spec: starts an episode immediately; None waits for a reset.
+            idempotent: stores the reply.
+            ws_base: address of this worker for clients, for example ``ws://127.0.0.1:8600``.
 
         Raises:
-            ServiceError: OVER_CAPACITY or DRAINING; INVALID_REQUEST; as scene cache and scenarios
-                do.
-            WorldError: the episode cannot run as asked.
+            ServiceError: OVER_CAPACITY or DRAINING; INVALID_REQUEST; or as for scene cache and
+                scenarios.
+            WorldError: the episode cannot run with these options.
         """
         if (scene is None) == (scenario is None):
             raise ServiceError(
@@ -309,12 +309,12 @@ class Sessions:
         return info
 
     async def find(self, session_id: str) -> Session:
-        """The open session of that id; one that an earlier run left open, or a worker that is no
-        more, is rebuilt first.
+        """The open session of that id; sessions of an earlier run or of a dead worker are rebuilt
+        first.
 
         Raises:
-            ServiceError: SESSION_CLOSED when it is over, UNKNOWN_SESSION, SESSION_ELSEWHERE while
-                another worker has it, or what is in the way of rebuilding it.
+            ServiceError: SESSION_CLOSED if it has ended, UNKNOWN_SESSION, SESSION_ELSEWHERE while
+                another worker has it, or an error of the rebuild.
         """
         if (session := self._open.get(session_id)) is not None:
             if session.log_unsure:
@@ -324,14 +324,14 @@ class Sessions:
         return await self._rebuilt(check_not_closed(await self.row(session_id)))
 
     async def row(self, session_id: str) -> SessionRow:
-        """The row of a session, open or closed, whoever has it, without rebuilding it.
+        """The row of a session, open or closed, of any worker, without rebuilding it.
 
         Raises:
             ServiceError: UNKNOWN_SESSION.
         """
         if (session := self._open.get(session_id)) is not None:
             return session.row
-        # What no id of ours looks like need not be asked of a database, which may choke on it.
+        # Ids of another format are not queried; the database may reject some of them.
         row = await self._store.session(session_id) if _ID.fullmatch(session_id) else None
         if row is None:
             hint = "GET /v1/sessions lists them"
@@ -346,19 +346,19 @@ class Sessions:
         idempotent: IdempotentRequest,
         step: int | None = None,
     ) -> SessionInfo:
-        """A new session that goes on from an instant of another, held by its lock.
+        """Create a session that continues from a step of another, whose lock is held.
 
-        Its log begins with a copy of the other's, so that it can be rebuilt on its own.
+        Its log begins with a copy of the other's, so that it can be rebuilt independently.
 
         Args:
-            session: the other one.
-            ws_base: how clients reach this worker.
-            idempotent: what the answer is stored under.
-            step: of that instant, in the running episode; None for the present one.
+            session: the other session.
+            ws_base: address of this worker for clients.
+            idempotent: stores the reply.
+            step: step of the current episode; None for the newest.
 
         Raises:
-            ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET; INVALID_REQUEST for a step that the
-                episode has not had.
+            ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET; INVALID_REQUEST for a step outside
+                the episode.
         """
         world = session.running_world()
         with self._reserved_slot(owner_name()):
@@ -420,14 +420,13 @@ class Sessions:
         return world, rows[: len(rows) - len(episode) + count]
 
     async def end_episode(self, session: Session) -> None:
-        """End the running episode where it is; the controller is told. A second time changes
-        nothing."""
+        """End the current episode at its newest step, and notify the controller. Idempotent."""
         async with session.lock:
             session.check_open()
             if session.running_world().over:
                 return
             message = await self.stepper.stop(session, "stopped")
-            # An action that waits for the clock is refused behind this, once the lock is let go.
+            # An action that waits for the clock is refused after this, when the lock is released.
             if session.tell_controller is not None:
                 with contextlib.suppress(Exception):
                     await session.tell_controller(message)
@@ -435,7 +434,7 @@ class Sessions:
 
     async def entries(self, session: Session) -> list[Entry]:
         """Everything that has happened to a session, oldest first."""
-        # A step on its way is in the log already; it may be withdrawn again.
+        # A step in progress is already in the log; it may be withdrawn again.
         end = session.next_seq
         rows = await self._store.session_entries(session.session_id)
         return entries_of(row for row in rows if row.seq < end)
@@ -461,7 +460,7 @@ class Sessions:
         return await self.pipeline.on_world_thread(score)
 
     async def close(self, session: Session, *, reason: str) -> None:
-        """End a session once its step under way is done; a second time changes nothing."""
+        """End a session after its step in progress; idempotent."""
         if self._open.pop(session.session_id, None) is None:
             return
         session.closed = _closed(session.session_id, reason)
@@ -478,8 +477,8 @@ class Sessions:
         log.info("session closed", session_id=session.session_id, reason=reason)
 
     def let_go(self, session: Session) -> None:
-        """Leave a session that another worker has taken over, or may; its connections are told to
-        come back to that one. A second time changes nothing."""
+        """Drop a session that another worker has taken over, or may take over; its connections are
+        redirected. Idempotent."""
         if self._open.get(session.session_id) is not session:
             return
         del self._open[session.session_id]
@@ -489,7 +488,7 @@ class Sessions:
         log.warning("session left to another worker", session_id=session.session_id)
 
     def hand_over(self) -> None:
-        """Leave all sessions to other workers, and take none back; what is on record is whole."""
+        """Hand over all sessions to other workers, and accept none back; the logs are complete."""
         self.draining = self._handed_over = True
         for session in list(self):
             self.let_go(session)
@@ -505,7 +504,7 @@ class Sessions:
         """Free the memory of a session without connections; :meth:`find` rebuilds it."""
         if self._open.pop(session.session_id, None) is None:
             return
-        # A request that has just found it must not move a world that is being rebuilt.
+        # A concurrent request must not advance a world that is being rebuilt.
         session.closed = ServiceError(
             ErrorCode.QUEUE_FULL,
             f"session {session.session_id!r} has just left the memory because it was idle",
@@ -522,7 +521,7 @@ class Sessions:
             self._warm.add(scene)
 
     def resume_token(self, row: SessionRow) -> str:
-        """Lets a controller come back; the same in every run, and not in the store."""
+        """Token to reconnect a controller; the same in every run, and not in the store."""
         return hmac.new(self.resume_key, row.session_id.encode(), "sha256").hexdigest()
 
     # --- inside -----------------------------------------------------------------------------
@@ -601,7 +600,7 @@ class Sessions:
     async def _start(
         self, scene: str | None, scenario: str | None, token: str
     ) -> tuple[SessionRow, EpisodeStart]:
-        """What the new session is and begins from; its scene is pinned."""
+        """Id and start of the new session; its scene is pinned."""
         view = await self._scenarios.view(scenario) if scenario is not None else None
         name = view.row.scene if view is not None else str(scene)
         pinned = await self._scene_cache.pin(name)

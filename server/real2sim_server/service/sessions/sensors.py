@@ -33,7 +33,7 @@ from ..rendering.background import BackgroundCompile
 from ..rendering.renderer import check_known, check_sensors
 
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
-"""Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
+"""Limit of raw images in one message; the remainder is for its other members."""
 
 
 def cameras_of(scene: Scene, sensors: Sequence[SensorSpec], *, max_pixels: int) -> list[Camera]:
@@ -50,7 +50,7 @@ def cameras_of(scene: Scene, sensors: Sequence[SensorSpec], *, max_pixels: int) 
 
 
 def check_message_bytes(size: int) -> None:
-    """Raises ServiceError: INVALID_REQUEST for raw images and clouds that no one message holds."""
+    """Raises ServiceError: INVALID_REQUEST if raw images and clouds exceed one message."""
     if size > MAX_IMAGE_BYTES:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST,
@@ -77,7 +77,8 @@ POINT_BYTES = 40
 async def mounted_beside(
     lidars: Sequence[LidarSpec], radars: Sequence[RadarSpec], dt_us: int
 ) -> RangingSensors:
-    """As :func:`.mounted_sensors`, and their rays prepared, beside event loop and engine. Raises
+    """As :func:`.mounted_sensors`, and prepares their rays, off the event loop and the engine.
+    Raises
     WorldError: INVALID_REQUEST."""
     if not lidars and not radars:
         return NO_SENSORS

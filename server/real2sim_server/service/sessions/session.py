@@ -48,14 +48,13 @@ A = TypeVar("A")
 
 
 class LockStep(Generic[A]):
-    """Which action is due, and the answer to the last one.
+    """The due action, and the answer to the last one.
 
-    Ask :meth:`cached_answer` before the world moves and call :meth:`advance` once it has moved; an
-    action that is refused in between leaves everything as it was. Actions are compared by their
-    canonical bytes.
+    Call :meth:`cached_answer` before the world advances and :meth:`advance` afterwards. An action
+    that is refused in between changes nothing. Actions are compared by their canonical bytes.
 
     Attributes:
-        step: of the newest observation; None before the first reset.
+        step: step of the newest observation; None before the first reset.
         over: whether the episode has ended.
     """
 
@@ -77,14 +76,14 @@ class LockStep(Generic[A]):
         self._last = (content, answer)
 
     def cached_answer(self, step: int, content: bytes) -> A | None:
-        """The answer already given to this action; None when it is the one that is due.
+        """The answer already given to this action; None if it is the due action.
 
         Args:
-            step: of the observation that the action answers.
-            content: canonical bytes of what the action asks for.
+            step: step of the observation that the action answers.
+            content: canonical bytes of the action.
 
         Raises:
-            ServiceError: NOT_RESET; STEP_CONFLICT for another action where one was taken;
+            ServiceError: NOT_RESET; STEP_CONFLICT if the step had another action;
                 STALE_STEP for older steps; EPISODE_OVER; BAD_STEP for newer steps.
         """
         if self.step is None:
@@ -113,16 +112,16 @@ class LockStep(Generic[A]):
         return None
 
     def is_due(self, step: int) -> bool:
-        """Whether an action for ``step`` is the one that the clock waits for."""
+        """Whether an action for ``step`` is due."""
         return step == self.step and not self.over
 
     def advance(self, content: bytes, answer: A, *, over: bool) -> None:
-        """The due action was taken; ``answer`` is kept until the next one."""
+        """The due action was taken; stores ``answer`` until the next one."""
         self._move(1, over=over)
         self._last = (content, answer)
 
     def skip(self, steps: int, *, over: bool) -> None:
-        """The clock was moved by other means; no answer is kept."""
+        """The clock was advanced without an action; no answer is stored."""
         self._move(steps, over=over)
         self._last = None
 
@@ -153,8 +152,8 @@ def _repeated(step: int, content: bytes, taken: bytes, answer: A) -> A:
 
 
 class ClockHold:
-    """Lets actions pass, all of them or so many, at once or at a pace; the others wait. Belongs to
-    the event loop."""
+    """Gates actions: passes all, or a number of them, immediately or at a pace; others wait. For
+    use on the event loop."""
 
     def __init__(self) -> None:
         self._steps: int | None = None
@@ -164,7 +163,7 @@ class ClockHold:
 
     @property
     def held(self) -> bool:
-        """Whether the next action has to wait until somebody lets it go."""
+        """Whether the next action has to wait for a release."""
         return self._steps == 0
 
     @property
@@ -174,18 +173,18 @@ class ClockHold:
 
     @property
     def wait_s(self) -> float:
-        """How long the next action has to wait from now [s]."""
+        """Remaining time until the next action may pass [s]."""
         if self.held:
             return math.inf
         return 0.0 if self._pace is None else max(0.0, self._next_s - clock.monotonic())
 
     def release(self, *, pace: float | None = None) -> None:
-        """All actions pass; with a pace, so many simulated seconds take a second."""
+        """Let all actions pass; ``pace`` is in simulated seconds per second."""
         self._steps, self._pace = None, pace
         self._changed.set()
 
     def hold(self, *, after: int = 0) -> None:
-        """So many more actions pass; then they wait."""
+        """Let ``after`` more actions pass, then hold."""
         self._steps = after
         self._changed.set()
 
@@ -210,10 +209,10 @@ KEPT = 4
 
 
 class ObserverQueue:
-    """A few observations on their way to one observer. Putting one in never waits.
+    """A short queue of observations for one observer. Adding one never waits.
 
     Attributes:
-        dropped: observations that the observer was too slow for.
+        dropped: number of observations dropped for a slow observer.
     """
 
     def __init__(self) -> None:
@@ -245,12 +244,12 @@ TellController = Callable[[EncodedMessage], Awaitable[None]]
 
 
 class NewestPlan(NamedTuple):
-    """What a controller wants.
+    """The newest plan of a controller.
 
     Attributes:
-        plan: as it was sent.
-        motion: of the observation that it answers.
-        took_us: from the observation to the action [us].
+        plan: as sent.
+        motion: motion in the observation that it answers.
+        took_us: time from the observation to the action [us].
     """
 
     plan: Plan
@@ -260,12 +259,12 @@ class NewestPlan(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EpisodeStart:
-    """What a session begins from, at its creation and at every reset.
+    """Start of a session, at its creation and at every reset.
 
     Attributes:
         scene: pinned in memory, shared with other sessions.
-        summary: of its bundle.
-        state: objects of the scenario as it was then, or of the bare scene.
+        summary: summary of its bundle.
+        state: objects of the scenario at that time, or of the bare scene.
     """
 
     scene: Scene
@@ -275,32 +274,32 @@ class EpisodeStart:
 
 @dataclass(eq=False)
 class Session:
-    """A light view onto a scene. Belongs to the event loop; its worlds are computed elsewhere.
+    """A session on a scene, for use on the event loop; its worlds are computed elsewhere.
 
     Attributes:
-        row: as it is in the store.
+        row: its row in the store.
         start: scene and objects at step 0.
-        resume_token: lets a controller come back; the same in every run of the worker.
+        resume_token: token to reconnect a controller; the same in every run of the worker.
         lock: held during any change of the session.
-        world: the committed instant; never changed in place, so readers need no lock.
-        cameras: of the episode's sensors at the sizes they name, by name.
-        lockstep: which action is due.
-        events: since the last answer to a REST step.
-        next_seq: of the session's log.
-        log_unsure: whether there may be something in the log from ``next_seq`` on that never took
-            effect: the store did not say how it ended.
-        unsure_replies: keys of answers that may be stored likewise.
-        snapshots: instants to return to, by name.
-        newest: observation of the present instant, where it has been shown.
+        world: the committed world; never modified in place, so readers need no lock.
+        cameras: cameras of the episode's sensors at the requested sizes, by name.
+        lockstep: the due action.
+        events: events since the last answer to a REST step.
+        next_seq: next entry of the session's log.
+        log_unsure: whether the log may have entries from ``next_seq`` that never took effect,
+            because the store did not report the outcome.
+        unsure_replies: keys of replies that may be stored likewise.
+        snapshots: saved states by name.
+        newest: observation of the current step, if it has been computed.
         late: whether the planner has missed the deadline of the due action, and the clock waits.
         expires_at: monotonic time at which the episode is cut off [s]; None for never.
-        controller: the connection that drives, if there is one.
-        tell_controller: sends it an observation that no action has led to.
-        hold: whether the clock may move.
-        newest_plan: that the controller has sent.
-        observers: queues of the connections that look on.
+        controller: the connection that drives, if any.
+        tell_controller: sends it an observation without an action.
+        hold: gates the clock.
+        newest_plan: newest plan of the controller.
+        observers: queues of the observers' connections.
         close_callbacks: one for each open connection.
-        closed: why the session is over; None while it is not.
+        closed: why the session has ended; None while it is open.
     """
 
     row: SessionRow
@@ -388,7 +387,7 @@ class Session:
 
 
 def opens_session(token: str | None, row: SessionRow) -> bool:
-    """Whether a token is that of the session of a row."""
+    """Whether a token is the session token of a row."""
     return token is not None and secrets_equal(token_hash(token), row.token_hash)
 
 
@@ -425,7 +424,7 @@ def session_info(session: Session, *, ws_base: str, token: str = "") -> SessionI
 
 
 def session_state(session_id: str, world: World, events: Iterable[Event]) -> SessionState:
-    """Where everything is at an instant, and what happened before it."""
+    """Poses of all objects at a step, and the events before it."""
     seen = world.observe()
     return SessionState.model_validate(
         {
@@ -447,7 +446,7 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
 
 
 def shown_state(session: Session) -> SessionState:
-    """As :func:`session_state`, for those who look on: with the newest plan."""
+    """As :func:`session_state`, with the newest plan, for observers."""
     state = session_state(session.session_id, session.running_world(), tuple(session.events))
     newest = session.newest_plan
     plan = plan_in_world(newest.plan, newest.motion) if newest is not None else None
@@ -463,7 +462,7 @@ def shown_state(session: Session) -> SessionState:
 
 
 def session_edited(session_id: str, world: World, outcome: EditOutcome) -> SessionEdited:
-    """What an edit of a running world led to."""
+    """The result of an edit in a running session."""
     return SessionEdited(
         session_id=session_id,
         step=world.steps,

@@ -24,7 +24,7 @@ from .schema import Claim, Policy, ScenarioRow, SessionEntry, SessionRow, Snapsh
 # compares it with the session's within the database.
 
 ClaimedEntries = tuple[Claim, Sequence[SessionEntry]]
-"""What a session's log gets, and by which right."""
+"""Entries for a session's log, and the claim on the session."""
 
 MAX_ROWS = 32
 """Entries that one statement appends; more of them take turns."""
@@ -35,10 +35,10 @@ TYPES = ("VARCHAR(80)", "INTEGER", "VARCHAR(16)", "INTEGER", "BYTEA", "BIGINT", 
 
 
 def appended(logs: Sequence[ClaimedEntries], *, on_server: bool) -> list[Write]:
-    """What appends entries to the logs of sessions.
+    """Statements that append entries to the logs of sessions.
 
     Args:
-        logs: of one session or of several.
+        logs: one or more logs.
         on_server: whether the database is PostgreSQL.
     """
     values = [
@@ -55,11 +55,11 @@ def appended(logs: Sequence[ClaimedEntries], *, on_server: bool) -> list[Write]:
 
 
 def withdrawn(claim: Claim, from_seq: int) -> list[Write]:
-    """What removes the end of a session's log."""
+    """Statements that remove the end of a session's log."""
     s, log = t.sessions.c, t.session_log.c
     mine = (s.session_id == claim.session_id) & (s.epoch == claim.epoch)
     end = (log.session_id == claim.session_id) & (log.seq >= from_seq)
-    # Changes nothing; holds the row, so that nobody takes the session over meanwhile.
+    # Changes nothing, but locks the row, so that the session cannot be taken over meanwhile.
     held = sa.update(t.sessions).where(mine).values(epoch=claim.epoch)
     return [Write(held, fenced=1), Write(sa.delete(t.session_log).where(end))]
 
@@ -68,9 +68,9 @@ def withdrawn(claim: Claim, from_seq: int) -> list[Write]:
 def _append(rows: int) -> str:
     """The statement that appends entries, for SQLite.
 
-    Every step of a session makes one: to have the statement put together by SQLAlchemy takes as
-    long as the append. Of many in one go the driver gives the interpreter up but once, not for
-    every row, and other threads keep it longer than a row takes.
+    Every step of a session executes it, and assembling it in SQLAlchemy takes as long as the
+    append. With many rows in one statement the driver releases the GIL only once; releasing it per
+    row lets other threads hold it for longer than a row takes.
     """
     values = ", ".join(["(?, ?, ?, ?, ?, ?, ?)"] * rows)
     given = ", ".join(f"v.column{k}" for k in range(1, 7))
@@ -91,8 +91,8 @@ def _appended_on_server(values: Sequence[tuple[object, ...]]) -> Write:
 
 @cache
 def _append_on_server(rows: int) -> sa.TextClause:
-    """The same for PostgreSQL. ``FOR SHARE`` waits for whoever is just taking a session over, and
-    looks at its epoch again."""
+    """The same for PostgreSQL. ``FOR SHARE`` waits for a concurrent takeover of the session, and
+    then checks its epoch again."""
     width = len(TYPES)
     values = ", ".join(
         "(" + ", ".join(f"CAST(:v{row * width + k} AS {TYPES[k]})" for k in range(width)) + ")"
@@ -122,24 +122,24 @@ __all__ = [
 ]
 
 ROW_BYTES = 120
-"""About what a row of a log takes beside its payload, with its index."""
+"""Approximate size of a log row without its payload, including its index [bytes]."""
 
 REPLY_LIFETIME_US = 24 * 3600 * 1_000_000
 
 
 class Store:
-    """What is asked of the database, and what is written to it.
+    """Queries and writes of the database.
 
-    Computing threads may write by :meth:`record` and :meth:`record_revision`, see
+    Computing threads may write with :meth:`record` and :meth:`record_revision`, see
     :class:`.database.Database`.
 
     Args:
         url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
-        worker_id: name to hold as long as the store is open; None for a guest.
-        timeout_s: of a statement, a lock, an answer [s].
-        durability: what reaches the disk before it is acknowledged.
-        migration: whether a store of an older schema is brought up to date.
-        on_call: told of each read and write, on the thread that did it.
+        worker_id: name to hold while the store is open; None for a guest.
+        timeout_s: timeout of a statement, a lock, an answer [s].
+        durability: what is on disk before it is acknowledged.
+        migration: whether to migrate a store of an older schema.
+        on_call: called after each read and write, on its thread.
     """
 
     def __init__(
@@ -163,25 +163,25 @@ class Store:
         )
 
     async def open(self) -> None:
-        """Connect and create what is missing.
+        """Connect and create missing tables.
 
         Raises:
-            StoreError: the database cannot be opened, or is of a newer version.
-            StateFolderError: another worker of that name is on it.
+            StoreError: the database cannot be opened, or has a newer version.
+            StateFolderError: another worker of that name uses it.
         """
         await self.database.open(Write(_delete_old_replies()))
 
     async def close(self) -> None:
-        """Finish what was begun and disconnect."""
+        """Finish pending calls and disconnect."""
         await self.database.close()
 
     @property
     def trouble(self) -> StoreTroubleError | None:
-        """What is wrong with the database; None while it is well."""
+        """Failure of the database; None while it is healthy."""
         return self.database.trouble
 
     async def watch(self) -> None:
-        """Look after the database for ever: notice trouble, and its end."""
+        """Monitor the database until cancelled: detect failures and recoveries."""
         await self.database.watch()
 
     # --- scenarios --------------------------------------------------------------------------
@@ -231,15 +231,15 @@ class Store:
         created_us: int,
         reply: StoredReply | None = None,
     ) -> None:
-        """Append one revision, and in the same transaction the answer to the request for it; on the
+        """Append one revision and, in the same transaction, the reply to its request; on the
         calling thread, never on the event loop.
 
         Args:
-            scenario_id: of the scenario.
-            revision: next of its log.
-            entry: JSON values; ``kind`` among them.
+            scenario_id: the scenario.
+            revision: next revision of its log.
+            entry: JSON values, including ``kind``.
             created_us: wall clock [us].
-            reply: stored for a repeated request.
+            reply: stored for repeated requests.
 
         Raises:
             ConflictError: the revision exists, or the scenario does not.
@@ -255,8 +255,7 @@ class Store:
         return (await self.database.write(Write(changes)))[-1] > 0
 
     async def newest_of_scenario(self, scenario_id: str) -> tuple[int, str] | None:
-        """Revisions that a scenario has, 0 for none, and its name; None where there is no such
-        scenario."""
+        """Number of revisions of a scenario, and its name; None if there is no such scenario."""
         log, row = t.scenario_log, t.scenarios
         newest = sa.select(sa.func.max(log.c.revision)).where(log.c.scenario_id == scenario_id)
         query = sa.select(newest.scalar_subquery().label("newest"), row.c.name)
@@ -358,13 +357,13 @@ class Store:
         instead: bool = False,
         reply: StoredReply | None = None,
     ) -> None:
-        """Append to a session's log, and the answer to the request for it, all or nothing.
+        """Append entries to a session's log, and the reply to their request, atomically.
 
         Args:
-            claim: on the session.
-            entries: with their places in its log.
-            instead: of anything that is there already from the first of those places on.
-            reply: stored for a repeated request.
+            claim: claim on the session.
+            entries: entries with their positions in the log.
+            instead: whether to replace existing entries from the first position.
+            reply: stored for repeated requests.
 
         Raises:
             ConflictError: a ``seq`` is taken.
@@ -392,10 +391,10 @@ class Store:
         self.database.execute(changes, promised=reply is not None)
 
     def record_together(self, logs: Sequence[ClaimedEntries]) -> None:
-        """Entries of several sessions by :meth:`record` in one transaction: all, or none of them.
+        """Store entries of several sessions in one transaction, as :meth:`record` does.
 
         Args:
-            logs: claims on sessions, and what their logs get.
+            logs: claims on sessions, and their entries.
         """
         if any(entries for _, entries in logs):
             self.database.execute(self._append(logs), promised=False)
@@ -404,7 +403,7 @@ class Store:
         return appended(logs, on_server=self.database.is_server)
 
     async def withdraw(self, claim: Claim, *, from_seq: int, replies: Sequence[str] = ()) -> None:
-        """Remove the end of a session's log, and answers by their keys: what was recorded ahead and
+        """Remove the end of a session's log and replies by their keys, which were stored ahead but
         never took effect.
 
         Raises:
@@ -424,7 +423,7 @@ class Store:
     # --- answers ----------------------------------------------------------------------------
 
     async def reply(self, key: str) -> StoredReply | None:
-        """The answer kept under ``key``, for 24 hours."""
+        """The reply stored under ``key``, for 24 hours."""
         table = t.idempotent_replies
         fresh = table.c.created_us > now_us() - REPLY_LIFETIME_US
         rows = await self.database.read(sa.select(table).where((table.c.key == key) & fresh))
@@ -435,13 +434,13 @@ class Store:
         return StoredReply(key, row["fingerprint"], row["status"], headers, row["body"])
 
     async def forget_old_replies(self) -> None:
-        """Remove the answers that are kept no longer."""
+        """Delete expired replies."""
         await self.database.write(Write(_delete_old_replies()))
 
     # --- size -------------------------------------------------------------------------------
 
     async def size_bytes(self) -> int:
-        """What the store takes, without what it could give back; of a server about its logs."""
+        """Size of the store without free pages; for a server, approximate size of its logs."""
         used = await self.database.used_bytes()
         if used is not None:
             return used
@@ -497,7 +496,7 @@ def _insert_rows(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
 
 @cache
 def _insert(table: sa.Table) -> sa.Insert:
-    """One statement for all rows of a table: to recognise a new one as known takes longer."""
+    """One statement for all rows of a table, because caching new statements is slower."""
     return sa.insert(table)
 
 
