@@ -66,8 +66,7 @@ class DepthSampling:
 
     Points above the road in the depth images are treated as static obstacles. A drive is admissible
     if the vehicle can continue on it for a moment and then stop without contact (after the dynamic
-    window of Fox, Burgard, Thrun 1997). The planner chooses the admissible drive with the best sum
-    of
+    window of Fox, Burgard, Thrun 1997). The planner chooses the admissible drive that is best in
     progress, comfort and nearness to the route. It does not predict motion: behind a car it keeps a
     stopping distance rather than a time gap, and it sees crossing traffic only at its current
     position.

@@ -49,7 +49,7 @@ def sealed(body: bytes, secret: str) -> bytes:
 
 
 def unsealed(stored: bytes, secret: str) -> bytes:
-    """The body that was sealed with ``secret``."""
+    """Open a body that was sealed with ``secret``."""
     if not stored.startswith(_SEALED):
         return stored
     nonce = stored[1 : 1 + NONCE_BYTES]
@@ -64,7 +64,7 @@ def _masked(body: bytes, nonce: bytes, secret: str) -> bytes:
 
 
 def worker_key(folder: Path) -> bytes:
-    """The key of a state folder, made the first time; only its owner can read it.
+    """The key of a state folder, created on first use; only its owner can read it.
 
     Raises:
         OSError: the folder cannot be written to.
@@ -267,7 +267,7 @@ class OverLimitError(Exception):
 
 
 class RevokedError(Exception):
-    """The token was removed while its holder was connected, or had a session."""
+    """The token was removed while its holder was connected or had a session."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"the token {name!r} is no longer valid")
@@ -377,7 +377,7 @@ class Account:
 
 
 ACCOUNT: ContextVar[Account | None] = ContextVar("account", default=None)
-"""For whom the running task works; tasks that it starts work for the same one."""
+"""Account of the running task; tasks that it starts inherit it."""
 
 
 def admit_message() -> None:
@@ -388,7 +388,7 @@ def admit_message() -> None:
 
 
 def owner_name() -> str:
-    """Name of the account that the running task makes things for."""
+    """Name of the account that owns objects created by the running task."""
     account = ACCOUNT.get()
     return account.name if account is not None else DEFAULT_NAME
 
@@ -441,7 +441,7 @@ class Accounts:
 
     @property
     def counts(self) -> bool:
-        """Whether anybody's sessions or jobs are limited in number."""
+        """Whether any account has a limited number of sessions or jobs."""
         return any(a.limits.sessions is not None or a.limits.jobs is not None for a in self)
 
     def take_word(self, told: Iterable[Mapping[str, Any]]) -> None:
@@ -469,7 +469,7 @@ class Accounts:
                         tell()
 
     def reload(self) -> None:
-        """Take over the file's tokens if it has changed; on any thread."""
+        """Reload the file's tokens if it has changed; on any thread."""
         try:
             self._load()
         except TokenFileError as error:

@@ -62,7 +62,7 @@ OPEN: tuple[APIRouter, ...] = (
 
 
 def operation_id(route: APIRoute) -> str:
-    """Name of a call in OpenAPI, stable as long as its function's name is: ``scenes-render``."""
+    """Operation id in OpenAPI, which depends only on the function's name: ``scenes-render``."""
     subject = str(route.tags[0]) if route.tags else "worker"
     return f"{subject}-{route.name}"
 

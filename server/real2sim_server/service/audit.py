@@ -29,13 +29,13 @@ class AuditEntry:
     """A request that changed something, or was refused for its token or role.
 
     Attributes:
-        account: name of the token; empty where there was none that is valid.
-        client: address that it came from.
-        worker_id: that answered.
+        account: name of the token; empty without a valid one.
+        client: address of the client.
+        worker_id: worker that answered.
         method, path: of the request.
-        status: of the answer.
-        request_id: as in the answer and the log.
-        at_us: when, wall clock [us].
+        status: status of the reply.
+        request_id: as in the reply and the log.
+        at_us: wall clock [us].
     """
 
     account: str
@@ -49,7 +49,7 @@ class AuditEntry:
 
 
 class AuditLog:
-    """Entries beyond the life of a process.
+    """Stored entries.
 
     Args:
         store: open while this is used.
@@ -82,9 +82,9 @@ class AuditLog:
 
 
 FLUSH_S = 1.0
-"""Between writes; the last second is lost with a worker that is killed."""
+"""Interval of writes [s]; a killed worker loses the last one."""
 MAX_WAITING = 10_000
-"""Entries that wait while the store is in trouble; older ones are dropped then."""
+"""Maximum number of pending entries while the store fails; older ones are dropped."""
 
 log = structlog.get_logger(__name__)
 
@@ -101,7 +101,7 @@ class Audit:
         self._waiting: deque[AuditEntry] = deque(maxlen=MAX_WAITING)
 
     def note(self, entry: AuditEntry) -> None:
-        """Remember an entry; it is on record a second later."""
+        """Queue an entry; it is stored within a second."""
         if len(self._waiting) == MAX_WAITING:
             log.error("audit entry dropped", entry=vars(self._waiting[0]))
         self._waiting.append(entry)

@@ -1,4 +1,4 @@
-"""Drives: jobs in which a planner drives a session and leaves a recording."""
+"""Drives: jobs in which a planner drives a session and stores a recording."""
 
 from __future__ import annotations
 
@@ -87,12 +87,12 @@ class CommandProcess:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the process is running."""
         return self._process.returncode is None
 
     def yield_to_urgent(self) -> None:
         """Lower its scheduling priority."""
-        # It has ended, or the system has no such thing.
+        # The process has ended, or the system does not support it.
         with contextlib.suppress(OSError, AttributeError):
             os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
 
@@ -105,7 +105,7 @@ class CommandProcess:
         return lines[-1] if lines else f"the process ended with {self._process.returncode}"
 
     async def close(self) -> None:
-        """End it, whatever it does."""
+        """Kill the process."""
         for end in (self._process.terminate, self._process.kill):
             if not self.running:
                 break
@@ -134,7 +134,7 @@ class CommandProcess:
 
 
 async def _last_of(stream: asyncio.StreamReader) -> bytes:
-    """The end of a stream, once it has ended."""
+    """The last part of a stream, at its end."""
     kept = b""
     while data := await stream.read(65_536):
         kept = (kept + data)[-MAX_ERROR_BYTES:]
@@ -144,7 +144,7 @@ async def _last_of(stream: asyncio.StreamReader) -> bytes:
 # --- The planner's process -----------------------------------------------------------------------
 
 EPISODE_STEPS = 100_000
-"""More than any recording has: it ends with its episode."""
+"""More steps than any recording has: the drive ends with its episode."""
 
 OF_THE_PLANNER = {
     *("sensors", "lidars", "radars", "action", "privileged"),
@@ -278,12 +278,12 @@ MAX_CACHED_DRIVES = 4
 
 @dataclass(frozen=True, eq=False)
 class Seat:
-    """Where a planner may sit down.
+    """Session and address for a planner.
 
     Attributes:
-        session: that it drives.
-        url: of this worker, as seen from this machine.
-        token: that opens the session.
+        session: session to drive.
+        url: address of this worker, from this machine.
+        token: token of the session.
     """
 
     session: Session
@@ -384,7 +384,7 @@ def _figures(recording: Recording, session: Session) -> dict[str, object]:
     }
 
 
-# --- at the wheel -------------------------------------------------------------------------------
+# --- driving ------------------------------------------------------------------------------------
 
 
 async def _driven(
@@ -417,7 +417,7 @@ async def _driven(
 
 @asynccontextmanager
 async def _planner(seat: Seat, request: DriveRequest) -> AsyncIterator[CommandProcess | None]:
-    """The planner's process while it drives; None where somebody else brings theirs."""
+    """The planner's process during the drive; None if an external planner drives."""
     if request.planner is None:
         yield None
         return

@@ -1,4 +1,4 @@
-"""Maintenance of a worker: removes leftovers of killed runs and whatever exceeds the limits."""
+"""Maintenance of a worker: removes leftovers of killed runs and data above the limits."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PIECE_ROWS = 1000
 PIECE_PAGES = 256
 SESSIONS_AT_ONCE = 8
 BREATH_S = 0.01
-"""Between two pieces."""
+"""Pause between batches [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -175,7 +175,7 @@ class Maintenance:
             await asyncio.sleep(PERIOD_S)
 
     async def once(self) -> None:
-        """Do all of it. Raises StoreTroubleError: the store is in trouble."""
+        """Run all tasks. Raises StoreTroubleError: the store fails."""
         await asyncio.to_thread(self.sweep)
         await self._retention.tidy(in_use={session.session_id for session in self._sessions})
         days = self._settings.job_retention_days

@@ -80,7 +80,7 @@ class Sharing:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Shares for the length of the block."""
+        """Share during the block."""
         tasks = [asyncio.create_task(self._share(), name="sharing")]
         tasks.append(asyncio.create_task(self._sweep(), name="sweeping objects"))
         try:
@@ -108,8 +108,8 @@ class Sharing:
         return True
 
     async def signed_url(self, kind: str, name: str, file: str, *, seconds: float) -> str | None:
-        """Where anybody may fetch a file for a while; None where it is not in the store of objects,
-        or that gives no such addresses.
+        """A temporary public URL of a file; None if it is not in the object store, or if the store
+        does not support such URLs.
 
         Raises:
             ServiceError: STORAGE_UNAVAILABLE.
@@ -205,7 +205,7 @@ class Sharing:
             self._assets.remove(asset_id)
 
     def _unshared(self) -> list[tuple[str, str, Path]]:
-        """Whole bundles that were made here and are not on record."""
+        """Complete local bundles that are not yet listed."""
         listed = [("scene", listing) for listing in self._catalog.scan().values()]
         whole = {listing.path for _, listing in listed if listing.reason is None}
         whole |= {self._assets.bundle(info.asset_id) for info in self._assets.list()}
@@ -225,7 +225,7 @@ class Sharing:
 
 
 def _made_before(folder: Path, row: BundleRow) -> bool:
-    """Whether a folder is there, and older than a row."""
+    """Whether a folder exists, and is older than a row."""
     try:
         return folder.stat().st_mtime * 1e6 < row.created_us
     except OSError:
@@ -241,7 +241,7 @@ def _unavailable(what: str, error: ObjectStoreError) -> ServiceError:
 
 
 RENEWALS = 4
-"""Of each lease, so that some may be late."""
+"""Renewals per lease duration, so that some may be late."""
 
 
 class Membership:
@@ -307,10 +307,10 @@ class Membership:
             try:
                 await self._renew()
             except StoreError:
-                # The store tells of its trouble itself; without it others cannot take over either.
+                # The store logs its own failures; without it others cannot take over either.
                 continue
             except Exception:
-                # Whatever it was: without its lease the worker would lose its sessions.
+                # Any error: without its lease the worker would lose its sessions.
                 log.exception("renewing the lease failed")
 
     async def _renew(self) -> None:
@@ -407,8 +407,8 @@ class Agent:
 
 # --- Prewarming ----------------------------------------------------------------------------------
 
-# The proxy sends new sessions to the worker that has their scene, until that one has half as many
-# again as the others. The next worker then already has the scene in memory.
+# The proxy sends new sessions to the worker that has their scene, until that worker has 1.5 times
+# as many as the others. The next worker then already has the scene in memory.
 
 LOOK_S = 5.0
 """Interval of checks for the fleet's hot scenes [s]."""
@@ -444,7 +444,7 @@ class Prewarming:
                 log.info("scene not loaded ahead", reason=str(error))
 
     async def look(self) -> None:
-        """Load the scenes that are this worker's to load.
+        """Load the scenes assigned to this worker.
 
         Raises:
             StoreError: of the database.

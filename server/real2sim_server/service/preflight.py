@@ -21,11 +21,11 @@ from .storage.connection import check_state_folder
 
 
 class SceneFolderError(ValueError):
-    """The folder of scenes that was named is not there."""
+    """The named scene folder does not exist."""
 
 
 class AddressError(OSError):
-    """The address cannot be listened on."""
+    """The address is not available."""
 
 
 def check_start(settings: Settings) -> None:
@@ -42,7 +42,7 @@ def check_start(settings: Settings) -> None:
 
 
 def check_scenes(settings: Settings) -> None:
-    """Raises SceneFolderError where a folder of scenes is named that is not there."""
+    """Raises SceneFolderError if a named scene folder does not exist."""
     folder = settings.scenes_dir
     if folder is None or folder.is_dir():
         return
@@ -63,8 +63,8 @@ def bind(host: str, port: int) -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except OSError as error:
         raise _unusable(host, port, error) from error
-    # Named as TCP, or asyncio would not turn Nagle's algorithm off on accepted connections, and
-    # every answer would wait 40 ms for an acknowledgement.
+    # Named as TCP, or asyncio would not disable Nagle's algorithm on accepted connections, and
+    # every reply would wait 40 ms for an acknowledgement.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -76,7 +76,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def listen(listener: socket.socket) -> None:
-    """Accept connections on a bound socket. Raises AddressError: it was taken since."""
+    """Accept connections on a bound socket. Raises AddressError: it has been taken since."""
     host, port = listener.getsockname()[:2]
     try:
         listener.listen(2048)
@@ -86,7 +86,7 @@ def listen(listener: socket.socket) -> None:
 
 
 def url_of(host: str, listener: socket.socket) -> str:
-    """How clients reach a bound socket, for example ``http://127.0.0.1:8600``."""
+    """Address of a bound socket for clients, for example ``http://127.0.0.1:8600``."""
     return f"http://{_in_url(host)}:{listener.getsockname()[1]}"
 
 

@@ -27,7 +27,7 @@ from ..accounts import ACCOUNT, ROLES, Account, Role
 from .responses import ServiceError
 
 FOREIGN_PAGE = 4403
-"""Code with which sockets of other sites' pages are closed."""
+"""Close code for sockets of other sites' pages."""
 PAGES = ("/", "/ui", "/ui/", "/docs")
 """Pages that other sites may link to."""
 OWN = ("same-origin", "none")
@@ -70,7 +70,7 @@ _HINT = (
 
 
 def _refusal(scope: Scope, headers: Headers) -> str | None:
-    """Why a request is refused; None where it is not."""
+    """Reason for refusing a request, or None."""
     origin, host = headers.get("origin"), headers.get("host")
     if origin is not None and not same_origin(origin, host):
         return f"a page of {origin[:200]!r} called a worker at {(host or '')[:200]!r}"
@@ -157,7 +157,7 @@ _bearer = HTTPBearer(
 
 
 class OpenBindError(ValueError):
-    """An address that others can reach, without a token."""
+    """A public address, without a token."""
 
 
 def check_bind(host: str, token: object) -> None:
@@ -176,7 +176,7 @@ def check_bind(host: str, token: object) -> None:
 
 
 def secrets_equal(given: str | None, expected: str) -> bool:
-    """Compare in a time that does not depend on where the two differ."""
+    """Compare in constant time."""
     return hmac.compare_digest((given or "").encode(), expected.encode())
 
 
@@ -184,7 +184,7 @@ async def require_token(
     _credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
     connection: HTTPConnection,
 ) -> None:
-    """Dependency of every route that is not open.
+    """Dependency of every protected route.
 
     Raises:
         ServiceError: UNAUTHORIZED.
@@ -200,7 +200,7 @@ def check_token(connection: HTTPConnection) -> None:
         OverLimitError: the account's request limit is reached.
     """
     if account_of(connection.scope) is not None:
-        return  # Its route has checked before anything was read.
+        return  # Its route has already checked the token.
     worker = connection.app.state.worker
     given = bearer_token(connection)
     account: Account | None = worker.accounts.of_token(given)
@@ -219,14 +219,14 @@ def bearer_token(connection: HTTPConnection) -> str | None:
 
 
 class TokenRoute(APIRoute):
-    """A route that checks the worker's token before anything of the request is read."""
+    """A route that checks the worker's token before reading the request."""
 
     async def check(self, request: Request) -> None:
         """Raises ServiceError: UNAUTHORIZED."""
         check_token(request)
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """FastAPI's handler, behind the check."""
+        """FastAPI's handler, after the check."""
         handle = super().get_route_handler()
 
         async def checked(request: Request) -> Response:
@@ -250,17 +250,17 @@ _ACCOUNT_KEY = "real2sim.account"
 
 
 def account_of(scope: Scope) -> Account | None:
-    """The account that a request or a socket is for; None until its token was checked."""
+    """The account of a request or a socket; None until its token is checked."""
     account: Account | None = scope.get(_ACCOUNT_KEY)
     return account
 
 
 def act_for(connection: HTTPConnection, account: Account) -> None:
-    """From now on the running task works for ``account``.
+    """Make the running task work for ``account``.
 
     Raises:
-        RevokedError: its token is no more.
-        OverLimitError: it has had its requests.
+        RevokedError: its token has been removed.
+        OverLimitError: its request limit is reached.
         ServiceError: FORBIDDEN: its role does not allow it.
     """
     connection.scope[_ACCOUNT_KEY] = account
@@ -278,7 +278,7 @@ _NEEDED: tuple[tuple[re.Pattern[str], Role], ...] = (
     (re.compile(r"/v1/sessions(/.*)?"), "drive"),
     (re.compile(r"/v1/sweeps"), "drive"),
 )
-"""Of requests that change something, by path; the first that fits counts."""
+"""Roles of requests that change something, by path; the first match applies."""
 
 
 def needed_role(method: str, path: str) -> Role:

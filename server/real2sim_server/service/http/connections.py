@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 SWEEP_S = 1.0
 MIN_BYTES_PER_S = 10_000
-"""A client that sends or reads faster than this is never dropped for being slow."""
+"""Minimum rate; faster clients are never dropped for being slow."""
 NEAR, FAR = 0.8, 0.6
 """Fractions of the limit: a warning is logged above the first, and re-armed below the second."""
 RESERVED_DESCRIPTORS = 256
@@ -59,7 +59,7 @@ _connection: ContextVar[Connection | None] = ContextVar("connection", default=No
 
 
 class DropReason(StrEnum):
-    """Why a connection was closed by the worker."""
+    """Reasons for closing a connection."""
 
     HEAD_TIMEOUT = "head_timeout"
     BODY_TIMEOUT = "body_timeout"
@@ -122,7 +122,7 @@ class Connections:
         self._warn_when_near()
 
     def await_client(self, connection: Connection) -> None:
-        """It is the client's turn to send: the connection may be crowded out."""
+        """It is the client's turn to send: the connection may be dropped for a new one."""
         if connection in self._open:
             self._silent.pop(connection, None)
             self._silent[connection] = None
@@ -132,7 +132,7 @@ class Connections:
         self._silent.pop(connection, None)
 
     def forget(self, connection: Connection) -> None:
-        """A connection has ended."""
+        """Remove an ended connection."""
         self._open.discard(connection)
         self._silent.pop(connection, None)
 
@@ -185,11 +185,11 @@ class Connections:
 
 
 class Connection(asyncio.Protocol):
-    """One connection of a client: uvicorn's protocol serves it, a worker's connections watch it.
+    """One connection of a client, served by uvicorn's protocol and watched by :class:`Connections`.
 
     Args:
-        protocol: of uvicorn, for HTTP.
-        connections: of the worker.
+        protocol: uvicorn's HTTP protocol.
+        connections: connections of the worker.
     """
 
     def __init__(self, protocol: asyncio.Protocol, connections: Connections) -> None:
@@ -197,12 +197,13 @@ class Connection(asyncio.Protocol):
         self._protocol = protocol
         self._connections = connections
         self._backlog = Backlog(connections.limits.write_s)
-        # When the client began to send a request; None while it need not send one.
+        # When the client's turn to send began; None while it is the worker's.
         self._head_since: float | None = None
         # Bytes since then, and bytes after the request in progress.
         self.received = 0
         self._ahead = 0
-        # While a request is in progress: seconds waited for its body, and since when.
+        # While a request is in progress: seconds waited for its body, and the start of the current
+        # wait.
         self._body_pending = False
         self._body_waited_s = 0.0
         self._body_since: float | None = None
@@ -230,7 +231,7 @@ class Connection(asyncio.Protocol):
         self._protocol.connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Bytes of a client."""
+        """Data from the client."""
         if self._transport.is_closing():
             return
         if not self._busy:
@@ -250,7 +251,7 @@ class Connection(asyncio.Protocol):
             _connection.reset(token)
 
     def eof_received(self) -> bool | None:
-        """The client sends nothing more."""
+        """The client will send no more data."""
         return self._protocol.eof_received()
 
     def pause_writing(self) -> None:
@@ -267,8 +268,8 @@ class Connection(asyncio.Protocol):
         self._protocol, self._answering = protocol, True
 
     def may_write(self, data: bytes) -> bool:
-        """Whether uvicorn may write ``data``. It refuses bad requests and handshakes in plain
-        text; the client gets a problem document instead."""
+        """Whether uvicorn may write ``data``. It refuses bad requests and handshakes in plain text;
+        the client receives a problem document instead."""
         refusing = self._refused or data.startswith(b"HTTP/1.1 400 ")
         if self._answering or not refusing:
             return True
@@ -442,7 +443,7 @@ class Backlog:
 
 
 async def receive_text(websocket: WebSocket) -> str:
-    """The next message, where messages are text.
+    """The next message, which must be text.
 
     Raises:
         WebSocketDisconnect: the client has disconnected.
@@ -469,7 +470,7 @@ def close_reason(text: str) -> str:
 
 
 def connection_limit(wanted: int) -> int:
-    """Connections that the limit of descriptors leaves room for, ``wanted`` at most."""
+    """Number of connections within the limit of file descriptors, at most ``wanted``."""
     try:
         import resource
     except ImportError:  # not on this system
@@ -481,7 +482,7 @@ def connection_limit(wanted: int) -> int:
 
 
 def last_answer(reason: DropReason, limits: ConnectionLimits) -> bytes:
-    """A whole HTTP answer for a connection that is closed with it."""
+    """A complete HTTP reply, after which the connection is closed."""
     failure = _FAILURES[reason](limits)
     problem = problem_of(failure, path="", request_id=None)
     body = json.dumps(problem.model_dump(mode="json", exclude_none=True)).encode()
@@ -489,7 +490,7 @@ def last_answer(reason: DropReason, limits: ConnectionLimits) -> bytes:
 
 
 def bad_request_answer() -> bytes:
-    """A whole HTTP answer to bytes that are not HTTP, or no handshake."""
+    """A complete HTTP reply to data that is not HTTP or not a valid handshake."""
     failure = ServiceError(
         ErrorCode.BAD_MESSAGE,
         "the bytes sent are neither an HTTP/1.1 request nor a WebSocket handshake of version 13",

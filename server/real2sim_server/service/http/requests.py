@@ -118,7 +118,7 @@ class RequestContext:
             await self._app(scope, receive, send_with_id)
         except Exception as error:
             failure = service_error(error, log_unexpected=True)
-            if status:  # the answer is under way; the server must cut it short
+            if status:  # the reply has begun; the server must cut it short
                 raise
             response = problem_response(failure, path=scope["path"], request_id=request_id)
             await response(scope, receive, send_with_id)
@@ -148,8 +148,8 @@ class BodyLimit:
 
     Args:
         app: the application.
-        limit: of all requests [bytes].
-        uploads: of multipart forms to these paths instead [bytes].
+        limit: limit for all requests [bytes].
+        uploads: limit for multipart forms to these paths [bytes].
     """
 
     def __init__(self, app: ASGIApp, *, limit: int, uploads: Mapping[str, int]) -> None:
@@ -194,7 +194,7 @@ def _request_id(headers: Headers) -> str:
 
 
 def _session(scope: Scope) -> dict[str, str]:
-    """The session that a request is about, for logs."""
+    """The session of a request, for logs."""
     found = (scope.get("path_params") or {}).get("session_id")
     return {"session_id": str(found)} if found else {}
 
@@ -241,7 +241,7 @@ class IdempotentRequest:
 
     @property
     def claim(self) -> str | None:
-        """Names this request and no other; None without a key."""
+        """Unique name of this request; None without a key."""
         return None if self.key is None else f"{self.key} {self.fingerprint}"
 
     def reply(
@@ -255,7 +255,7 @@ class IdempotentRequest:
     def reply_bytes(
         self, content: bytes, *, status: int, headers: Mapping[str, str] | None = None
     ) -> StoredReply | None:
-        """The same for JSON that is written already."""
+        """The same for encoded JSON."""
         if self.key is None:
             return None
         body = sealed(content, self.secret)
@@ -327,7 +327,7 @@ class Idempotency:
     async def _given(
         self, full_key: str, fingerprint: str, secret: str, key: str
     ) -> Response | None:
-        """The answer given under a key. Raises ServiceError: IDEMPOTENCY_CONFLICT."""
+        """The reply stored under a key. Raises ServiceError: IDEMPOTENCY_CONFLICT."""
         stored = await self._store.reply(full_key)
         if stored is None:
             return None

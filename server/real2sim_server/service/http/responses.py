@@ -40,7 +40,7 @@ from ..storage.connection import (
 )
 
 # Problems. Routes and the classes below them raise :class:`ServiceError`; errors of lower packages
-# are translated here and nowhere else.
+# are converted only here.
 
 # --- Disconnects ---------------------------------------------------------------------------------
 
@@ -49,7 +49,7 @@ T = TypeVar("T")
 
 
 class ClientDisconnectedError(Exception):
-    """The client has closed the connection before its answer."""
+    """The client has closed the connection before its reply."""
 
 
 async def cancel_on_disconnect(request: Request, work: Coroutine[Any, Any, T]) -> T:
@@ -168,7 +168,7 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
 
 
 def service_error(error: Exception, *, log_unexpected: bool = False) -> ServiceError:
-    """The error as clients get it. Unexpected ones become INTERNAL and reveal nothing."""
+    """The error for clients. Unexpected ones become INTERNAL and reveal nothing."""
     failure = _translated(error)
     if log_unexpected and failure.code is ErrorCode.INTERNAL:
         log.error("unexpected error", exc_info=error)
@@ -226,7 +226,7 @@ def _of_shortage(error: Exception) -> ServiceError | None:
         log.error("files in trouble", reason=str(error))
         detail = f"the worker's files cannot be used just now: {error.strerror}"
         return ServiceError(ErrorCode.STORAGE_UNAVAILABLE, detail, hint=_AGAIN)
-    # torch's class is known by its name, so that this module needs no torch.
+    # Compare torch's class by name, so that this module does not import torch.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return ServiceError(
             ErrorCode.OUT_OF_MEMORY,
@@ -261,7 +261,7 @@ def problem_of(error: ServiceError, *, path: str, request_id: str | None) -> Pro
 
 
 def problem_response(error: ServiceError, *, path: str, request_id: str | None) -> Response:
-    """The answer that carries ``error``."""
+    """The reply for ``error``."""
     problem = problem_of(error, path=path, request_id=request_id)
     return Response(
         json.dumps(problem.model_dump(mode="json", exclude_none=True)),
@@ -333,7 +333,7 @@ def _pointer(error: Mapping[str, Any], body: Any) -> str:
 
 
 def _places(parts: Sequence[int | str], body: Any) -> Iterator[int | str]:
-    """Only the parts that are members of ``body``: pydantic names union tags among them."""
+    """Only the parts that are members of ``body``: pydantic also includes union tags."""
     for index, part in enumerate(parts):
         is_last = index == len(parts) - 1
         if isinstance(body, dict) and (part in body or is_last):
@@ -384,7 +384,7 @@ def _of_http(request: Request, error: HTTPException) -> ServiceError:
 
 
 NOTHING = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-"""Content security policy of answers that are no pages."""
+"""Content security policy of replies that are not pages."""
 
 SECURITY_HEADERS = {
     "Content-Security-Policy": NOTHING,
@@ -420,7 +420,7 @@ def choose_among(offered: Sequence[str], accept: str | None, *, of: str) -> str:
 def info_response(
     body: BaseModel, *, status: int = 200, headers: Mapping[str, str] | None = None
 ) -> Response:
-    """A model that was made here and needs no second validation."""
+    """A reply with a model that was created here and needs no second validation."""
     return Response(
         body.model_dump_json(),
         status_code=status,
@@ -435,17 +435,17 @@ async def large_response(
     status: int = 200,
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """The answer for a model with many objects, built and written on another thread.
+    """A reply with a large model, built and encoded on another thread.
 
-    It is written in pieces: one call for all of a scene's trajectories would keep every thread
-    waiting for the interpreter for tens of milliseconds, the event loop too.
+    It is encoded in parts: one call for all of a scene's trajectories would hold the GIL for tens
+    of milliseconds and block the event loop.
     """
     content = await asyncio.to_thread(lambda: json_in_pieces(build()))
     return Response(content, status, dict(headers or {}), "application/json")
 
 
 def json_in_pieces(model: BaseModel) -> str:
-    """The same JSON value as ``model_dump_json``, one call for each model in a list."""
+    """The same JSON as ``model_dump_json``, with one call for each model in a list."""
     lists = {
         name: value
         for name, value in model
@@ -465,7 +465,7 @@ def etag(revision: int) -> str:
 
 
 def _quality(accept: str, media_type: str) -> float:
-    """How much ``accept`` likes ``media_type``: the q of the most specific range that fits."""
+    """Quality of ``media_type`` in ``accept``: the q of the most specific matching range."""
     kind = media_type.split("/", maxsplit=1)[0]
     specificity = {media_type: 3, f"{kind}/*": 2, "*/*": 1}
     best, quality = 0, 0.0

@@ -38,7 +38,7 @@ OTHER = "other"
 
 
 class Metrics:
-    """All metrics, on a registry of their own, so that one process may hold several workers."""
+    """All metrics, in a separate registry, so that one process can run several workers."""
 
     def __init__(self) -> None:
         registry = self.registry = CollectorRegistry()
@@ -161,19 +161,19 @@ class Metrics:
         )
 
     def observe_job(self, label: str, waited_s: float, ran_s: float) -> None:
-        """Note one engine job."""
+        """Record an engine job."""
         self.engine_seconds += ran_s
         self.queue_wait.observe(waited_s)
         self.jobs.labels(label).observe(ran_s)
 
     def observe_store(self, call: str, seconds: float, done: bool) -> None:
-        """Note a read or write of the store."""
+        """Record a read or write of the store."""
         self.store_calls.labels(call).observe(seconds)
         if not done:
             self.store_failures.labels(call).inc()
 
     def observe_ended_job(self, kind: str, state: str) -> None:
-        """Note a job that is over."""
+        """Record an ended job."""
         self.ended_jobs.labels(kind, state).inc()
 
     def observe_request(self, method: str, route: str, status: int, seconds: float) -> None:
@@ -183,7 +183,7 @@ class Metrics:
 
     @contextmanager
     def open_socket(self, kind: str) -> Iterator[None]:
-        """Count a socket for the length of the block; ``kind``: ``drive`` or ``view``."""
+        """Count a socket during the block; ``kind``: ``drive`` or ``view``."""
         with self.sockets.labels(kind).track_inprogress():
             yield
 
@@ -198,7 +198,7 @@ class Metrics:
         self.registry.register(_AccountCollector(accounts, sessions))
 
     async def exposition(self) -> tuple[bytes, str]:
-        """Body and media type of ``/metrics``, made on another thread, one at a time."""
+        """Body and media type of ``/metrics``, computed on another thread, one at a time."""
         return await asyncio.to_thread(self._expose), CONTENT_TYPE_LATEST
 
     def _expose(self) -> bytes:
@@ -207,7 +207,7 @@ class Metrics:
 
 
 class Durations:
-    """Counted durations of a :class:`LoopHistogram`, for one value of its label."""
+    """Durations of a :class:`LoopHistogram`, for one label value."""
 
     def __init__(self, bounds: Sequence[float]) -> None:
         self._bounds = bounds
@@ -247,7 +247,7 @@ class LoopHistogram(Collector):
         registry.register(self)
 
     def observe_ms(self, named: Mapping[str, float]) -> None:
-        """Count one duration [ms] of each of several values of the label."""
+        """Record one duration [ms] for each of several label values."""
         for name, ms in named.items():
             series = self._series.get((name,)) or self.labels(name)
             seconds = ms / 1e3

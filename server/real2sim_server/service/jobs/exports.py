@@ -61,14 +61,14 @@ class VideoSource:
     vehicle: Callable[[int], Float] | None = None
 
     def T_world_vehicle(self, t_us: int) -> Float:
-        """[4, 4] of the vehicle that carries the cameras, at an instant."""
+        """[4, 4] pose of the cameras' vehicle at a time."""
         return self.scene.ego.transform(t_us) if self.vehicle is None else self.vehicle(t_us)
 
 
 async def export_video(
     video_source: VideoSource, request: ExportRequest, *, renderer: Renderer, context: JobContext
 ) -> JobResult:
-    """Draw a video frame by frame, other users of the engine in between.
+    """Render a video frame by frame, interleaved with other work of the engine.
 
     Raises:
         ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST; TIME_OUT_OF_RANGE.
@@ -101,7 +101,7 @@ async def export_video(
 async def _render_frame(
     renderer: Renderer, render_request: RenderRequest, context: JobContext
 ) -> EncodedFrame:
-    """The frame, rendered when interactive requests leave room in the queue."""
+    """The frame, rendered when the queue has room besides interactive requests."""
     while True:
         try:
             return (await renderer.render(render_request, stream="export")).frames[0]
@@ -111,7 +111,7 @@ async def _render_frame(
 
 
 def frame_times(video_source: VideoSource, request: ExportRequest) -> list[int]:
-    """Instants of the frames [us].
+    """Times of the frames [us].
 
     Raises:
         ServiceError: TIME_OUT_OF_RANGE or INVALID_REQUEST.
@@ -181,7 +181,7 @@ ARCHIVE = "dataset.tar"
 FOLDER = "dataset"
 
 LABELLING = 0.9
-"""Share of the work that is over when all frames are labelled."""
+"""Fraction of the work that is done when all frames are labelled."""
 
 ROOM_CHECKS_S = 5.0
 """Interval of disk space checks while frames are labelled [s]."""
@@ -229,16 +229,16 @@ class EngineBackend:
 
     @property
     def draws_lenses(self) -> bool:
-        """As of the backend that draws."""
+        """As for the backend that renders."""
         return getattr(self.backend, "draws_lenses", False)
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
-        """Draw when interactive requests leave room in the queue. Raises JobCancelled."""
+        """Render when the queue has room besides interactive requests. Raises JobCancelled."""
         yielding = replace(request, between=self.engine.yield_to_urgent)
         return self.on_engine(self.backend.rasterize, yielding)
 
     def warm_up(self) -> None:
-        """The engine's is warm."""
+        """The engine's backend is already warm."""
 
     def on_engine(self, work: Callable[[T], R], argument: T) -> R:
         """The result of ``work`` on the engine's thread. Raises JobCancelled."""
@@ -253,7 +253,7 @@ class EngineBackend:
 
 @dataclass(frozen=True)
 class EngineCaster:
-    """Follows beams on the engine."""
+    """Traces rays on the engine."""
 
     backend: EngineBackend
     name: str = "engine"
@@ -318,8 +318,8 @@ async def make_dataset(
     backend: EngineBackend,
     quota: Quota,
 ) -> JobResult:
-    """Label a drive, write it in all formats, and pack it into one file; or only tell how much
-    there would be.
+    """Label a drive, write it in all formats, and pack it into one file; or only estimate its
+    size.
 
     Raises:
         JobCancelled: the job was cancelled.
@@ -384,7 +384,7 @@ class _Progress:
 
 
 def _packed(folder: Path, context: JobContext) -> JobResult:
-    """The files that the job leaves: the archive, the manifest and sheets to look at."""
+    """Result files of the job: the archive, the manifest and preview sheets."""
     manifest = json.loads((folder / MANIFEST).read_bytes())
     files = {ARCHIVE: "application/x-tar", MANIFEST: "application/json"}
     shutil.copyfile(folder / MANIFEST, context.folder / MANIFEST)

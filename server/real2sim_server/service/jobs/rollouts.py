@@ -89,7 +89,7 @@ class RolloutPlan:
 
 @dataclass(frozen=True, eq=False)
 class ResolvedObjects:
-    """A scenario's objects, each with the id of the object in the scene that it shows."""
+    """Objects of a scenario, each with the id of its scene object."""
 
     visible: tuple[ObjectState, ...]
 
@@ -200,7 +200,7 @@ def run_rollout(
     progress: Callable[[float], None],
     cancelled: Callable[[], bool],
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Simulate and keep the result in ``folder``; figures, and names of files by media type."""
+    """Simulate and store the result in ``folder``; returns figures, and files by media type."""
     result = simulate(
         plan.scene,
         plan.resolved_objects,
@@ -234,7 +234,7 @@ def summary_of(result: SimulationResult) -> dict[str, Any]:
 
 
 def describe(result: SimulationResult) -> dict[str, Any]:
-    """Everything but deformed shapes, for plots and maps: times, poses, contacts, energies."""
+    """Everything except deformed shapes, for plots and maps: times, poses, contacts, energies."""
     return summary_of(result) | {
         "times_us": [result.start_us + round(t * 1e6) for t in result.times_s.tolist()],
         "energy_names": list(ENERGIES),
@@ -255,7 +255,7 @@ def describe(result: SimulationResult) -> dict[str, Any]:
 
 
 class RolloutPlayback:
-    """A finished rollout as pictures; for one thread at a time."""
+    """Renders a finished rollout; not thread-safe."""
 
     def __init__(self, scene: Scene, state: ScenarioState, result: SimulationResult) -> None:
         self._scene = scene
@@ -300,7 +300,7 @@ class RolloutPlayback:
 
 
 def with_assets(scene: Scene, state: ScenarioState) -> tuple[Scene, PlacedObjects]:
-    """The scene with the scenario's assets as objects of it."""
+    """The scene with the scenario's assets as objects."""
     objects = dict(scene.objects)
     visible = []
     for subject in state.visible:
@@ -459,7 +459,7 @@ class Simulations:
         return await self._jobs.start(new, work, idempotent=idempotent)
 
     async def rebuild(self, info: JobInfo) -> Work:
-        """The rollout of a job on record, of the scenario as it was then."""
+        """The rollout of a stored job, with the scenario at its revision."""
         fields = dict(info.request)
         scenario_id, revision = fields.pop("scenario"), fields.pop("revision")
         return await self._work(scenario_id, revision, SimulateRequest.model_validate(fields))

@@ -1,4 +1,4 @@
-"""The asset library: things to insert, each a bundle that never changes."""
+"""The asset library: immutable bundles of objects to insert."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ class LibraryAsset:
 
     @property
     def nbytes(self) -> int:
-        """Memory of its Gaussians, in the light of every scene that shows it [bytes]."""
+        """Memory of its Gaussians, including relit copies for scenes [bytes]."""
         with self._lock:
             clouds = [self.asset.cloud, *self._lit.values()]
-        # Clouds in another light share all tensors but their colours.
+        # Relit clouds share all tensors except colours.
         tensors = [t for cloud in clouds for t in cloud.tensors().values()]
         return sum({t.data_ptr(): t.nbytes for t in tensors}.values())
 
@@ -76,7 +76,7 @@ class LibraryAsset:
 
     @property
     def category(self) -> str:
-        """Class of the thing."""
+        """Category of the asset."""
         return self.asset.category
 
     @property
@@ -101,12 +101,12 @@ class LibraryAsset:
 
     @property
     def ambient(self) -> Colour | None:
-        """Mean colour of where it was cut out."""
+        """Mean colour of its original surroundings."""
         given = self.asset.provenance.get("ambient")
         return tuple(given) if given is not None else None
 
     def cloud_in(self, scene: Scene) -> GaussianCloud:
-        """Its Gaussians in the light of ``scene``, on its device."""
+        """Its Gaussians relit for ``scene``, on the scene's device."""
         found = self._lit.get(scene)
         if found is None:
             cloud = self.asset.cloud.to(scene.background.device)
@@ -141,7 +141,7 @@ class AssetLibrary:
         self._loading = threading.Lock()
 
     def list(self) -> list[AssetInfo]:
-        """All assets by id; broken bundles are passed over, with a line in the log."""
+        """All assets by id; broken bundles are skipped and logged."""
         names = sorted(
             p.name.removesuffix(ASSET_SUFFIX) for p in self.folder.glob(f"*{ASSET_SUFFIX}")
         )
@@ -156,7 +156,7 @@ class AssetLibrary:
         return _info(summary)
 
     def find(self, asset_id: str) -> LibraryAsset | None:
-        """The asset of that id, read from disk when it is not in memory.
+        """The asset of that id, read from disk if it is not in memory.
 
         Raises:
             ServiceError: OUT_OF_MEMORY.
@@ -192,7 +192,7 @@ class AssetLibrary:
             ]
 
     def add(self, asset: Asset, *, claim: str | None = None) -> AssetInfo:
-        """Keep an asset; ``claim`` as in :mod:`.imports`.
+        """Store an asset; ``claim`` as in :mod:`.imports`.
 
         Raises:
             ServiceError: ALREADY_EXISTS: assets never change, because scenarios rely on them.
@@ -215,11 +215,11 @@ class AssetLibrary:
         return self.info(asset_id)
 
     def made_by(self, claim: str | None, asset_id: str) -> AssetInfo | None:
-        """The asset, if that request has made it already."""
+        """The asset, if the same request has already created it."""
         return self.info(asset_id) if bears_claim(self.bundle(asset_id), claim) else None
 
     def check_free(self, asset_id: str) -> None:
-        """Raises ServiceError: ALREADY_EXISTS where the id is taken."""
+        """Raises ServiceError: ALREADY_EXISTS if the id is taken."""
         if self.bundle(asset_id).exists():
             raise ServiceError(
                 ErrorCode.ALREADY_EXISTS,
@@ -244,9 +244,9 @@ class AssetLibrary:
                 self._removing.discard(asset_id)
 
     def remove(self, asset_id: str) -> None:
-        """Delete a hidden asset; its id may be given again."""
+        """Delete a hidden asset; its id becomes available again."""
         with self._lock:
-            # Renamed first: a crash must not leave half a bundle under its name.
+            # Renamed first: a crash must not leave a partial bundle under its name.
             trash = self.folder / f".removed-{secrets.token_hex(6)}"
             self.bundle(asset_id).rename(trash)
             for known in (self._kept, self._strong, self._alive, self._summaries):
@@ -340,7 +340,7 @@ def _info(summary: AssetSummary) -> AssetInfo:
 
 
 def extract_object(scene: Scene, object_id: str, *, asset_id: str, category: str | None) -> Asset:
-    """An object of a scene as an asset, with the light it was seen in.
+    """An object of a scene as an asset, with its original lighting.
 
     Raises:
         UnknownObjectError: ``scene`` has no such object.

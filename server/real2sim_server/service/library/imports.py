@@ -196,10 +196,10 @@ def _check_name(folder: Path, name: str) -> None:
 
 
 def scene_name(source: Path, given: str | None) -> str:
-    """The name to import under.
+    """The name of the new scene.
 
     Raises:
-        ServiceError: INVALID_REQUEST when it cannot be part of a path.
+        ServiceError: INVALID_REQUEST if it cannot be part of a path.
     """
     if given is None:
         stem = source.name.split(".")[0]
@@ -227,7 +227,7 @@ def _import_failed(detail: str) -> ServiceError:
 T = TypeVar("T")
 
 MAX_IMPORTS = 8
-"""Imports that are received, wait or run; each may hold an upload on disk."""
+"""Imports being received, waiting or running; each may have an upload on disk."""
 
 
 class ImportQueue:
@@ -242,7 +242,7 @@ class ImportQueue:
         self._taken = 0
 
     def close(self) -> None:
-        """Begin no further import."""
+        """Start no further imports."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     @contextmanager
@@ -265,5 +265,5 @@ class ImportQueue:
             self._taken -= 1
 
     async def run(self, work: Callable[[], T]) -> T:
-        """``work()`` once the imports before it are over."""
+        """``work()`` after all earlier imports."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)

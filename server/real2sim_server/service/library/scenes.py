@@ -51,14 +51,14 @@ class MemoryHolder(Protocol):
 
     @property
     def held_bytes(self) -> int:
-        """Memory of all that is loaded or being loaded."""
+        """Memory of all loaded and loading items."""
 
     def idle(self) -> Sequence[IdleItem]:
         """Items that can be dropped."""
 
 
 class MemoryBudget:
-    """Bytes that all holders may take together. Safe to use on any thread.
+    """Memory budget of all holders. Thread-safe.
 
     Args:
         total_bytes: the budget.
@@ -178,7 +178,7 @@ class Quota:
 
 
 def folder_usage(folder: Path) -> tuple[int, int]:
-    """Entries of a folder, and bytes of the files in them; hidden entries are being made."""
+    """Number of entries of a folder, and bytes of their files; hidden entries are incomplete."""
     entries = [entry for entry in _scan(folder) if not entry.name.startswith(".")]
     return len(entries), sum(map(_size, entries))
 
@@ -238,7 +238,7 @@ class SceneCatalog:
         self._lock = threading.Lock()
 
     def scan(self) -> dict[str, Listing]:
-        """All bundles by scene name, in the order of their names."""
+        """All bundles by scene name, sorted."""
         with self._lock:
             return self._scan()
 
@@ -264,14 +264,14 @@ class SceneCatalog:
             self._known[listing.path] = (_fingerprint(listing.path), broken)
 
     def public(self, error: Exception) -> str:
-        """The error's message without the place of the folder on this machine."""
+        """The error's message without the folder's path on this machine."""
         return str(error).replace(f"{self.folder}/", "")
 
     def _candidates(self) -> Iterator[Path]:
         if not self.folder.is_dir():
             return
         for path in sorted(self.folder.iterdir()):
-            # Hidden folders are bundles that are just being written.
+            # Hidden folders are bundles being written.
             if path.name.startswith(".") or not path.is_dir():
                 continue
             if path.suffix == BUNDLE_SUFFIX or (path / SCENE_DOCUMENT).exists():
@@ -371,15 +371,15 @@ class SceneCache:
         self._resident: dict[str, _Resident] = {}
         self._loading: dict[str, asyncio.Task[Scene]] = {}
         self._reserved: dict[str, int] = {}
-        # Reading and hashing bundles is disk work: on the engine it would hold up every session,
-        # on the loop everything. One thread, because disks and memory serve one best.
+        # Reading and hashing bundles is disk work; it would block sessions on the engine, and all
+        # requests on the event loop. One thread, because disks and memory serve one reader best.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         budget.add(self)
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="scenes")
 
     def close(self) -> None:
-        """Forget all scenes and end the disk thread."""
+        """Drop all scenes and end the disk thread."""
         self._disk.shutdown(cancel_futures=True)
         self._resident.clear()
 
@@ -387,10 +387,10 @@ class SceneCache:
         """``fn()`` on the thread that reads and writes bundles."""
         return await asyncio.get_running_loop().run_in_executor(self._disk, fn)
 
-    # --- looking ----------------------------------------------------------------------------
+    # --- queries ----------------------------------------------------------------------------
 
     async def refresh(self) -> dict[str, Listing]:
-        """Look into the scene folder; all scenes by name."""
+        """List the scene folder; all scenes by name."""
         self._listings = await asyncio.to_thread(self.catalog.scan)
         return self._listings
 
@@ -398,7 +398,7 @@ class SceneCache:
         """The bundle of that name.
 
         Raises:
-            ServiceError: UNKNOWN_SCENE, with the names there are.
+            ServiceError: UNKNOWN_SCENE, with the available names.
         """
         known = self._listings.get(name) or (await self.refresh()).get(name)
         if known is None and self.fetch is not None and await self.fetch(name):
@@ -426,7 +426,7 @@ class SceneCache:
             return resident.summary
         listing = await self.listing(name)
         if listing.summary is None:
-            # It may have been mended since.
+            # It may have been repaired since.
             listing = (await self.refresh()).get(name, listing)
         if listing.summary is None:
             raise _broken(name, listing.reason)
@@ -473,10 +473,10 @@ class SceneCache:
             for nbytes in (r.scene.nbytes + scene_levels_bytes(r.scene),)
         ]
 
-    # --- using ------------------------------------------------------------------------------
+    # --- use --------------------------------------------------------------------------------
 
     async def get(self, name: str) -> Scene:
-        """The scene, loaded if need be. A reference keeps it alive; it is not pinned.
+        """The scene, loaded if necessary. A reference keeps it alive; it is not pinned.
 
         Raises:
             ServiceError: UNKNOWN_SCENE, SCENE_BROKEN, or OUT_OF_MEMORY.
@@ -490,7 +490,7 @@ class SceneCache:
         return resident.scene
 
     def unpin(self, name: str) -> None:
-        """Give back one pin."""
+        """Release one pin."""
         resident = self._resident[name]
         if resident.pins <= 0:
             raise RuntimeError(f"scene {name!r} is not pinned")
@@ -499,7 +499,7 @@ class SceneCache:
 
     @asynccontextmanager
     async def pinned(self, name: str) -> AsyncIterator[Scene]:
-        """The scene, in memory for the length of the block. Raises like :meth:`get`."""
+        """The scene, in memory during the block. Raises like :meth:`get`."""
         scene = await self.pin(name)
         try:
             yield scene
@@ -507,7 +507,7 @@ class SceneCache:
             self.unpin(name)
 
     async def unload(self, name: str) -> None:
-        """Take the scene out of memory; nothing to do when it is not there.
+        """Remove the scene from memory; no effect if it is not there.
 
         Raises:
             ServiceError: UNKNOWN_SCENE, or SCENE_IN_USE while sessions pin it.
@@ -575,7 +575,7 @@ class SceneCache:
         return scene
 
     def _drop(self, name: str, nbytes: int) -> int:
-        """Forget an idle scene to make room; other threads leave that to the loop."""
+        """Drop an idle scene; from other threads this runs on the event loop."""
         loop = self._loop
         if loop is None or loop.is_closed():
             return 0

@@ -1,4 +1,4 @@
-"""REST models of scenes and scenarios, and their Gaussians as files for renderers elsewhere."""
+"""REST models of scenes and scenarios, and their Gaussians as files for external renderers."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def scene_info(
 
 
 def scene_objects(summary: SceneSummary, *, tracks: bool) -> list[ObjectInfo]:
-    """The objects of an unedited scene; instance ids as the renderer gives them."""
+    """The objects of an unedited scene, with the renderer's instance ids."""
     return [
         ObjectInfo(
             object_id=o.object_id,
@@ -98,7 +98,7 @@ def edited_objects(
 
 
 def camera_info(camera: Camera) -> CameraInfo:
-    """A camera as the wire has it."""
+    """A camera as a protocol model."""
     return CameraInfo(
         name=camera.name,
         width=camera.width,
@@ -125,9 +125,9 @@ def camera_infos(cameras: Sequence[Camera]) -> list[CameraInfo]:
 
 
 def track(trajectory: Trajectory) -> Track:
-    """A trajectory as the wire has it."""
-    # Values were checked when the trajectory was made; validating thousands of poses again
-    # would hold up the event loop.
+    """A trajectory as a protocol model."""
+    # The trajectory is already validated; validating thousands of poses again would block the event
+    # loop.
     return Track.model_construct(
         times_us=trajectory.times_us.tolist(),
         positions=[tuple(p) for p in trajectory.positions.tolist()],
@@ -138,7 +138,7 @@ def track(trajectory: Trajectory) -> Track:
 # Gaussians as files: sorted and packed once.
 
 GZIP_LEVEL = 1
-"""Packs in a sixth of the time of level 9, into 3 % more bytes."""
+"""Six times as fast as level 9, for 3 % more bytes."""
 
 MAX_BYTES = 64 << 20
 

@@ -33,7 +33,7 @@ from ...world.ranging import Cloud
 
 
 def camera_with(camera: Camera, optics: Optics) -> Camera:
-    """A camera of a rig with the optics of a sensor. Raises SceneError for optics that are none."""
+    """A camera of a rig with the optics of a sensor. Raises SceneError for invalid optics."""
     if optics == "pinhole":
         return camera
     if optics == "recorded":
@@ -89,12 +89,12 @@ class FollowingImage:
         self._lock = threading.Lock()
 
     def ready(self) -> None:
-        """Return when the pixels are there; any number of times."""
+        """Wait until the pixels are complete; may be called repeatedly."""
         with self._lock:
             if self._follow is not None:
                 self._wait()
                 self.pixels[:] = self._follow()
-                self._follow = None  # and the drawn image with it
+                self._follow = None  # also releases the rendered image
 
 
 def blurred(
@@ -182,7 +182,7 @@ class EncodedFrame:
     """One image, encoded.
 
     Attributes:
-        header: everything but its bytes.
+        header: everything except its bytes.
         data: its bytes.
     """
 
@@ -196,12 +196,12 @@ class EncodedFrame:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the decoded image."""
+        """Data type of the decoded image."""
         return tuple(self.header.fields["shape"])
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Of the wire's Frame, ``data`` as bytes among them."""
+        """Members of the protocol's Frame, including ``data`` as bytes."""
         return self.header.fields | {"data": bytes(self.data)}
 
 
@@ -279,11 +279,11 @@ _UINT64 = b"\xcf"
 # --- Point clouds --------------------------------------------------------------------------------
 
 DEFLATE_LEVEL = 1
-"""Higher ones take three times as long for a tenth less."""
+"""Higher levels take three times as long for 10 % less."""
 
 
 def cloud_parts(cloud: Cloud) -> list[Part]:
-    """The wire's PointCloud, in parts; raw columns are not copied."""
+    """The protocol's PointCloud, in parts; raw columns are not copied."""
     columns = {name: _little(column) for name, column in cloud.columns.items()}
     fields = {
         "sensor": cloud.sensor,
@@ -306,8 +306,8 @@ def cloud_parts(cloud: Cloud) -> list[Part]:
 
 
 def deflated(columns: Sequence[NDArray[Any]]) -> bytes:
-    """Columns by zlib, the first bytes of all numbers of each before the second ones: they hardly
-    differ from point to point."""
+    """Columns compressed by zlib, with the first bytes of all numbers before the second ones: these
+    hardly differ between points."""
     packer = zlib.compressobj(DEFLATE_LEVEL)
     parts = []
     for column in columns:

@@ -1,4 +1,4 @@
-"""From instances to encoded frames: rendered on the engine, encoded on other threads."""
+"""From instances to encoded frames: rendering on the engine, encoding on other threads."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ R = TypeVar("R")
 
 MAX_ENCODERS = 8
 BULK_NICENESS = 10
-"""Of the thread that encodes large pictures; the engine's is less, see there."""
+"""Niceness of the thread that encodes large images; the engine has a higher priority."""
 
 VIEW_PIXELS = 2_000_000
 """Requests with more pixels have a lower priority than interactive ones."""
@@ -156,7 +156,7 @@ class Renderer:
         self._bulk_encoders.shutdown(cancel_futures=True)
 
     async def warm_up(self) -> None:
-        """Render and encode something in every form, so that no first frame waits for it."""
+        """Render and encode once in every form, so that no first frame is slow."""
         await self._engine.call(warm_up, self._backend, label="warm-up")
         self.jpeg, why = await asyncio.to_thread(jpeg_encoder_for, device_of(self._backend))
         log.info("jpeg", encoder=why)
@@ -195,8 +195,8 @@ class Renderer:
         cameras: Sequence[Camera],
         things: Callable[[], Sequence[Instance]],
     ) -> None:
-        """Wait until cameras can be drawn without holding up others: for levels of detail, see
-        there, and for kernels of lenses and of small images.
+        """Wait until cameras can be rendered without delaying others: for levels of detail, and for
+        kernels of lenses and small images.
 
         Raises:
             ServiceError: OUT_OF_MEMORY; INVALID_REQUEST where the backend draws no lenses.
@@ -345,7 +345,7 @@ class Renderer:
 
 
 def encoder_threads() -> int:
-    """Images that are encoded at a time: on half of the cores, two at least."""
+    """Images that are encoded in parallel: half of the cores, at least two."""
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
     return max(2, min(MAX_ENCODERS, cores // 2))
@@ -362,7 +362,7 @@ Pass = tuple[RasterOptions, tuple[str, ...]]
 
 
 def _passes(requests: Sequence[RenderRequest]) -> dict[Pass, dict[int, list[int]]]:
-    """Indices of the sensors of each request, by the pass that draws them."""
+    """Indices of the sensors of each request, by rendering pass."""
     passes: dict[Pass, dict[int, list[int]]] = {}
     for r, request in enumerate(requests):
         for options, indices in _sensors_by_options(request.sensors).items():
@@ -464,7 +464,7 @@ def check_sensors(
     return cameras
 
 
-# --- HTTP answers --------------------------------------------------------------------------------
+# --- HTTP replies --------------------------------------------------------------------------------
 
 CODEC_OF: dict[str, Codec] = {
     "image/jpeg": "jpeg",
@@ -500,7 +500,7 @@ MSGPACK = "application/msgpack"
 
 
 def choose_frames_type(accept: str | None, modalities: Sequence[Modality]) -> str:
-    """The same for images of these modalities: msgpack, or, for one image, any of its forms."""
+    """The same for images of these modalities: msgpack, or for one image any of its formats."""
     if len(modalities) == 1:
         return choose_media_type(accept, modalities[0])
     return choose_among([MSGPACK], accept, of="more than one image")

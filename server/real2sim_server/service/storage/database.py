@@ -44,13 +44,13 @@ T = TypeVar("T")
 
 TIMEOUT_S = 5.0
 PATIENCE = 3.0
-"""Timeouts that a caller waits for its turn and its answer."""
+"""Timeouts that a caller waits, for its turn and its answer."""
 PROBE_S = 1.0
-"""Between questions whether a store in trouble is well again."""
+"""Interval of probes of a failing store [s]."""
 CHECK_S = 5.0
-"""Between questions whether a store is still well."""
+"""Interval of probes of a healthy store [s]."""
 SCHEMA_TIMEOUT_S = 3600.0
-"""Of a migration: it may have to rewrite everything."""
+"""Timeout of a migration, which may rewrite all tables [s]."""
 
 Durability = Literal["all", "edits", "process"]
 """What is on disk before it is acknowledged: everything, everything except session steps, or
@@ -87,7 +87,7 @@ class Write:
         return connection.execute(self.statement, cast("Any", self.rows))
 
     def checked(self, changed: int) -> int:
-        """The rows that it changed. Raises FencedError."""
+        """Number of changed rows. Raises FencedError."""
         if self.fenced is not None and changed != self.fenced:
             raise FencedError("another worker has taken the session over")
         return changed
@@ -167,7 +167,7 @@ class Database:
 
     @property
     def is_file(self) -> bool:
-        """Whether it is a file of SQLite's."""
+        """Whether it is an SQLite file."""
         return self._file is not None
 
     async def watch(self) -> None:
@@ -179,7 +179,7 @@ class Database:
             except StoreError:
                 continue
             except Exception:
-                # Whatever it was: without this watch the store would never be well again.
+                # Any error: without this loop the store would never recover.
                 log.exception("looking after the store failed")
 
     # --- statements -------------------------------------------------------------------------
@@ -199,10 +199,10 @@ class Database:
         return await self.on_thread(read)
 
     async def write(self, *changes: Write) -> list[int]:
-        """Rows changed by each statement, in one transaction; the answer is a promise.
+        """Rows changed by each statement, in one transaction, durable on return.
 
         Raises:
-            ConflictError: a row that must be new exists.
+            ConflictError: a row already exists.
             FencedError: a session was taken over.
         """
         self._refuse_while_down()
@@ -230,8 +230,8 @@ class Database:
         """Like :meth:`write`, on the calling thread; never on the event loop.
 
         Args:
-            changes: all of them, or none.
-            promised: whether somebody relies on them beyond a session: then they are on the disk
+            changes: executed in one transaction.
+            promised: whether they matter beyond a session: then they are on disk
                 before this returns, unless ``durability`` is ``process``.
         """
         self._refuse_while_down()
@@ -251,10 +251,10 @@ class Database:
         return counts
 
     async def on_thread(self, fn: Callable[[], T]) -> T:
-        """``fn()`` on the thread of the database, awaited as long as any answer.
+        """``fn()`` on the thread of the database, with the usual timeout.
 
         Raises:
-            StoreUnavailableError: it was not done in that time.
+            StoreUnavailableError: it did not finish in time.
         """
         return await self._run(fn, patience_s=PATIENCE * self._timeout_s)
 
@@ -267,7 +267,7 @@ class Database:
         return await self.on_thread(self._pages_bytes)
 
     async def give_back(self, pages: int) -> bool:
-        """Give free pages of a database file back to the disk; whether there are more."""
+        """Return free pages of a database file to the disk; returns whether there are more."""
         if self._file is None:
             return False
         return await self.on_thread(partial(self._shrink, pages))
@@ -383,13 +383,13 @@ class Database:
         return self._file.parent if self._file else None
 
     def _set_durable(self, writer: sa.Connection, *, durable: bool) -> None:
-        # NORMAL loses no committed transaction when the process dies, only when the machine does.
+        # NORMAL only loses committed transactions if the machine crashes.
         pragma = f"PRAGMA synchronous={'FULL' if durable else 'NORMAL'}"
         _driver_of(writer).execute(pragma).close()
         self._writer_is_durable = durable
 
     def _drop_writer(self) -> None:
-        """A connection that has failed may be in any state; the next write gets another one."""
+        """Close a failed connection, which may be in any state; the next write opens a new one."""
         writer, self._writer = self._writer, None
         if writer is not None:
             with contextlib.suppress(sa.exc.SQLAlchemyError):
@@ -401,7 +401,7 @@ class Database:
             raise StoreError("the store is not open")
         return self._engine
 
-    # --- trouble ----------------------------------------------------------------------------
+    # --- failures ---------------------------------------------------------------------------
 
     def _refuse_while_down(self) -> None:
         trouble = self._trouble
@@ -409,7 +409,7 @@ class Database:
             raise type(trouble)(trouble.reason)
 
     def _reraise(self, error: Exception) -> NoReturn:
-        """Raise the error as callers get it; trouble is noted."""
+        """Raise the converted error, and record failures."""
         found = sorted_error(error, folder=self._folder)
         if isinstance(found, StoreTroubleError):
             self._noted(found)
@@ -484,7 +484,7 @@ class Database:
         """Create or migrate the schema, with a long timeout."""
         engine = self._connected()
         with engine.connect():
-            pass  # Whether anybody is there is found out in the usual time.
+            pass  # The connection is checked with the usual timeout.
         if self._file is None and engine.dialect.name == "sqlite":
             prepare_schema(engine, policy=self._migration)
             return
@@ -520,8 +520,8 @@ def _driver_of(connection: sa.Connection) -> sqlite3.Connection:
     assert found is not None
     return cast("sqlite3.Connection", found)
 
-"""Retrieve the outcome of abandoned work, so that asyncio does not log it as unhandled."""
+
 def _looked_at(work: asyncio.Future[Any]) -> None:
-    """Nobody may be left to be told how it ended."""
+    """Retrieve the outcome of abandoned work, so that asyncio does not log it as unhandled."""
     if not work.cancelled():
         work.exception()
