@@ -1,4 +1,4 @@
-"""Starting a worker: for good, or for the length of a ``with`` block."""
+"""Runs a worker: until a signal, or during a ``with`` block."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ def spare_what_is_there() -> None:
 
 
 def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
-    """Send structlog and the standard library's loggers to stderr in one form.
+    """Send logs of structlog and the standard library to stderr in one format.
 
     Args:
-        level: lowest level that is written.
-        log_format: ``text``, ``json``, or ``auto``: text when stderr is a terminal.
+        level: minimum level.
+        log_format: ``text``, ``json``, or ``auto``: text if stderr is a terminal.
     """
     text = log_format == "text" or (log_format == "auto" and sys.stderr.isatty())
     shared: list[Any] = [
@@ -80,7 +80,7 @@ def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
         wrapper_class=structlog.stdlib.BoundLogger,
         cache_logger_on_first_use=True,
     )
-    # Tracebacks as plain text: prettier ones print local variables, tokens among them.
+    # Plain tracebacks: prettier ones print local variables, which may contain tokens.
     render: list[Any] = (
         [structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)]
         if text
@@ -96,7 +96,7 @@ def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level.upper())
-    # One line a request is ours; the server's own would double it.
+    # We log one line per request; the server's access log would duplicate it.
     logging.getLogger("uvicorn.access").disabled = True
     for name in ("uvicorn", "uvicorn.error", "asyncio", "alembic"):
         logging.getLogger(name).setLevel(max(logging.WARNING, root.level))
@@ -145,11 +145,11 @@ def run(settings: Settings) -> int:
     worker: Worker = app.state.worker
     print(_announcement(worker, url_of(settings.host, listener)), file=sys.stderr, flush=True)
     server = DrainingServer(server_config(app, settings), worker)
-    # A lost device poisons the process: it ends, so that its supervisor starts a new one.
+    # A lost device makes the process unusable: it ends, and its supervisor starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
     search_seldom()
     worker.on_ready = spare_what_is_there
-    # The server stops gracefully at a signal and then raises it once more for us.
+    # The server stops gracefully at a signal and then raises it again for us.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt), _start_errors_told_once(worker):
         server.run(sockets=[listener])
@@ -229,7 +229,7 @@ class DrainingServer(uvicorn.Server):
         self._stops_at: float | None = None
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """A signal: the first SIGTERM begins to drain, any other one stops."""
+        """Handle a signal: the first SIGTERM starts draining, any other one stops."""
         if sig == signal.SIGTERM and self._stops_at is None and self.started:
             self._worker.drain()
             self._stops_at = time.monotonic() + self._worker.settings.drain_seconds
@@ -238,7 +238,7 @@ class DrainingServer(uvicorn.Server):
             super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
-        """Ten times a second: whether it is time to stop."""
+        """Check ten times a second whether to stop."""
         if self._stops_at is not None and time.monotonic() >= self._stops_at:
             if not self._worker.handed_over and await self._handed_over():
                 self._stops_at = time.monotonic() + LINGER_S
@@ -255,7 +255,7 @@ class DrainingServer(uvicorn.Server):
 
 
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
-    """How uvicorn serves a worker."""
+    """uvicorn's configuration for a worker."""
     config = uvicorn.Config(
         app,
         http="h11",
@@ -298,7 +298,7 @@ def _wait_until_ready(
         if not thread.is_alive():
             reason = worker.start_error or "see its log"
             raise RuntimeError(f"the worker ended while it started: {reason}")
-        # Short, because a worker that has died leaves the connection open and silent.
+        # Short, because a dead worker leaves the connection open without data.
         ready, answer = _ask_readiness(address, timeout_s=0.5)
         if ready:
             return

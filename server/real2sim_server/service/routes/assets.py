@@ -1,4 +1,4 @@
-"""The asset library: upload, cut out, look."""
+"""The asset library: upload, cut out, query."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ async def _added(
 
 @router.get("")
 async def list_assets(worker: WorkerOf) -> AssetList:
-    """The whole library."""
+    """All assets of the library."""
     return AssetList(assets=await asyncio.to_thread(worker.assets.list))
 
 
@@ -124,9 +124,9 @@ async def delete(
     asset_id: Identifier,
     dry_run: Annotated[bool, Query(description="check, change nothing")] = False,
 ) -> Response:
-    """Remove an asset that no scenario has in its history; its id may then be given again.
+    """Delete an asset that no scenario's history refers to; its id becomes available again.
 
-    Sessions that show it go on.
+    Sessions that show it continue.
     """
     await asyncio.to_thread(worker.assets.info, asset_id)
     await _check_unused(worker, asset_id)

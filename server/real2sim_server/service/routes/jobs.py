@@ -77,7 +77,7 @@ async def list_jobs(
 
 @router.get("/{job_id}")
 async def describe(worker: WorkerOf, job_id: Identifier) -> JobInfo:
-    """One job: state, progress, and once it is over its result or error."""
+    """One job: state, progress, and at its end the result or error."""
     return await worker.jobs.get(job_id)
 
 
@@ -120,7 +120,7 @@ async def events(
     after = int(last_event_id or 0)
     info = await worker.jobs.get(job_id)
     if info.over and info.event <= after:
-        return Response(status_code=204)  # tells browsers not to connect again
+        return Response(status_code=204)  # tells browsers not to reconnect
     return StreamingResponse(
         event_stream(_named(worker.jobs, job_id, after)),
         media_type="text/event-stream",
@@ -132,7 +132,7 @@ async def events(
 async def preview(
     worker: WorkerOf, job_id: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
-    """One frame of a finished simulation, or of a drive from where its vehicle was at ``t_us``."""
+    """One frame of a finished simulation, or of a drive from its vehicle's pose at ``t_us``."""
     media_type = query.media_type()
     video_source = await worker.video_source(job_id)
     t_us = video_source.span[0] if query.t_us is None else query.t_us
@@ -227,7 +227,7 @@ async def create(
 
 
 async def rebuild(worker: Worker, info: JobInfo) -> Work:
-    """The export of a job on record, of the scenario as it was then."""
+    """The export of a stored job, with the scenario at its revision."""
     fields = dict(info.request)
     revision = fields.pop("revision", None)
     return await _work(worker, EXPORT_BODY.validate_python(fields), revision, None)
@@ -245,7 +245,7 @@ async def _work(
 
 
 def _is_portable(body: ExportRequest | DatasetRequest) -> bool:
-    """Whether all that it shows is in the store, and the same for all workers."""
+    """Whether all its inputs are in the store, and the same for all workers."""
     if isinstance(body, DatasetRequest):
         return body.session is None and body.recording is None
     return body.simulation is None
@@ -339,7 +339,7 @@ async def _edited_source(
 
 
 def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """A scenario's history without its instants: the same edits give the same bytes."""
+    """A scenario's history without timestamps, so that equal edits give equal bytes."""
     if all(entry["kind"] == "edit" for entry in entries):
         return {"operations": [edit for entry in entries for edit in entry["operations"]]}
     kept = ("kind", "operations", "target")

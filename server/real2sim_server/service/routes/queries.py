@@ -44,7 +44,7 @@ class FrameQuery:
     ] = None
 
     def media_type(self) -> str:
-        """Form of the answer. Raises ServiceError: NOT_ACCEPTABLE."""
+        """Format of the reply. Raises ServiceError: NOT_ACCEPTABLE."""
         return choose_media_type(self.accept, self.modality)
 
     def render_request(self, scene: Scene, state: ScenarioState, media_type: str) -> RenderRequest:
@@ -111,7 +111,7 @@ class SweepQuery:
     accept: Annotated[str | None, Header(description=f"{MSGPACK} or {POINTS}")] = None
 
     def media_type(self) -> str:
-        """Form of the answer. Raises ServiceError: NOT_ACCEPTABLE."""
+        """Format of the reply. Raises ServiceError: NOT_ACCEPTABLE."""
         return choose_among([MSGPACK, POINTS], self.accept, of="a sweep")
 
     def mounted(self) -> MountedLidar:
@@ -119,7 +119,7 @@ class SweepQuery:
         return mounted_sensors([LidarSpec(lidar=self.lidar)], [], 1).lidars[0]
 
     def instant(self, state: ScenarioState) -> int:
-        """When the sweep ends [us]."""
+        """Time of the last ray [us]."""
         return state.clock[0] if self.t_us is None else self.t_us
 
 

@@ -1,4 +1,4 @@
-"""Scenarios: create, edit, undo, look; their storyboards and the gallery of corner cases."""
+"""Scenarios: create, edit, undo, query; their storyboards and the gallery of corner cases."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Change:
 
     @property
     def expected(self) -> int | None:
-        """Revision that the change was made for. Raises ServiceError: INVALID_REQUEST."""
+        """Revision that the change is based on. Raises ServiceError: INVALID_REQUEST."""
         return expected_revision(self.if_match)
 
     def guard(self, worker: Worker) -> AbstractAsyncContextManager[IdempotentRequest]:
@@ -95,7 +95,7 @@ ChangeOf = Annotated[Change, Depends(_change_of)]
 async def create(
     worker: WorkerOf, body: ScenarioCreate, request: Request, idempotency_key: IdempotencyKey = None
 ) -> Response:
-    """A new scenario on a scene; it is stored and survives a restart."""
+    """Create a scenario on a scene; it is stored and survives a restart."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -129,7 +129,7 @@ async def import_(
 
 @router.get("/{scenario_id}", response_model=ScenarioInfo)
 async def describe(worker: WorkerOf, scenario_id: Identifier) -> Response:
-    """One scenario with all its objects as they are now."""
+    """One scenario with all its current objects."""
     view = await worker.scenarios.view(scenario_id)
     return await large_response(view.info, headers={"ETag": etag(view.revision)})
 
@@ -143,7 +143,7 @@ async def rename(worker: WorkerOf, scenario_id: Identifier, body: ScenarioRename
 
 @router.delete("/{scenario_id}", status_code=204, response_class=Response)
 async def delete(worker: WorkerOf, scenario_id: Identifier) -> Response:
-    """Remove a scenario and its history. Sessions that began from it go on."""
+    """Delete a scenario and its history. Sessions that started from it continue."""
     await worker.scenarios.delete(scenario_id)
     return Response(status_code=204)
 
@@ -155,7 +155,7 @@ async def edit(
     body: OperationBatch,
     change: ChangeOf,
 ) -> Response:
-    """Apply a batch of operations, all or none; 412 with the missed entries when it is stale."""
+    """Apply a batch of operations, all or none; 412 with the missed entries if it is stale."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -174,7 +174,7 @@ async def edit(
 async def history(
     worker: WorkerOf, scenario_id: Identifier, after: Annotated[int, Query(ge=0)] = 0
 ) -> History:
-    """Revisions behind ``after``, oldest first."""
+    """Revisions after ``after``, oldest first."""
     return await worker.scenarios.history(scenario_id, after=after)
 
 
@@ -184,7 +184,7 @@ async def undo(
     scenario_id: Identifier,
     change: ChangeOf,
 ) -> Response:
-    """Take back the last batch that is in effect."""
+    """Undo the last batch that is in effect."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -200,7 +200,7 @@ async def redo(
     scenario_id: Identifier,
     change: ChangeOf,
 ) -> Response:
-    """Bring back the last batch that was undone."""
+    """Redo the last batch that was undone."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -218,7 +218,7 @@ async def fork(
     body: ScenarioFork | None = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """A new scenario with the same history, up to a revision; the two go separate ways."""
+    """Create an independent scenario with the same history, up to a revision."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -276,7 +276,7 @@ async def calibrate(  # noqa: PLR0917, one parameter for each part of the reques
 
 @router.get("/{scenario_id}/export", response_model=ScenarioDocument)
 async def export(worker: WorkerOf, scenario_id: Identifier) -> Response:
-    """The scenario with its whole history as one JSON file that names its scene by hash."""
+    """The scenario with its whole history as one JSON file that refers to its scene by hash."""
     document = await worker.scenarios.export(scenario_id)
     name = f"{scenario_id}.scenario.json"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
@@ -351,10 +351,10 @@ async def sweep(
 
 
 def expected_revision(if_match: str | None) -> int | None:
-    """Revision that ``If-Match`` names; None where any will do.
+    """Revision in ``If-Match``; None if any is accepted.
 
     Raises:
-        ServiceError: INVALID_REQUEST for anything but ``"r<number>"`` or ``*``.
+        ServiceError: INVALID_REQUEST for values other than ``"r<number>"`` or ``*``.
     """
     if if_match is None or if_match.strip() == "*":
         return None

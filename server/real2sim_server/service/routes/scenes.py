@@ -63,7 +63,7 @@ router = APIRouter(prefix="/v1", tags=["scenes"], route_class=TokenRoute)
 
 @router.get("/scenes", response_model=SceneList)
 async def list_scenes(worker: WorkerOf) -> Response:
-    """Every scene below the worker's scene folder, resident or not, broken ones with the reason."""
+    """All scenes in the worker's scene folder, resident or not; broken ones have a reason."""
     scene_cache = worker.scene_cache
     listed = [
         (item, scene_cache.state(name)) for name, item in (await scene_cache.refresh()).items()
@@ -84,9 +84,9 @@ async def describe(worker: WorkerOf, scene: Identifier) -> Response:
 
 @router.get("/scenes/{scene}/lanes", response_model=SceneLanes)
 async def lanes(worker: WorkerOf, scene: Identifier, roads: bool = True) -> Response:
-    """The lanes of a scene: centre lines, neighbours, stop lines, signals; 404 where it has none.
+    """The lanes of a scene: centre lines, neighbours, stop lines, signals; 404 if it has none.
 
-    `roads=false` leaves out reference lines of roads.
+    `roads=false` omits the reference lines of roads.
     """
     summary = await worker.scene_cache.summary(scene)
     graph = await asyncio.to_thread(lambda: summary.lanes)
@@ -144,7 +144,7 @@ async def load(
 
 @router.delete("/scenes/{scene}/residency", response_model=SceneInfo)
 async def unload(worker: WorkerOf, scene: Identifier) -> Response:
-    """Take a scene out of memory; 409 while sessions use it."""
+    """Unload a scene from memory; 409 while sessions use it."""
     await worker.scene_cache.unload(scene)
     return await scene_response(worker, scene)
 
@@ -153,7 +153,7 @@ async def unload(worker: WorkerOf, scene: Identifier) -> Response:
 async def render(
     worker: WorkerOf, scene: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
-    """One frame of the unedited scene, from where the recording vehicle was at ``t_us``."""
+    """One frame of the unedited scene, from the recording vehicle's pose at ``t_us``."""
     media_type = query.media_type()
     resident = await worker.scene_cache.get(scene)
     render_request = await asyncio.to_thread(
@@ -213,7 +213,7 @@ async def scene_response(
 # --- Imports -------------------------------------------------------------------------------------
 
 UPLOAD_PATHS = ("/v1/scenes",)
-"""Where forms may be larger than other requests."""
+"""Paths whose forms may be larger than other requests."""
 
 _BODY = {
     "requestBody": {
@@ -242,7 +242,7 @@ _BODY = {
 async def import_(
     worker: WorkerOf, request: Request, idempotency_key: IdempotencyKey = None
 ) -> Response:
-    """Add a scene: a bundle or ply below the import folder (JSON), the demo street
+    """Add a scene: a bundle or ply in the import folder (JSON), the demo street
     (`{"demo": true}`), or an uploaded ply."""
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
     with worker.imports.place():
@@ -325,7 +325,7 @@ def _import(worker: Worker, source: Path, name: str, claim: str | None) -> None:
 
 
 def stored_upload(file: UploadFile, staging: Path) -> Path:
-    """The upload as a file in ``staging``: readers map files, and tell some formats by suffix."""
+    """The upload as a file in ``staging``: readers map files, and some formats need the suffix."""
     given = Path(file.filename or "upload.ply").name.lower()
     ending = next((suffix for suffix in suffixes() if given.endswith(suffix)), ".ply")
     stored = staging / f"upload{ending}"

@@ -1,4 +1,4 @@
-"""Sessions by plain requests: the same world as the drive socket, for scripts."""
+"""Sessions over REST: the same world as the drive socket, for scripts."""
 
 from __future__ import annotations
 
@@ -225,9 +225,9 @@ async def edit(
     body: SessionEdit,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Edit the running world before its next step: put road users there (`spawn`) and take them
-    away (`delete`), move objects. A controller may be driving meanwhile; the next observation has
-    the event `edited`."""
+    """Edit the running world before its next step: add road users (`spawn`), remove them (`delete`)
+    or move objects. Also possible while a controller drives; its next observation has the event
+    `edited`."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -347,7 +347,7 @@ async def recording(
     session: SessionOf,
     frames: Annotated[bool, Query(description="draw and keep the images too")] = False,
 ) -> Response:
-    """The running episode as a file, to be replayed and scored again: `real2sim replay`."""
+    """The current episode as a file, for replay and scoring: `real2sim replay`."""
     made = await recording_of(worker.sessions, session, frames=frames)
     name = f"{session.session_id}.r2e"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
@@ -373,7 +373,7 @@ async def render(
     body: SessionRender,
     accept: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """Images, sweeps and scans of the current instant; never moves time."""
+    """Images, sweeps and scans of the current step; time does not advance."""
     pipeline, world = worker.sessions.pipeline, session.running_world()
     return await view_response(pipeline, world, body, accept)
 
@@ -405,8 +405,8 @@ MSGPACK = "application/msgpack"
 async def view_response(
     pipeline: StepPipeline, world: World, asked: SessionRender, accept: str | None
 ) -> Response:
-    """All frames and clouds as msgpack; a single image also as a file, if ``accept`` likes that
-    best.
+    """All frames and clouds as msgpack; a single image also as a file, if ``accept`` prefers
+    that.
 
     In msgpack each frame has the codec its sensor names.
 

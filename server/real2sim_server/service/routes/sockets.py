@@ -1,4 +1,4 @@
-"""The drive socket and the view socket. A handshake that fails is answered over HTTP."""
+"""The drive socket and the view socket. Failed handshakes are answered over HTTP."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ log = structlog.get_logger(__name__)
 
 @router.websocket("/{session_id}/drive")
 async def drive(socket: WebSocket, worker: WorkerOf, session_id: str) -> None:
-    """Drive a session in lock step, or look on; see docs of the drive socket."""
+    """Drive a session in lockstep, or observe it; see the drive socket's documentation."""
     try:
         protocol = common_protocol(socket)
         account = account_of_handshake(socket, worker)
@@ -128,7 +128,7 @@ def _steps(session: Session) -> int:
 
 
 def common_protocol(socket: WebSocket) -> str:
-    """The subprotocol that both sides speak. Raises ServiceError: UNSUPPORTED_PROTOCOL."""
+    """The common subprotocol. Raises ServiceError: UNSUPPORTED_PROTOCOL."""
     offered = list(socket.scope.get("subprotocols", []))
     for protocol in SUPPORTED_SUBPROTOCOLS:
         if protocol in offered:
@@ -159,7 +159,7 @@ def account_of_token(worker: Worker, token: str | None) -> Account | None:
 
 @contextlib.contextmanager
 def ended_when_revoked(connection: Connection, account: Account) -> Iterator[None]:
-    """The connection ends when the token of its account is no more."""
+    """End the connection when the token of its account is removed."""
     revoked = partial(_end, connection, account)
     account.on_revoked.add(revoked)
     try:
@@ -184,7 +184,7 @@ _ending: set[asyncio.Future[None]] = set()
 # answered; older ones are dropped.
 
 REVISION_CHECK_S = 1.0
-"""How often an idle view checks the revision of its scenario."""
+"""Interval at which an idle view checks its scenario's revision [s]."""
 PICK_WIDTH = 640
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -234,7 +234,7 @@ class ViewConnection:
         self._revoked = asyncio.Event()
 
     def end(self) -> None:
-        """Leave the browser: its token is no more."""
+        """Disconnect the browser: its token was removed."""
         self._revoked.set()
 
     async def serve(self) -> None:
@@ -247,7 +247,7 @@ class ViewConnection:
         finally:
             for task in tasks:
                 task.cancel()
-            # Not gather(): cancelled itself, it would pass on the cancellation of its tasks.
+            # Not gather(): if cancelled itself, it would pass the cancellation to its tasks.
             await asyncio.wait(tasks)
         for task in tasks:
             error = None if task.cancelled() else task.exception()
@@ -424,7 +424,7 @@ def _render_request(
 HANDSHAKE_TIMEOUT_S = 10.0
 CLOSED_BAD_MESSAGE, CLOSED_UNAUTHORIZED, CLOSED_NOT_FOUND = 4400, 4401, 4404
 CLOSED_TIMEOUT, CLOSED_OVER_LIMIT, CLOSED_FAILED = 4408, 4429, 4500
-"""Codes with which the socket is closed."""
+"""Close codes of the socket."""
 CLOSED_BY = {
     ErrorCode.UNKNOWN_SCENARIO: CLOSED_NOT_FOUND,
     ErrorCode.UNAUTHORIZED: CLOSED_UNAUTHORIZED,
@@ -453,7 +453,7 @@ class NoHelloError(Exception):
 
 @view_router.websocket("/{scenario_id}/view")
 async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
-    """Frames and picks of a scenario for one browser; the latest question wins."""
+    """Frames and picks of a scenario for one browser; newer requests replace older ones."""
     await socket.accept()
     try:
         with worker.metrics.open_socket("view"):

@@ -47,7 +47,7 @@ from ..storage.store import ScenarioRow, SnapshotRow, Store, StoreError
 
 @dataclass(frozen=True, eq=False)
 class ScenarioView:
-    """A scenario at one revision: for answers, previews and new sessions. Never changes."""
+    """An immutable scenario at one revision: for replies, previews and new sessions."""
 
     row: ScenarioRow
     summary: SceneSummary
@@ -72,19 +72,19 @@ class ScenarioView:
 
 
 def created_headers(info: ScenarioInfo) -> dict[str, str]:
-    """Headers of the answer to a creation."""
+    """Headers of the reply to a creation."""
     return {"Location": f"/v1/scenarios/{info.scenario_id}", "ETag": info.etag}
 
 
 def tag(result: OperationResult) -> dict[str, str]:
-    """Headers of the answer to a change."""
+    """Headers of the reply to a change."""
     return {"ETag": result.etag}
 
 
 class StoredOperations(Sequence[Operation]):
-    """Operations as the store has them, made into models when one is looked at.
+    """Stored operations, parsed on access.
 
-    They were checked when they were written; of a long log most are never looked at again.
+    They were validated when written; most entries of a long log are never accessed again.
     """
 
     def __init__(self, stored: Sequence[Mapping[str, Any]]) -> None:
@@ -106,7 +106,7 @@ class StoredOperations(Sequence[Operation]):
 
 
 def stored_entry(stored: Mapping[str, Any]) -> LogEntry:
-    """One revision as the store has it."""
+    """One stored revision."""
     return LogEntry(
         revision=stored["revision"],
         kind=stored["kind"],
@@ -123,7 +123,7 @@ def replayed(
     log: Sequence[HistoryEntry],
     assets: AssetLookup | None,
 ) -> Scenario:
-    """The scenario that a log leads to. Raises EditError where it does not fit its scene."""
+    """The scenario of a log. Raises EditError if the log does not fit its scene."""
     return Scenario.replay(
         ScenarioState.of(summary, assets=assets),
         [
@@ -136,7 +136,7 @@ def replayed(
 
 
 def history_entry(entry: LogEntry) -> HistoryEntry:
-    """One revision as the wire has it."""
+    """One revision as a protocol model."""
     return HistoryEntry(
         revision=entry.revision,
         kind=entry.kind,
@@ -148,7 +148,7 @@ def history_entry(entry: LogEntry) -> HistoryEntry:
 
 
 def asset_hashes(entries: Iterable[LogEntry], assets: AssetLookup | None) -> dict[str, str]:
-    """Content hash of every asset that a log names, by id."""
+    """Content hash of every asset in a log, by id."""
     named = {
         operation.asset_id
         for entry in entries
@@ -162,7 +162,7 @@ def asset_hashes(entries: Iterable[LogEntry], assets: AssetLookup | None) -> dic
 def operation_result(
     planned: PlannedEntry, *, revision: int, dry_run: bool = False
 ) -> OperationResult:
-    """The answer to a change."""
+    """The reply to a change."""
     return OperationResult(
         revision=revision,
         etag=etag(revision),
@@ -187,7 +187,7 @@ def stale_revision(scenario: Scenario, expected: int) -> ServiceError:
 
 
 def changed_elsewhere(scenario_id: str) -> ServiceError:
-    """The refusal of a change that another worker was faster than."""
+    """The refusal of a change after another worker's faster one."""
     return ServiceError(
         ErrorCode.STALE_REVISION,
         f"another worker has changed scenario {scenario_id!r}",
@@ -210,7 +210,7 @@ def listed_info(row: ScenarioRow, kinds: Sequence[str]) -> ScenarioInfo:
 
 
 def scenario_head(row: ScenarioRow, revision: int) -> dict[str, Any]:
-    """The fields that every answer about a scenario has."""
+    """The fields of every reply about a scenario."""
     return {
         "scenario_id": row.scenario_id,
         "name": row.name,
@@ -223,13 +223,13 @@ def scenario_head(row: ScenarioRow, revision: int) -> dict[str, Any]:
 
 
 def iso_time(instant_us: int) -> str:
-    """An instant as the wire has it: UTC, ISO 8601."""
+    """A time as in replies: UTC, ISO 8601."""
     return datetime.fromtimestamp(instant_us / 1e6, UTC).isoformat(timespec="milliseconds")
 
 
 # --- Snapshots -----------------------------------------------------------------------------------
 
-# A long log then replays only its end.
+# With a snapshot, only the end of a long log is replayed.
 
 INTERVAL = 128
 """Revisions between snapshots. A snapshot adds a few milliseconds after one edit in this many, and
@@ -272,7 +272,7 @@ class Snapshots:
         return scenario
 
     def save_if_due(self, scenario_id: str, revision: int, state: ScenarioState) -> None:
-        """Save ``state`` in the background when the last snapshot is old."""
+        """Save ``state`` in the background if the last snapshot is old."""
         if revision - self._revisions.get(scenario_id, 0) < INTERVAL:
             return
         self._revisions[scenario_id] = revision
@@ -309,7 +309,7 @@ class Snapshots:
             row = SnapshotRow(scenario_id, revision, self._made_by, packed)
             await self._store.save_snapshot(row)
         except (StoreError, SQLAlchemyError, RuntimeError) as error:
-            # Deleted meanwhile, or the worker is stopping: the log is all that counts.
+            # Deleted meanwhile, or the worker is stopping; the log is sufficient.
             log.info("snapshot not kept", scenario_id=scenario_id, reason=str(error))
 
 
@@ -318,7 +318,7 @@ class Snapshots:
 # A recorded scene is available as a read-only scenario.
 
 PREFIX = "recorded."
-"""Before the content hash of a scene: the id of its recording. No other id begins like that."""
+"""Id prefix of recordings, before the content hash of the scene. No other id has it."""
 
 
 def recorded_hash(scenario_id: str) -> str | None:
@@ -356,9 +356,9 @@ class CachedScenario:
     """A scenario in memory.
 
     Attributes:
-        row: replaced where its name has changed.
-        scenario: replaced, under the lock, by a longer one when others have added to its log.
-        lock: one edit at a time; readers need none, for states are immutable.
+        row: replaced when its name changes.
+        scenario: replaced, under the lock, when others have extended its log.
+        lock: serializes edits; readers need none, because states are immutable.
     """
 
     row: ScenarioRow
@@ -385,7 +385,7 @@ class ScenarioCache:
         self._opening: dict[str, asyncio.Lock] = {}
 
     def evict(self, scenario_id: str) -> None:
-        """Forget it; the next request reads it from the store."""
+        """Drop it from the cache; the next request reads it from the store."""
         self._cached.pop(scenario_id, None)
 
     async def wait_for_changes(self) -> None:
@@ -411,11 +411,10 @@ class ScenarioCache:
                     return
 
     async def get(self, scenario_id: str) -> CachedScenario:
-        """The scenario with all that is in its log, by whichever worker; a scene as it was
-        recorded has none.
+        """The scenario with all entries of its log, by any worker; a recorded scene has no log.
 
         Raises:
-            ServiceError: UNKNOWN_SCENARIO, or SCENE_BROKEN where its scene has changed.
+            ServiceError: UNKNOWN_SCENARIO, or SCENE_BROKEN if its scene has changed.
         """
         if (wanted := recorded_hash(scenario_id)) is not None:
             return await self._recorded(scenario_id, wanted)
@@ -433,7 +432,7 @@ class ScenarioCache:
         return cached
 
     async def _recorded(self, scenario_id: str, wanted: str) -> CachedScenario:
-        """A scene as it was recorded; only memory has it."""
+        """A recorded scene, which is not stored."""
         cached = self._cached.get(scenario_id)
         if cached is not None:
             there = await self._scene_cache.summary(cached.row.scene)
@@ -466,7 +465,7 @@ class ScenarioCache:
         if name != cached.row.name:
             cached.row = replace(cached.row, name=name)
         if stored < known:
-            # The store has been put back to an earlier day.
+            # The store was restored from an earlier backup.
             self.evict(scenario_id)
             return False
         if stored > cached.scenario.revision:

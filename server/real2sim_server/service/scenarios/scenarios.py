@@ -1,4 +1,4 @@
-"""Scenarios of a worker: edited under a lock each, on record before they take effect."""
+"""Scenarios of a worker: one lock per scenario, edits stored before they take effect."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from .scenario_cache import (
 __all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
 
 MAX_RACES = 8
-"""Tries of one change against changes of other workers to the same scenario."""
+"""Attempts of one change if other workers change the same scenario."""
 
 
 class Scenarios:
@@ -178,7 +178,7 @@ class Scenarios:
         return earlier.state
 
     async def history(self, scenario_id: str, *, after: int = 0) -> History:
-        """Revisions behind ``after``, oldest first."""
+        """Revisions after ``after``, oldest first."""
         scenario = (await self._scenarios_cache.get(scenario_id)).scenario
         return History(
             revision=scenario.revision,
@@ -243,7 +243,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
-        """Take back the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
+        """Undo the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
         result = await self._change(
             scenario_id, lambda s: s.plan_undo(who=who), expected, idempotent=idempotent
         )
@@ -258,7 +258,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
-        """Bring back the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
+        """Redo the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
         result = await self._change(
             scenario_id, lambda s: s.plan_redo(who=who), expected, idempotent=idempotent
         )
@@ -314,7 +314,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
     ) -> OperationResult:
         for _ in range(MAX_RACES):
-            # Another worker may be faster; then the change is planned anew behind its entry.
+            # If another worker is faster, the change is planned again on top of its entry.
             with contextlib.suppress(ConflictError):
                 return await self._change_once(
                     scenario_id, plan, expected, dry_run=dry_run, idempotent=idempotent

@@ -1,6 +1,7 @@
-"""One drive socket once its client is known: messages in lock step or as an observer.
+"""A drive socket after its hello: messages in lockstep, or as an observer.
 
-The first two phases of a step are here, ``_receive`` and ``_check``; see `pipeline` for the others.
+It contains the first two phases of a step, ``_receive`` and ``_check``; see `pipeline` for the
+others.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ class DeadlineTimer:
 
     @property
     def waiting(self) -> bool:
-        """Whether an action is being waited for."""
+        """Whether an action is due."""
         return self._waiting is not None and not self._waiting.done()
 
     @property
@@ -188,7 +189,7 @@ class Connection:
         )
 
     async def serve(self, hello: Hello) -> None:
-        """Serve until one of both leaves. A client that vanishes is no error."""
+        """Serve until either side leaves. A vanished client is not an error."""
         session = self._session
         try:
             session.check_open()
@@ -251,11 +252,11 @@ class Connection:
                 session.controller = session.tell_controller = None
 
     async def end(self, error: ServiceError) -> None:
-        """Tell the client why, and leave it."""
+        """Send the client the reason, and disconnect."""
         await self._close_with_error(error)
 
     async def yield_control(self) -> None:
-        """Leave the session to the connection that has resumed it."""
+        """Leave the session to the connection that resumed it."""
         self._session.close_callbacks.discard(self._close_with_error)
         self._deadline_timer.cancel()
         await self._close_with_error(controller_taken(self._session.session_id))
@@ -384,16 +385,16 @@ class Connection:
             await session.hold.wait(min(wait_s, PROGRESS_S))
 
     def _check(self, action: Action, content: bytes) -> EncodedMessage | None:
-        """Whether this action is due; the answer to it where it was given before.
+        """Whether this action is due; returns its answer if it was given before.
 
         Raises:
-            ServiceError: the session is over, or the action is out of step.
+            ServiceError: the session has ended, or the action is for another step.
         """
         self._session.check_open()
         return self._session.lockstep.cached_answer(action.step, content)
 
     async def _change(self, message: Attach | Agent | Snapshot | Restore | Fork) -> EncodedMessage:
-        """Changes other than steps and edits; the session's lock is held."""
+        """Changes other than steps and edits; the caller holds the session's lock."""
         session, stepper = self._session, self._sessions.stepper
         match message:
             case Attach():
@@ -482,7 +483,7 @@ class Connection:
         return received
 
     async def _send(self, message: EncodedMessage, message_id: int = 0) -> None:
-        # The end of the session is sent from elsewhere.
+        # Another task sends the end of the session.
         async with self._sending:
             await send(self._socket, message, message_id)
 
@@ -498,7 +499,7 @@ class Connection:
 
 
 def _check_role(message: ClientMessage, role: str) -> None:
-    """Raises ServiceError: NOT_CONTROLLER for a message that such clients may not send."""
+    """Raises ServiceError: NOT_CONTROLLER for a message that observers may not send."""
     allowed = ALLOWED_MESSAGES[role]
     if isinstance(message, allowed):
         return

@@ -41,7 +41,7 @@ class ReceivedMessage:
     """One message of a client.
 
     Attributes:
-        message: as its model.
+        message: the parsed message.
         content: canonical bytes of an action's plan; empty for other messages.
     """
 
@@ -74,10 +74,10 @@ class BadMessageError(Exception):
 
 
 def read_message(data: bytes) -> ReceivedMessage:
-    """The message in ``data``.
+    """Parse the message in ``data``.
 
     Raises:
-        BadMessageError: not a message; one of another protocol version is fatal.
+        BadMessageError: invalid; fatal if it has another protocol version.
     """
     if (action := action_in(data)) is not None:
         return action
@@ -102,14 +102,14 @@ def action_in(data: bytes) -> ReceivedAction | None:
 
 
 def _read(data: bytes) -> ClientMessage:
-    """The message in ``data``. Raises as :func:`read_message` does."""
+    """Parse the message in ``data``. Raises as :func:`read_message` does."""
     try:
         fields = decode(data, max_bytes=MAX_CLIENT_MESSAGE_BYTES)
     except CodecError as error:
         raise BadMessageError(bad_message(str(error))) from error
     message_id = _id_of(fields)
     version = fields.get("v", PROTOCOL_VERSION)
-    # An array would be compared value by value.
+    # An array would be compared element by element.
     if type(version) is not int or version != PROTOCOL_VERSION:
         detail = (
             f"the message has protocol version {version!r}; this worker speaks {PROTOCOL_VERSION}. "
