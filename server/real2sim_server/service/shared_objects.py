@@ -1,4 +1,4 @@
-"""Objects that workers share: bundles of scenes and assets and files of jobs, stored by content."""
+"""Objects shared by workers: scene and asset bundles and job files, stored by content."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ DIGEST = re.compile(r"[0-9a-f]{64}")
 FRESH_S = 12 * 3600.0
 """Age from which an object is written again when it is put, to renew its age [s]."""
 RETRIES = 3
-"""Of a request that a store has not answered, or has refused for being busy."""
+"""Retries of a request that timed out, or that a busy store refused."""
 PIECE_BYTES = 4 << 20
-"""That is read from a store at a time."""
+"""Size of one read from a store [bytes]."""
 
 
 class ObjectStoreError(Exception):
-    """The store of objects cannot be used, or does not have the object; nothing has happened."""
+    """The object store fails, or does not have the object; the call had no effect."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class StoredObject:
     Attributes:
         digest: SHA-256 of its content, hexadecimal.
         bytes: size.
-        age_s: since it was last put [s].
+        age_s: time since it was last put [s].
     """
 
     digest: str
@@ -64,22 +64,22 @@ class StoredObject:
 
 
 class ObjectStore(Protocol):
-    """A store of objects; safe to use on any thread, never on the event loop.
+    """An object store. Thread-safe, but not for the event loop.
 
-    Every method raises :class:`ObjectStoreError` where the store cannot be used.
+    Every method raises :class:`ObjectStoreError` if the store fails.
     """
 
     def put(self, file: Path, digest: str) -> None:
         """Store the content of a file whose digest is known."""
 
     def read(self, digest: str, start: int, end: int) -> bytes:
-        """Bytes ``start`` to ``end`` of an object, the last excluded."""
+        """Bytes ``start`` to ``end`` of an object, end-exclusive."""
 
     def find(self, digest: str) -> StoredObject | None:
         """Metadata of an object; None if the store does not have it."""
 
     def signed_url(self, digest: str, seconds: float) -> str | None:
-        """Where anybody may fetch the object for a while; None where that cannot be had."""
+        """A temporary public URL of the object; None if not supported."""
 
     def list(self) -> Iterator[StoredObject]:
         """All objects, in any order."""
@@ -124,7 +124,7 @@ class FolderObjects:
         self._folder = folder
 
     def put(self, file: Path, digest: str) -> None:
-        """Keep the content of a file."""
+        """Store the content of a file."""
         path = self._path(digest)
         try:
             if path.is_file():
@@ -166,7 +166,7 @@ class FolderObjects:
                 yield found
 
     def remove(self, digest: str) -> None:
-        """Forget an object."""
+        """Delete an object."""
         try:
             self._path(digest).unlink(missing_ok=True)
         except OSError as error:
@@ -177,13 +177,13 @@ class FolderObjects:
 
 
 class S3Objects:
-    """Objects in a bucket of S3, or of anything that speaks its protocol.
+    """Objects in an S3 bucket, or in a compatible service.
 
     Args:
         bucket: its name.
-        prefix: of the objects' names.
-        endpoint: where it is served; AWS by default.
-        region: of the bucket.
+        prefix: prefix of the objects' names.
+        endpoint: address of the service; default: AWS.
+        region: region of the bucket.
 
     Raises:
         ValueError: obstore is not installed, or refuses the options.
@@ -217,7 +217,7 @@ class S3Objects:
             raise ValueError(f"the bucket {bucket!r} cannot be used: {error}") from error
 
     def put(self, file: Path, digest: str) -> None:
-        """Keep the content of a file."""
+        """Store the content of a file."""
         import obstore
 
         found = self.find(digest)
@@ -247,7 +247,7 @@ class S3Objects:
         return _stored(found)
 
     def signed_url(self, digest: str, seconds: float) -> str | None:
-        """Where anybody may fetch it for a while."""
+        """A temporary public URL."""
         import obstore
 
         with _refusals():
@@ -262,7 +262,7 @@ class S3Objects:
                 yield from (_stored(one) for one in some if DIGEST.search(str(one["path"])))
 
     def remove(self, digest: str) -> None:
-        """Forget an object."""
+        """Delete an object."""
         import obstore
 
         with _refusals():
@@ -312,7 +312,7 @@ def _unusable(error: OSError) -> ObjectStoreError:
 MARK = ".taken-out"
 """Marker file of a bundle from the object store; its time is that of the last use."""
 UNREFERENCED_S = 24 * 3600.0
-"""Age from which on an object that no bundle has is removed."""
+"""Age after which an unused object is deleted [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -322,7 +322,7 @@ class BundleFile:
     """A file of a bundle.
 
     Attributes:
-        path: below the bundle's folder, with ``/``.
+        path: relative to the bundle's folder, with ``/``.
         digest: SHA-256 of its content.
         bytes: size.
     """
@@ -388,7 +388,7 @@ class BundleFolders:
         self._lock = threading.Lock()
 
     def own(self, kind: str) -> list[Path]:
-        """Bundles of a kind that were made here."""
+        """Local bundles of a kind, without downloaded ones."""
         return [path for path in self._all(kind) if not (path / MARK).exists()]
 
     def put(self, kind: str, name: str, folder: Path) -> SharedBundle:
@@ -513,15 +513,15 @@ def _inside(folder: Path, path: str) -> Path:
 
 @dataclass(frozen=True)
 class BundleRow:
-    """A bundle on record.
+    """A listed bundle.
 
     Attributes:
         kind: ``scene``, ``asset`` or ``job``.
-        name: of the scene, asset or job.
-        content: digest of all that is in it.
+        name: name of the scene, asset or job.
+        content: digest of its content.
         document: its files and their digests, JSON.
-        bytes: of all files.
-        created_us: when it was put on record, or deleted.
+        bytes: size of all files.
+        created_us: time at which it was listed, or deleted.
     """
 
     kind: str
@@ -538,7 +538,7 @@ class BundleRow:
 
 
 class BundleLog:
-    """Bundles beyond the folders of one worker.
+    """The list of shared bundles.
 
     Args:
         store: open while this is used.
@@ -576,13 +576,13 @@ class BundleLog:
         return int(row["many"]), int(row["newest"])
 
     async def mark_deleted(self, kind: str, name: str) -> None:
-        """Leave word that a bundle was deleted."""
+        """Mark a bundle as deleted."""
         empty = {"content": "", "document": "", "bytes": 0, "created_us": now_us()}
         change = sa.update(t.shared_bundles).where(self._is(kind, name)).values(empty)
         await self._store.write(Write(change), *self._notice())
 
     async def remove(self, kind: str, name: str) -> None:
-        """Forget a bundle."""
+        """Remove a bundle from the list."""
         gone = Write(sa.delete(t.shared_bundles).where(self._is(kind, name)))
         await self._store.write(gone, *self._notice())
 

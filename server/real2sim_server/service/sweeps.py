@@ -1,4 +1,4 @@
-"""Sweeps and searches as jobs: `real2sim sweep` and `real2sim search` in processes of their own."""
+"""Sweeps and searches as jobs: `real2sim sweep` and `real2sim search` in child processes."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ PARQUET, XML, JSON, TAR = (
     "application/x-tar",
 )
 SUMMED_UP = ("name", "cell", "score", "values", "impact", "avoidable_until")
-"""Of a failure, in the result of the job; the rest is in its files."""
+"""Members of a failure in the job's result; the rest is in its files."""
 
 
 def check_scenario(request: SweepRequest) -> None:
-    """Refuse a scenario that cannot be read, before the job begins.
+    """Refuse an unreadable scenario before the job begins.
 
     Raises:
         ServiceError: INVALID_REQUEST.
@@ -165,7 +165,7 @@ ROOM_CHECKS_S = 5.0
 """Interval of disk space checks [s]."""
 
 MAX_RECORDED = 64_000
-"""Characters of a request that are put on record; jobs of longer ones are not begun anew."""
+"""Maximum length of a stored request, in characters; jobs with longer ones cannot be restarted."""
 
 SHARES = {
     "episodes": (0.0, 0.95),
@@ -174,7 +174,7 @@ SHARES = {
     "failures": (0.7, 0.9),
     "probability": (0.9, 0.99),
 }
-"""Of the whole work, by stage: from, to."""
+"""Range of the whole work, by stage: from, to."""
 
 
 class Sweeps:
@@ -191,11 +191,11 @@ class Sweeps:
     async def start(
         self, request: SweepRequest, *, who: str, idempotent: IdempotentRequest
     ) -> JobInfo:
-        """Begin one.
+        """Start a sweep or search.
 
         Raises:
-            ServiceError: UNKNOWN_SCENE, INVALID_REQUEST for a scenario that cannot be read; as jobs
-                do.
+            ServiceError: UNKNOWN_SCENE, INVALID_REQUEST for an unreadable scenario; or as for
+                jobs.
         """
         await self._scene_cache.listing(request.scene)
         await asyncio.to_thread(check_scenario, request)
@@ -207,7 +207,7 @@ class Sweeps:
         return await self._jobs.start(new, self._work(request), idempotent=idempotent)
 
     async def rebuild(self, info: JobInfo) -> Work:
-        """The work of a job on record."""
+        """The work of a stored job."""
         return self._work(SweepRequest.model_validate(info.request))
 
     def _work(self, request: SweepRequest) -> Work:

@@ -1,4 +1,4 @@
-"""Kernels are ready before they are needed: compiled on the first run, later loaded from disk."""
+"""Prepares kernels ahead of use: compiled on the first run, later loaded from disk."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class KernelWarmUp:
             self._planning.set()
 
     async def ready(self, spec: ResetSpec) -> None:
-        """Wait for the kernels that an episode cannot begin without."""
+        """Wait for the kernels that an episode requires."""
         if may_deform(spec):
             self.deformation.begin()
         if plans_ahead(spec.ego):
@@ -101,7 +101,7 @@ class KernelWarmUp:
         await asyncio.to_thread(warm_up_world)
 
     async def _tell(self) -> None:
-        """Say how far it is: on a terminal in one line, else in the log now and then."""
+        """Report progress: on one line of a terminal, else in the log at intervals."""
         line = StatusLine(log.info)
         try:
             while True:
@@ -126,12 +126,12 @@ class DeformationKernels:
         self._making: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
-        """Make them, unless they are there or being made."""
+        """Prepare the kernels, unless they are ready or in progress."""
         if self._making is None:
             self._making = asyncio.create_task(self._make())
 
     async def wait(self) -> None:
-        """Return once they are there, or cannot be made ahead: then they are made when needed."""
+        """Wait until they are ready or preparation fails; then they are compiled on demand."""
         self.begin()
         assert self._making is not None
         await asyncio.wait([self._making])

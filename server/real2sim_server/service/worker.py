@@ -1,4 +1,4 @@
-"""Everything that makes up one worker, put together once."""
+"""A worker: assembles all its parts."""
 
 from __future__ import annotations
 
@@ -108,12 +108,12 @@ class Worker:
 
     @classmethod
     def build(cls, settings: Settings) -> Worker:
-        """Put a worker together; nothing runs yet.
+        """Assemble a worker; nothing runs yet.
 
         Raises:
-            RenderError: the backend of the settings cannot be used here.
-            TokenFileError: the file of tokens cannot be used.
-            ValueError: the store of objects is none.
+            RenderError: the backend of the settings is not available here.
+            TokenFileError: the token file is unusable.
+            ValueError: invalid URL of the object store.
         """
         metrics = Metrics()
         secret = settings.token.get_secret_value() if settings.token is not None else None
@@ -203,10 +203,10 @@ class Worker:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Worker]:
-        """The worker at work: from the start of its engine to the end of its last job.
+        """Run the worker during the block: from the start of its engine to the end of its last job.
 
         Raises:
-            StateFolderError: another worker is on the state folder, or it cannot be written to.
+            StateFolderError: another worker uses the state folder, or it is not writable.
             StoreError: the store cannot be opened.
         """
         async with AsyncExitStack() as at_exit:
@@ -275,13 +275,13 @@ class Worker:
 
     @property
     def scene_limits(self) -> StagingLimits:
-        """Of the process that reads an imported scene."""
+        """Limits of the process that reads an imported scene."""
         largest = min(self.settings.max_scene_bytes, self.settings.scene_memory_bytes)
         return self._limits(largest)
 
     @property
     def asset_limits(self) -> StagingLimits:
-        """Of the process that reads an uploaded asset."""
+        """Limits of the process that reads an uploaded asset."""
         return self._limits(min(self.settings.max_asset_bytes, self.settings.scene_memory_bytes))
 
     def _limits(self, max_bytes: int) -> StagingLimits:
@@ -290,7 +290,7 @@ class Worker:
 
     @property
     def scenes_quota(self) -> Quota:
-        """Of the scene folder."""
+        """Quota of the scene folder."""
         return Quota(
             self.settings.scenes_path,
             "scenes",
@@ -302,7 +302,7 @@ class Worker:
 
     @property
     def assets_quota(self) -> Quota:
-        """Of the asset library."""
+        """Quota of the asset library."""
         return Quota(
             self.settings.assets_path,
             "assets",
@@ -313,7 +313,7 @@ class Worker:
         )
 
     def replayed(self, answer: Response) -> Response:
-        """Count an answer that was given before."""
+        """Count a repeated reply."""
         self.metrics.replays.inc()
         return answer
 
@@ -388,7 +388,7 @@ class Worker:
         return True
 
     def _add_demo(self) -> None:
-        """Put the demo street into the scene folder, unless a scene of its name is there."""
+        """Import the demo street, unless a scene of its name exists."""
         try:
             import_scene(
                 SHIPPED_STREET,
@@ -441,7 +441,7 @@ class Worker:
         }
 
     def _load(self) -> float:
-        """Share of the time since the last call in which the engine worked."""
+        """Utilization of the engine since the last call, 0 to 1."""
         now, worked = time.monotonic(), self.metrics.engine_seconds
         since, before = self._last_load
         self._last_load = (now, worked)

@@ -51,13 +51,13 @@ T = TypeVar("T")
 
 WARM_UP_WIDTH = 320
 MAX_TOGETHER = 16
-"""Steps without sensors made in one go: the first waits for the last, some milliseconds."""
+"""Maximum batch of steps without sensors: the first waits a few milliseconds for the last."""
 MAX_TOGETHER_DRAWN = 8
-"""The same of steps with images."""
+"""The same for steps with images."""
 MAX_PIXELS_TOGETHER = 16_000_000
-"""Of their images."""
+"""The same for their images."""
 MAX_WAITING = 1024
-"""Steps that may wait for the thread of worlds."""
+"""Maximum number of steps waiting for the thread of worlds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class EncodedObservation:
 
     @property
     def answer(self) -> EncodedMessage:
-        """For the client that is answered."""
+        """The message for the answered client."""
         return self.placed or self.message
 
 
@@ -142,7 +142,7 @@ class Step:
 
     @property
     def moved(self) -> World:
-        """The new world of a step that has advanced."""
+        """The new world of an advanced step."""
         assert self.world is not None
         return self.world
 
@@ -193,7 +193,7 @@ class StepPipeline:
         self._evaluators = ThreadPoolExecutor(1, thread_name_prefix="evaluate")
 
     def start(self) -> None:
-        """Begin to move worlds."""
+        """Start the threads."""
         self._worlds.start()
 
     def close(self) -> None:
@@ -247,7 +247,8 @@ class StepPipeline:
         await self._renderer.ready(sensors, [cameras[s.camera] for s in sensors], shown)
 
     def drawn_with(self, world: World, cameras: Mapping[str, Camera]) -> Scene | None:
-        """With the sessions of which scene the next step of a world may be drawn; None for none.
+        """The scene whose sessions may share a rendering batch with the world's next step; None for
+        none.
 
         No session waits for the deformations of another.
         """
@@ -265,13 +266,14 @@ class StepPipeline:
     # --- a change of the world ------------------------------------------------------------------
 
     async def run(self, step: Step) -> EncodedObservation:
-        """Advance, render, evaluate and encode; the observation of the new world.
+        """Advance, render, evaluate and encode; returns the observation of the new world.
 
-        Evaluation has ended when this returns or raises. Where it raises, nothing has happened but
+        Evaluation has ended when this returns or raises. If it raises, nothing has changed, except
+        that the change may be stored.
         that the change may be on record.
 
         Raises:
-            QueueFullError: too much waits for the thread.
+            QueueFullError: the thread's queue is full.
         """
         try:
             await self._compute_on_thread(step)
@@ -294,8 +296,8 @@ class StepPipeline:
         )
 
     def compute(self, steps: Sequence[Step]) -> list[Exception | None]:
-        """Advance, render and evaluate steps in one go; why each has failed, None where it has not.
-        Where one fails, the others go on."""
+        """Advance, render and evaluate a batch of steps; returns the error of each, or None.
+        Failures do not affect the other steps."""
         for step in steps:
             step.timer.stage("queue")
         self.advance(steps)
@@ -325,7 +327,7 @@ class StepPipeline:
             step.timer.stage("world")
 
     def render(self, steps: Sequence[Step]) -> None:
-        """Draw the images and make the clouds of worlds, their objects deformed first."""
+        """Render the images and clouds of worlds, after deforming their objects."""
         for step in steps:
             with step.catching():
                 _deform(step.moved, step.timer)
@@ -368,7 +370,7 @@ class StepPipeline:
         return observation
 
     def _draw(self, steps: Sequence[Step]) -> None:
-        """Draw the images of steps in one go, or none where one of them fails."""
+        """Render the images of a batch of steps; none of them if one fails."""
         requests = [(_request(s.moved, s.sensors), _cameras(s)) for s in steps]
         for step, images in zip(steps, self._renderer.render_together(requests), strict=True):
             step.images = _estimated(step.moved, images)
@@ -445,7 +447,7 @@ class StepPipeline:
         Raises:
             ServiceError: INVALID_REQUEST for too many rays.
             TimeOutOfRangeError: ``t_us`` is outside the recording.
-            QueueFullError: too much waits for the engine.
+            QueueFullError: the engine's queue is full.
         """
         await self._clouds.ready(RangingSensors((mounted,)))
         cast = partial(self._clouds.recorded, scene, state, mounted, t_us)
@@ -508,7 +510,7 @@ def _packed(step: Step, kind: str, frames: Sequence[EncodedFrame]) -> EncodedObs
 
 
 def _deform(world: World, timer: PhaseTimer) -> None:
-    """Find the shapes that images of a world show."""
+    """Compute the deformed shapes in a world's images."""
     if world.deformation is not None:
         world.deformation.solve(world.t_us)
         timer.stage("physics")

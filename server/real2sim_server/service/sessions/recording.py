@@ -1,4 +1,4 @@
-"""A session's episode as a file."""
+"""Recordings of sessions' episodes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
 
 
 async def episode_of(sessions: Sessions, session: Session) -> Recording:
-    """The running episode so far, without images.
+    """The current episode so far, without images.
 
     Raises:
         ServiceError: NOT_RESET.

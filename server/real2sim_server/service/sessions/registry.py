@@ -44,7 +44,7 @@ from .step import Stepper
 
 
 def entries_of(rows: Iterable[SessionEntry]) -> list[Entry]:
-    """Entries of a stored log, for the world to live through again."""
+    """Entries of a stored log, to replay in a world."""
     return [Entry(row.kind, row.step or 0, row.payload) for row in rows]
 
 
@@ -88,7 +88,7 @@ async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> 
 async def _cameras_ready(
     pipeline: StepPipeline, session: Session, world: World
 ) -> dict[str, Camera]:
-    """Cameras of an episode, once all that its observations would wait for is there."""
+    """Cameras of an episode, once everything that its observations would wait for is ready."""
     start, sensors = session.start, world.spec.sensors
     cameras = pipeline.cameras(start.scene, sensors)
     await pipeline.ranging_ready(world.ranging, sensors, cameras)
@@ -97,10 +97,10 @@ async def _cameras_ready(
 
 
 async def state_at(scenarios: Scenarios, scenario_id: str, revision: int) -> ScenarioState:
-    """Objects of a scenario as they were at a revision.
+    """Objects of a scenario at a revision.
 
     Raises:
-        ServiceError: UNKNOWN_SCENARIO where it was deleted.
+        ServiceError: UNKNOWN_SCENARIO if it was deleted.
     """
     view = await scenarios.view(scenario_id)
     if view.revision == revision:
@@ -123,7 +123,7 @@ async def state_at(scenarios: Scenarios, scenario_id: str, revision: int) -> Sce
 
 
 def check_scene(row: SessionRow, scene_hash: str) -> None:
-    """Raises ServiceError: SCENE_BROKEN when the scene is not the one the session ran on."""
+    """Raises ServiceError: SCENE_BROKEN if the scene differs from the session's."""
     if row.scene_hash != scene_hash:
         raise ServiceError(
             ErrorCode.SCENE_BROKEN,
@@ -224,7 +224,7 @@ class Sessions:
         self._in_creation: Counter[str] = Counter()
         self._rebuilding: dict[str, asyncio.Task[Session]] = {}
         self._closing: set[asyncio.Future[None]] = set()
-        # Objects of a bare scene are the same for all sessions on it.
+        # All sessions on a bare scene share its objects.
         self._bare_states: WeakKeyDictionary[Scene, ScenarioState] = WeakKeyDictionary()
         self._warm: WeakSet[Scene] = WeakSet()
         metrics.watch(metrics.sessions, lambda: len(self._open))
@@ -246,7 +246,7 @@ class Sessions:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Sessions]:
-        """Idle sessions are evicted for the length of the block; open ones end with it."""
+        """Evict idle sessions during the block; open ones end with it."""
         self.pipeline.start()
         evicting = asyncio.create_task(self._evict_idle(), name="idle-sessions")
         try:
@@ -394,10 +394,10 @@ class Sessions:
     async def _back_at(
         self, session: Session, rows: list[SessionEntry], step: int
     ) -> tuple[World, list[SessionEntry]]:
-        """The instant of a step, and the log up to it.
+        """The world at a step, and the log up to it.
 
         Raises:
-            ServiceError: INVALID_REQUEST, the episode has not had it.
+            ServiceError: INVALID_REQUEST, the episode does not have the step.
         """
         episode = last_episode(entries_of(rows))
 
@@ -433,17 +433,17 @@ class Sessions:
         session.hold.release()
 
     async def entries(self, session: Session) -> list[Entry]:
-        """Everything that has happened to a session, oldest first."""
+        """All entries of a session's log, oldest first."""
         # A step in progress is already in the log; it may be withdrawn again.
         end = session.next_seq
         rows = await self._store.session_entries(session.session_id)
         return entries_of(row for row in rows if row.seq < end)
 
     async def scores(self, session: Session) -> list[Score]:
-        """Final scores of the running episode; empty before the first reset.
+        """Final scores of the current episode; empty before the first reset.
 
-        After a collision the same episode is run once more without reactions of the ego, for the
-        impact speed that NeuroNCAP compares with.
+        After a collision, the episode is simulated again without reactions of the ego, for the
+        impact speed that NeuroNCAP uses as reference.
         """
         world = session.world
         if world is None:
@@ -468,7 +468,7 @@ class Sessions:
             try:
                 await self._store.close_session(session.row.claim, reason=reason)
             except BaseException:
-                # It is not over as long as the store does not say so.
+                # It has not ended until the store says so.
                 session.closed = None
                 self._open[session.session_id] = session
                 raise
@@ -494,7 +494,7 @@ class Sessions:
             self.let_go(session)
 
     async def let_go_of_lost(self) -> None:
-        """Leave all sessions that were taken over: this worker was thought dead."""
+        """Drop all sessions that were taken over: other workers considered this one dead."""
         epochs = await self._leases.epochs(list(self._open))
         for session in self:
             if epochs.get(session.session_id) != session.row.epoch:
@@ -514,7 +514,7 @@ class Sessions:
         log.info("session evicted", session_id=session.session_id)
 
     async def warm_up(self, session: Session) -> None:
-        """Draw the session's scene once, so that no observation waits for a first render."""
+        """Render the session's scene once, so that no observation waits for a first render."""
         scene = session.start.scene
         if scene not in self._warm:
             await self.pipeline.first_render(scene, session.start.state)
@@ -532,8 +532,8 @@ class Sessions:
 
         Raises:
             ServiceError: DRAINING or OVER_CAPACITY.
-            OverLimitError: its owner has as many as they may.
-            RevokedError: its owner's token is no more.
+            OverLimitError: the owner's session limit is reached.
+            RevokedError: the owner's token has been removed.
         """
         if self.draining:
             raise ServiceError(ErrorCode.DRAINING, "the worker is stopping")
@@ -588,7 +588,7 @@ class Sessions:
         return session
 
     def _tell(self, session: Session, error: ServiceError) -> None:
-        """End a session's connections; not awaited, for clients may be slow to read."""
+        """End a session's connections; not awaited, because clients may read slowly."""
         for close in session.close_callbacks:
             closing = asyncio.ensure_future(close(error))
             self._closing.add(closing)
@@ -642,12 +642,12 @@ class Sessions:
 
 
 def created_headers(info: SessionInfo) -> dict[str, str]:
-    """Headers of the answer to a creation."""
+    """Headers of the reply to a creation."""
     return {"Location": f"/v1/sessions/{info.session_id}"}
 
 
 def check_not_closed(row: SessionRow) -> SessionRow:
-    """The row. Raises ServiceError: SESSION_CLOSED when its session is over."""
+    """The row. Raises ServiceError: SESSION_CLOSED if its session has ended."""
     if row.closed_us is not None:
         raise _closed(row.session_id, row.reason or "closed")
     return row

@@ -1,4 +1,4 @@
-"""One closed-loop session: its lock step, its clock, its edits, its viewers and its REST models."""
+"""One closed-loop session: its lockstep, clock, edits, observers and REST models."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ class LockStep(Generic[A]):
         self._last: tuple[bytes, A] | None = None
 
     def reset(self, step: int = 0, *, over: bool = False) -> None:
-        """An episode begins at step 0, or is returned to at another."""
+        """Start an episode at step 0, or return to a snapshot at another step."""
         self.step, self.over, self._last = step, over, None
 
     def end(self) -> None:
-        """The episode ends without a step; the last answer can still be had again."""
+        """End the episode without a step; the last answer can still be repeated."""
         self.over = True
 
     def restore_answer(self, content: bytes, answer: A) -> None:
@@ -168,7 +168,7 @@ class ClockHold:
 
     @property
     def free(self) -> bool:
-        """Whether actions need not ask before they move the clock."""
+        """Whether actions pass without waiting."""
         return self._steps is None and self._pace is None
 
     @property
@@ -189,7 +189,7 @@ class ClockHold:
         self._changed.set()
 
     def take_step(self, dt_us: int) -> None:
-        """An action passes, for a step so long."""
+        """Count a passing action with the given step duration."""
         if self._steps:
             self._steps -= 1
         if self._pace is not None:
@@ -197,7 +197,7 @@ class ClockHold:
             self._next_s = max(self._next_s, now) + dt_us * 1e-6 / self._pace
 
     async def wait(self, seconds: float) -> None:
-        """Wait for a change, so long at most."""
+        """Wait for a change, with a timeout."""
         self._changed.clear()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
@@ -205,7 +205,7 @@ class ClockHold:
 
 
 KEPT = 4
-"""Observations that wait for a slow observer; older ones are dropped."""
+"""Maximum queue length for a slow observer; older observations are dropped."""
 
 
 class ObserverQueue:
@@ -221,14 +221,14 @@ class ObserverQueue:
         self._filled = asyncio.Event()
 
     def put(self, message: EncodedMessage) -> None:
-        """Add the newest observation; the oldest makes room."""
+        """Add the newest observation; a full queue drops the oldest."""
         if len(self._waiting) == KEPT:
             self.dropped += 1
         self._waiting.append(message)
         self._filled.set()
 
     async def take(self) -> EncodedMessage:
-        """The oldest that waits."""
+        """The oldest queued observation."""
         await self._filled.wait()
         message = self._waiting.popleft()
         if not self._waiting:
@@ -237,7 +237,7 @@ class ObserverQueue:
 
 
 CloseWithError = Callable[[ServiceError], Awaitable[None]]
-"""Tells a connection that its session is over, and ends it."""
+"""Ends a connection with the reason that its session has ended."""
 
 
 TellController = Callable[[EncodedMessage], Awaitable[None]]
@@ -328,27 +328,27 @@ class Session:
 
     @property
     def session_id(self) -> str:
-        """Names its worker: ``<worker>.<random>``."""
+        """Session id, which starts with its worker: ``<worker>.<random>``."""
         return self.row.session_id
 
     @property
     def connected(self) -> bool:
-        """Whether anybody is connected by socket."""
+        """Whether any socket is connected."""
         return bool(self.close_callbacks)
 
     def touch(self) -> None:
-        """Somebody uses the session."""
+        """Record a use of the session."""
         self.used_at = clock.monotonic()
 
     def running_world(self) -> World:
-        """The committed instant. Raises ServiceError: NOT_RESET before the first reset."""
+        """The committed world. Raises ServiceError: NOT_RESET before the first reset."""
         if self.world is None:
             raise not_reset()
         return self.world
 
     @property
     def spec(self) -> ResetSpec:
-        """Of the running episode; the defaults before the first one."""
+        """Spec of the current episode; the defaults before the first one."""
         return self.world.spec if self.world else ResetSpec()
 
     def begin(self, world: World, cameras: dict[str, Camera]) -> None:
@@ -361,16 +361,16 @@ class Session:
 
     @property
     def expired(self) -> bool:
-        """Whether the episode has used up its wall-clock time."""
+        """Whether the episode has exceeded its wall-clock time."""
         return self.expires_at is not None and clock.monotonic() >= self.expires_at
 
     def take_events(self) -> list[Event]:
-        """Events since this was called last."""
+        """Events since the last call."""
         taken, self.events = self.events, []
         return taken
 
     def check_open(self) -> None:
-        """Raises ServiceError: SESSION_CLOSED once the session is over."""
+        """Raises ServiceError: SESSION_CLOSED if the session has ended."""
         if self.closed is not None:
             raise self.closed
 
@@ -380,7 +380,7 @@ class Session:
             raise controller_taken(self.session_id)
 
     def publish(self, message: EncodedMessage) -> None:
-        """The newest observation, for all observers; never waits."""
+        """Send the newest observation to all observers; never waits."""
         self.newest = message
         for queue in self.observers:
             queue.put(message)
@@ -404,7 +404,7 @@ def controller_taken(session_id: str) -> ServiceError:
 
 
 def session_info(session: Session, *, ws_base: str, token: str = "") -> SessionInfo:
-    """A session; only its creator gets the token."""
+    """A session; only the reply to its creation has the token."""
     world, row = session.world, session.row
     created = datetime.fromtimestamp(row.created_us / 1e6, UTC)
     return SessionInfo(
@@ -473,7 +473,7 @@ def session_edited(session_id: str, world: World, outcome: EditOutcome) -> Sessi
 
 
 def welcome_fields(session: Session, role: str) -> dict[str, Any]:
-    """Of the wire's Welcome, without envelope."""
+    """Members of the protocol's Welcome, without envelope."""
     start, world = session.start, session.world
     objects = (world.state if world else start.state).visible
     infos = edited_objects(objects, start.summary, tracks=False)
@@ -504,7 +504,8 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
 
 
 def result_fields(world: World | None, scores: Sequence[Score]) -> dict[str, Any]:
-    """Of the wire's Result, without envelope; ``world``: the last instant, if an episode began."""
+    """Members of the protocol's Result, without envelope; ``world``: the last one, if there is
+    one."""
     return {
         "steps": world.steps if world else 0,
         "t_us": world.t_us if world else None,

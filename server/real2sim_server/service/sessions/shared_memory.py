@@ -92,7 +92,7 @@ class Segment:
 
     @property
     def offer(self) -> dict[str, Any]:
-        """Of the wire's SharedMemory."""
+        """The protocol's SharedMemory."""
         return {"name": self._path.name, "slots": SLOTS, "slot_bytes": self._slot_bytes}
 
     @property
@@ -106,7 +106,7 @@ class Segment:
         return sum(self._taken)
 
     def attach(self, secret: bytes) -> None:
-        """The client has opened the memory. Raises ServiceError: INVALID_REQUEST, it has not."""
+        """The client has opened the memory. Raises ServiceError: INVALID_REQUEST, wrong secret."""
         if not secrets_equal(secret.hex(), self._secret.hex()):
             raise ServiceError(
                 ErrorCode.INVALID_REQUEST,
@@ -162,9 +162,9 @@ class Segment:
             self._memory = np.empty(0, np.uint8)
 
     def _take(self, number: int, size: int) -> bool:
-        """Whether the first ``size`` bytes of a slot are there to be written to.
+        """Whether the first ``size`` bytes of a slot can be allocated.
 
-        Pages of a file that the system cannot provide would end the process when written to.
+        Writing to pages that the system cannot provide would kill the process.
         """
         if size <= self._taken[number]:
             return True
@@ -184,7 +184,7 @@ class Segment:
         return True
 
     def _reserve(self, number: int, size: int) -> None:
-        """Count memory of a slot. Raises ServiceError: OUT_OF_MEMORY."""
+        """Reserve memory for a slot. Raises ServiceError: OUT_OF_MEMORY."""
         taken = self._taken
         self._budget.make_room(
             "shared memory of images",
@@ -205,11 +205,11 @@ def _placed(frame: EncodedFrame, memory: NDArray[np.uint8], offset: int) -> Enco
 
 
 class FrameSlot(NamedTuple):
-    """Where the images of one answer may be written.
+    """Slot for the images of one answer.
 
     Attributes:
-        segment: of the connection.
-        number: of the slot.
+        segment: shared memory of the connection.
+        number: number of the slot.
     """
 
     segment: Segment
@@ -221,11 +221,11 @@ class FrameSlot(NamedTuple):
 
 
 class Segments:
-    """The shared memory of a worker's controllers, under its budget of memory.
+    """Shared memory of a worker's controllers, within the memory budget.
 
     Args:
-        budget: in which it counts.
-        segment_bytes: of one controller; 0 offers none.
+        budget: memory budget that counts it.
+        segment_bytes: size for one controller; 0 disables shared memory.
     """
 
     def __init__(self, budget: MemoryBudget, segment_bytes: int) -> None:
@@ -236,11 +236,11 @@ class Segments:
 
     @property
     def held_bytes(self) -> int:
-        """Memory that images have taken."""
+        """Memory allocated for images [bytes]."""
         return sum(segment.taken_bytes for segment in self._segments)
 
     def idle(self) -> Sequence[IdleItem]:
-        """Nothing: clients may be looking at all of it."""
+        """Nothing: clients may be using all of it."""
         return ()
 
     def create(self) -> Segment | None:
@@ -282,7 +282,7 @@ def _removed_if_left(path: Path) -> bool:
 
 
 def _lock(file: int) -> None:
-    """Own a file until it is closed; the kernel ends that with the process. Raises OSError."""
+    """Lock a file until it is closed; the lock ends with the process. Raises OSError."""
     import fcntl
 
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

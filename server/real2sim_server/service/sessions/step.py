@@ -51,7 +51,7 @@ MakeEditReply = Callable[[World, EditOutcome], StoredReply | None]
 MAX_SNAPSHOTS = 32
 
 STEPS_AT_ONCE = 20
-"""Steps of a REST request that are computed in one go; other sessions get their turn between."""
+"""Steps of a REST request computed in one batch; other sessions run in between."""
 
 
 class Stepper:
@@ -96,9 +96,9 @@ class Stepper:
         return observation.answer
 
     async def restart(self, session: Session, spec: ResetSpec, *, reply: MakeReply) -> None:
-        """Begin an episode without rendering its first observation. Raises like reset().
+        """Start an episode without rendering its first observation. Raises like reset().
 
-        ``reply`` makes the answer that is stored with it.
+        ``reply`` creates the reply that is stored with it.
         """
         cameras = await self._announced(session, spec)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
@@ -107,7 +107,7 @@ class Stepper:
         session.begin(world, cameras)
 
     async def begin(self, session: Session, spec: ResetSpec) -> None:
-        """Like restart(), for a session that is not in the store yet; see beginning_entries()."""
+        """Like restart(), for a session that is not yet stored; see beginning_entries()."""
         cameras = await self._announced(session, spec)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         session.begin(world, cameras)
@@ -123,7 +123,7 @@ class Stepper:
         return cameras
 
     def beginning_entries(self, session: Session) -> list[SessionEntry]:
-        """The log of a session that is not in the store yet: its first episode, if it has one."""
+        """Log of a session that is not yet stored: its first episode, if any."""
         if session.world is None:
             return []
         return _entries(session, [("reset", 0, reset_payload(session.spec))])
@@ -164,9 +164,9 @@ class Stepper:
         return observation.answer
 
     async def step_without_action(self, session: Session) -> EncodedMessage:
-        """Go on without the action that is due, by the episode's fallback; the observation.
+        """Advance without the due action, by the episode's fallback; returns the observation.
 
-        That action is stale from here on.
+        The action is stale afterwards.
         """
         change = partial(_moved, session.running_world(), None, 0, True)
         entry = action_payload(None, missed=True)
@@ -175,7 +175,7 @@ class Stepper:
         return observation.message
 
     async def stop(self, session: Session, reason: str) -> EncodedMessage:
-        """End the episode where it is; the present observation with the reason."""
+        """End the episode at its newest step; returns its observation with the reason."""
         now = session.running_world()
         record = ("stop", now.steps, stop_payload(reason))
         step = Step(partial(_stopped, now, reason), session.cameras, clouds=bool(now.ranging))
@@ -193,7 +193,7 @@ class Stepper:
         *,
         slot: FrameSlot | None = None,
     ) -> EncodedObservation:
-        """The clock moves by one step."""
+        """Advance the clock by one step."""
         now = session.running_world()
         step = Step(
             change,
@@ -239,7 +239,7 @@ class Stepper:
         base_rev: int | None,
         reply: MakeEditReply | None = None,
     ) -> EditOutcome:
-        """Edit the world before its next step; ``reply`` makes the answer that is stored with it.
+        """Edit the world before its next step; ``reply`` creates the reply that is stored with it.
 
         Raises:
             EditError, ServiceError: nothing has changed.
@@ -258,7 +258,7 @@ class Stepper:
         return outcome
 
     async def set_agent_plan(self, session: Session, message: Agent) -> None:
-        """Give an externally driven object a plan. Raises WorldError."""
+        """Set the plan of an externally driven object. Raises WorldError."""
         now = session.running_world()
 
         def steered() -> World:
@@ -272,7 +272,7 @@ class Stepper:
         session.world = world
 
     async def snapshot(self, session: Session, name: str) -> World:
-        """Keep the present instant under a name. Raises ServiceError: INVALID_REQUEST."""
+        """Save the current state under a name. Raises ServiceError: INVALID_REQUEST."""
         now = session.running_world()
         if name not in session.snapshots and len(session.snapshots) >= MAX_SNAPSHOTS:
             raise ServiceError(
@@ -285,7 +285,7 @@ class Stepper:
         return now
 
     async def restore(self, session: Session, name: str) -> EncodedMessage:
-        """Go back to a snapshot; its observation.
+        """Return to a snapshot; returns its observation.
 
         Raises:
             ServiceError: NOT_FOUND.

@@ -76,7 +76,7 @@ def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
     with tempfile.TemporaryDirectory(prefix=".backup-", dir=out.parent) as folder:
         copy = Path(folder) / DATABASE
         _copy_database(database, copy)
-        # After the database: an asset that it names is there already, and never changes.
+        # After the database: its assets already exist, and never change.
         bundles = [path for path in sorted(assets.glob("[!.]*")) if path.is_dir()]
         info = BackupInfo(
             format=FORMAT,
@@ -145,7 +145,7 @@ def _copy_database(source: Path, target: Path) -> None:
         contextlib.closing(sqlite3.connect(target)) as writing,
     ):
         try:
-            # In one piece, so that it ends also while a worker writes; it keeps no writer waiting.
+            # In one step, so that it finishes even while a worker writes; writers need not wait.
             reading.backup(writing, pages=-1)
             writing.execute("PRAGMA journal_mode=DELETE")
         except sqlite3.Error as error:
@@ -153,7 +153,7 @@ def _copy_database(source: Path, target: Path) -> None:
 
 
 def _checked_schema(database: Path) -> int:
-    """The schema version of a copy. Raises BackupError: it is damaged."""
+    """Schema version of a copy. Raises BackupError: it is damaged."""
     with contextlib.closing(sqlite3.connect(database)) as connection:
         try:
             (state,) = connection.execute("PRAGMA quick_check(1)").fetchone()

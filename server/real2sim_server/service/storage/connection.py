@@ -38,7 +38,7 @@ REFUSED_ERRNOS = frozenset(
 )
 """Errors of read-only, broken or missing disks, and of folders of other users."""
 LITTLE_SPACE = 1 << 20
-"""Free bytes below which a failed write is put down to a full disk."""
+"""With fewer free bytes, a failed write is attributed to a full disk."""
 
 
 class StoreError(RuntimeError):
@@ -46,7 +46,7 @@ class StoreError(RuntimeError):
 
 
 class ConflictError(StoreError):
-    """A row that must be new exists already: another writer was first."""
+    """A row already exists: another writer was first."""
 
 
 class FencedError(StoreError):
@@ -54,10 +54,10 @@ class FencedError(StoreError):
 
 
 class StoreTroubleError(StoreError):
-    """The store cannot do it just now, and whether it was done is open; send it again later.
+    """The store currently fails, and the outcome is unknown; try again later.
 
     Args:
-        reason: in the words of the driver, for the log and not for clients.
+        reason: text of the driver, for logs only.
     """
 
     told = "the worker's store is in trouble"
@@ -68,13 +68,13 @@ class StoreTroubleError(StoreError):
 
 
 class StoreUnavailableError(StoreTroubleError):
-    """The database is gone, frozen or locked."""
+    """The database is unreachable, frozen or locked."""
 
     told = "the worker's store does not answer"
 
 
 class StoreBusyError(StoreUnavailableError):
-    """One statement was given up; the database is well."""
+    """One statement was cancelled; the database is healthy."""
 
     told = "the worker's store was too busy for this"
 
@@ -92,11 +92,11 @@ class StoreFullError(StoreTroubleError):
 
 
 def sorted_error(error: Exception, *, folder: Path | None) -> StoreError | None:
-    """The error of a driver as one of ours; None where it is a bug.
+    """Convert an error of a driver; None if it is a bug.
 
     Args:
-        error: of SQLAlchemy, of a driver, or of the system.
-        folder: of a database that is a file.
+        error: from SQLAlchemy, a driver, or the system.
+        folder: folder of a database file.
     """
     if isinstance(error, StoreError):
         return error
@@ -168,14 +168,14 @@ def _has_little_space(folder: Path) -> bool:
 
 _KINDS_OF_STATES: tuple[tuple[tuple[str, ...], type[StoreTroubleError]], ...] = (
     (("53100",), StoreFullError),
-    # Of a server that follows another one, for example.
+    # A read-only standby server, for example.
     (("25006",), StoreReadOnlyError),
-    # Deadlocks and the like, locks and statements that took too long.
+    # Deadlocks and similar conflicts, and timeouts of locks and statements.
     (("40", "55P03", "57014"), StoreBusyError),
-    # Connection, transaction state, resources, state of the server, operator, system.
+    # Connection, transaction state, resources, server state, operator, system.
     (("08", "25", "53", "55", "57", "58"), StoreUnavailableError),
 )
-"""Beginnings of states of a server's errors; the first that fits counts."""
+"""Prefixes of a server's SQLSTATE; the first match applies."""
 
 
 def _of_server(error: SQLAlchemyError, cause: BaseException) -> StoreError | None:
@@ -206,22 +206,22 @@ def _why(error: BaseException) -> str:
 
 
 DRIVER_TIMEOUTS = {"pg8000": "timeout", "psycopg": "connect_timeout", "psycopg2": "connect_timeout"}
-"""Argument of a PostgreSQL driver that limits its waiting [s]. Only pg8000 limits reading too, so
-that a server that is frozen is noticed."""
+"""Timeout argument of each PostgreSQL driver [s]. Only pg8000 also limits reads, so that a frozen
+server is detected."""
 
 RETRY_S = 0.01
-"""Between two attempts to change the journal of an SQLite database [s]."""
+"""Interval of attempts to switch the journal of an SQLite database [s]."""
 
 SERVER_SHARE = 0.8
-"""Of the time that a statement may take, before the server itself gives it up."""
+"""Fraction of the statement timeout after which the server cancels a statement."""
 
 
 def connect(url: str, *, timeout_s: float) -> sa.Engine:
-    """An engine for ``url``; SQLite's folder is made, its journal is a write-ahead one.
+    """An engine for ``url``; for SQLite, creates the folder and uses a write-ahead journal.
 
     Args:
         url: SQLAlchemy URL.
-        timeout_s: of one statement, of a lock, and of an answer of the server [s].
+        timeout_s: timeout of a statement, a lock, and a server's answer [s].
     """
     parsed = make_url(url)
     if parsed.get_backend_name() != "sqlite":
@@ -274,7 +274,7 @@ def keep_write_ahead_journal(cursor: sqlite3.Cursor, timeout_s: float) -> None:
 
 def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:
     limit = DRIVER_TIMEOUTS.get(url.get_driver_name())
-    # The others take whole seconds.
+    # The other drivers require whole seconds.
     seconds = timeout_s if limit == "timeout" else max(1, round(timeout_s))
     arguments = {limit: seconds} if limit else {}
     engine = sa.create_engine(
@@ -388,7 +388,7 @@ class StateFolderError(OSError):
 
 
 def check_state_folder(folder: Path) -> None:
-    """Refuse a state folder that cannot be used now. Raises StateFolderError."""
+    """Check that the state folder is usable. Raises StateFolderError."""
     with owned_folder(folder):
         pass
 
@@ -416,12 +416,12 @@ def owned_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def owned_name(database: Path, worker_id: str) -> Iterator[None]:
-    """Be the only worker of that name on a database file, for the length of the block.
+    """Ensure during the block that only this worker uses a name on a database file.
 
-    Workers with state folders and names of their own may share one database.
+    Workers with separate state folders and names may share one database.
 
     Raises:
-        StateFolderError: another process has the name, named by its PID.
+        StateFolderError: another process has the name (with its PID).
     """
     path = database.with_name(f"{database.name}.{worker_id}.lock")
     try:
@@ -491,7 +491,7 @@ def _unusable(folder: Path, error: OSError) -> StateFolderError:
 # --- Ownership of a name on a server -------------------------------------------------------------
 
 NAME_SPACE = 0x5232_5302
-"""Of PostgreSQL's advisory locks: names of workers."""
+"""Class of PostgreSQL's advisory locks for worker names."""
 
 
 class NameOnServer:
@@ -506,7 +506,7 @@ class NameOnServer:
         self._connection: sa.Connection | None = None
 
     def hold(self) -> None:
-        """Take the name, or make sure that it is still ours.
+        """Take the name, or check that it is still ours.
 
         Raises:
             StoreError: another worker has it.
@@ -523,7 +523,7 @@ class NameOnServer:
             raise
 
     def drop(self) -> None:
-        """Give the name back."""
+        """Release the name."""
         connection, self._connection = self._connection, None
         if connection is not None:
             with contextlib.suppress(sa.exc.SQLAlchemyError, OSError):
@@ -568,11 +568,11 @@ class NameOnServer:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A statement for such a connection.
+    """A statement for :class:`PreparedStatements`.
 
     Attributes:
-        text: with ``:name`` for values; it returns a row for each that it changes.
-        values: by name.
+        text: with ``:name`` for values; returns a row for each changed one.
+        values: values by name.
     """
 
     text: str
@@ -580,11 +580,11 @@ class Prepared:
 
 
 class PreparedStatements:
-    """Statements that are prepared once for each connection. For one thread at a time.
+    """Statements that are prepared once per connection. Not thread-safe.
 
     Args:
-        url: of the database, with the driver pg8000.
-        timeout_s: of a statement, a lock, an answer [s].
+        url: URL of the database, with the driver pg8000.
+        timeout_s: timeout of a statement, a lock, an answer [s].
     """
 
     def __init__(self, url: sa.URL, *, timeout_s: float) -> None:
@@ -610,7 +610,7 @@ class PreparedStatements:
             raise
 
     def close(self) -> None:
-        """Disconnect; the next statement connects again."""
+        """Disconnect; the next statement reconnects."""
         connection, self._connection = self._connection, None
         self._known.clear()
         if connection is not None:

@@ -119,13 +119,13 @@ class Leases:
 
 
 def is_alive(worker_id: sa.ColumnElement[str], store: Store) -> sa.ColumnElement[bool]:
-    """Whether the worker that a column names keeps its promise, as a condition."""
+    """SQL condition: whether the worker named by a column has a valid lease."""
     w = t.workers.c
     return sa.exists().where((w.worker_id == worker_id) & (w.lease_until_us > clock_of(store)))
 
 
 def clock_of(store: Store) -> sa.ColumnElement[int]:
-    """Wall clock that all compare times by [us], as an expression."""
+    """SQL expression: the common wall clock [us]."""
     if store.database.is_server:
         seconds = sa.func.extract("epoch", sa.func.clock_timestamp())
         return sa.cast(seconds * 1_000_000, sa.BigInteger)
@@ -144,7 +144,7 @@ CHANNEL = "real2sim"
 BEAT_S = 1.0
 """Interval of server health checks, which also receive notifications buffered by the driver [s]."""
 RETRY_S = 1.0
-"""Between attempts to connect."""
+"""Interval of connection attempts [s]."""
 PAUSE_S = 0.05
 """Delay from a notification to the resulting query, to collect further ones [s]."""
 
@@ -179,7 +179,7 @@ class Notices:
 
     @property
     def can_hear(self) -> bool:
-        """Whether the store has word to give."""
+        """Whether the database supports notifications."""
         return self._url.get_backend_name() == "postgresql" and (
             self._url.get_driver_name() == "pg8000"
         )
@@ -200,7 +200,8 @@ class Notices:
             await asyncio.to_thread(thread.join)
 
     def listener(self, topic: Topic) -> Callable[[float], Awaitable[None]]:
-        """A function that waits for word about ``topic`` since its last call, or some seconds."""
+        """A function that waits, with a timeout, for a notification about ``topic`` since its last
+        call."""
         seen = self._counts[topic]
 
         async def wait(seconds: float) -> None:
@@ -226,7 +227,7 @@ class Notices:
             try:
                 self._listen_once(loop)
             except Exception as error:
-                # The store tells of its trouble itself; meanwhile others look now and then.
+                # The store logs its own failures; meanwhile waiters poll.
                 log.debug("not listening", reason=str(error))
             self._stop.wait(RETRY_S)
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 # Tables.
 
 SCHEMA_VERSION = 1
-"""Raise it with every change of a table, together with a new file in ``revisions/versions``."""
+"""Increase it with every table change, together with a new file in ``revisions/versions``."""
 
 metadata = MetaData()
 
@@ -125,7 +125,7 @@ session_log = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 
-# Workers that share the store, and until when each has promised to be alive.
+# Workers that share the store, and the end of each lease.
 workers = Table(
     "workers",
     metadata,
@@ -146,9 +146,9 @@ jobs = Table(
     Column("created_us", BigInteger, nullable=False),
     # Increases whenever a worker takes over the job, as for a session.
     Column("epoch", Integer, nullable=False, server_default="0"),
-    # Times that a worker died at it.
+    # Number of workers that died while running it.
     Column("deaths", Integer, nullable=False, server_default="0"),
-    # Whether any worker can begin it anew from its document, and whether somebody has cancelled it.
+    # Whether any worker can rebuild it from its document, and whether a client has cancelled it.
     Column("portable", Integer, nullable=False, server_default="0"),
     Column("cancelled", Integer, nullable=False, server_default="0"),
 )
@@ -299,7 +299,7 @@ class StoredReply:
     """An answer stored for a request that may be repeated with the same Idempotency-Key.
 
     Attributes:
-        key: the header's value together with the call it was sent to.
+        fingerprint: SHA-256 of the request; a different one with the same key is refused.
         fingerprint: SHA-256 of the request; another one under the same key is refused.
     """
 
@@ -337,7 +337,7 @@ class SchemaStatus:
 
 
 def schema_status(engine: sa.Engine) -> SchemaStatus:
-    """Look at a store's schema; nothing changes.
+    """Check a store's schema without changes.
 
     Raises:
         StoreError: this program can neither use nor migrate it.

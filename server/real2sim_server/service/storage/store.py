@@ -1,4 +1,4 @@
-"""Durable memory of a worker: scenarios, sessions, and stored answers."""
+"""Persistent scenarios, sessions and replies of a worker."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from .schema import Claim, Policy, ScenarioRow, SessionEntry, SessionRow, Snapsh
 
 # --- Session logs --------------------------------------------------------------------------------
 
-# A worker that slept for longer than its lease may wake up in the middle of a step, after another
-# one has taken over the session. So each write states the epoch of its claim, and the statement
-# compares it with the session's within the database.
+# A worker that was suspended for longer than its lease may resume in the middle of a step, after
+# another one has taken over the session. Each write therefore has the epoch of its claim, and the
+# statement compares it with the session's in the database.
 
 ClaimedEntries = tuple[Claim, Sequence[SessionEntry]]
 """Entries for a session's log, and the claim on the session."""
 
 MAX_ROWS = 32
-"""Entries that one statement appends; more of them take turns."""
+"""Maximum number of entries per statement."""
 
 COLUMNS = "session_id, seq, kind, step, payload, created_us"
 TYPES = ("VARCHAR(80)", "INTEGER", "VARCHAR(16)", "INTEGER", "BYTEA", "BIGINT", "INTEGER")
-"""Of the columns and the epoch, in PostgreSQL."""
+"""PostgreSQL types of the columns and the epoch."""
 
 
 def appended(logs: Sequence[ClaimedEntries], *, on_server: bool) -> list[Write]:
@@ -83,7 +83,7 @@ def _append(rows: int) -> str:
 def _appended_on_server(values: Sequence[tuple[object, ...]]) -> Write:
     given = {f"v{k}": value for k, value in enumerate(chain.from_iterable(values))}
     text = _append_on_server(len(values))
-    # Of one session all rows are written or none: the statement needs no transaction around it.
+    # Either all rows of a session are written or none: the statement needs no transaction.
     alone = len({row[0] for row in values}) == 1
     prepared = Prepared(f"{text.text} RETURNING 1", given) if alone else None
     return Write(text.bindparams(**given), fenced=len(values), prepared=prepared)
@@ -193,8 +193,8 @@ class Store:
         entries: Sequence[Mapping[str, Any]] = (),
         reply: StoredReply | None = None,
     ) -> None:
-        """Add a scenario with a log that it may have, and in the same transaction the answer to
-        the request for it; ``entries`` hold their revisions."""
+        """Add a scenario with an optional log and, in the same transaction, the reply to its
+        request; ``entries`` include their revisions."""
         rows = [_log_row(row.scenario_id, e["revision"], e, row.created_us) for e in entries]
         log = [_insert_rows(t.scenario_log, *rows)] if rows else []
         await self.database.write(
@@ -213,7 +213,7 @@ class Store:
         return [ScenarioRow(**row) for row in await self.database.read(query)]
 
     async def delete_scenario(self, scenario_id: str) -> bool:
-        """Remove a scenario and its log; whether there was one."""
+        """Delete a scenario and its log; returns whether it existed."""
         of_scenario = t.scenario_log.c.scenario_id == scenario_id
         counts = await self.database.write(
             Write(sa.delete(t.scenario_log).where(of_scenario)),
@@ -249,7 +249,7 @@ class Store:
         self.database.execute(changes)
 
     async def rename_scenario(self, scenario_id: str, name: str) -> bool:
-        """Give a scenario another name; whether there was one."""
+        """Rename a scenario; returns whether it exists."""
         of_scenario = t.scenarios.c.scenario_id == scenario_id
         changes = sa.update(t.scenarios).where(of_scenario).values(name=name)
         return (await self.database.write(Write(changes)))[-1] > 0
@@ -265,7 +265,7 @@ class Store:
         return (rows[0]["newest"] or 0, rows[0]["name"]) if rows else None
 
     async def scenario_entries(self, scenario_id: str, *, after: int = 0) -> list[dict[str, Any]]:
-        """The log of a scenario behind revision ``after``, oldest first."""
+        """The log of a scenario after revision ``after``, oldest first."""
         log = t.scenario_log
         query = sa.select(log.c.entry).where(log.c.scenario_id == scenario_id)
         query = query.where(log.c.revision > after)
@@ -273,7 +273,7 @@ class Store:
         return [json.loads(row["entry"]) for row in rows]
 
     async def save_snapshot(self, row: SnapshotRow) -> None:
-        """Keep it in place of an older one of its scenario.
+        """Store a snapshot, replacing an older one of its scenario.
 
         Raises:
             ConflictError: the scenario was deleted.
@@ -317,8 +317,8 @@ class Store:
         entries: Sequence[SessionEntry] = (),
         reply: StoredReply | None = None,
     ) -> None:
-        """Add a session with a log that it may have, and in the same transaction the answer to the
-        request for it."""
+        """Add a session with an optional log and, in the same transaction, the reply to its
+        request."""
         rows = [{"session_id": row.session_id} | vars(entry) for entry in entries]
         entry_writes = [_insert_rows(t.session_log, *rows)] if rows else []
         await self.database.write(
@@ -341,8 +341,8 @@ class Store:
         return [SessionRow(**row) for row in rows]
 
     async def close_session(self, claim: Claim, *, reason: str) -> None:
-        """Note that a session is over; a second time changes nothing, nor does it once another
-        worker has the session."""
+        """Mark a session as ended; idempotent, and without effect if another worker has the
+        session."""
         s = t.sessions.c
         still_open = (s.session_id == claim.session_id) & s.closed_us.is_(None)
         mine = still_open & (s.epoch == claim.epoch)
@@ -387,7 +387,7 @@ class Store:
         changes = [*self._append([(claim, entries)]), *_reply_writes(reply)]
         if instead:
             changes = [*withdrawn(claim, entries[0].seq), *changes]
-        # A stored answer is a promise beyond the session.
+        # A stored reply must be durable beyond the session.
         self.database.execute(changes, promised=reply is not None)
 
     def record_together(self, logs: Sequence[ClaimedEntries]) -> None:
@@ -414,13 +414,13 @@ class Store:
         await self.database.write(*withdrawn(claim, from_seq), *forgotten)
 
     async def session_entries(self, session_id: str, *, after: int = -1) -> list[SessionEntry]:
-        """The log of a session behind ``after``, oldest first."""
+        """The log of a session after ``after``, oldest first."""
         log = t.session_log
         query = sa.select(log.c.seq, log.c.kind, log.c.step, log.c.payload, log.c.created_us)
         query = query.where((log.c.session_id == session_id) & (log.c.seq > after))
         return [SessionEntry(**row) for row in await self.database.read(query.order_by(log.c.seq))]
 
-    # --- answers ----------------------------------------------------------------------------
+    # --- replies ----------------------------------------------------------------------------
 
     async def reply(self, key: str) -> StoredReply | None:
         """The reply stored under ``key``, for 24 hours."""
@@ -451,7 +451,7 @@ class Store:
         return int(row["bytes"]) + ROW_BYTES * int(row["rows"])
 
     async def give_back(self, pages: int) -> bool:
-        """Give free pages of a database file back to the disk; whether there are more."""
+        """Return free pages of a database file to the disk; returns whether there are more."""
         return await self.database.give_back(pages)
 
     # --- other tables -------------------------------------------------------------------
@@ -461,10 +461,11 @@ class Store:
         return await self.database.read(query)
 
     async def write(self, *changes: Write, reply: StoredReply | None = None) -> list[int]:
-        """Rows changed by each statement, in one transaction, also with the answer to a request.
+        """Rows changed by each statement, in one transaction, optionally with the reply to a
+        request.
 
         Raises:
-            ConflictError: a row that must be new exists.
+            ConflictError: a row already exists.
         """
         return await self.database.write(*changes, *_reply_writes(reply))
 
