@@ -88,9 +88,9 @@ def parse_retry_after(value: str | None, *, now: float | None = None) -> float |
 
 # Models between clients and workers of different versions.
 #
-# Requests only hold members that the caller has set, so that an older worker gets nothing unknown
-# and a newer worker applies its own defaults. Unknown members of replies are ignored, also inside
-# models for which a worker is strict.
+# Requests only contain members that the caller has set, so that an older worker receives nothing
+# unknown and a newer worker applies its own defaults. Unknown members of replies are ignored, also
+# in models for which a worker is strict.
 
 M = TypeVar("M", bound=BaseModel)
 T = TypeVar("T")
@@ -242,7 +242,7 @@ def _missed(values: Any) -> list[HistoryEntry]:
         try:
             entries.append(HistoryEntry.model_validate(value, extra="ignore"))
         except ValidationError:
-            # The error matters more than one entry that a newer worker writes differently.
+            # The error is more important than an entry in a newer worker's format.
             continue
     return entries
 
@@ -385,10 +385,10 @@ class ViewRequest:
 
 
 def checked(model: type[M], /, **fields: Any) -> M:
-    """A model of these fields.
+    """A model with these fields.
 
     Raises:
-        ValueError: one sentence that names every field that is not allowed, and why.
+        ValueError: names every invalid field, and the reason.
     """
     try:
         return model(**fields)
@@ -443,7 +443,7 @@ def file_put(path: str, content: bytes, media_type: str, *, if_match: str) -> Re
 def upload(path: str, file: Path, form: dict[str, str]) -> Request:
     """A POST of a file with form fields."""
     key = new_key()
-    # The boundary follows from the key, so that every try sends the same bytes.
+    # The boundary derives from the key, so that every try sends the same bytes.
     headers = {
         "Idempotency-Key": key,
         "Content-Type": f"multipart/form-data; boundary=real2sim-{key}",

@@ -141,7 +141,7 @@ UNREACHABLE_HINT = "start a worker with `real2sim serve`, or check the address"
 
 def client_options(target: Target) -> dict[str, Any]:
     """Arguments of an HTTP client for a worker."""
-    # A proxy that the environment names cannot reach a worker on this machine.
+    # A proxy from the environment cannot reach a worker on this machine.
     return {
         "base_url": target.url,
         "headers": target.headers,

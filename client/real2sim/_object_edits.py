@@ -129,7 +129,7 @@ class ObjectEdits(Handle, Generic[R]):
         return track
 
     def pose(self, t: float | None = None, *, t_us: int | None = None) -> Pose:
-        """Where its box is: between two poses positions linear, rotations on the shortest arc.
+        """Pose of its box: positions are interpolated linearly, rotations along the shortest arc.
 
         Args:
             t, t_us: instant in seconds or in microseconds; default: when it appears.
@@ -254,7 +254,7 @@ class ObjectEdits(Handle, Generic[R]):
     def set_pose(
         self, position: Vector, quaternion: Quaternion = UPRIGHT, *, snap: bool = False
     ) -> R:
-        """Place the object in the world [m], for the whole time range.
+        """Set the object's pose in the world [m], for the whole time range.
 
         Examples:
             >>> result = car.set_pose(position=(18.0, 1.0, 0.75))
@@ -308,7 +308,7 @@ class ObjectEdits(Handle, Generic[R]):
         recorded: str | None = None,
         fit: str = "box",
     ) -> R:
-        """Give it another look.
+        """Change its appearance.
 
         Args:
             asset: id in the asset library; or
@@ -418,7 +418,7 @@ class ObjectEdits(Handle, Generic[R]):
         return self._make(Delete)
 
     def restore(self) -> R:
-        """Bring it back after :meth:`delete`.
+        """Restore the object after :meth:`delete`.
 
         Examples:
             >>> result = car.delete()
@@ -460,7 +460,7 @@ class ScenarioEdits(Generic[R]):
         quaternion: Quaternion = UPRIGHT,
         region_id: str | None = None,
     ) -> R:
-        """Hide the background inside a box [m]; :meth:`remove` its id to bring it back.
+        """Hide the background inside a box [m]; :meth:`remove` its id to restore it.
 
         Examples:
             >>> scenario.erase_region(position=(10, 0, 1), size=(2, 2, 3), region_id="sign").created
@@ -478,7 +478,7 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add an invisible box that does not yield, for the physics.
+        """Add an invisible rigid box, for the physics.
 
         Examples:
             >>> result = scenario.add_box(position=(20, 0, 0.5), size=(0.5, 6, 1))
@@ -496,7 +496,7 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add an invisible post or drum about its own z axis, for the physics.
+        """Add an invisible rigid post or drum about its own z axis, for the physics.
 
         Examples:
             >>> result = scenario.add_cylinder(position=(20, 0, 1.5), radius=0.1, height=3.0)
@@ -516,7 +516,7 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add all within ``radius`` of a line along its own z axis, for the physics; or a ball.
+        """Add a capsule: all points within ``radius`` of a line along its z axis; or a ball.
 
         Examples:
             >>> result = scenario.add_capsule(position=(20, 0, 0.5), radius=0.5)
@@ -537,9 +537,9 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add a closed body of triangles, or a sheet with a ``thickness`` [m], for the physics.
+        """Add a closed triangle mesh, or a sheet with a ``thickness`` [m], for the physics.
 
-        Triangles list vertices counter-clockwise seen from outside.
+        Vertices of a triangle are counter-clockwise as seen from outside.
 
         Examples:
             >>> ramp = [(20, -2, 0), (20, 2, 0), (26, -2, 1), (26, 2, 1)]
@@ -577,7 +577,7 @@ class ScenarioEdits(Generic[R]):
     def add_ground(
         self, *, offset: float = 0.0, friction: float | None = None, collider_id: str | None = None
     ) -> R:
-        """Add the recorded ground, moved up by ``offset`` [m], for the physics.
+        """Add the recorded ground, raised by ``offset`` [m], for the physics.
 
         Examples:
             >>> result = scenario.add_ground(collider_id="road")
@@ -607,7 +607,7 @@ class ScenarioEdits(Generic[R]):
         return self._edit(checked(Delete, object_id=thing_id))
 
     def restore(self, thing_id: str) -> R:
-        """Bring a removed object, region or collider back.
+        """Restore a removed object, region or collider.
 
         Examples:
             >>> result = scenario.remove("post")

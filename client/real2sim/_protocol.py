@@ -183,7 +183,7 @@ class ProtocolState:
     ) -> PendingRequest[View]:
         """Requests images of the current time, and clouds of LiDARs and radars."""
         message = checked(Render, id=self._next_id(), sensors=list(sensors), **ranging)
-        # A LiDAR or a lens that no step has needed may need kernels that are not yet compiled.
+        # A LiDAR or lens that no step has used may need kernels that are not yet compiled.
         return self._request_for(message, View, "images", long_timeout=True, has_images=True)
 
     def agent(
@@ -225,12 +225,12 @@ class ProtocolState:
         )
 
     def read(self, data: bytes | str, request: PendingRequest[A]) -> A | None:
-        """The answer in ``data``; None where it is progress, or late for an older request.
+        """The answer in ``data``; None if it is progress, or late for an older request.
 
         Raises:
             StatusError: the worker refuses the message.
-            ProtocolMismatchError: the worker speaks another version.
-            MalformedReplyError: something else than a valid message came.
+            ProtocolMismatchError: the worker has another version.
+            MalformedReplyError: not a valid message.
         """
         message = server_message(data, SERVER_MESSAGE)
         if isinstance(message, Error):
@@ -238,7 +238,7 @@ class ProtocolState:
                 return None
             superseded = message.code in _SUPERSEDED and request.answer is Obs
             if superseded and (newest := self.take_unsolicited(newest=True)) is not None:
-                # The planner was late and the worker went on without it.
+                # The planner was late and the worker advanced without it.
                 return newest  # type: ignore[return-value]
             raise error_of(message)
         if isinstance(message, Obs) and message.id == 0:
@@ -265,10 +265,10 @@ class ProtocolState:
         return message
 
     def handle_unsolicited(self, data: bytes | str) -> None:
-        """Take in a message while nothing is awaited.
+        """Process a message while no answer is pending.
 
         Raises:
-            StatusError: the worker ends the connection, and why.
+            StatusError: the worker ends the connection; has the reason.
         """
         message = server_message(data, SERVER_MESSAGE)
         if isinstance(message, Error):
@@ -328,11 +328,11 @@ def _required(model: type[BaseModel]) -> set[str]:
 
 
 def server_message(data: bytes | str, messages: TypeAdapter[M]) -> M:
-    """The message of a worker, one of ``messages``.
+    """Parse a message of the worker, one of ``messages``.
 
     Raises:
-        ProtocolMismatchError: the worker speaks another version.
-        MalformedReplyError: something else than a valid message came.
+        ProtocolMismatchError: the worker has another version.
+        MalformedReplyError: not a valid message.
     """
     if isinstance(data, str):
         raise MalformedReplyError("the worker sent text where binary messages are spoken")

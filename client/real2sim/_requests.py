@@ -150,7 +150,7 @@ def reset_spec(sensors: Sequence[Sensor], codec: str, options: ResetOptions) -> 
     """The spec of an episode.
 
     Raises:
-        ValueError: a field that is not allowed.
+        ValueError: an invalid field.
     """
     given: dict[str, Any] = dict(options)
     given |= ranging_specs(options.get("lidars", ()), options.get("radars", ()))

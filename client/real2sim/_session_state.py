@@ -111,16 +111,16 @@ def pose_between(before: Matrix, after: Matrix, fraction: float) -> Matrix:
 
 
 class SharedFrames:
-    """The memory that a worker has offered, open.
+    """Shared memory offered by a worker, opened.
 
     Args:
-        offer: of a welcome.
+        offer: offer of a welcome.
 
     Attributes:
-        secret: proves to the worker that this is its memory.
+        secret: proves to the worker that this client has opened it.
 
     Raises:
-        OSError: it is not on this machine, or not for us.
+        OSError: it is not on this machine, or not accessible.
     """
 
     def __init__(self, offer: SharedMemory) -> None:

@@ -74,7 +74,7 @@ class PointCloud(Handle):
 
     @cached_property
     def columns(self) -> Columns:
-        """All columns by name, [N] or [N, width] each; decoded at the first use, read-only.
+        """All columns by name, [N] or [N, width] each; decoded on first access, read-only.
 
         Raises:
             MalformedReplyError: broken data.

@@ -241,7 +241,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         }
         if self._agents:
             seen["agents"] = _nearest_agents(obs, self._agents)
-        # A slower camera keeps its last image until the next one is due.
+        # A slower camera repeats its last image until the next one is due.
         for name, image in _images_in(obs):
             most, dtype = FORMS[name.partition("/")[2] or "rgb"]
             self._images[name] = np.minimum(image, most).astype(dtype)

@@ -1,4 +1,4 @@
-"""Everything the SDK raises.
+"""Exceptions of the SDK.
 
 ::
 
@@ -135,7 +135,7 @@ class StatusError(Real2SimError):
     """
 
     def __init__(self, details: ErrorDetails) -> None:
-        # Many workers say the first of the errors in the detail already.
+        # Many workers include the first of the errors in the detail.
         unsaid = [e for e in details.errors if e.message not in details.detail]
         places = "; ".join(f"{e.pointer or '/'}: {e.message}" for e in unsaid)
         message = f"{details.detail} ({places})" if places else details.detail

@@ -226,7 +226,7 @@ class Frame(Image):
 
     Attributes:
         sensor: name of the camera.
-        t_us: instant shown.
+        t_us: time of the image.
         T_world_sensor: [4, 4] float64, camera frame (x right, y down, z forward) to world.
         K: [3, 3] float64 intrinsics [px].
 

@@ -222,11 +222,11 @@ class Observation(View):
 
 
 def observation_from_wire(obs: Obs, pixels: Sequence[memoryview | None] = ()) -> Observation:
-    """The observation in a message.
+    """Parse the observation in a message.
 
     Args:
         obs: the message.
-        pixels: of its images in shared memory, None for each that is not there; default: none is.
+        pixels: of its images in shared memory, None for each other image; default: none.
 
     Raises:
         MalformedReplyError: a route or matrix of another shape.

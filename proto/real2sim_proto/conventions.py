@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-# Classes of semantic images: Cityscapes label numbers, so that its tools read them.
+# Classes of semantic images: Cityscapes label numbers, for compatibility with its tools.
 
 SEMANTIC_CLASSES: dict[str, int] = {
     "unlabeled": 0,
@@ -57,7 +57,7 @@ SKY = SEMANTIC_CLASSES["sky"]
 
 
 def semantic_class(category: str) -> int:
-    """Number of the class of objects of that category."""
+    """Class number of objects of a category."""
     return SEMANTIC_CLASSES[CLASS_OF_CATEGORY.get(category, "dynamic")]
 
 

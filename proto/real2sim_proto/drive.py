@@ -1,7 +1,7 @@
-"""Messages of the drive socket, and the parts of them that REST sessions share.
+"""Messages of the drive socket, and the parts shared with REST sessions.
 
 Every message is a map with ``v`` (protocol version), ``type`` and ``id``. A client numbers its
-messages with ``id``; the answer carries the same ``id``. The clock moves only on ``action``.
+messages with ``id``, and the answer has the same ``id``. The clock only advances on ``action``.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from .sensors import (
 # file and returns the secret must be on the worker's machine; an address would not prove that.
 
 SHM_FOLDER = "/dev/shm"
-"""Where POSIX systems keep files that are memory."""
+"""Folder of shared memory files on POSIX systems."""
 SHM_NAME = r"^real2sim-[0-9a-f]{32}$"
 """Pattern of the file names; no other file is opened or removed."""
 SHM_MAGIC = b"real2sim-frames1"
 SHM_SECRET_BYTES = 32
 SHM_HEADER_BYTES = 4096
 SHM_ALIGNMENT = 64
-"""Images begin at multiples of this."""
+"""Alignment of images in bytes."""
 MAX_SHM_SLOTS = 64
 
 
@@ -76,7 +76,7 @@ Slot = Annotated[
 
 
 def check_asked(*asked: Sequence[object]) -> None:
-    """Raises ValueError: nothing is to be shown."""
+    """Raises ValueError if there is nothing to render."""
     if not any(asked):
         raise ValueError("nothing is asked for; name sensors, lidars or radars")
 
@@ -102,7 +102,7 @@ class ServerEnvelope(Envelope, ServerModel):
 
 
 class EgoState(ServerModel):
-    """The controlled vehicle at one instant; frames as in `conventions`."""
+    """State of the controlled vehicle at one time; frames as in `conventions`."""
 
     _instead: ClassVar = {
         "heading": "ego.yaw",
@@ -129,7 +129,7 @@ class EgoState(ServerModel):
 
 
 class AgentState(ServerModel):
-    """Another road user at one instant."""
+    """Another road user at one time."""
 
     _instead: ClassVar = {
         "heading": "2 * math.atan2(agent.quaternion[3], agent.quaternion[0])",
@@ -165,7 +165,7 @@ EventType = Literal[
 
 
 class Event(ServerModel):
-    """Something that happened in this step."""
+    """An event of this step."""
 
     type: str = one_of(EventType)
     t_us: Microseconds
@@ -184,7 +184,7 @@ class Event(ServerModel):
 
 
 class SignalShown(ServerModel):
-    """A traffic signal of the storyboard at one instant."""
+    """State of a traffic signal of the storyboard."""
 
     signal_id: str
     state: str = Field(description="in the words of the storyboard, such as 'red' or 'off;off;on'")
@@ -194,7 +194,7 @@ class SignalShown(ServerModel):
 
 
 class LaneShown(ServerModel):
-    """A piece of a lane of the scene's map, near the vehicle."""
+    """A section of a lane of the scene's map, near the vehicle."""
 
     lane_id: str
     kind: LaneKind
@@ -215,7 +215,7 @@ class LaneShown(ServerModel):
 class Score(ServerModel):
     """One score of an episode, with the version of its formula.
 
-    Scores of different versions must not be compared.
+    Scores of different versions are not comparable.
     """
 
     name: str
@@ -256,9 +256,9 @@ class Hello(Envelope):
 
 
 class Attach(Envelope):
-    """The shared memory of the welcome is open here; answered by attached.
+    """Confirms that the client has opened the shared memory; answered by attached.
 
-    Only as the first message after the welcome: any other one declines it.
+    Only valid as the first message after the welcome; any other message declines it.
     """
 
     type: Literal["attach"] = "attach"
@@ -276,7 +276,7 @@ class Reset(Envelope):
 
 
 class Action(Envelope):
-    """Answer to obs(step); moves the clock by one dt and is answered by obs(step + 1)."""
+    """Answer to obs(step); advances the clock by one dt and is answered by obs(step + 1)."""
 
     type: Literal["action"] = "action"
     step: int = Field(ge=0)
@@ -285,7 +285,7 @@ class Action(Envelope):
 
 
 class Edit(Envelope):
-    """Changes the session's world before the next step."""
+    """Edits the session's world before the next step."""
 
     type: Literal["edit"] = "edit"
     base_rev: int | None = Field(default=None, description="refused when the session is elsewhere")
@@ -293,7 +293,7 @@ class Edit(Envelope):
 
 
 class Render(Envelope):
-    """An out-of-loop view of the current instant; never moves time."""
+    """Requests an out-of-loop view of the current time; does not advance the clock."""
 
     type: Literal["render"] = "render"
     sensors: list[SensorSpec] = Field(default_factory=list, max_length=MAX_SENSORS)
@@ -404,7 +404,7 @@ class PointCloud(ServerModel):
 
 
 class SharedMemory(ServerModel):
-    """Memory that a controller on the worker's machine may read raw images from."""
+    """Shared memory for raw images, for a controller on the worker's machine."""
 
     name: str = Field(pattern=SHM_NAME, description="of a file in /dev/shm")
     slots: int = Field(ge=1, le=MAX_SHM_SLOTS)
@@ -412,7 +412,7 @@ class SharedMemory(ServerModel):
 
 
 class Welcome(ServerEnvelope):
-    """Answer to hello. Loading, compilation and the first render are over by now."""
+    """Answer to hello, after loading, compilation and the first render."""
 
     type: Literal["welcome"] = "welcome"
     protocol: str
@@ -440,7 +440,7 @@ class Welcome(ServerEnvelope):
 
 
 class Attached(ServerEnvelope):
-    """Answer to attach. Messages may name slots from now on."""
+    """Answer to attach. Later messages may name slots."""
 
     type: Literal["attached"] = "attached"
 
@@ -524,7 +524,7 @@ class Kept(ServerEnvelope):
 
 
 class Forked(ServerEnvelope):
-    """Answer to fork: another session at the same instant."""
+    """Answer to fork: another session with the same state."""
 
     type: Literal["forked"] = "forked"
     session_id: str
@@ -557,7 +557,7 @@ class Error(ServerEnvelope):
 
 
 class Result(ServerEnvelope):
-    """The session is over."""
+    """The session has ended."""
 
     type: Literal["result"] = "result"
     steps: int

@@ -1,4 +1,4 @@
-"""How an episode runs: sensors, vehicle, traffic, time limits, contact, scoring."""
+"""Options of an episode: sensors, vehicle, traffic, time limits, contact, scoring."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class ActuatorSpec(Model):
 
 
 class SuspensionSpec(Model):
-    """Springs and dampers between wheels and body.
+    """Suspension of the body.
 
     The defaults are those of a mid-size car: it pitches by about 1.4 degrees per g of braking and
     rolls by about 3.9 degrees per g in bends. Ride frequencies and damping: Gillespie 1992,
@@ -133,7 +133,7 @@ class SuspensionSpec(Model):
 
 
 class EgoSpec(Model):
-    """How the controlled vehicle moves."""
+    """Dynamics of the controlled vehicle."""
 
     dynamics: Literal["kinematic_bicycle", "dynamic_bicycle"] = "kinematic_bicycle"
     tracker: Literal["pursuit", "lqr", "ilqr", "perfect"] = Field(
@@ -182,7 +182,7 @@ class ConstantVelocityDriver(Model):
 
 
 class IdmParameters(Model):
-    """Of the intelligent driver model (Treiber et al. 2000)."""
+    """Parameters of the intelligent driver model (Treiber et al. 2000)."""
 
     desired_speed: Speed | None = Field(
         default=None, description="[m/s]; default: its highest recorded speed"
@@ -263,7 +263,7 @@ class HardBrakeDriver(Model):
 
 
 class JunctionCrossingDriver(Model):
-    """Crosses the ego's route so that both arrive together."""
+    """Crosses the ego's route, timed to arrive together with the ego."""
 
     kind: Literal["junction_crossing"] = "junction_crossing"
     ahead: Metre = Field(
@@ -369,7 +369,7 @@ class AgentsSpec(Model):
     )
 
 
-# --- what the seed draws ----------------------------------------------------------------------
+# --- randomization ----------------------------------------------------------------------------
 
 
 class StartRandomization(Model):
@@ -390,8 +390,8 @@ Fraction = Annotated[float, Field(ge=0, le=0.9)]
 
 
 class TrafficRandomization(Model):
-    """Parameters of IDM drivers: each is multiplied by a factor that is drawn once per object,
-    uniform within 1 plus or minus this."""
+    """Parameters of IDM drivers: each is multiplied by a factor sampled once per object, uniform
+    within 1 plus or minus this value."""
 
     desired_speed: Fraction = 0.0
     headway: Fraction = 0.0
@@ -520,13 +520,13 @@ class ScoringSpec(Model):
 
 
 ENDLESS_US = 3_600_000_000
-"""Length of episodes beyond the log that name no horizon: an hour, unless the client ends them."""
+"""Length of episodes beyond the log without a horizon, unless the client ends them: an hour."""
 
 MAX_HORIZON = 1_000_000
 
 
 class ResetSpec(Model):
-    """How an episode begins and runs."""
+    """Options of an episode."""
 
     @model_validator(mode="before")
     @classmethod

@@ -14,7 +14,7 @@ from .scenes import Reply
 
 
 class JobState(StrEnum):
-    """Where a job is."""
+    """State of a job."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -22,16 +22,16 @@ class JobState(StrEnum):
     FAILED = "failed"
     CANCELLED = "cancelled"
     INTERRUPTED = "interrupted"
-    """The worker stopped while it ran; start it again."""
+    """The worker stopped while the job was running; start the job again."""
 
 
 OVER = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED})
-"""States that last."""
+"""Final states."""
 
 JobKind = Literal["load_scene", "simulate", "calibrate", "export", "drive", "sweep"]
 
 PlannerName = Literal["follow_route", "pid", "idm", "depth_sampling"]
-"""Planners of the SDK that a worker starts itself."""
+"""Planners of the SDK that a worker can start."""
 
 
 class JobFile(Reply):
@@ -70,7 +70,7 @@ class JobInfo(Reply):
 
     @property
     def over(self) -> bool:
-        """Whether it will not change any more."""
+        """Whether the state is final."""
         return self.state in OVER
 
 
@@ -81,7 +81,7 @@ class JobList(Reply):
 
 
 class DriveRequest(Model):
-    """Body of `POST /v1/sessions/{id}/drive`: a planner drives the session, and is recorded."""
+    """Body of `POST /v1/sessions/{id}/drive`: a planner drives the session, with a recording."""
 
     planner: PlannerName | None = Field(
         default="follow_route",
@@ -152,7 +152,7 @@ Sigma = Annotated[float, Field(gt=0, le=100)]
 
 
 class ObservedBox(Model):
-    """Where a tracker saw an object."""
+    """Position of an object from a tracker."""
 
     t_us: Microseconds
     position: Vector3 = Field(description="of the box centre, world [m]")
@@ -163,7 +163,7 @@ class ObservedBox(Model):
 
 
 class SeenPoint(Model):
-    """Where a marked point was seen."""
+    """Position of a marked point."""
 
     t_us: Microseconds
     position: Vector3 = Field(description="world [m]")
@@ -177,7 +177,7 @@ class ObservedPoint(Model):
 
 
 class ObservedImage(Model):
-    """A picture of a camera of the scene, from where the recording vehicle was."""
+    """An image from a camera of the scene, at the recording vehicle's pose."""
 
     t_us: Microseconds
     camera: Identifier
@@ -280,7 +280,7 @@ class SweptValues(Model):
 
 
 class DatasetSweep(Model):
-    """The same drive many times over, each with other values in its edits."""
+    """Repeats the same drive with other parameter values in its edits."""
 
     parameters: dict[Identifier, SweptValues] = Field(min_length=1, max_length=16)
     draws: int = Field(

@@ -31,7 +31,7 @@ def _not_drawn(object_id: Any) -> Any:
 
 
 ObjectId = Annotated[Identifier, BeforeValidator(_not_drawn)]
-"""Id of an object that edits can name."""
+"""Id of an editable object."""
 
 MaterialName = Literal["rigid", "metal", "foam", "rubber", "jelly", "sand", "snow"]
 """Materials of an object; the physics defines their parameters."""
@@ -169,14 +169,14 @@ class Delete(Model):
 
 
 class Restore(Model):
-    """Bring a deleted object, erased region or collider back as it was."""
+    """Restore a deleted object, erased region or collider."""
 
     op: Literal["restore"] = "restore"
     object_id: ObjectId
 
 
 class Insert(Model):
-    """Add an object from the asset library, standing at a pose or following a trajectory."""
+    """Add an object from the asset library, at a pose or on a trajectory."""
 
     op: Literal["insert"] = "insert"
     asset_id: Identifier
@@ -246,7 +246,7 @@ class Spawn(Model):
 
 
 class Replace(Model):
-    """Give an object another look, fitted into its box: an asset's, or a recorded object's."""
+    """Replace an object's appearance with an asset's or a recorded object's, fitted to its box."""
 
     op: Literal["replace"] = "replace"
     object_id: ObjectId
@@ -375,7 +375,7 @@ class PlaneShape(Model):
 
 
 class BoxShape(Model):
-    """A solid box."""
+    """A rigid box."""
 
     kind: Literal["box"] = "box"
     position: Vector3 = Field(description="centre [m]")
@@ -384,7 +384,7 @@ class BoxShape(Model):
 
 
 class CylinderShape(Model):
-    """A solid post or drum with flat ends; its axis is the z axis of its pose."""
+    """A rigid post or drum with flat ends; its axis is the z axis of its pose."""
 
     kind: Literal["cylinder"] = "cylinder"
     position: Vector3 = Field(description="centre [m]")
@@ -394,7 +394,8 @@ class CylinderShape(Model):
 
 
 class CapsuleShape(Model):
-    """All within a radius of a line along the z axis of its pose; a ball where length is 0."""
+    """A capsule: all points within a radius of a line along the z axis of its pose; with length 0 a
+    ball."""
 
     kind: Literal["capsule"] = "capsule"
     position: Vector3 = Field(description="middle of the line [m]")
@@ -409,7 +410,7 @@ VertexIndex = Annotated[int, Field(ge=0, lt=4096)]
 
 
 class MeshShape(Model):
-    """A body of triangles; or a sheet of them with a thickness."""
+    """A closed triangle mesh, or a sheet of triangles with a thickness."""
 
     kind: Literal["mesh"] = "mesh"
     position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="of its origin [m]")
@@ -426,7 +427,7 @@ class MeshShape(Model):
 
 
 class GroundShape(Model):
-    """The recorded ground, moved up or down."""
+    """The recorded ground, with a vertical offset."""
 
     kind: Literal["ground"] = "ground"
     offset: Metres = Field(default=0.0, description="[m]")
@@ -439,7 +440,7 @@ ColliderShape = Annotated[
 
 
 class AddCollider(Model):
-    """Add something invisible that does not yield, for the physics."""
+    """Add an invisible rigid collider, for the physics."""
 
     op: Literal["add_collider"] = "add_collider"
     collider_id: Identifier | None = Field(default=None, description="default: collider_<n>")
@@ -448,7 +449,7 @@ class AddCollider(Model):
 
 
 class SetTime(Model):
-    """The span in which the scenario plays: where previews, physics and exports begin and end."""
+    """Time span of the scenario: of previews, physics and exports."""
 
     op: Literal["set_time"] = "set_time"
     start_us: Microseconds | None = Field(default=None, description="default: of the recording")
@@ -512,7 +513,7 @@ OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
 
 
 def subject_of(operation: Operation) -> str | None:
-    """Id that an operation names; None where it leaves the choice of a new one open."""
+    """Id in an operation: object, region or collider; None if the worker chooses it."""
     for field in ("object_id", "region_id", "collider_id"):
         if field in type(operation).model_fields:
             subject: str | None = getattr(operation, field)

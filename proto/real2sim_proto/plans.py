@@ -74,7 +74,7 @@ class Control(Model):
 
 
 class PoseCommand(Model):
-    """Puts the vehicle there at the next time stamp, whatever its dynamics; on the ground."""
+    """Sets the vehicle's pose at the next step, regardless of its dynamics; on the ground."""
 
     kind: Literal["pose"] = "pose"
     x: Metres = Field(description="world [m]")

@@ -16,7 +16,7 @@ WITHOUT_SCENES = "`real2sim serve --demo` shows a street at once; your own: `rea
 
 
 class Reply(Guided, BaseModel):
-    """Base of answers. Readers ignore unknown members, so that newer workers can add some."""
+    """Base of replies. Readers ignore unknown members, so that newer workers can add some."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -117,7 +117,7 @@ class SceneInfo(Reply):
 
 
 class SceneList(Reply):
-    """All scenes below the worker's scene folder."""
+    """All scenes in the worker's scene folder."""
 
     scenes: list[SceneInfo]
 

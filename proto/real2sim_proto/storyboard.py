@@ -47,7 +47,7 @@ ElementName = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class BoundingBox(Model):
-    """(length, width, height) [m], and where its middle is from the reference point [m]."""
+    """(length, width, height) [m], and the box centre relative to the reference point [m]."""
 
     size: tuple[Value, Value, Value]
     centre: tuple[Value, Value, Value]
@@ -114,7 +114,7 @@ Roads = Annotated[RouteLanes | MapRoads, Field(discriminator="kind")]
 
 
 class SignalHead(Model):
-    """A traffic signal: where vehicles are to stop for it."""
+    """A traffic signal, with its stop position."""
 
     signal_id: Reference
     stop_line: WorldPosition | None = Field(default=None, description="None: not known")
@@ -151,14 +151,14 @@ class InitAction(Model):
 
 
 class Action(Model):
-    """Part of an event."""
+    """An action of an event."""
 
     name: ElementName
     action: AnyAction
 
 
 class Event(Model):
-    """Actions that begin together."""
+    """Actions that start together."""
 
     name: ElementName
     priority: Literal["override", "skip", "parallel"] = Field(
@@ -170,7 +170,7 @@ class Event(Model):
 
 
 class Maneuver(Model):
-    """Events of one purpose."""
+    """A sequence of events."""
 
     name: ElementName
     events: list[Event] = Field(min_length=1, max_length=200)
@@ -186,7 +186,7 @@ class ManeuverGroup(Model):
 
 
 class Act(Model):
-    """Groups that begin together."""
+    """Maneuver groups that start together."""
 
     name: ElementName
     groups: list[ManeuverGroup] = Field(min_length=1, max_length=100)
@@ -195,7 +195,7 @@ class Act(Model):
 
 
 class Story(Model):
-    """Acts of one topic."""
+    """A group of acts."""
 
     name: ElementName
     acts: list[Act] = Field(min_length=1, max_length=100)
@@ -212,7 +212,7 @@ class ValueSet(Model):
 
 
 class ValueRange(Model):
-    """From lowest to highest in steps."""
+    """Values from lowest to highest with a constant step."""
 
     kind: Literal["range"] = "range"
     low: float
@@ -221,7 +221,7 @@ class ValueRange(Model):
 
 
 class Uniform(Model):
-    """Drawn from low to high."""
+    """Uniform distribution between low and high."""
 
     kind: Literal["uniform"] = "uniform"
     low: float
@@ -240,7 +240,7 @@ class Normal(Model):
 
 
 class Poisson(Model):
-    """Drawn as the number of events, `mean` of them expected."""
+    """Poisson distribution with the given mean."""
 
     kind: Literal["poisson"] = "poisson"
     mean: Annotated[float, Field(gt=0, le=1e6)]
@@ -256,7 +256,7 @@ class Weighted(Model):
 
 
 class Choice(Model):
-    """Drawn from these by their weights."""
+    """Discrete distribution with weights."""
 
     kind: Literal["choice"] = "choice"
     values: list[Weighted] = Field(min_length=1, max_length=100_000)
@@ -271,7 +271,7 @@ class Bin(Model):
 
 
 class Histogram(Model):
-    """Drawn from ranges by their weights, uniform in each."""
+    """Histogram distribution: ranges with weights, uniform in each."""
 
     kind: Literal["histogram"] = "histogram"
     bins: list[Bin] = Field(min_length=1, max_length=100_000)
@@ -337,10 +337,10 @@ class Storyboard(Model):
 
 
 def resolved(board: Storyboard) -> Storyboard:
-    """The storyboard with the values of its parameters instead of expressions.
+    """The storyboard with parameter values instead of expressions.
 
     Raises:
-        ValueError: an expression that has none, or leads to a value that is not allowed.
+        ValueError: an expression without a value, or with an invalid one.
     """
     # Content without expressions is shared, so that it is validated once.
     if not any(_has_expression(getattr(board, name)) for name in _RESOLVED):

@@ -18,7 +18,7 @@ Reference = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Orientation(Model):
-    """A heading [rad]; of relative ones against the frame that the position is given in."""
+    """A heading [rad]; a relative one is relative to the frame of the position."""
 
     h: Value = 0.0
     relative: bool = False
@@ -30,7 +30,7 @@ DRIVING = Field(
 
 
 class WorldPosition(Model):
-    """In the frame of the road network's map; without one, of the scene's world."""
+    """In the frame of the road network's map, or of the scene's world if there is none."""
 
     kind: Literal["world"] = "world"
     x: Value
@@ -182,7 +182,7 @@ class SpeedLimits(Model):
 
 
 class SpeedAction(Model):
-    """To a speed, in a form of time."""
+    """Change to a target speed, with a given transition."""
 
     kind: Literal["speed"] = "speed"
     speed: Value = Field(description="[m/s]; or difference, or factor")
@@ -193,14 +193,14 @@ class SpeedAction(Model):
 
 
 class SpeedPoint(Model):
-    """So long after the one before, this speed."""
+    """Target speed, and the time since the previous one."""
 
     time: Value
     speed: Value
 
 
 class SpeedProfileAction(Model):
-    """Through speeds, changing linearly between them."""
+    """Speed profile with linear changes between entries."""
 
     kind: Literal["speed_profile"] = "speed_profile"
     points: list[SpeedPoint] = Field(min_length=1, max_length=10_000)
@@ -231,7 +231,7 @@ class LaneOffsetAction(Model):
 
 
 class LateralDistanceAction(Model):
-    """Keeps a distance sideways from an entity."""
+    """Keeps a lateral distance to an entity."""
 
     kind: Literal["lateral_distance"] = "lateral_distance"
     entity: Reference
@@ -245,7 +245,7 @@ class LateralDistanceAction(Model):
 
 
 class LongitudinalDistanceAction(Model):
-    """Keeps a distance or a gap in time to an entity, along the road."""
+    """Keeps a distance or a time gap to an entity, along the road."""
 
     kind: Literal["longitudinal_distance"] = "longitudinal_distance"
     entity: Reference
@@ -288,14 +288,14 @@ class SynchronizeAction(Model):
 
 
 class Vertex(Model):
-    """A place on a polyline, and when to be there."""
+    """A vertex of a polyline, and its time."""
 
     time: Value = 0.0
     position: Position
 
 
 class Polyline(Model):
-    """Straight between places."""
+    """Straight lines between vertices."""
 
     shape: Literal["polyline"] = "polyline"
     vertices: list[Vertex] = Field(min_length=2, max_length=20_000)
@@ -314,7 +314,7 @@ class Clothoid(Model):
 
 
 class ControlPoint(Model):
-    """Of a NURBS."""
+    """Control point of a NURBS."""
 
     position: Position
     weight: Value = 1.0
@@ -340,7 +340,7 @@ class Nurbs(Model):
 
 
 class ClothoidPiece(Model):
-    """Of a spline: curvature [1/m] that changes linearly over its length [m]."""
+    """Segment of a spline: curvature [1/m] changes linearly over its length [m]."""
 
     start: Value
     end: Value
@@ -349,7 +349,7 @@ class ClothoidPiece(Model):
 
 
 class ClothoidSpline(Model):
-    """Clothoids, each from where the one before ends, as it heads there."""
+    """Clothoid segments, each continuing the previous one in position and heading."""
 
     shape: Literal["clothoid_spline"] = "clothoid_spline"
     position: Position
@@ -369,7 +369,7 @@ class Timing(Model):
 
 
 class FollowTrajectoryAction(Model):
-    """Along a curve, at its own speed or by the curve's times."""
+    """Follows a curve, at its own speed or at the curve's times."""
 
     kind: Literal["follow_trajectory"] = "follow_trajectory"
     name: str = Field(default="trajectory", max_length=200)
@@ -401,14 +401,15 @@ class TeleportAction(Model):
 
 
 class VisibilityAction(Model):
-    """Whether it is in the world: shown, measured and hit. All three go together here."""
+    """Whether the entity is in the world: visible, measured and collidable, always together."""
 
     kind: Literal["visibility"] = "visibility"
     visible: bool
 
 
 class FollowingParameters(Model):
-    """Of the intelligent driver model (Treiber et al. 2000), as of the driver ``idm``."""
+    """Parameters of the intelligent driver model (Treiber et al. 2000), as for the driver
+    ``idm``."""
 
     desired_speed: Annotated[float, Field(ge=0, le=150)] | None = Field(
         default=None, description="[m/s]; default: its speed when the action begins"
@@ -423,7 +424,7 @@ class FollowingParameters(Model):
 
 
 class ControllerAction(Model):
-    """Drives by the intelligent driver model in its lane, until an action moves it otherwise."""
+    """Drives by the intelligent driver model in its lane, until another action controls it."""
 
     kind: Literal["controller"] = "controller"
     active: bool = True
@@ -446,7 +447,7 @@ PrivateAction = Annotated[
     | ControllerAction,
     Field(discriminator="kind"),
 ]
-"""Of each entity of a maneuver group."""
+"""Actions of each entity of a maneuver group."""
 
 
 class AddEntityAction(Model):
@@ -465,7 +466,7 @@ class DeleteEntityAction(Model):
 
 
 class SignalStateAction(Model):
-    """A traffic signal shows a state from now on."""
+    """Sets the state of a traffic signal."""
 
     kind: Literal["signal_state"] = "signal_state"
     signal: Reference

@@ -111,8 +111,8 @@ class AsyncClient(Handle):
         """Versions, device, limits, conventions.
 
         Raises:
-            UnreachableError: no worker answers.
-            ProtocolMismatchError: the worker speaks another protocol version.
+            UnreachableError: no worker responds.
+            ProtocolMismatchError: the worker has another protocol version.
 
         Examples:
             >>> info = await client.server()

@@ -210,7 +210,7 @@ class AsyncJobs(AsyncCollection[JobInfo]):
 
 
 class AsyncJob(JobBase):
-    """One job as this client last saw it.
+    """A job in its last fetched state.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -222,7 +222,7 @@ class AsyncJob(JobBase):
         self._transport = transport
 
     async def refresh(self) -> AsyncJob:
-        """See how far it is; returns itself.
+        """Fetch the current state; returns itself.
 
         Examples:
             >>> job = await job.refresh()
@@ -263,7 +263,7 @@ class AsyncJob(JobBase):
         return self
 
     async def cancel(self) -> AsyncJob:
-        """Ask it to end; returns itself.
+        """Request cancellation; returns itself.
 
         Examples:
             >>> job = await job.cancel()

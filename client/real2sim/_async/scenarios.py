@@ -51,7 +51,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
     """
 
     async def create(self, scene: SceneRef, name: str = "") -> AsyncScenario:
-        """A new scenario without edits on a scene.
+        """Create a scenario without edits on a scene.
 
         Raises:
             NotFoundError: no such scene.
@@ -62,7 +62,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
             (0, ['car_red', 'car_blue', 'post'])
         """
         info = await self._transport.send(_requests.create_scenario(scene_name(scene), name))
-        # The answer to a creation leaves trajectories out; a handle always has them.
+        # The reply to a creation omits trajectories; a handle always has them.
         return await AsyncScenario(self._transport, info).refresh()
 
     async def import_document(
@@ -139,7 +139,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         return await self._transport.send(_requests.gallery_picture(name))
 
     async def delete(self, scenario: ScenarioRef) -> None:
-        """Remove a scenario and its history.
+        """Delete a scenario and its history.
 
         Examples:
             >>> await client.scenarios.delete(scenario)
@@ -148,7 +148,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
 
 
 class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
-    """One scenario as this client last saw it.
+    """A scenario in its last fetched state.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -180,9 +180,9 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             dry_run: check them and change nothing.
 
         Raises:
-            ValueError: an operation that is not valid.
-            StaleRevisionError: somebody else edited first.
-            InvalidOperationError: an unknown object, or a result that is not allowed.
+            ValueError: an invalid operation.
+            StaleRevisionError: someone else edited first.
+            InvalidOperationError: an unknown object, or an invalid result.
 
         Examples:
             >>> result = await scenario.apply(
@@ -211,10 +211,10 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
 
         Args:
             asset: id in the library.
-            position, quaternion: where its box is, for the whole time range.
-            size: box to fit [m]; default: the asset's own.
+            position, quaternion: pose of its box, for the whole time range.
+            size: box size to fit [m]; default: the asset's own.
             object_id: default: the asset's id with a number.
-            snap: put it onto the ground, whatever z is.
+            snap: place it on the ground, regardless of z.
 
         Raises:
             InvalidOperationError: no such asset.
@@ -413,7 +413,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return AsyncJob(self._transport, info)
 
     async def fork(self, *, name: str | None = None, revision: int | None = None) -> AsyncScenario:
-        """A new scenario with the same history, up to a revision.
+        """Create a scenario with the same history, up to a revision.
 
         Examples:
             >>> result = await scenario.remove("post")
@@ -425,7 +425,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return await AsyncScenario(self._transport, await self._transport.send(call)).refresh()
 
     async def export(self) -> ScenarioDocument:
-        """The whole scenario as one document; ``model_dump_json()`` makes a file of it.
+        """Export the whole scenario as one document; ``model_dump_json()`` converts it to a file.
 
         Examples:
             >>> result = await scenario.remove("post")
@@ -443,11 +443,11 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         t_us: int | None = None,
         part: str = "all",
     ) -> Path:
-        """Write a point cloud with colour, normal, class and instance: the centres of Gaussians.
+        """Write the centres of the Gaussians as a ply with colour, normal, class and instance.
 
         Args:
             path: of the ply file.
-            t, t_us: instant in seconds or in microseconds; default: the start.
+            t, t_us: time in seconds or in microseconds; default: the start.
             part: ``all``, ``background`` or ``objects``.
 
         Examples:
@@ -497,10 +497,10 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return await self._repeated(_requests.undo, count)
 
     async def redo(self, count: int = 1) -> OperationResult:
-        """Make the edit again that was taken back last, or the last ``count``.
+        """Redo the edit that was undone last, or the last ``count`` edits.
 
         Raises:
-            ConflictError: nothing was taken back.
+            ConflictError: there is nothing to redo.
 
         Examples:
             >>> result = await scenario.remove("post")
@@ -619,7 +619,7 @@ class AsyncSceneObject(ObjectEdits[Awaitable[OperationResult]]):
         frame: str = "world",
         snap: bool = False,
     ) -> AsyncSceneObject:
-        """Add a copy, shifted [m], and return its handle; ``snap`` puts it onto the ground.
+        """Add a copy, shifted [m], and return its handle; ``snap`` places it on the ground.
 
         Examples:
             >>> copy = await car.duplicate(x=9.0)

@@ -144,7 +144,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         return info
 
     async def unload(self, scene: SceneRef) -> None:
-        """Free the memory of a scene that no session uses.
+        """Unload a scene from memory.
 
         Raises:
             ConflictError: a session uses it.
@@ -168,7 +168,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         return await self._transport.send(_requests.import_scene(path, scene))
 
     async def upload(self, path: str | os.PathLike[str], *, scene: str | None = None) -> SceneInfo:
-        """Send a bundle or splat file of this machine to the worker and import it there.
+        """Upload a bundle or splat file of this machine to the worker and import it.
 
         Examples:
             >>> (await client.scenes.upload(folder / "corner.ply", scene="mine")).gaussians
@@ -407,7 +407,7 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
         await self._transport.send(_requests.delete_asset(asset_id))
 
     async def thumbnail(self, asset_id: str, *, width: int = 256) -> Image:
-        """A picture of it (png).
+        """A picture of the asset (png).
 
         Examples:
             >>> (await client.assets.thumbnail("hatch", width=64)).codec

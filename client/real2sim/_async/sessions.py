@@ -1,4 +1,4 @@
-"""Drive sessions: over a socket in lock step, or by plain requests.
+"""Drive sessions: over a socket in lockstep, or over REST.
 
 A session is used by one thread or task at a time.
 """
@@ -83,12 +83,12 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         sensors: Sequence[Sensor] = (),
         **options: Unpack[ResetOptions],
     ) -> SessionInfo:
-        """A new session, its episode started.
+        """Create a session and start its episode.
 
         Args:
             scene, scenario: exactly one of them, or its name or id.
-            sensors: as of ``DriveSession.reset``.
-            options: as of ``DriveSession.reset``.
+            sensors: as in ``DriveSession.reset``.
+            options: as in ``DriveSession.reset``.
 
         Examples:
             >>> info = await client.sessions.create(scene="street", dt_us=50_000)
@@ -137,7 +137,7 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
     async def step(
         self, session_id: str, *, n: int = 1, plan: Plan | Mapping[str, Any] | None = None
     ) -> SessionState:
-        """``n`` clock steps under one plan; default: the last plan, else along the log.
+        """Run ``n`` clock steps under one plan; default: the last plan, else along the log.
 
         Examples:
             >>> state = await client.sessions.step(info.session_id, n=5)
@@ -237,7 +237,7 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         radars: Sequence[RadarSensor] = (),
         codec: str = "auto",
     ) -> View:
-        """Images of the current instant; never moves time.
+        """Render images of the current step, without advancing it.
 
         Examples:
             >>> view = await client.sessions.render(info.session_id, ["front"])
@@ -386,11 +386,11 @@ class AsyncDriveSession(SessionBase):
         return observation_from_wire(message)
 
     async def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> Edited:
-        """Change this session's world before the next step; all operations apply, or none.
+        """Edit this session's world before the next step; all operations apply, or none.
 
         Raises:
-            ValueError: an operation that is not valid.
-            InvalidOperationError: an unknown object, or a result that is not allowed.
+            ValueError: an invalid operation.
+            InvalidOperationError: an unknown object, or an invalid result.
 
         Examples:
             >>> edited = await session.edit([{"op": "duplicate", "object_id": "car_red", "x": 9.0}])

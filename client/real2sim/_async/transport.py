@@ -27,7 +27,7 @@ class AsyncTransport:
         self._http = httpx2.AsyncClient(transport=transport, **client_options(target))
 
     async def send(self, call: Call[T]) -> T:
-        """The parsed answer; retried where that is safe.
+        """The parsed answer; retried if that is safe.
 
         Raises:
             Real2SimError: no answer, or the worker refuses.
@@ -39,7 +39,7 @@ class AsyncTransport:
             except Real2SimError as error:
                 delay = attempts.delay_after(error)
                 if delay is None:
-                    # The caller's lines say where it happened; those below are always the same.
+                    # The traceback of the caller is useful; the frames below are always the same.
                     raise error.with_traceback(None) from error.__cause__
             await sleep(delay)
 

@@ -206,12 +206,12 @@ class PinholeView:
 
 @dataclass(frozen=True, eq=False)
 class Lookup:
-    """Where the pixels of a wanted view are seen.
+    """Source pixels of a requested view.
 
     Attributes:
-        size: of the view, width, height [px].
-        parts: of each camera that sees some: its name, rows of the view's pixels [N], and for each
-            four pixels around and their weights [N, 4].
+        size: width and height of the view [px].
+        parts: for each contributing camera its name, the indices of the view's pixels [N], and for
+            each the four surrounding pixels and their weights [N, 4].
         covered: fraction of the view that any camera sees.
     """
 

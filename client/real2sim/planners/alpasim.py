@@ -1,7 +1,8 @@
 """Planners made for AlpaSim (NVIDIA 2025), unchanged: gRPC, ``EgodriverService``.
 
-AlpaSim's local frame is here the world, shifted so that an episode begins at its origin: its
-numbers are single precision. Its rig frame is the vehicle frame. Needs the ``alpasim`` extra.
+AlpaSim's local frame is our world frame, shifted so that an episode begins at its origin, because
+its numbers are single precision. Its rig frame is the vehicle frame. Requires the ``alpasim``
+extra.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ class AlpasimDriver:
         try:
             answer = self._call("drive", request)
         except _RefusalError as refusal:
-            # NVIDIA's models say so while the past that they are shown is too short.
+            # NVIDIA's models report this while their history is too short.
             if refusal.status != "FAILED_PRECONDITION" or self._planned:
                 raise
             return self._meanwhile(obs, refusal.details)
@@ -286,7 +287,7 @@ class AlpasimDriver:
         else:
             focal = {"focal_length_x": frame.K[0, 0], "focal_length_y": frame.K[1, 1]}
             intrinsics.opencv_pinhole_param.CopyFrom(m.OpenCVPinholeCameraParam(**centre, **focal))
-        # In spite of its name this is where the camera is in the rig; see AlpaSim's comment on it.
+        # Despite its name this is the camera's pose in the rig; see AlpaSim's comment on it.
         pose = self._pose(T_ego_camera(obs, frame))
         return m.AvailableCamera(intrinsics=intrinsics, rig_to_camera=pose, logical_id=name)
 
@@ -344,11 +345,11 @@ ANGLE_TO_PIXELS = 2
 
 
 class _RefusalError(PeerError):
-    """A call that the driver did not answer.
+    """A failed call to the driver.
 
     Attributes:
-        status: name of gRPC's.
-        details: the driver's words.
+        status: gRPC's status name.
+        details: the driver's message.
     """
 
     def __init__(self, what: str, *, status: str, details: str) -> None:

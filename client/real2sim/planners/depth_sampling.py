@@ -218,6 +218,7 @@ def _way(speed: float, acceleration: float, times: Array, *, limit: float) -> Ar
     """[K, 2] metres travelled and speed [m/s] at ``times``; speed between 0 and ``limit``.
 
     Above the limit the drive brakes at least gently until it is reached.
+    Above the limit the drive brakes at least gently until the limit is reached.
     """
     if speed > limit:
         acceleration, limit = min(acceleration, -1.0), speed

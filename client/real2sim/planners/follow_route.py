@@ -49,9 +49,9 @@ class Comfort:
 
 
 class FollowRoute:
-    """A planner for examples and tests: the route as a path, a speed limit at each point of it.
+    """A planner for examples and tests: follows the route within a speed limit at each point.
 
-    Others are only seen in sessions that are reset with ``privileged=True``.
+    It only sees other road users in sessions that are reset with ``privileged=True``.
 
     Examples:
         >>> planner = FollowRoute(speed=5.0)
@@ -73,7 +73,7 @@ class FollowRoute:
         spacing: float = 0.25,
         comfort: Comfort | None = None,
     ) -> None:
-        """Make a planner.
+        """Create a planner.
 
         Args:
             speed: cruising speed [m/s].
@@ -82,7 +82,7 @@ class FollowRoute:
             comfort: accelerations and gaps; default: ``Comfort()``.
 
         Raises:
-            ValueError: as :func:`delays_of_poses` does.
+            ValueError: see :func:`delays_of_poses`.
         """
         self._delays = delays_of_poses(speed=speed, horizon=horizon, spacing=spacing)
         self.speed = speed
@@ -107,10 +107,10 @@ class FollowRoute:
 
 
 def delays_of_poses(*, speed: float, horizon: float, spacing: float) -> Array:
-    """[K] float64 seconds from now at which a plan has poses.
+    """[K] float64 delays of a plan's poses [s].
 
     Raises:
-        ValueError: a speed, a horizon or a spacing with which no plan can be made.
+        ValueError: a speed, horizon or spacing that allows no plan.
     """
     if not (speed > 0 and 0 < spacing <= horizon):
         raise ValueError(
@@ -297,7 +297,7 @@ def drive_profile(
 ) -> Array:
     """[K] float64 metres travelled after each delay [s], from ``speed``, within limits.
 
-    Braking may exceed ``comfort.braking`` where somebody is already too near.
+    Braking may exceed ``comfort.braking`` if an obstacle is already too near.
     """
     travelled: list[float] = []
     profile, position, now, speed = Profile(arc, limits), 0.0, 0.0, max(speed, 0.0)

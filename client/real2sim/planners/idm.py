@@ -50,7 +50,7 @@ class Follower:
     clearance: float = 0.3
 
     def answer(self, speed: float, desired: float, gap: float, closing: float) -> float:
-        """Acceleration [m/s^2] at ``gap`` metres behind a leader that one closes in on.
+        """Acceleration [m/s^2] at ``gap`` metres behind an approached lead vehicle.
 
         ``a (1 - (v/v0)^4 - (s*/s)^2)`` with ``s* = s0 + v T + v dv / (2 sqrt(a b))``.
         """

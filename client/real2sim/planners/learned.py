@@ -1,6 +1,6 @@
-"""A small network that drives by one camera; learned from recorded drives.
+"""A small network that drives with one camera, trained on recorded drives.
 
-``real2sim train-policy`` makes the file of weights. Needs torch and safetensors.
+``real2sim train-policy`` writes the file of weights. Requires torch and safetensors.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class PolicyShape:
         """The shape in the header of a file.
 
         Raises:
-            ValueError: a file of another kind.
+            ValueError: a different kind of file.
         """
         found = (metadata or {}).get("format")
         if found != FORMAT:
@@ -152,7 +152,7 @@ def network(shape: PolicyShape) -> Any:
     class Policy(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
-            # Files of weights name the layers as the attributes are named here.
+            # The attribute names are the layer names in files of weights.
             widths = (3, 16, 24, 32, 48)
             layers: list[Any] = []
             for before, after in itertools.pairwise(widths):

@@ -1,7 +1,7 @@
 """Planners made for NeuroNCAP (Ljungbergh et al. 2024), unchanged: HTTP with ``/infer``.
 
-The planner serves ``GET /alive``, ``POST /reset`` and ``POST /infer``. Images go to it as it
-expects them, as tensors written by ``torch.save``, so torch must be installed here.
+The planner serves ``GET /alive``, ``POST /reset`` and ``POST /infer``. It expects images as
+tensors written by ``torch.save``, so torch must be installed here.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ class NeuroNcap:
 
 
 def _canbus(obs: Observation) -> list[float]:
-    """nuScenes' vehicle bus as these planners count it.
+    """nuScenes' vehicle bus in these planners' conventions.
 
     Position [m], orientation wxyz, acceleration [m/s^2], rotation rate [rad/s], velocity [m/s],
     the last three in the vehicle frame.

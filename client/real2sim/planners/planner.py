@@ -72,7 +72,7 @@ class Needs:
     all_cameras: bool = False
 
     def sensors(self, cameras: Sequence[CameraInfo]) -> list[dict[str, Any]]:
-        """Sensors to reset with, out of a session's cameras.
+        """Sensors to pass to reset, from a session's cameras.
 
         Raises:
             ValueError: a camera that the scene lacks.

@@ -44,10 +44,10 @@ log = logging.getLogger(__name__)
 
 
 class Refusal(Exception):
-    """A request that is not served.
+    """A refused request.
 
     Attributes:
-        status: name of gRPC's.
+        status: gRPC's status name.
     """
 
     def __init__(self, status: str, said: str) -> None:
@@ -151,7 +151,7 @@ class AlpasimRenderer:
                     focal_length_y=K[1][1],
                 )
             )
-            # In spite of its name this is where the camera is in the rig.
+            # Despite its name this is the camera's pose in the rig.
             pose = self._pose(np.array(camera.T_vehicle_camera))
             available.append(
                 m.AvailableCamera(intrinsics=spec, rig_to_camera=pose, logical_id=name)
@@ -199,7 +199,7 @@ class AlpasimRenderer:
     def _render_lidar(self, _request: Any) -> Any:
         raise _no_lidar()
 
-    # --- pictures -------------------------------------------------------------------------------
+    # --- images ---------------------------------------------------------------------------------
 
     def _each(self, items: Sequence[Any]) -> list[tuple[str, bytes | Refusal]]:
         """The image of each item of a batch, or the reason for its failure."""

@@ -165,14 +165,14 @@ class LinkedScene:
         """The frames of ``views``, in order, in as few requests as the worker allows.
 
         Args:
-            views: all of one instant.
-            their_us: that instant on their clock [us].
+            views: all of one time.
+            their_us: that time on their clock [us].
             poses: [4, 4] of box centres in their world, by the scene's object ids.
-            others: as of ``client.scenes.view``.
+            others: as in ``client.scenes.view``.
 
         Raises:
             Real2SimError: as ``client.scenes.view`` does.
-            ValueError: a size that no worker draws.
+            ValueError: a size that workers do not support.
         """
         placed = {name: self._pose(pose) for name, pose in poses.items()}
         frames: list[Frame] = []

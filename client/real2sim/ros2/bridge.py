@@ -181,7 +181,7 @@ class RosNode:
     """
 
     def __init__(self) -> None:
-        """Begin ROS.
+        """Initialize ROS.
 
         Raises:
             NoRosError: a package of ROS cannot be imported.

@@ -56,7 +56,7 @@ class MessageTypes:
 
 @dataclass(frozen=True)
 class MessageBuilder:
-    """Makes messages of one kind of classes.
+    """Creates messages of one family of message classes.
 
     Attributes:
         types: the classes.
