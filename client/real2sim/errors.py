@@ -17,7 +17,7 @@
         ├── UnauthorizedError          token missing or wrong             (401, 403)
         ├── NotFoundError              no such scene, scenario, session, object, camera (404)
         ├── ConflictError              not in this state                  (409)
-        │   ├── StaleRevisionError         somebody else edited first     (412); has .missed
+        │   ├── StaleRevisionError         someone else edited first      (412); has .missed
         │   ├── StepConflictError          this step was answered with other content
         │   ├── StaleStepError             the session is past this step
         │   ├── BadStepError               the session is not there yet

@@ -37,8 +37,8 @@ from .worker import Worker
 # few thousand steps, although nearly all objects exist before the first step and stay.
 
 YOUNG = 20_000
-"""New objects between two small searches; a step makes some 200, nearly all of which go by
-themselves."""
+"""New objects between two young collections; a step creates about 200, nearly all freed by
+reference counting."""
 
 
 def search_seldom() -> None:

@@ -435,11 +435,10 @@ def check_known(scene: Scene, sensors: Iterable[SensorSpec]) -> None:
 def check_sensors(
     rig: CameraRig, sensors: Sequence[SensorSpec], *, max_pixels: int
 ) -> list[Camera]:
-    """The cameras of ``sensors`` at the sizes they name.
+    """The cameras of ``sensors`` at the requested sizes.
 
     Raises:
-        ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels, and for optics that
-            are none.
+        ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels or invalid optics.
     """
     cameras = []
     for sensor in sensors:

@@ -298,11 +298,12 @@ async def drive(  # noqa: PLR0917, one parameter for each part of the request
     idempotency_key: IdempotencyKey = None,
     who: ClientName = "",
 ) -> Response:
-    """Let a planner drive the session, from a reset to the end, and store a recording; the response
-    is
-    a job. Once it has succeeded: `GET /v1/jobs/{id}/files/playback.json` (poses, scores, plans and
-    events of every step), `recording.r2e`, and `GET /v1/jobs/{id}/preview`. The session stays open
-    and can be forked from any of its steps."""
+    """Let a planner drive the session, from a reset to the end, and store a recording.
+
+    The response is a job. Once it has succeeded: `GET /v1/jobs/{id}/files/playback.json` (poses,
+    scores, plans and events of every step), `recording.r2e`, and `GET /v1/jobs/{id}/preview`. The
+    session stays open and can be forked from any of its steps.
+    """
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)

@@ -78,8 +78,7 @@ async def mounted_beside(
     lidars: Sequence[LidarSpec], radars: Sequence[RadarSpec], dt_us: int
 ) -> RangingSensors:
     """As :func:`.mounted_sensors`, and prepares their rays, off the event loop and the engine.
-    Raises
-    WorldError: INVALID_REQUEST."""
+    Raises WorldError: INVALID_REQUEST."""
     if not lidars and not radars:
         return NO_SENSORS
 
