@@ -1,4 +1,4 @@
-"""``python -m real2sim``: the command, for environments whose scripts are not on the path."""
+"""``python -m real2sim``: the command line, for environments without scripts on the path."""
 
 from .cli import main
 

@@ -1,9 +1,9 @@
-"""Messages of AlpaSim's driver and of its renderer, and a pinhole as f-theta.
+"""Messages of AlpaSim's driver and renderer, and a pinhole camera in the f-theta model.
 
-Names and numbers of fields are those of AlpaSim's ``egodriver.proto``, ``common.proto`` and
-``sensorsim.proto``, version 0; what is left out here, readers skip. Enumerations are plain numbers,
-which is the same on the wire. The classes live in a pool of their own, so that a process may load
-AlpaSim's own ones too.
+Field names and numbers follow AlpaSim's ``egodriver.proto``, ``common.proto`` and
+``sensorsim.proto``, version 0. Readers skip the fields that are omitted here. Enumerations are
+plain numbers, which have the same wire format. The classes live in a separate pool, so a process
+can also load AlpaSim's own classes.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ EGODRIVER = {
     "DriveRequest": "string session_uuid 1, fixed64 time_now_us 3, fixed64 time_query_us 4",
     "DriveResponse": "common.Trajectory trajectory 2, bool terminate_session 4",
 }
-"""Fields as TYPE NAME NUMBER; a star means repeated. Nested messages stand side by side here, which
-is the same on the wire."""
+"""Fields as TYPE NAME NUMBER; a star means repeated. Nested messages are listed at the top level,
+which has the same wire format."""
 
 DRIVER_METHODS = {
     "start_session": ("DriveSessionRequest", "SessionRequestStatus"),
@@ -201,9 +201,9 @@ class Ftheta:
 
     Attributes:
         angle_to_pixels: coefficients from power 0 on; [rad] to [px].
-        pixels_to_angle: the way back.
-        max_angle: of a corner of the image off the axis [rad].
-        stretch: factor of pixels along x against those along y.
+        pixels_to_angle: coefficients of the inverse; [px] to [rad].
+        max_angle: angle between an image corner and the optical axis [rad].
+        stretch: ratio of the pixel scales along x and y.
     """
 
     angle_to_pixels: list[float]
@@ -229,7 +229,7 @@ class Ftheta:
 
 
 def _odd_polynomial(x: Matrix, y: Matrix) -> list[float]:
-    """Coefficients from power 0 on, those of even powers 0."""
+    """Coefficients from power 0 up; those of even powers are 0."""
     powers = np.arange(1, 2 * ODD_TERMS, 2)
     scale = float(x[-1])
     found = np.linalg.lstsq((x[:, None] / scale) ** powers, y, rcond=None)[0]

@@ -37,13 +37,13 @@ RETRYABLE_CODES = frozenset(code.value for code in RETRYABLE)
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """Exponential back-off with jitter; the worker's ``Retry-After`` comes first.
+    """Exponential back-off with jitter; the worker's ``Retry-After`` takes precedence.
 
     Attributes:
-        retries: tries after the first one; 0 turns retrying off.
+        retries: retries after the first try; 0 disables them.
         first_delay: seconds before the first retry; doubles with each.
-        longest_delay: seconds; cap of the own back-off.
-        longest_wait_asked: seconds; a worker that asks for more is not waited for.
+        longest_delay: maximum back-off in seconds.
+        longest_wait_asked: seconds; a longer ``Retry-After`` ends the retries.
     """
 
     retries: int = 2
@@ -72,7 +72,7 @@ class RetryPolicy:
 
 
 def parse_retry_after(value: str | None, *, now: float | None = None) -> float | None:
-    """Seconds of a ``Retry-After`` header: a number or an HTTP date; None where there is none."""
+    """Seconds of a ``Retry-After`` header (a number or an HTTP date), or None."""
     if value is None:
         return None
     try:
@@ -88,9 +88,9 @@ def parse_retry_after(value: str | None, *, now: float | None = None) -> float |
 
 # Models between clients and workers of different versions.
 #
-# Requests only hold members that the caller has set, so that an older worker gets nothing unknown
-# and a newer worker applies its own defaults. Unknown members of replies are ignored, also inside
-# models for which a worker is strict.
+# Requests only contain members that the caller has set, so that an older worker receives nothing
+# unknown and a newer worker applies its own defaults. Unknown members of replies are ignored, also
+# in models for which a worker is strict.
 
 M = TypeVar("M", bound=BaseModel)
 T = TypeVar("T")
@@ -100,9 +100,9 @@ _UNKNOWN_VALUES = frozenset({"literal_error", "union_tag_invalid"})
 
 
 def sent_fields(model: BaseModel) -> dict[str, Any]:
-    """What of a model is sent: what was set, and constants as ``type`` and ``kind``.
+    """Fields of a model to send: those that were set, and constants such as ``type`` and ``kind``.
 
-    None is left out where it is the default, and kept where it says something else.
+    None is omitted if it is the default, and sent otherwise.
     """
     fields, known = {}, type(model).model_fields
     constants, given = _constants(type(model)), model.model_fields_set
@@ -118,12 +118,12 @@ def read_fields(messages: TypeAdapter[T], fields: Mapping[str, Any]) -> T:
 
 
 def read_json(model: type[M], content: bytes) -> M:
-    """A worker's answer; members that are not known here are ignored.
+    """Parse a worker's answer; unknown members are ignored.
 
-    A value that is none of those known here is left out: a list lacks it, a member has its default.
+    An unknown value of an enumeration is dropped: a list omits it, a member gets its default.
 
     Raises:
-        ValidationError: it is no such model.
+        ValidationError: the content does not fit the model.
     """
     try:
         return model.model_validate_json(content, extra="ignore")
@@ -132,7 +132,7 @@ def read_json(model: type[M], content: bytes) -> M:
         if any(problem["type"] not in _UNKNOWN_VALUES for problem in problems):
             raise
         fields = json.loads(content)
-        # From the end of lists on, so that places before stay what they are.
+        # From the end of lists, so that earlier indices stay valid.
         for problem in reversed(problems):
             _leave_out(fields, problem["loc"])
         return model.model_validate(fields, extra="ignore")
@@ -164,9 +164,9 @@ def _constants(model: type[BaseModel]) -> frozenset[str]:
 
 
 def _leave_out(fields: Any, place: tuple[int | str, ...]) -> None:
-    """Take out the innermost item or member that an error's place names.
+    """Remove the innermost item or member that an error's location names.
 
-    Places hold names of members of unions besides, which the value does not have.
+    Locations also contain names of union members, which the value does not have.
     """
     holder, key, inside = None, None, fields
     for part in place:
@@ -185,7 +185,7 @@ MEDIA_TYPES = {"raw": MSGPACK, "jpeg": "image/jpeg", "png": "image/png"}
 
 @dataclass(frozen=True)
 class Reply:
-    """What came back; header names in lower case."""
+    """A response; header names in lower case."""
 
     status: int
     headers: Mapping[str, str]
@@ -242,7 +242,7 @@ def _missed(values: Any) -> list[HistoryEntry]:
         try:
             entries.append(HistoryEntry.model_validate(value, extra="ignore"))
         except ValidationError:
-            # The error matters more than one entry that a newer worker writes differently.
+            # The error is more important than an entry in a newer worker's format.
             continue
     return entries
 
@@ -252,8 +252,7 @@ def nothing(_reply: Reply) -> None:
 
 
 def model_of(model: type[M], *, whole: bool = False) -> Callable[[Reply], M]:
-    """Reads answers that are a model; ``whole``: one that will be given back some day, of which
-    nothing may get lost."""
+    """A parser of answers; ``whole`` keeps unknown members, for models that are sent back later."""
 
     def parse(reply: Reply) -> M:
         try:
@@ -326,9 +325,9 @@ def _wire_cloud(value: Any) -> WireCloud:
 
 
 def describe(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """What is wrong, in one line: ``sensors/0/width: input should be ...``.
+    """The errors in one line: ``sensors/0/width: input should be ...``.
 
-    Of the model's own members that are not there it says which are meant.
+    For an unknown member of the model it suggests the right name.
     """
     members = list(model.model_fields) if model else []
     problems = []
@@ -349,7 +348,7 @@ def describe(error: ValidationError, model: type[BaseModel] | None = None) -> st
 
 @dataclass(frozen=True)
 class Request:
-    """What goes out. ``idempotent`` requests may be sent again when no reply came."""
+    """A request. ``idempotent`` requests may be repeated when no reply arrived."""
 
     method: str
     path: str
@@ -386,10 +385,10 @@ class ViewRequest:
 
 
 def checked(model: type[M], /, **fields: Any) -> M:
-    """A model of these fields.
+    """A model with these fields.
 
     Raises:
-        ValueError: one sentence that names every field that is not allowed, and why.
+        ValueError: names every invalid field, and the reason.
     """
     try:
         return model(**fields)
@@ -398,10 +397,10 @@ def checked(model: type[M], /, **fields: Any) -> M:
 
 
 def instant_us(t: float | None, t_us: float | None) -> int | None:
-    """An instant given in seconds or in microseconds; None: neither.
+    """A time given in seconds or in microseconds, in microseconds; None if neither is given.
 
     Raises:
-        ValueError: given both ways, or no whole number of microseconds.
+        ValueError: both are given, or it is not a whole number of microseconds.
     """
     if t is not None and t_us is not None:
         raise ValueError(f"t={t!r} (seconds) and t_us={t_us!r} (microseconds); give one of them")
@@ -425,7 +424,7 @@ def post(
     if_match: str | None = None,
     long_timeout: bool = False,
 ) -> Request:
-    """A POST that may be tried again: the worker knows it by its Idempotency-Key."""
+    """A POST that is safe to retry: its Idempotency-Key identifies it to the worker."""
     headers = {"Idempotency-Key": new_key()}
     if body is not None:
         headers["Content-Type"] = "application/json"
@@ -436,7 +435,7 @@ def post(
 
 
 def file_put(path: str, content: bytes, media_type: str, *, if_match: str) -> Request:
-    """A PUT of a file's content that may be tried again, as a POST may."""
+    """A PUT of a file's content, safe to retry like :func:`post`."""
     headers = {"Idempotency-Key": new_key(), "Content-Type": media_type, "If-Match": if_match}
     return Request("PUT", path, {}, headers, content, long_timeout=True)
 
@@ -444,7 +443,7 @@ def file_put(path: str, content: bytes, media_type: str, *, if_match: str) -> Re
 def upload(path: str, file: Path, form: dict[str, str]) -> Request:
     """A POST of a file with form fields."""
     key = new_key()
-    # The boundary follows from the key, so that every try sends the same bytes.
+    # The boundary derives from the key, so that every try sends the same bytes.
     headers = {
         "Idempotency-Key": key,
         "Content-Type": f"multipart/form-data; boundary=real2sim-{key}",
@@ -453,19 +452,19 @@ def upload(path: str, file: Path, form: dict[str, str]) -> Request:
 
 
 def json_of(body: BaseModel) -> bytes:
-    """What was set of the model, as JSON."""
+    """The set fields of the model as JSON."""
     return json.dumps(sent_fields(body), allow_nan=False, separators=(",", ":")).encode()
 
 
 def segment(name: str) -> str:
-    """A name as one part of a path. Raises ValueError for what cannot be one."""
+    """A name as one path segment. Raises ValueError if it cannot be one."""
     if not name or name in {".", ".."}:
         raise ValueError(f"{name!r} is not a name that a path can hold")
     return quote(name, safe="")
 
 
 def bearer(token: str | None) -> dict[str, str]:
-    """The header that shows a token. Raises ValueError for one that a header cannot hold."""
+    """The Authorization header of a token. Raises ValueError for an invalid token."""
     return {} if token is None else {"Authorization": f"Bearer {bearer_token(token)}"}
 
 

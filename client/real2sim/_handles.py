@@ -1,4 +1,4 @@
-"""What all handles share: hints for mistaken calls, references, states of scenarios and jobs."""
+"""Shared by all handles: hints for wrong calls, references, states of scenarios and jobs."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ KEYWORDS = {
     "timestamp": "t_us=2_000_000 (microseconds)",
     "yaw": "angle=0.26 (radians)",
 }
-"""Arguments that people try first, and those that are meant."""
+"""Arguments that users often try, and the correct ones."""
 
 
 class Handle(Guided):
-    """Base of the SDK's objects: wrong names and arguments say what to write instead."""
+    """Base of the SDK's objects: errors for wrong names and arguments suggest the right one."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -60,14 +60,14 @@ class Handle(Guided):
 
 
 def guided(function: F) -> F:
-    """A function that, called with an unknown argument, says which one to write instead."""
+    """Decorate a function: the error for an unknown argument suggests the right one."""
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         try:
             return function(*args, **kwargs)
         except TypeError as error:
-            # Errors that come from inside the function have a traceback that goes on.
+            # The traceback of an error from inside the function has more frames.
             if error.__traceback__ is None or error.__traceback__.tb_next is not None:
                 raise
             taken = [p for p in inspect.signature(function).parameters if p != "self"]
@@ -79,7 +79,7 @@ def guided(function: F) -> F:
 
 
 def argument_advice(name: str, taken: Sequence[str]) -> str:
-    """What to write instead of an argument that is not among those that are taken."""
+    """Suggestion for an unknown argument."""
     meant = {k: v for k, v in KEYWORDS.items() if v.partition("=")[0] in taken}
     return advice(name, taken, meant, otherwise="it takes")
 
@@ -134,7 +134,7 @@ class ScenarioState(Handle):
 
     @property
     def storyboard(self) -> Storyboard | None:
-        """What happens in sessions that bring no storyboard of their own; None: nothing."""
+        """Storyboard of sessions that set none themselves, or None."""
         return self._info.storyboard
 
     def __repr__(self) -> str:
@@ -193,28 +193,28 @@ class Objects(Mapping[str, H], Generic[H]):
 # References: callers may pass a scene, a scenario or a job as an object or by its id.
 
 SceneRef: TypeAlias = str | SceneInfo
-"""A scene: its name, or what ``client.scenes`` gave."""
+"""A scene: its name, or its info from ``client.scenes``."""
 
 ScenarioRef: TypeAlias = str | ScenarioInfo | ScenarioState
-"""A scenario: its id, its handle, or what ``client.scenarios.list()`` gave."""
+"""A scenario: its id, its handle, or its info from ``client.scenarios.list()``."""
 
 
 def scene_name(scene: SceneRef) -> str:
-    """Name of a scene. Raises TypeError for what is none."""
+    """Name of a scene. Raises TypeError for other objects."""
     if isinstance(scene, SceneInfo):
         return scene.scene
     return _checked_id(scene, "scene", "a name or a SceneInfo")
 
 
 def scenario_id_of(scenario: ScenarioRef) -> str:
-    """Id of a scenario. Raises TypeError for what is none."""
+    """Id of a scenario. Raises TypeError for other objects."""
     if isinstance(scenario, ScenarioInfo | ScenarioState):
         return scenario.scenario_id
     return _checked_id(scenario, "scenario", "an id or a scenario's handle")
 
 
 def job_id_of(job: Any) -> str:
-    """Id of a job. Raises TypeError for what is none."""
+    """Id of a job. Raises TypeError for other objects."""
     info = getattr(job, "info", job)
     if isinstance(info, JobInfo):
         return info.job_id
@@ -222,7 +222,7 @@ def job_id_of(job: Any) -> str:
 
 
 def session_and_token(session: Any) -> tuple[str | None, str | None]:
-    """Id of a session and its token, as far as it is known. Raises TypeError for what is none."""
+    """Id of a session, and its token if known. Raises TypeError for other objects."""
     if session is None or isinstance(session, str):
         return session, None
     name, token = getattr(session, "session_id", None), getattr(session, "token", None)
@@ -275,7 +275,7 @@ class JobBase(Handle):
 
     @property
     def result(self) -> dict[str, Any]:
-        """What it found, once it has succeeded; before that, nothing."""
+        """The job's result; empty until it has succeeded."""
         return self.info.result or {}
 
     def __repr__(self) -> str:
@@ -284,10 +284,10 @@ class JobBase(Handle):
 
 
 def poll_delays(job_id: str, timeout: float | None) -> Iterator[float]:
-    """Pauses between two looks, ever longer.
+    """Increasing pauses between two polls.
 
     Raises:
-        ReplyTimeoutError: when the time is up.
+        ReplyTimeoutError: the timeout has passed.
     """
     started, delay = time.monotonic(), FIRST_POLL
     while timeout is None or time.monotonic() - started < timeout:

@@ -36,17 +36,16 @@ CLIENT_HEADER = "X-Real2Sim-Client"
 
 @dataclass(frozen=True)
 class Target:
-    """Where the worker is and how long to wait for it.
+    """Address of the worker, and timeouts.
 
     Attributes:
         url: ``http://host:port`` or ``https://...``, with an optional path prefix.
-        token: sent as bearer token; never shown.
-        timeout: seconds that a reply may take.
-        long_timeout: seconds for the calls that may load a scene, compile kernels or run many
-            steps.
-        name: who is calling, for the history of scenarios.
-        policy: which requests are sent again.
-        shared_memory: whether sessions that do not say must have it (True) or must not (False).
+        token: sent as bearer token; never displayed.
+        timeout: maximum seconds to wait for a reply.
+        long_timeout: seconds for calls that may load a scene, compile kernels or run many steps.
+        name: name of the caller, for the history of scenarios.
+        policy: which requests are retried.
+        shared_memory: default for sessions: required (True), disabled (False), or None.
     """
 
     url: str
@@ -77,7 +76,7 @@ class Target:
 
     @property
     def loopback(self) -> bool:
-        """Whether the worker is on this machine, as far as the address tells."""
+        """Whether the address is a loopback address."""
         host = urlsplit(self.url).hostname or ""
         if host == "localhost":
             return True
@@ -92,7 +91,7 @@ class Target:
         return headers if self.name is None else headers | {CLIENT_HEADER: self.name}
 
     def drive_url(self, session_id: str) -> str:
-        """Address of a session's drive socket, by the way this client reaches the worker."""
+        """Address of a session's drive socket, on the host that this client uses."""
         scheme, rest = self.url.split("://", 1)
         return f"{'wss' if scheme == 'https' else 'ws'}://{rest}/v1/sessions/{session_id}/drive"
 
@@ -118,10 +117,10 @@ def resolve_target(
     retries: int,
     shared_memory: bool | None = None,
 ) -> Target:
-    """The target of these arguments; what is None comes from the environment, else the default.
+    """Resolve a target from arguments; for None, from the environment, then the defaults.
 
     Raises:
-        ValueError: not such an address; the sentence says so where the environment gave it.
+        ValueError: invalid address; the message says if it comes from the environment.
     """
     found = url or os.environ.get(URL_VARIABLE) or DEFAULT_URL
     if token is None:
@@ -142,7 +141,7 @@ UNREACHABLE_HINT = "start a worker with `real2sim serve`, or check the address"
 
 def client_options(target: Target) -> dict[str, Any]:
     """Arguments of an HTTP client for a worker."""
-    # A proxy that the environment names cannot reach a worker on this machine.
+    # A proxy from the environment cannot reach a worker on this machine.
     return {
         "base_url": target.url,
         "headers": target.headers,
@@ -169,7 +168,7 @@ def request_options(target: Target, request: Request) -> Iterator[dict[str, Any]
 
 @contextlib.contextmanager
 def http_errors(target: Target, request: Request) -> Iterator[None]:
-    """What goes wrong on the way, as errors of the SDK; the library's own would say no more."""
+    """Convert errors of the HTTP library into errors of the SDK."""
     try:
         yield
     except httpx2.ConnectTimeout:
@@ -201,7 +200,7 @@ def accepted_reply(response: httpx2.Response, request: Request) -> Reply:
     """The reply in a response. Raises Real2SimError where the worker refuses the request."""
     headers = {name.lower(): value for name, value in response.headers.items()}
     reply = Reply(response.status_code, headers, response.content)
-    # A proxy may answer with the same status in words of its own.
+    # A proxy may send the same status with a different body.
     expected = reply.status in request.accepted and reply.media_type == "application/json"
     if reply.status >= 300 and not expected:
         raise error_from_reply(reply)
@@ -217,9 +216,9 @@ class Attempts:
         self._made = 0
 
     def delay_after(self, error: Real2SimError) -> float | None:
-        """Seconds until the next try; None where there is none."""
+        """Seconds until the next try, or None for no retry."""
         attempt, self._made = self._made, self._made + 1
-        # Who has waited long already would only add work to a worker that is slow.
+        # After a long wait, a retry would only add load to a slow worker.
         waited = self._request.long_timeout and isinstance(error, ReplyTimeoutError)
         if not self._request.idempotent or waited or not _is_transient(error):
             return None

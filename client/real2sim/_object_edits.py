@@ -1,6 +1,6 @@
 """The edits of a scenario and of its objects.
 
-``R`` is what an edit gives: an ``OperationResult``, or in the async client an awaitable of one.
+``R`` is the return type of an edit: ``OperationResult``, or its awaitable in the async client.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class ObjectEdits(Handle, Generic[R]):
 
     @property
     def category(self) -> str:
-        """What it is, such as ``car``."""
+        """Category, such as ``car``."""
         return self.info.category
 
     @property
@@ -129,7 +129,7 @@ class ObjectEdits(Handle, Generic[R]):
         return track
 
     def pose(self, t: float | None = None, *, t_us: int | None = None) -> Pose:
-        """Where its box is: between two poses positions linear, rotations on the shortest arc.
+        """Pose of its box: positions are interpolated linearly, rotations along the shortest arc.
 
         Args:
             t, t_us: instant in seconds or in microseconds; default: when it appears.
@@ -164,8 +164,8 @@ class ObjectEdits(Handle, Generic[R]):
         return Pose(position=tuple(mixed[:3, 3].tolist()), quaternion=quaternion_of(mixed[:3, :3]))
 
     def corners(self, t: float | None = None, *, t_us: int | None = None) -> NDArray[np.float64]:
-        """[8, 3] float64 corners of its box in the world [m]: four in front, four behind, each
-        from the upper left one clockwise as seen from behind. Times as of :meth:`pose`.
+        """[8, 3] float64 corners of its box in the world [m]: four front, then four rear, each
+        clockwise from the upper left as seen from behind. Times as in :meth:`pose`.
 
         Examples:
             >>> scenario.objects["post"].corners().shape
@@ -195,11 +195,11 @@ class ObjectEdits(Handle, Generic[R]):
         """Shift the object [m].
 
         Args:
-            x, y, z: by how much, along the axes of ``frame``.
-            frame: ``world``, or ``object``, which turns with it.
-            start_us, end_us: only in between, growing and fading smoothly; default: at all times.
-            blend_us: how long growing and fading take; default: half a second.
-            snap: put it onto the ground.
+            x, y, z: distance along the axes of ``frame``.
+            frame: ``world``, or ``object``, which rotates with the object.
+            start_us, end_us: time range of the edit, with smooth ends; default: all times.
+            blend_us: duration of each smooth end; default: half a second.
+            snap: place the object on the ground.
 
         Examples:
             >>> car.translate(x=1.5, frame="object").revision
@@ -221,16 +221,16 @@ class ObjectEdits(Handle, Generic[R]):
         blend_us: int | None = None,
         about_us: int | None = None,
     ) -> R:
-        """Turn it [rad]; times as of :meth:`translate`.
+        """Rotate the object [rad]; times as in :meth:`translate`.
 
         Args:
             angle: [rad].
             axis: of any length.
-            frame: of the axis, ``world`` or ``object``.
-            start_us, end_us, blend_us: as of :meth:`translate`.
-            about_us: turns its path with it, about where it is at this instant [us]. Without one it
-                turns in place at each pose: an object that moves then goes sideways, of which
-                ``warnings`` of the result tell.
+            frame: frame of the axis, ``world`` or ``object``.
+            start_us, end_us, blend_us: as in :meth:`translate`.
+            about_us: rotates the path too, about the object's position at this time [us]. By
+                default the object rotates in place at each pose; a moving object then drives
+                sideways, and ``warnings`` of the result report it.
 
         Examples:
             >>> result = car.rotate(angle=0.26)
@@ -242,7 +242,7 @@ class ObjectEdits(Handle, Generic[R]):
         )
 
     def scale(self, *, x: float = 1.0, y: float = 1.0, z: float = 1.0, anchor: str = "bottom") -> R:
-        """Multiply the size along the object's axes; ``anchor``: ``bottom`` or ``centre`` stays.
+        """Multiply the size along the object's axes; ``anchor`` is fixed: ``bottom`` or ``centre``.
 
         Examples:
             >>> result = car.scale(x=1.5)
@@ -254,7 +254,7 @@ class ObjectEdits(Handle, Generic[R]):
     def set_pose(
         self, position: Vector, quaternion: Quaternion = UPRIGHT, *, snap: bool = False
     ) -> R:
-        """Place the object in the world [m], for the whole time range.
+        """Set the object's pose in the world [m], for the whole time range.
 
         Examples:
             >>> result = car.set_pose(position=(18.0, 1.0, 0.75))
@@ -270,13 +270,13 @@ class ObjectEdits(Handle, Generic[R]):
         quaternions: Sequence[Quaternion],
         snap: bool = False,
     ) -> R:
-        """Let it follow a trajectory; it exists only within these times.
+        """Make the object follow a trajectory; it only exists within these times.
 
         Args:
             times_us: [T] increasing [us].
-            positions: [T] of the centre of its box in the world [m].
-            quaternions: [T] wxyz.
-            snap: put it onto the ground at every pose.
+            positions: [T, 3] centres of its box in the world [m].
+            quaternions: [T, 4] wxyz.
+            snap: place it on the ground at every pose.
 
         Examples:
             >>> result = car.set_trajectory(
@@ -294,7 +294,7 @@ class ObjectEdits(Handle, Generic[R]):
         return self._make(SetTrajectory, trajectory=track, snap=snap)
 
     def retime(self, *, delay_us: int = 0, speed: float = 1.0) -> R:
-        """Let it do the same later (or earlier), faster or slower.
+        """Delay its motion (or advance it), or change its speed.
 
         Examples:
             >>> result = scenario.objects["car_blue"].retime(delay_us=300_000, speed=1.2)
@@ -308,7 +308,7 @@ class ObjectEdits(Handle, Generic[R]):
         recorded: str | None = None,
         fit: str = "box",
     ) -> R:
-        """Give it another look.
+        """Change its appearance.
 
         Args:
             asset: id in the asset library; or
@@ -336,17 +336,17 @@ class ObjectEdits(Handle, Generic[R]):
         restitution: float | None = None,
         grid: int | None = None,
     ) -> R:
-        """Say what it is for the physics; what is left out goes back to its default.
+        """Set physical properties; those you omit return to their defaults.
 
         Args:
             mass: [kg].
             material: ``rigid``, ``metal``, ``foam``, ``rubber``, ``jelly``, ``sand`` or ``snow``.
-            young, poisson: E [Pa] and nu of one material throughout, ``jelly`` unless named.
-            density: rho [kg/m^3] of what it is filled with; instead of ``mass``.
-            yield_stress: [Pa]; of ``metal`` (unless named) or ``foam``.
+            young, poisson: E [Pa] and nu of one material throughout; ``jelly`` if none is named.
+            density: density of the filling [kg/m^3]; instead of ``mass``.
+            yield_stress: [Pa]; of ``metal`` (the default) or ``foam``.
             friction: Coulomb coefficient.
-            restitution: 0 to 1, fraction of the approach speed that is left after a bounce.
-            grid: cells along twice its longest edge, as the paper counts them.
+            restitution: 0 to 1, fraction of the approach speed after a bounce.
+            grid: cells along twice its longest edge (the paper's definition).
 
         Examples:
             >>> result = car.set_physics(material="metal", mass=1200.0, friction=0.6)
@@ -372,7 +372,7 @@ class ObjectEdits(Handle, Generic[R]):
         angular: Vector | None = None,
         frame: str = "world",
     ) -> R:
-        """Say how fast it enters the physics [m/s, rad/s]; left out: as on its trajectory.
+        """Set its initial velocity in the physics [m/s, rad/s]; default: that of its trajectory.
 
         Examples:
             >>> result = car.set_velocity(linear=(8.0, 0.0, 0.0), frame="object")
@@ -388,17 +388,17 @@ class ObjectEdits(Handle, Generic[R]):
         width: float | None = None,
         phase: int | None = None,
     ) -> R:
-        """Say how a person of the body model walks; what is left out goes back to its own way.
+        """Set the gait of a person of the body model; values you omit return to the person's own.
 
         Args:
-            stride: factor on the length of strides, 0.5 to 1.6.
-            arms: factor on the swing of the arms.
-            lean: further lean forward [rad].
-            width: factor on the distance between the feet's tracks.
+            stride: factor on stride length, 0.5 to 1.6.
+            arms: factor on arm swing.
+            lean: additional forward lean [rad].
+            width: factor on the lateral distance between the feet.
             phase: 1 starts with the other foot.
 
         Raises:
-            InvalidOperationError: it is nobody who walks.
+            InvalidOperationError: the object is not a walking person.
 
         Examples:
             >>> info = client.assets.person("tom", build="man")
@@ -418,7 +418,7 @@ class ObjectEdits(Handle, Generic[R]):
         return self._make(Delete)
 
     def restore(self) -> R:
-        """Bring it back after :meth:`delete`.
+        """Restore the object after :meth:`delete`.
 
         Examples:
             >>> result = car.delete()
@@ -450,7 +450,7 @@ class ObjectEdits(Handle, Generic[R]):
 
 
 class ScenarioEdits(Generic[R]):
-    """The edits that belong to no object that is there already."""
+    """Edits that do not belong to an existing object."""
 
     def erase_region(
         self,
@@ -460,7 +460,7 @@ class ScenarioEdits(Generic[R]):
         quaternion: Quaternion = UPRIGHT,
         region_id: str | None = None,
     ) -> R:
-        """Hide the background inside a box [m]; :meth:`remove` its id to bring it back.
+        """Hide the background inside a box [m]; :meth:`remove` its id to restore it.
 
         Examples:
             >>> scenario.erase_region(position=(10, 0, 1), size=(2, 2, 3), region_id="sign").created
@@ -478,7 +478,7 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add an invisible box that does not yield, for the physics.
+        """Add an invisible rigid box, for the physics.
 
         Examples:
             >>> result = scenario.add_box(position=(20, 0, 0.5), size=(0.5, 6, 1))
@@ -496,7 +496,7 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add an invisible post or drum about its own z axis, for the physics.
+        """Add an invisible rigid post or drum about its own z axis, for the physics.
 
         Examples:
             >>> result = scenario.add_cylinder(position=(20, 0, 1.5), radius=0.1, height=3.0)
@@ -516,7 +516,7 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add all within ``radius`` of a line along its own z axis, for the physics; or a ball.
+        """Add a capsule: all points within ``radius`` of a line along its z axis; or a ball.
 
         Examples:
             >>> result = scenario.add_capsule(position=(20, 0, 0.5), radius=0.5)
@@ -537,9 +537,9 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add a closed body of triangles, or a sheet with a ``thickness`` [m], for the physics.
+        """Add a closed triangle mesh, or a sheet with a ``thickness`` [m], for the physics.
 
-        Triangles list vertices counter-clockwise seen from outside.
+        Vertices of a triangle are counter-clockwise as seen from outside.
 
         Examples:
             >>> ramp = [(20, -2, 0), (20, 2, 0), (26, -2, 1), (26, 2, 1)]
@@ -565,7 +565,7 @@ class ScenarioEdits(Generic[R]):
         friction: float | None = None,
         collider_id: str | None = None,
     ) -> R:
-        """Add a plane that objects stay above, for the physics.
+        """Add a plane for the physics; objects stay above it.
 
         Examples:
             >>> result = scenario.add_plane(point=(0, 0, 0), friction=0.9)
@@ -577,7 +577,7 @@ class ScenarioEdits(Generic[R]):
     def add_ground(
         self, *, offset: float = 0.0, friction: float | None = None, collider_id: str | None = None
     ) -> R:
-        """Add the recorded ground, moved up by ``offset`` [m], for the physics.
+        """Add the recorded ground, raised by ``offset`` [m], for the physics.
 
         Examples:
             >>> result = scenario.add_ground(collider_id="road")
@@ -587,7 +587,7 @@ class ScenarioEdits(Generic[R]):
         return self._collider(checked(GroundShape, offset=offset), friction, collider_id)
 
     def set_time(self, *, start_us: int | None = None, end_us: int | None = None) -> R:
-        """Set the span in which the scenario plays; left out: as recorded.
+        """Set the time span of the scenario; default: as recorded.
 
         Examples:
             >>> result = scenario.set_time(start_us=500_000)
@@ -607,7 +607,7 @@ class ScenarioEdits(Generic[R]):
         return self._edit(checked(Delete, object_id=thing_id))
 
     def restore(self, thing_id: str) -> R:
-        """Bring a removed object, region or collider back.
+        """Restore a removed object, region or collider.
 
         Examples:
             >>> result = scenario.remove("post")
@@ -618,7 +618,7 @@ class ScenarioEdits(Generic[R]):
         return self._edit(checked(Restore, object_id=thing_id))
 
     def set_storyboard(self, storyboard: Storyboard | Mapping[str, Any] | None) -> R:
-        """Say what road users do in sessions of the scenario, and when; None: nothing is written.
+        """Set the storyboard of the scenario's sessions; None removes it.
 
         Args:
             storyboard: a model of ``real2sim_proto.storyboard``, or its fields.

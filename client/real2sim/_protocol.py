@@ -1,7 +1,7 @@
 """The client's side of the drive socket, without the socket.
 
-A drive session, sync or async, talks through a :class:`ProtocolState`: it numbers messages, says
-which answer is awaited, and turns bytes into answers or exceptions.
+A drive session, sync or async, uses a :class:`ProtocolState`, which numbers messages, matches
+answers to them, and converts bytes into answers or exceptions.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ A = TypeVar("A", bound=Envelope)
 M = TypeVar("M")
 
 MAX_UNSOLICITED = 16
-"""Unsolicited observations kept until they are taken; older ones are dropped."""
+"""Buffered unsolicited observations; the oldest are dropped."""
 
 _SUPERSEDED = {ErrorCode.STALE_STEP.value, ErrorCode.EPISODE_OVER.value}
 
@@ -84,14 +84,13 @@ _STATUS = {code.value: status for code, status in HTTP_STATUS.items()}
 
 @dataclass(frozen=True)
 class PendingRequest(Generic[A]):
-    """A message that goes out, and the answer that it waits for.
+    """A message to send, and the type of its answer.
 
     Attributes:
         long_timeout: whether the answer may take as long as loading a scene.
-        idempotent: whether it may be sent again after the connection was lost; the worker moves
-            only once.
-        only_at_revision: revision at which alone it may be sent again.
-        has_images: whether the answer may hold images.
+        idempotent: whether it may be resent after a lost connection; the worker applies it once.
+        only_at_revision: the only revision at which it may be resent.
+        has_images: whether the answer may contain images.
     """
 
     id: int
@@ -125,7 +124,7 @@ class ProtocolState:
     def hello(
         self, *, sdk: str, role: str, token: str | None, resume_token: str | None = None
     ) -> PendingRequest[Welcome]:
-        """The first message; with a resume token it goes on where the connection was lost."""
+        """The first message; with a resume token it continues a lost connection."""
         resume = None
         if resume_token is not None:
             resume = Resume(token=resume_token, last_step=self._step)
@@ -143,7 +142,7 @@ class ProtocolState:
         )
 
     def attach(self, secret: bytes) -> PendingRequest[Attached]:
-        """Says that the shared memory of the welcome is open here."""
+        """Confirms that this client has opened the shared memory of the welcome."""
         message = Attach(id=self._next_id(), secret=secret)
         return self._request_for(
             message, Attached, "confirmation of shared memory", idempotent=False
@@ -157,11 +156,11 @@ class ProtocolState:
         )
 
     def action(self, plan: Plan | Mapping[str, Any]) -> PendingRequest[Obs]:
-        """Answers the newest observation.
+        """Answers the newest observation with a plan.
 
         Raises:
-            NotResetError: there is none yet.
-            ValueError: a plan that is not valid.
+            NotResetError: there is no observation yet.
+            ValueError: an invalid plan.
         """
         if self._step is None:
             raise NotResetError(
@@ -182,9 +181,9 @@ class ProtocolState:
     def render(
         self, sensors: Sequence[SensorSpec], ranging: Mapping[str, Any]
     ) -> PendingRequest[View]:
-        """Asks for images of the current instant, and clouds of LiDARs and radars."""
+        """Requests images of the current time, and clouds of LiDARs and radars."""
         message = checked(Render, id=self._next_id(), sensors=list(sensors), **ranging)
-        # A LiDAR or a lens that no step has needed may need kernels that are not yet compiled.
+        # A LiDAR or lens that no step has used may need kernels that are not yet compiled.
         return self._request_for(message, View, "images", long_timeout=True, has_images=True)
 
     def agent(
@@ -193,7 +192,7 @@ class ProtocolState:
         times_us: Sequence[int],
         poses: Sequence[tuple[float, float, float]],
     ) -> PendingRequest[Driven]:
-        """Says where an externally driven object goes."""
+        """Sets the plan of an externally driven object."""
         message = checked(
             Agent,
             id=self._next_id(),
@@ -209,7 +208,7 @@ class ProtocolState:
         return self._request_for(message, Kept, "confirmation of the snapshot")
 
     def restore(self, name: str) -> PendingRequest[Obs]:
-        """Goes back to a snapshot."""
+        """Returns to a snapshot."""
         message = checked(Restore, id=self._next_id(), name=name)
         return self._request_for(
             message, Obs, f"observation of snapshot {name!r}", long_timeout=True
@@ -226,12 +225,12 @@ class ProtocolState:
         )
 
     def read(self, data: bytes | str, request: PendingRequest[A]) -> A | None:
-        """The answer in ``data``; None where it is progress, or late for an older request.
+        """The answer in ``data``; None if it is progress, or late for an older request.
 
         Raises:
             StatusError: the worker refuses the message.
-            ProtocolMismatchError: the worker speaks another version.
-            MalformedReplyError: something else than a valid message came.
+            ProtocolMismatchError: the worker has another version.
+            MalformedReplyError: not a valid message.
         """
         message = server_message(data, SERVER_MESSAGE)
         if isinstance(message, Error):
@@ -239,7 +238,7 @@ class ProtocolState:
                 return None
             superseded = message.code in _SUPERSEDED and request.answer is Obs
             if superseded and (newest := self.take_unsolicited(newest=True)) is not None:
-                # The planner was late and the worker went on without it.
+                # The planner was late and the worker advanced without it.
                 return newest  # type: ignore[return-value]
             raise error_of(message)
         if isinstance(message, Obs) and message.id == 0:
@@ -266,10 +265,10 @@ class ProtocolState:
         return message
 
     def handle_unsolicited(self, data: bytes | str) -> None:
-        """Take in a message while nothing is awaited.
+        """Process a message while no answer is pending.
 
         Raises:
-            StatusError: the worker ends the connection, and why.
+            StatusError: the worker ends the connection; has the reason.
         """
         message = server_message(data, SERVER_MESSAGE)
         if isinstance(message, Error):
@@ -300,10 +299,10 @@ def valid_plan(plan: Plan | Mapping[str, Any]) -> Plan:
     """The plan as its model.
 
     Raises:
-        ValueError: one sentence about what is not allowed in it.
+        ValueError: describes the invalid field in one sentence.
     """
     if isinstance(plan, Mapping) and "kind" not in plan:
-        # Members tell the kind, since no two kinds share one that must be there.
+        # The members determine the kind: no two kinds share a required member.
         models: tuple[type[BaseModel], ...] = (TrajectoryPlan, Control, PoseCommand)
         kinds = [m for m in models if _required(m) <= set(plan)]
         if not kinds:
@@ -329,11 +328,11 @@ def _required(model: type[BaseModel]) -> set[str]:
 
 
 def server_message(data: bytes | str, messages: TypeAdapter[M]) -> M:
-    """The message of a worker, one of ``messages``.
+    """Parse a message of the worker, one of ``messages``.
 
     Raises:
-        ProtocolMismatchError: the worker speaks another version.
-        MalformedReplyError: something else than a valid message came.
+        ProtocolMismatchError: the worker has another version.
+        MalformedReplyError: not a valid message.
     """
     if isinstance(data, str):
         raise MalformedReplyError("the worker sent text where binary messages are spoken")
@@ -357,7 +356,7 @@ def server_message(data: bytes | str, messages: TypeAdapter[M]) -> M:
 
 
 def error_of(message: Error) -> Exception:
-    """What an error of the worker raises."""
+    """The exception for an error message of the worker."""
     return error_for(
         ErrorDetails(
             status=_STATUS.get(message.code, 500),
@@ -399,7 +398,7 @@ def check_subprotocol(chosen: str | None) -> None:
 
 @contextlib.contextmanager
 def handshake_errors(target: Target) -> Iterator[None]:
-    """What goes wrong while the socket opens, as errors of the SDK."""
+    """Convert errors of the socket's handshake into errors of the SDK."""
     try:
         yield
     except websockets.exceptions.InvalidStatus as error:

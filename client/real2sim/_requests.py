@@ -1,7 +1,6 @@
-"""One function a REST call: what goes out, and how the answer is read.
+"""One function per REST call: builds the request and parses the answer.
 
-Everything here is pure, so that the sync and the async client share all of it and differ only
-in who waits.
+All functions are pure. The sync and the async client share them and differ only in the I/O.
 """
 
 from __future__ import annotations
@@ -139,10 +138,10 @@ class ResetOptions(TypedDict, total=False):
 
 
 def sensor_specs(sensors: Sequence[Sensor], codec: str) -> list[SensorSpec]:
-    """Specs of sensors; ``codec`` holds for those that do not name one.
+    """Specs of sensors; ``codec`` applies to those that set none.
 
     Raises:
-        ValueError: a field that is not allowed.
+        ValueError: an invalid field.
     """
     return [_sensor_spec(sensor, codec) for sensor in _several(sensors)]
 
@@ -151,7 +150,7 @@ def reset_spec(sensors: Sequence[Sensor], codec: str, options: ResetOptions) -> 
     """The spec of an episode.
 
     Raises:
-        ValueError: a field that is not allowed.
+        ValueError: an invalid field.
     """
     given: dict[str, Any] = dict(options)
     given |= ranging_specs(options.get("lidars", ()), options.get("radars", ()))
@@ -161,10 +160,10 @@ def reset_spec(sensors: Sequence[Sensor], codec: str, options: ResetOptions) -> 
 def ranging_specs(
     lidars: Sequence[LidarSensor], radars: Sequence[RadarSensor]
 ) -> dict[str, list[LidarSpec] | list[RadarSpec]]:
-    """Specs of LiDARs and radars as members of a message, which has those alone that are given.
+    """Specs of LiDARs and radars as message members; omitted arguments are absent.
 
     Raises:
-        ValueError: a field that is not allowed.
+        ValueError: an invalid field.
     """
     found: dict[str, list[LidarSpec] | list[RadarSpec]] = {}
     if lidars:
@@ -175,7 +174,7 @@ def ranging_specs(
 
 
 def _several(sensors: Any) -> Sequence[Any]:
-    """Sensors as a sequence, also where one alone is given."""
+    """Sensors as a sequence; accepts a single sensor."""
     return sensors if isinstance(sensors, Sequence) and not isinstance(sensors, str) else [sensors]
 
 

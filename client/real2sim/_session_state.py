@@ -71,9 +71,9 @@ def pose_matrix(position: Sequence[float], quaternion: Sequence[float]) -> Matri
 
 
 def quaternion_of(R: Matrix) -> tuple[float, float, float, float]:
-    """wxyz of a rotation, by the largest eigenvector of Bar-Itzhack's matrix (2000).
+    """wxyz of a rotation: the largest eigenvector of Bar-Itzhack's matrix (2000).
 
-    It is that of the rotation nearest to ``R``, so single precision does no harm.
+    It represents the rotation nearest to ``R``, so single precision is sufficient.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
     K = np.array(
@@ -106,21 +106,21 @@ def pose_between(before: Matrix, after: Matrix, fraction: float) -> Matrix:
 # --- Shared memory --------------------------------------------------------------------------------
 
 # Raw images on the worker's machine. Each message names a slot for the images of its reply. A slot
-# is free again when the last array on it is gone. If a caller keeps all images, the next ones come
-# over the socket.
+# is free again once the last array that uses it is released. If a caller holds all slots, further
+# images arrive over the socket.
 
 
 class SharedFrames:
-    """The memory that a worker has offered, open.
+    """Shared memory offered by a worker, opened.
 
     Args:
-        offer: of a welcome.
+        offer: offer of a welcome.
 
     Attributes:
-        secret: proves to the worker that this is its memory.
+        secret: proves to the worker that this client has opened it.
 
     Raises:
-        OSError: it is not on this machine, or not for us.
+        OSError: it is not on this machine, or not accessible.
     """
 
     def __init__(self, offer: SharedMemory) -> None:
@@ -137,10 +137,10 @@ class SharedFrames:
         return self._lent
 
     def pixels_of(self, frames: Sequence[Frame]) -> list[memoryview | None]:
-        """What lies in the slot lent for an answer; None for each image that came with it.
+        """Pixels of an answer's images in its slot; None for each image sent over the socket.
 
         Raises:
-            MalformedReplyError: an image that does not lie in that slot.
+            MalformedReplyError: an image outside the slot.
         """
         if all(frame.offset is None for frame in frames):
             return [None] * len(frames)
@@ -148,7 +148,7 @@ class SharedFrames:
             raise MalformedReplyError("an image in shared memory where no slot was named")
         slot, self._lent = self._lent, None
         begin = self._begin(slot)
-        # Views of it end in this array, which gives the slot back when the last of them is gone.
+        # All views share this array; the slot is returned when the last of them is released.
         owner = np.frombuffer(self._memory, np.uint8, self._slot_bytes, begin)
         weakref.finalize(owner, self._free.append, slot).atexit = False
         return [_part(owner.data, frame, begin) for frame in frames]
@@ -158,7 +158,7 @@ class SharedFrames:
 
 
 def _part(slot: memoryview, frame: Frame, begin: int) -> memoryview | None:
-    """The bytes of a frame in its slot, which begins at ``begin``."""
+    """The bytes of a frame in the slot, whose image part starts at ``begin``."""
     if frame.offset is None:
         return None
     first = frame.offset - begin
@@ -214,8 +214,8 @@ def is_passing(error: Real2SimError) -> bool:
 
 
 def is_away(error: Real2SimError) -> bool:
-    """Whether nothing has happened because what the worker writes to is away, or because a proxy
-    finds no worker that may take anything new meanwhile."""
+    """Whether the request had no effect because the worker's store is unreachable, or because a
+    proxy finds no worker that accepts new requests."""
     if not isinstance(error, StatusError):
         return False
     return error.code == ErrorCode.STORAGE_UNAVAILABLE or (
@@ -225,18 +225,18 @@ def is_away(error: Real2SimError) -> bool:
 
 @dataclass(frozen=True)
 class SessionPlan:
-    """Which session to open and how.
+    """Which session to open, and its options.
 
     Attributes:
-        scene, scenario: what a new session runs on; exactly one of them.
-        session_id: joins this session instead of making one.
-        token: of the session that is joined.
+        scene, scenario: subject of a new session; exactly one of them.
+        session_id: joins this session instead of creating one.
+        token: token of the joined session.
         role: ``controller`` or ``observer``.
-        codec: of sensors that name none: ``auto``, ``raw``, ``jpeg`` or ``png``.
-        reconnect: seconds for which a lost connection, or a message that the worker refuses for
-            now, is tried again; 0 gives up at once.
-        shared_memory: True must have it, False must not; None has it where it can, unless the
-            client says otherwise.
+        codec: codec of sensors that set none: ``auto``, ``raw``, ``jpeg`` or ``png``.
+        reconnect: seconds to retry a lost connection or a temporarily refused message; 0 disables
+            retries.
+        shared_memory: True requires it, False disables it, None uses it if possible, unless the
+            client sets a default.
     """
 
     scene: str | None = None
@@ -285,7 +285,7 @@ class SessionBase(Handle):
 
     @property
     def welcome(self) -> Welcome:
-        """What the worker said at the start: cameras, objects, time range, limits, versions.
+        """The worker's welcome message: cameras, objects, time range, limits, versions.
 
         Raises:
             NotOpenError: the session was not opened yet.
@@ -313,7 +313,7 @@ class SessionBase(Handle):
 
     @property
     def shared_memory(self) -> bool:
-        """Whether raw images come by memory that this program shares with the worker."""
+        """Whether raw images arrive through shared memory."""
         return self._memory is not None
 
     @property
@@ -346,7 +346,7 @@ class SessionBase(Handle):
         return None
 
     def _without_memory(self, reason: str) -> None:
-        """Go on over the socket alone. Raises UnreachableError: the session must not."""
+        """Continue over the socket. Raises UnreachableError if shared memory is required."""
         if self._wants_memory:
             raise UnreachableError(
                 f"no shared memory with the worker at {self._target.url}: {reason}",
@@ -370,7 +370,7 @@ class SessionBase(Handle):
         return self._memory.lend() if self._memory and request.has_images else None
 
     def _pixels_of(self, frames: Sequence[Frame]) -> Sequence[memoryview | None]:
-        """What of an answer's images lies in shared memory."""
+        """Pixels of an answer's images that are in shared memory, else None."""
         return () if self._memory is None else self._memory.pixels_of(frames)
 
     def _may_resend(self, request: PendingRequest[Any]) -> bool:
@@ -422,5 +422,5 @@ class SessionTokens:
         self._tokens.pop(session_id, None)
 
     def of(self, session_id: str) -> str | None:
-        """The worker's own token goes before a session's; it opens every session."""
+        """The token to send: the worker's own, which opens every session, else the session's."""
         return self._own or self._tokens.get(session_id)

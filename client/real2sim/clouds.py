@@ -1,4 +1,4 @@
-"""Point clouds of LiDARs and radars: bytes as a worker sends them, arrays when asked for."""
+"""Point clouds of LiDARs and radars: encoded bytes, decoded to arrays on access."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class PointCloud(Handle):
     Attributes:
         sensor: its name.
         modality: ``lidar`` or ``radar``.
-        t_us: instant; a sweep's last ray is fired then.
-        duration_us: from the first ray to the last; 0 of radars.
-        frame: of ``points``: ``sensor`` or ``vehicle`` (x forward, y left, z up in both).
-        compensated: points are as seen from the pose at ``t_us``; False: from where the sensor was
-            when each ray was fired.
+        t_us: time of the cloud; for a LiDAR, the time of the last ray.
+        duration_us: time from the first ray to the last; 0 for radars.
+        frame: frame of ``points``: ``sensor`` or ``vehicle`` (x forward, y left, z up in both).
+        compensated: True: points are as seen from the pose at ``t_us``; False: from the sensor's
+            pose when each ray was fired.
         T_world_sensor: [4, 4] float64 at ``t_us``.
         T_vehicle_sensor: [4, 4] float64.
         count: number of points, N.
@@ -74,7 +74,7 @@ class PointCloud(Handle):
 
     @cached_property
     def columns(self) -> Columns:
-        """All columns by name, [N] or [N, width] each; decoded at the first use, read-only.
+        """All columns by name, [N] or [N, width] each; decoded on first access, read-only.
 
         Raises:
             MalformedReplyError: broken data.
@@ -92,7 +92,7 @@ class PointCloud(Handle):
 
     @property
     def instance(self) -> NDArray[np.uint16]:
-        """[N] uint16 id of the object that was met; 0 is background."""
+        """[N] uint16 id of the hit object; 0 is background."""
         return self._column("instance")
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:

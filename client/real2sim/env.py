@@ -31,7 +31,7 @@ from .observation import Observation
 Obs = dict[str, NDArray[Any]]
 
 ACCELERATION, BRAKING, STEERING = 4.0, 8.0, 0.6
-"""What an action of 1, -1 and, sideways, 1 stands for [m/s^2], [rad]."""
+"""Accelerations of the actions 1 and -1 [m/s^2], and steering angle of the action 1 [rad]."""
 
 ENV_ID = "real2sim/Drive-v0"
 """For ``gymnasium.make``, once this module is imported."""
@@ -41,11 +41,11 @@ FAR = 1e4
 """Bound of positions in observations [m]."""
 
 AGENTS = 16
-"""Road users that a vehicle without cameras is told of."""
+"""Number of observed road users for a vehicle without cameras."""
 AGENT_FIELDS = 9
 
 POINTS = 8192
-"""Rows of a LiDAR in observations, if nobody says how many."""
+"""Default number of LiDAR rows in observations."""
 DETECTIONS = 256
 """Rows of a radar."""
 CLOUD_FIELDS = {"lidar": ("intensity",), "radar": ("velocity", "rcs")}
@@ -70,31 +70,30 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
 
     Observation: ``state`` [5] float32 (speed, lateral speed, acceleration, steering, yaw rate; SI),
     ``route`` [20, 2] float32 in the vehicle frame [m], each camera's image under its name, uint8
-    [H, W, 3], and what else a sensor shows: ``front/depth`` [H, W] float32 [m], ``front/instance``
-    [H, W] uint16. ``agents`` [N, 9] float32 are the N road users nearest to the vehicle, in its
-    frame: 1, x, y [m], cosine and sine of the heading, velocity along x and y [m/s], length, width
-    [m]; rows of zeros where there are fewer. A LiDAR under its name is [P, 4] float32, x, y, z [m]
-    and intensity; of more returns than P every so manieth is shown. A radar is [256, 5] float32, x,
-    y, z, radial velocity [m/s] and RCS [dBsm], the nearest first. Rows of zeros where there are
-    fewer; a slower sensor keeps its last image or cloud until the next one is due.
+    [H, W, 3], and other modalities such as ``front/depth`` [H, W] float32 [m] and
+    ``front/instance`` [H, W] uint16. ``agents`` [N, 9] float32 are the N road users nearest to the
+    vehicle, in its frame: 1, x, y [m], cosine and sine of the heading, velocity along x and y
+    [m/s], length, width [m]. A LiDAR under its name is [P, 4] float32: x, y, z [m] and intensity;
+    more than P returns are subsampled evenly. A radar is [256, 5] float32: x, y, z, radial velocity
+    [m/s] and RCS [dBsm], nearest first. Unused rows are zero. A slower sensor repeats its last
+    image or cloud until the next one is due.
 
-    Reward: metres of way along the route, less 10 for a contact that the ego is to blame for, less
-    0.1 for a step off the road. ``info`` has ``metrics``, ``events`` and what the seed has
-    ``drawn`` for the episode; :attr:`last` is the whole observation.
+    Reward: metres of progress along the route, minus 10 for a contact that is the ego's fault,
+    minus 0.1 per step off the road. ``info`` has ``metrics``, ``events`` and the episode's randomly
+    sampled values in ``drawn``; :attr:`last` is the whole observation.
 
-    The seed of ``reset`` draws what ``options`` name in ``randomization`` and ``agents.spawn``;
-    without them episodes of all seeds are the same.
+    The seed of ``reset`` only affects ``randomization`` and ``agents.spawn`` of ``options``;
+    without them the episodes of all seeds are identical.
 
     Args:
-        url, token: of the worker; defaults as of :func:`real2sim.connect`.
+        url, token: address and token of the worker; defaults as in :func:`real2sim.connect`.
         scene, scenario: exactly one of them, or its name or id.
-        sensors: camera names or specs; a spec says which modalities.
-        lidars, radars: names of the worker's catalogues or specs, as of ``DriveSession.reset``.
+        sensors: camera names or specs; a spec selects modalities.
+        lidars, radars: names in the worker's catalogues or specs, as in ``DriveSession.reset``.
         points: P, rows of each LiDAR.
-        agents: how many road users are shown; default: 16 without any sensors, else
-            none.
-        options: of ``DriveSession.reset``; ``seed`` and ``action`` are the environment's, and
-            ``privileged`` where it shows agents.
+        agents: number of observed road users; default: 16 without sensors, else 0.
+        options: as in ``DriveSession.reset``. The environment sets ``seed`` and ``action``, and
+            also ``privileged`` if it observes agents.
 
     Examples:
         >>> env = real2sim.make_env(scene="street", sensors=["front"], render_mode="rgb_array")
@@ -152,7 +151,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, dict[str, Any]]:
-        """Start an episode; ``options`` override those of the environment for this one.
+        """Start an episode; ``options`` override those of the environment for this episode.
 
         Examples:
             >>> obs, info = env.reset(seed=3, options={"dt_us": 50_000})
@@ -194,7 +193,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         """
         if self.render_mode is None:
             return None
-        # Of a slower camera, the last one that was due.
+        # A slower camera repeats its last image.
         shown = self._images or dict(_images_in(self._last))
         return next(image.copy() for name, image in shown.items() if "/" not in name)
 
@@ -242,7 +241,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         }
         if self._agents:
             seen["agents"] = _nearest_agents(obs, self._agents)
-        # A slower camera keeps its last image until the next one is due.
+        # A slower camera repeats its last image until the next one is due.
         for name, image in _images_in(obs):
             most, dtype = FORMS[name.partition("/")[2] or "rgb"]
             self._images[name] = np.minimum(image, most).astype(dtype)
@@ -262,7 +261,7 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
 
 
 def _images_in(obs: Observation) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Images by the names that they have in observations: rgb by its camera alone."""
+    """Images by their observation keys; rgb uses the camera's name."""
     for camera, modalities in obs.frames.items():
         for modality in modalities:
             name = camera if modality == "rgb" else f"{camera}/{modality}"
@@ -289,7 +288,7 @@ def _nearest_agents(obs: Observation, count: int) -> NDArray[np.float32]:
     turn = np.array([[ahead, left], [-left, ahead]])
     positions = np.array([agent.position[:2] for agent in obs.agents]) - obs.ego.position[:2]
     velocities = np.array([agent.velocity[:2] for agent in obs.agents])
-    # Of two that are as far, the one with the lower id, whatever order they come in.
+    # Ties in distance are ordered by id, so the result does not depend on the input order.
     distances = np.linalg.norm(positions, axis=1)
     ids = np.array([agent.object_id for agent in obs.agents])
     nearest = np.lexsort((ids, distances))[:count]

@@ -1,4 +1,4 @@
-"""Everything the SDK raises.
+"""Exceptions of the SDK.
 
 ::
 
@@ -17,7 +17,7 @@
         ├── UnauthorizedError          token missing or wrong             (401, 403)
         ├── NotFoundError              no such scene, scenario, session, object, camera (404)
         ├── ConflictError              not in this state                  (409)
-        │   ├── StaleRevisionError         somebody else edited first     (412); has .missed
+        │   ├── StaleRevisionError         someone else edited first      (412); has .missed
         │   ├── StepConflictError          this step was answered with other content
         │   ├── StaleStepError             the session is past this step
         │   ├── BadStepError               the session is not there yet
@@ -45,7 +45,7 @@ class Real2SimError(Exception):
     """Base of all errors of the SDK.
 
     Attributes:
-        hint: what to do about it; None where nothing is known. A traceback shows it.
+        hint: how to fix it, or None. A traceback shows it.
 
     Examples:
         >>> client = real2sim.connect()
@@ -60,7 +60,7 @@ class Real2SimError(Exception):
         super().__init__(message)
         self.hint = hint
         if hint is not None:
-            # A traceback shows notes, so that a script says what to do too.
+            # A traceback shows notes, so scripts show the hint too.
             self.add_note(f"hint: {hint}")
 
 
@@ -73,7 +73,7 @@ class ConnectionLostError(UnreachableError):
 
 
 class ReplyTimeoutError(Real2SimError, TimeoutError):
-    """A reply did not come in time."""
+    """A reply did not arrive in time."""
 
     def __init__(self, awaited: str, seconds: float, *, hint: str | None = None) -> None:
         super().__init__(f"no {awaited} within {seconds:g} s", hint=hint)
@@ -107,7 +107,7 @@ class InvalidValue:
 
 @dataclass(frozen=True)
 class ErrorDetails:
-    """What a worker says about a request that it refuses."""
+    """Details of a worker's error response."""
 
     status: int
     code: str
@@ -125,17 +125,17 @@ class StatusError(Real2SimError):
     """The worker refused a request or a message.
 
     Attributes:
-        status: HTTP status; for messages of the drive socket the status that its code has there.
-        code: stable code, see ``real2sim_proto.ErrorCode``; newer workers may have others.
-        detail: what was given and what is allowed.
-        request_id: names the request in the worker's log.
-        errors: values that were not accepted, with JSON pointers into the request.
-        retry_after: seconds after which the worker wants to be asked again.
-        step: step that the drive session is at, where the worker says so.
+        status: HTTP status; drive socket messages have the status of the same code.
+        code: stable code, see ``real2sim_proto.ErrorCode``; newer workers may send others.
+        detail: the given value and the allowed ones.
+        request_id: identifies the request in the worker's log.
+        errors: rejected values, with JSON pointers into the request.
+        retry_after: seconds after which to retry.
+        step: current step of the drive session, if the worker sends it.
     """
 
     def __init__(self, details: ErrorDetails) -> None:
-        # Many workers say the first of the errors in the detail already.
+        # Many workers include the first of the errors in the detail.
         unsaid = [e for e in details.errors if e.message not in details.detail]
         places = "; ".join(f"{e.pointer or '/'}: {e.message}" for e in unsaid)
         message = f"{details.detail} ({places})" if places else details.detail
@@ -174,11 +174,11 @@ class ConflictError(StatusError):
 
 
 class StaleRevisionError(ConflictError):
-    """Somebody else edited first; look at what they did and apply again.
+    """Someone else edited the scenario first; review their edits and apply yours again.
 
     Attributes:
-        revision: revision that the scenario is at, where the worker says so.
-        missed: history entries that this client had not seen, oldest first.
+        revision: current revision of the scenario, if the worker sends it.
+        missed: history entries that this client has not seen, oldest first.
     """
 
     def __init__(self, details: ErrorDetails) -> None:
@@ -196,11 +196,11 @@ class StaleStepError(ConflictError):
 
 
 class BadStepError(ConflictError):
-    """The session has not come to this step yet."""
+    """The session has not reached this step yet."""
 
 
 class NotResetError(ConflictError):
-    """No episode has been started; ``reset`` comes first."""
+    """No episode is running; call ``reset`` first."""
 
 
 class EpisodeOverError(ConflictError):
@@ -216,7 +216,7 @@ class CapacityError(StatusError):
 
 
 class SessionElsewhereError(CapacityError):
-    """Another worker has the session; whoever drives is connected to it again by itself."""
+    """Another worker has the session; drive sessions reconnect to it automatically."""
 
 
 class SessionClosedError(StatusError):
@@ -272,7 +272,7 @@ _BY_STATUS: dict[int, type[StatusError]] = {
 
 
 def error_for(details: ErrorDetails) -> Real2SimError:
-    """The exception for what a worker says: by code where it is known, else by status."""
+    """The exception for a worker's error: by code if known, else by status."""
     if details.code == "UNSUPPORTED_PROTOCOL" or details.status == 426:
         return ProtocolMismatchError(details.detail, hint=details.hint)
     by_status = _BY_STATUS.get(

@@ -1,4 +1,4 @@
-"""Images as a worker sends them: bytes at once, an array when asked for."""
+"""Images: encoded bytes, decoded to arrays on access."""
 
 from __future__ import annotations
 
@@ -27,18 +27,20 @@ if TYPE_CHECKING:
 # Previews for notebooks: every modality as a small JPEG.
 
 FAR_PERCENTILE = 98.0
-"""Of what is hit: depths and uncertainties beyond it are all alike."""
+"""Percentile of valid pixels; larger depths and uncertainties are clipped to it."""
 HUES = np.array([[37, 151, 211], [101, 67, 173], [23, 59, 131]])
-"""Of each channel: spread the numbers of neighbouring ids far apart."""
+"""Factors per channel that give neighbouring ids distinct colours."""
 
 
 def preview_jpeg(array: NDArray[Any], modality: str) -> bytes:
-    """An image as jpeg: colours as they are, near surfaces and certain pixels bright, each number
-    of ``instance`` and ``semantic`` in a colour of its own and 0 in black.
+    """Encode an image as jpeg, with false colours unless it is ``rgb``.
+
+    Near surfaces and certain pixels are bright. Each number of ``instance`` and ``semantic`` has a
+    distinct colour; 0 is black.
 
     Args:
-        array: of the image, see :class:`~.images.Image`.
-        modality: of the image.
+        array: pixels, see :class:`~.images.Image`.
+        modality: modality of the image.
     """
     import simplejpeg
 
@@ -81,12 +83,13 @@ class Image(Handle):
         codec: ``raw``, ``jpeg`` or ``png``.
         modality: ``rgb`` (uint8 [H, W, 3]), ``depth`` or ``median_depth`` (float32 [H, W], metres
             along the camera z axis, 0 where nothing was hit), ``instance`` (uint16 [H, W], 0 is
+            along the camera z axis, 0 without a hit), ``instance`` (uint16 [H, W], 0 is
             background), ``semantic`` (uint8 [H, W], numbers of
-            ``real2sim_proto.SEMANTIC_CLASSES``) or ``uncertainty`` (float32 [H, W], absolute error
-            of the colour, of 1, that training lets expect).
-        dtype: of the pixels sent; ``uint16`` depth is in steps of ``DEPTH_PNG_UNIT``, ``uint16``
-            uncertainty in steps of ``UNCERTAINTY_PNG_UNIT``.
-        shape: of the array: [H, W, 3] or [H, W].
+            ``real2sim_proto.SEMANTIC_CLASSES``) or ``uncertainty`` (float32 [H, W], expected
+            absolute error of the colour, 0 to 1).
+        dtype: data type of the transmitted pixels; ``uint16`` depth is in steps of
+            ``DEPTH_PNG_UNIT``, ``uint16`` uncertainty in steps of ``UNCERTAINTY_PNG_UNIT``.
+        shape: shape of the array: [H, W, 3] or [H, W].
 
     Examples:
         >>> client = real2sim.connect()
@@ -123,7 +126,7 @@ class Image(Handle):
 
     @cached_property
     def array(self) -> NDArray[Any]:
-        """The image, decoded at the first use; read-only where it is a view of ``data``.
+        """The image, decoded on first access; read-only if it is a view of ``data``.
 
         Raises:
             ImageDecodeError: broken data, or a png where neither Pillow nor OpenCV is installed.
@@ -162,13 +165,13 @@ class Image(Handle):
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the image atomically and return its path.
 
-        The bytes go out as they came where the suffix fits the codec (``.jpg``, ``.png``,
-        ``.npy`` for raw); rgb can also be written as ``.jpg`` or ``.png``, and anything as
+        The bytes are written unchanged if the suffix fits the codec (``.jpg``, ``.png``,
+        ``.npy`` for raw); rgb can also be written as ``.jpg`` or ``.png``, and any image as
         ``.npy``.
 
         Raises:
-            ValueError: a suffix that the image cannot be written as; a ``.png`` that has to be
-                made where neither Pillow nor OpenCV is installed.
+            ValueError: the image cannot be written with this suffix; or ``.png`` encoding
+                without Pillow or OpenCV installed.
 
         Examples:
             >>> image.save(folder / "front.jpg").suffix
@@ -188,7 +191,7 @@ class Image(Handle):
         return writers[suffix]()
 
     def _writers(self) -> dict[str, Callable[[], bytes]]:
-        """Who writes the image, by each suffix that would do."""
+        """Encoders of the image by supported suffix."""
         writers: dict[str, Callable[[], bytes]] = {".npy": self._as_npy}
         if self.modality == "rgb":
             writers |= {".jpg": self._as_jpeg, ".jpeg": self._as_jpeg, ".png": self._as_png}
@@ -223,7 +226,7 @@ class Frame(Image):
 
     Attributes:
         sensor: name of the camera.
-        t_us: instant shown.
+        t_us: time of the image.
         T_world_sensor: [4, 4] float64, camera frame (x right, y down, z forward) to world.
         K: [3, 3] float64 intrinsics [px].
 
@@ -243,7 +246,7 @@ class Frame(Image):
 
 
 class PlacedFrame(Frame):
-    """A raw frame in shared memory. Its bytes are copied when they are asked for."""
+    """A raw frame in shared memory; its bytes are copied on access."""
 
     @cached_property
     def data(self) -> bytes:
@@ -276,7 +279,7 @@ def frame_from_wire(wire: WireFrame, pixels: memoryview | None = None) -> Frame:
     if pixels is not None:
         if wire.codec != "raw":
             raise MalformedReplyError(f"an image of codec {wire.codec!r} in shared memory")
-        # In the place where the properties keep what they have found.
+        # The cache slot of the cached properties.
         del frame.__dict__["data"]
         frame.__dict__["array"] = _raw_array(frame, pixels)
     return frame
@@ -293,9 +296,9 @@ def frames_by_camera(
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that nobody ever sees half of it; makes the folder where it is missing."""
+    """Write a file atomically; creates its folder if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Opened and not made by tempfile, whose files nobody else may read.
+    # tempfile would create a file that only its owner can read.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
     try:
         with temporary.open("xb") as file:
@@ -335,7 +338,7 @@ def _decode_raw(image: Image) -> NDArray[Any]:
 
 
 def _raw_array(image: Image, data: bytes | memoryview) -> NDArray[Any]:
-    """The array that lies in ``data``. Raises ImageDecodeError: it is none of the image's."""
+    """The array in ``data``. Raises ImageDecodeError if it does not fit the image."""
     dtype = np.dtype(image.dtype).newbyteorder("<")
     try:
         return np.frombuffer(data, dtype=dtype).reshape(image.shape)

@@ -1,4 +1,4 @@
-"""What a session shows: observations of the loop, and views beside it."""
+"""Observations of the drive loop, and views rendered between its steps."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class View(Handle):
     """Images of one committed instant.
 
     Attributes:
-        t_us: that instant.
-        revision: of the session's edits.
-        frames: camera -> modality -> frame.
-        clouds: LiDAR or radar -> point cloud.
+        t_us: time of the images.
+        revision: revision of the session's edits.
+        frames: frames by camera and modality.
+        clouds: point clouds by LiDAR or radar.
         timing: milliseconds by stage, measured by the worker.
 
     Examples:
@@ -72,10 +72,10 @@ class View(Handle):
 
         Args:
             camera: its name; default: the only one.
-            modality: as the sensor asked for it.
+            modality: a modality of the sensor.
 
         Raises:
-            KeyError: this instant has no such frame; the sentence names those it has.
+            KeyError: no such frame; the message names the available ones.
 
         Examples:
             >>> view.image("left").shape
@@ -111,7 +111,7 @@ class View(Handle):
         """The sweep of a LiDAR; default: of the only one.
 
         Raises:
-            KeyError: this instant has none of that name; the sentence names those it has.
+            KeyError: no such LiDAR; the message names the available ones.
 
         Examples:
             >>> with real2sim.connect() as other, other.session(scene="street") as driven:
@@ -145,28 +145,28 @@ class View(Handle):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation(View):
-    """What the vehicle perceives at step ``step``.
+    """The vehicle's perception at step ``step``.
 
     Attributes:
-        step: number of the instant; 0 after reset.
+        step: number of the step; 0 after reset.
         ego: state of the controlled vehicle; ``position`` is the rear axle's centre on the ground.
         route: [R, 2] float64, x and y of the route ahead in the vehicle frame [m].
         command: ``straight``, ``left`` or ``right``.
-        agents: other road users in the world frame, by number or ``object_id``; filled when reset
+        agents: other road users in the world frame, by number or ``object_id``; requires a reset
             with ``privileged=True``.
-        lanes: pieces of the map's lanes near the vehicle, the nearest first; filled when reset with
+        lanes: sections of the map's lanes near the vehicle, nearest first; requires a reset with
             ``privileged=True`` on a scene with a map.
         signals: traffic signals of the storyboard.
-        events: what happened in this step.
+        events: events of this step.
         metrics: scores so far, by name.
-        terminated: the episode ended by something that happened in it.
+        terminated: the episode ended because of an event.
         truncated: the episode ended because its time was over.
-        reason: why it ended.
-        warming_up: whether the vehicle still moves as recorded; plans wait.
-        lap: times that the vehicle of a loop has been put back to the start of the route.
-        drawn: what the seed has drawn for this episode in the step that led here, by name.
-        ego_truth: where the vehicle is, in a privileged episode whose ``ego`` is an estimate with
-            errors; None elsewhere.
+        reason: reason for the end.
+        warming_up: whether the vehicle still follows the recording; plans have no effect yet.
+        lap: completed laps of a loop.
+        drawn: values sampled from the seed in this step, by name.
+        ego_truth: true state of the vehicle, if the episode is privileged and ``ego`` is a noisy
+            estimate; else None.
 
     Examples:
         >>> client = real2sim.connect()
@@ -212,7 +212,7 @@ class Observation(View):
 
     @property
     def over(self) -> bool:
-        """Whether the episode has ended, either way.
+        """Whether the episode has ended, terminated or truncated.
 
         Examples:
             >>> obs.over
@@ -222,11 +222,11 @@ class Observation(View):
 
 
 def observation_from_wire(obs: Obs, pixels: Sequence[memoryview | None] = ()) -> Observation:
-    """The observation in a message.
+    """Parse the observation in a message.
 
     Args:
         obs: the message.
-        pixels: of its images in shared memory, None for each that is not there; default: none is.
+        pixels: of its images in shared memory, None for each other image; default: none.
 
     Raises:
         MalformedReplyError: a route or matrix of another shape.

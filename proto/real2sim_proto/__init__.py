@@ -1,7 +1,7 @@
-"""The contract between a Real2Sim worker and everyone who talks to it.
+"""The protocol between a Real2Sim worker and its clients.
 
-Models live in the module of their concept: ``operations``, ``scenes``, ``scenarios``,
-``sessions``, ``drive``, ``errors``; ``codec`` turns drive messages into bytes and back.
+Each module has the models of one concept: ``operations``, ``scenes``, ``scenarios``,
+``sessions``, ``drive``, ``errors``. ``codec`` encodes and decodes drive messages.
 """
 
 from .codec import CodecError, decode, encode

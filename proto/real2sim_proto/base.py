@@ -19,25 +19,25 @@ from typing import (
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
-# Errors for missing names, which say what to write instead.
+# Errors for missing names, with a suggestion.
 
 MAX_SHOWN = 24
 
 
 class Guided:
-    """Base of the objects users hold: the error for an unknown attribute says what to write.
+    """Base of the objects users hold: the error for an unknown attribute suggests the right one.
 
-    Subclasses list in ``_instead`` what people try first, and what does it here.
+    Subclasses list in ``_instead`` the names that users often try, and their replacements.
     """
 
     _instead: ClassVar[Mapping[str, str]] = {}
 
-    # Hidden from type checkers, which would take every attribute for one that is there.
+    # Hidden from type checkers, which would otherwise accept every attribute.
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
             kind = type(self).__name__
-            # Libraries probe private names to see what an object can do; nobody reads the error.
+            # Libraries probe private names; nobody reads that error.
             if name.startswith("_"):
                 raise AttributeError(f"{kind!r} object has no attribute {name!r}")
             said = advice(name, attributes(self), instead_of(type(self)))
@@ -45,7 +45,7 @@ class Guided:
 
 
 def instead_of(kind: type) -> Mapping[str, str]:
-    """What a class and its bases say to write instead of names that they do not have."""
+    """Replacements for unknown names, of a class and its bases."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         found |= vars(base).get("_instead", {})
@@ -53,7 +53,7 @@ def instead_of(kind: type) -> Mapping[str, str]:
 
 
 def attributes(thing: object) -> list[str]:
-    """Public names of an object; of a message those of its members alone."""
+    """Public names of an object; for a message, only its members."""
     members = getattr(type(thing), "model_fields", None)
     return [name for name in members or dir(thing) if not name.startswith("_")]
 
@@ -65,7 +65,7 @@ def advice(
     *,
     otherwise: str = "there are",
 ) -> str:
-    """What to write instead of a name: what is known for it, else what is alike, else all."""
+    """Suggestion for an unknown name: the known replacement, else similar names, else all names."""
     if instead and name in instead:
         return f"write {instead[name]}"
     if close := difflib.get_close_matches(name, there := list(there), n=2):
@@ -93,7 +93,7 @@ def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, 
             f"quaternion {quaternion!r} has length {norm:.6g}; a rotation needs a unit one, wxyz"
         )
     if abs(norm - 1.0) < 1e-15:
-        # Left bit for bit, so that reading back what was stored changes nothing.
+        # Kept bit for bit, so that reading stored values changes nothing.
         return quaternion
     w, x, y, z = quaternion
     return (w / norm, x / norm, y / norm, z / norm)
@@ -107,10 +107,11 @@ Quaternion = Annotated[
 
 
 def bearer_token(text: str) -> str:
-    """A token as a header holds it: without white space around it, which files and shells add.
+    """A token for a header, without the surrounding white space that files and shells add.
 
     Raises:
-        ValueError: it holds what no header may hold. The sentence does not show the token.
+        ValueError: the token has characters that a header cannot contain. The message does not
+            show the token.
     """
     token = text.strip()
     for place, character in enumerate(token, 1):
@@ -123,8 +124,8 @@ def bearer_token(text: str) -> str:
 
 
 def one_of(values: Any) -> Any:
-    """Field of an answer that has one of a ``Literal``'s values today; newer workers may have more,
-    and readers take them as they come."""
+    """Field of an answer with one of a ``Literal``'s values; newer workers may send others, which
+    readers accept."""
     return Field(json_schema_extra={"enum": list(get_args(values))})
 
 
@@ -140,10 +141,10 @@ N = TypeVar("N")
 
 
 class Named(list[N]):
-    """A list that also finds items by ``object_id`` or ``name``: ``cameras["front"]``.
+    """A list that also looks up items by ``object_id`` or ``name``: ``cameras["front"]``.
 
     Attributes:
-        filled_by: what to do so that there are some; shown where one is asked for and none is.
+        filled_by: how to fill the list; shown by the error of a lookup in an empty list.
     """
 
     def __init__(self, items: Iterable[N] = (), *, filled_by: str = "") -> None:

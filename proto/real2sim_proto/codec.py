@@ -1,9 +1,8 @@
-"""msgpack with arrays, strict on the way in.
+"""msgpack with arrays, with strict decoding.
 
-Maps have string keys; allowed values are None, bool, int, float, str, bytes, lists, maps and
-NumPy arrays. An array travels as ext type 1, whose payload is the msgpack array
-``[dtype, shape, bytes]``: dtype one of :data:`ARRAY_DTYPES` (little-endian), bytes in C order.
-There is no pickle anywhere.
+Maps have string keys. Allowed values are None, bool, int, float, str, bytes, lists, maps and
+NumPy arrays. An array is ext type 1; its payload is the msgpack array ``[dtype, shape, bytes]``:
+dtype is one of :data:`ARRAY_DTYPES` (little-endian), bytes are in C order. Pickle is never used.
 """
 
 from __future__ import annotations
@@ -20,30 +19,30 @@ ARRAY_DTYPES = ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "
 MAX_DEPTH = 48
 MAX_ARRAY_NDIM = 8
 MAX_SERVER_MESSAGE_BYTES = 256 * 1024 * 1024
-"""A worker sends messages up to this size, and clients read them: rgb, depth and instance of five
-cameras of 1920x1280, raw, take 106 MiB."""
+"""Maximum size of a worker's message; raw rgb, depth and instance of five cameras of 1920x1280 take
+106 MiB."""
 DEFAULT_MAX_BYTES = MAX_SERVER_MESSAGE_BYTES
 MAX_CLIENT_MESSAGE_BYTES = 1024 * 1024
-"""A worker accepts messages up to this size from a client; plans and edits are small."""
+"""Maximum size of a client's message; plans and edits are small."""
 
 
 SMALL_ARRAY_BYTES = 4096
-"""Up to this size it takes longer to describe an array than to copy it."""
+"""Smaller arrays are copied: describing them would take longer."""
 
 _LITTLE = {np.dtype(name): name for name in ARRAY_DTYPES}
 _SENT_AS = _LITTLE | {dtype.newbyteorder(">"): name for dtype, name in _LITTLE.items()}
-"""On the wire all are little-endian."""
+"""All are little-endian on the wire."""
 
 
 class CodecError(ValueError):
-    """Bytes that are not a valid message. The sentence says what was found and what is allowed."""
+    """Bytes that are not a valid message; the error states what was found and what is allowed."""
 
 
 def encode(message: dict[str, Any]) -> bytes:
-    """Bytes of a message.
+    """Encode a message.
 
     Raises:
-        CodecError: a value of a type that the wire does not carry.
+        CodecError: a value of an unsupported type.
 
     Examples:
         >>> encode({"v": 1, "type": "bye", "id": 3}).hex()
@@ -57,7 +56,7 @@ def encode(message: dict[str, Any]) -> bytes:
 
 
 def decode(data: bytes, *, max_bytes: int = DEFAULT_MAX_BYTES) -> dict[str, Any]:
-    """The message in ``data``; arrays are read-only views into it.
+    """Decode a message; arrays are read-only views into ``data``.
 
     Raises:
         CodecError: too large, not msgpack, trailing bytes, not a map with string keys, nested
@@ -87,7 +86,7 @@ def decode(data: bytes, *, max_bytes: int = DEFAULT_MAX_BYTES) -> dict[str, Any]
 
 
 def unpack(data: bytes) -> Any:
-    """What is in ``data``, for a reader that looks at every value itself; see :func:`decode`.
+    """Decode ``data`` for a reader that checks every value itself; see :func:`decode`.
 
     Raises:
         CodecError: an unknown ext type, or an array whose parts disagree.
@@ -105,7 +104,7 @@ def _pack_array(value: object) -> msgpack.ExtType:
     if dtype is None:
         raise TypeError(f"arrays of dtype {value.dtype} have no place on the wire")
     if value.nbytes <= SMALL_ARRAY_BYTES:
-        # In C order, whatever order it has here.
+        # In C order, regardless of the array's own order.
         data = value.astype(dtype, copy=False).tobytes()
         return msgpack.ExtType(ARRAY_EXT, _array_head(dtype, value.shape, len(data)) + data)
     array = np.ascontiguousarray(value, dtype=dtype)
@@ -115,7 +114,7 @@ def _pack_array(value: object) -> msgpack.ExtType:
 
 @functools.lru_cache(maxsize=256)
 def _array_head(dtype: str, shape: tuple[int, ...], size: int) -> bytes:
-    """What stands before the ``size`` bytes of an array; most are of few shapes."""
+    """Header of an array with ``size`` bytes; cached, since few shapes occur."""
     payload: bytes = msgpack.packb([dtype, shape, bytes(size)])
     return payload[: len(payload) - size]
 
@@ -156,7 +155,7 @@ def _check_values(value: Any, depth: int) -> None:
                 _check_values(item, depth - 1)
     elif kind is list:
         for item in value:
-            # Rows of numbers are most of what is sent.
+            # Rows of numbers are the most frequent lists.
             if type(item) not in _LEAVES and not (
                 depth and type(item) is list and _LEAVES.issuperset(map(type, item))
             ):

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-# Classes of semantic images: Cityscapes label numbers, so that its tools read them.
+# Classes of semantic images: Cityscapes label numbers, for compatibility with its tools.
 
 SEMANTIC_CLASSES: dict[str, int] = {
     "unlabeled": 0,
@@ -26,9 +26,9 @@ SEMANTIC_CLASSES: dict[str, int] = {
     "motorcycle": 32,
     "bicycle": 33,
 }
-"""Number in the image by name. ``static`` is the background, ``ground`` the part of it that is
-driven or walked on (what is within 15 cm of the fitted ground's height), ``dynamic`` an object of
-another category, ``unlabeled`` where nothing is and the scene has no sky."""
+"""Number in the image by name. ``static`` is the background, ``ground`` its driven or walked part
+(within 15 cm of the fitted ground's height), ``dynamic`` an object of another category, and
+``unlabeled`` an empty pixel in a scene without sky."""
 
 CLASS_OF_CATEGORY = {
     "car": "car",
@@ -57,7 +57,7 @@ SKY = SEMANTIC_CLASSES["sky"]
 
 
 def semantic_class(category: str) -> int:
-    """Number of the class of objects of that category."""
+    """Class number of objects of a category."""
     return SEMANTIC_CLASSES[CLASS_OF_CATEGORY.get(category, "dynamic")]
 
 
@@ -73,7 +73,7 @@ SUPPORTED_SUBPROTOCOLS = (DRIVE_SUBPROTOCOL,)
 
 
 def protocol_mismatch(offered: list[str]) -> str:
-    """Sentence that names both sides' versions and what to do.
+    """Error message with the versions of both sides and the remedy.
 
     Examples:
         >>> protocol_mismatch(["real2sim.v9.msgpack"]).partition(";")[0]
@@ -108,4 +108,4 @@ CONVENTIONS: dict[str, str] = {
     "channels, as far as training rays tell; 0.25 for what none has met",
     "uncertainty_png": "16 bit, steps of 1/65535",
 }
-"""What each convention says, by its name."""
+"""Text of each convention by name."""

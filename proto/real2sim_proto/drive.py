@@ -1,7 +1,7 @@
-"""Messages of the drive socket, and the parts of them that REST sessions share.
+"""Messages of the drive socket, and the parts shared with REST sessions.
 
 Every message is a map with ``v`` (protocol version), ``type`` and ``id``. A client numbers its
-messages with ``id``; the answer carries the same ``id``. The clock moves only on ``action``.
+messages with ``id``, and the answer has the same ``id``. The clock only advances on ``action``.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ from .sensors import (
 
 # Shared memory for images, between a worker and a controller on the same machine.
 #
-# The first bytes of a file hold a marker and a secret; slots of equal size follow. A client that
-# can open the file and returns the secret is on the worker's machine, which no address proves.
+# The file starts with a marker and a secret; slots of equal size follow. A client that can open the
+# file and returns the secret must be on the worker's machine; an address would not prove that.
 
 SHM_FOLDER = "/dev/shm"
-"""Where POSIX systems keep files that are memory."""
+"""Folder of shared memory files on POSIX systems."""
 SHM_NAME = r"^real2sim-[0-9a-f]{32}$"
-"""Names are of this form; no other file is ever opened or removed."""
+"""Pattern of the file names; no other file is opened or removed."""
 SHM_MAGIC = b"real2sim-frames1"
 SHM_SECRET_BYTES = 32
 SHM_HEADER_BYTES = 4096
 SHM_ALIGNMENT = 64
-"""Images begin at multiples of this."""
+"""Alignment of images in bytes."""
 MAX_SHM_SLOTS = 64
 
 
@@ -76,33 +76,33 @@ Slot = Annotated[
 
 
 def check_asked(*asked: Sequence[object]) -> None:
-    """Raises ValueError: nothing is to be shown."""
+    """Raises ValueError if there is nothing to render."""
     if not any(asked):
         raise ValueError("the request is empty; name sensors, lidars or radars")
 
 
 class Envelope(Model):
-    """What every message has."""
+    """Members of every message."""
 
     v: Literal[1] = 1
     id: int = Field(default=0, ge=0, le=2**53)
 
 
 class ServerModel(Model):
-    """Base of what a worker says. Readers ignore unknown members: newer workers may add some."""
+    """Base of the worker's messages. Readers ignore unknown members: newer workers may add some."""
 
     model_config = ConfigDict(extra="ignore")
 
 
 class ServerEnvelope(Envelope, ServerModel):
-    """What every message from the worker has."""
+    """Members of every message from the worker."""
 
 
 # --- shared by socket and REST sessions -------------------------------------------------------
 
 
 class EgoState(ServerModel):
-    """The controlled vehicle at one instant; frames as in `conventions`."""
+    """State of the controlled vehicle at one time; frames as in `conventions`."""
 
     _instead: ClassVar = {
         "heading": "ego.yaw",
@@ -129,7 +129,7 @@ class EgoState(ServerModel):
 
 
 class AgentState(ServerModel):
-    """Another road user at one instant."""
+    """Another road user at one time."""
 
     _instead: ClassVar = {
         "heading": "2 * math.atan2(agent.quaternion[3], agent.quaternion[0])",
@@ -165,7 +165,7 @@ EventType = Literal[
 
 
 class Event(ServerModel):
-    """Something that happened in this step."""
+    """An event of this step."""
 
     type: str = one_of(EventType)
     t_us: Microseconds
@@ -184,7 +184,7 @@ class Event(ServerModel):
 
 
 class SignalShown(ServerModel):
-    """A traffic signal of the storyboard at one instant."""
+    """State of a traffic signal of the storyboard."""
 
     signal_id: str
     state: str = Field(description="in the words of the storyboard, such as 'red' or 'off;off;on'")
@@ -194,7 +194,7 @@ class SignalShown(ServerModel):
 
 
 class LaneShown(ServerModel):
-    """A piece of a lane of the scene's map, near the vehicle."""
+    """A section of a lane of the scene's map, near the vehicle."""
 
     lane_id: str
     kind: LaneKind
@@ -215,7 +215,7 @@ class LaneShown(ServerModel):
 class Score(ServerModel):
     """One score of an episode, with the version of its formula.
 
-    Scores of different versions must not be compared.
+    Scores of different versions are not comparable.
     """
 
     name: str
@@ -236,7 +236,7 @@ class Score(ServerModel):
 
 
 class Resume(Model):
-    """Goes on with a session whose connection was lost."""
+    """Continues a session whose connection was lost."""
 
     token: str = Field(max_length=500, description="`resume_token` of the welcome")
     last_step: int | None = Field(default=None, ge=0, description="newest observation received")
@@ -256,9 +256,9 @@ class Hello(Envelope):
 
 
 class Attach(Envelope):
-    """The shared memory of the welcome is open here; answered by attached.
+    """Confirms that the client has opened the shared memory; answered by attached.
 
-    Only as the first message after the welcome: any other one declines it.
+    Only valid as the first message after the welcome; any other message declines it.
     """
 
     type: Literal["attach"] = "attach"
@@ -276,7 +276,7 @@ class Reset(Envelope):
 
 
 class Action(Envelope):
-    """Answer to obs(step); moves the clock by one dt and is answered by obs(step + 1)."""
+    """Answer to obs(step); advances the clock by one dt and is answered by obs(step + 1)."""
 
     type: Literal["action"] = "action"
     step: int = Field(ge=0)
@@ -285,7 +285,7 @@ class Action(Envelope):
 
 
 class Edit(Envelope):
-    """Changes the session's world before the next step."""
+    """Edits the session's world before the next step."""
 
     type: Literal["edit"] = "edit"
     base_rev: int | None = Field(default=None, description="refused when the session is elsewhere")
@@ -293,7 +293,7 @@ class Edit(Envelope):
 
 
 class Render(Envelope):
-    """An out-of-loop view of the current instant; never moves time."""
+    """Requests an out-of-loop view of the current time; does not advance the clock."""
 
     type: Literal["render"] = "render"
     sensors: list[SensorSpec] = Field(default_factory=list, max_length=MAX_SENSORS)
@@ -308,7 +308,7 @@ class Render(Envelope):
 
 
 class Agent(Envelope):
-    """Where an externally driven object goes from the next step on; answered by `driven`."""
+    """The trajectory of an externally driven object from the next step; answered by `driven`."""
 
     type: Literal["agent"] = "agent"
     object_id: Identifier
@@ -322,21 +322,21 @@ class Agent(Envelope):
 
 
 class Snapshot(Envelope):
-    """Keeps the present instant to return to; answered by `kept`."""
+    """Saves the current state to return to; answered by `kept`."""
 
     type: Literal["snapshot"] = "snapshot"
     name: Identifier
 
 
 class Restore(Envelope):
-    """Goes back to a snapshot; answered by its obs."""
+    """Returns to a snapshot; answered by its obs."""
 
     type: Literal["restore"] = "restore"
     name: Identifier
 
 
 class Fork(Envelope):
-    """Makes a new session that goes on from the present instant; answered by `forked`."""
+    """Creates a new session that continues from the current state; answered by `forked`."""
 
     type: Literal["fork"] = "fork"
 
@@ -382,7 +382,7 @@ class Frame(ServerModel):
 
 
 class PointCloud(ServerModel):
-    """What a LiDAR or a radar has measured: columns, one after the other in `data`."""
+    """Measurements of a LiDAR or a radar: columns, concatenated in `data`."""
 
     sensor: str
     modality: str = one_of(CloudModality)
@@ -404,7 +404,7 @@ class PointCloud(ServerModel):
 
 
 class SharedMemory(ServerModel):
-    """Memory that a controller on the worker's machine may read raw images from."""
+    """Shared memory for raw images, for a controller on the worker's machine."""
 
     name: str = Field(pattern=SHM_NAME, description="of a file in /dev/shm")
     slots: int = Field(ge=1, le=MAX_SHM_SLOTS)
@@ -412,7 +412,7 @@ class SharedMemory(ServerModel):
 
 
 class Welcome(ServerEnvelope):
-    """Answer to hello. Loading, compilation and the first render are over by now."""
+    """Answer to hello, after loading, compilation and the first render."""
 
     type: Literal["welcome"] = "welcome"
     protocol: str
@@ -440,13 +440,13 @@ class Welcome(ServerEnvelope):
 
 
 class Attached(ServerEnvelope):
-    """Answer to attach. Messages may name slots from now on."""
+    """Answer to attach. Later messages may name slots."""
 
     type: Literal["attached"] = "attached"
 
 
 class Obs(ServerEnvelope):
-    """What the vehicle perceives at one committed instant."""
+    """The vehicle's perception at one committed step."""
 
     type: Literal["obs"] = "obs"
     step: int
@@ -524,7 +524,7 @@ class Kept(ServerEnvelope):
 
 
 class Forked(ServerEnvelope):
-    """Answer to fork: another session at the same instant."""
+    """Answer to fork: another session with the same state."""
 
     type: Literal["forked"] = "forked"
     session_id: str
@@ -534,7 +534,7 @@ class Forked(ServerEnvelope):
 
 
 class Progress(ServerEnvelope):
-    """Long work before welcome or obs is under way."""
+    """Long work before welcome or obs is in progress."""
 
     type: Literal["progress"] = "progress"
     phase: str
@@ -542,7 +542,7 @@ class Progress(ServerEnvelope):
 
 
 class Error(ServerEnvelope):
-    """A message was refused. The session goes on unless `fatal`."""
+    """A message was refused. The session continues unless `fatal`."""
 
     type: Literal["error"] = "error"
     code: str
@@ -557,7 +557,7 @@ class Error(ServerEnvelope):
 
 
 class Result(ServerEnvelope):
-    """The session is over."""
+    """The session has ended."""
 
     type: Literal["result"] = "result"
     steps: int

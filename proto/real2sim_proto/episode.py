@@ -1,4 +1,4 @@
-"""How an episode runs: sensors, vehicle, traffic, time limits, contact, scoring."""
+"""Options of an episode: sensors, vehicle, traffic, time limits, contact, scoring."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ class VehicleSpec(Model):
     """Mass, tyres and load of the controlled vehicle; used by `dynamic_bicycle` and in contact.
 
     Cornering coefficients are lateral force per load and slip angle. The defaults are those of a
-    mid-size car (0.2 per degree at the front, more at the rear, so that it understeers by about
-    1.2 degrees per g; Gillespie 1992, Fundamentals of Vehicle Dynamics, ch. 6).
+    mid-size car: 0.2 per degree at the front and more at the rear, which gives an understeer of
+    about 1.2 degrees per g (Gillespie 1992, Fundamentals of Vehicle Dynamics, ch. 6).
     """
 
     mass: Annotated[float, Field(gt=0, le=1e5)] = Field(default=1500.0, description="[kg]")
@@ -84,7 +84,7 @@ class VehicleSpec(Model):
 
 
 class ActuatorSpec(Model):
-    """What lies between a command and the wheels.
+    """Actuator dynamics between a command and the wheels.
 
     The default lags are those of nuPlan's kinematic bicycle.
     """
@@ -105,7 +105,7 @@ class ActuatorSpec(Model):
 
 
 class SuspensionSpec(Model):
-    """Springs and dampers between wheels and body.
+    """Suspension of the body.
 
     The defaults are those of a mid-size car: it pitches by about 1.4 degrees per g of braking and
     rolls by about 3.9 degrees per g in bends. Ride frequencies and damping: Gillespie 1992,
@@ -133,7 +133,7 @@ class SuspensionSpec(Model):
 
 
 class EgoSpec(Model):
-    """How the controlled vehicle moves."""
+    """Dynamics of the controlled vehicle."""
 
     dynamics: Literal["kinematic_bicycle", "dynamic_bicycle"] = "kinematic_bicycle"
     tracker: Literal["pursuit", "lqr", "ilqr", "perfect"] = Field(
@@ -170,19 +170,19 @@ class EgoSpec(Model):
 
 
 class ReplayDriver(Model):
-    """Moves as recorded, or as edited; sees nobody."""
+    """Moves as recorded, or as edited; does not react to others."""
 
     kind: Literal["log"] = "log"
 
 
 class ConstantVelocityDriver(Model):
-    """Goes straight on as it moved when it began; sees nobody."""
+    """Keeps its initial velocity; does not react to others."""
 
     kind: Literal["constant_velocity"] = "constant_velocity"
 
 
 class IdmParameters(Model):
-    """Of the intelligent driver model (Treiber et al. 2000)."""
+    """Parameters of the intelligent driver model (Treiber et al. 2000)."""
 
     desired_speed: Speed | None = Field(
         default=None, description="[m/s]; default: its highest recorded speed"
@@ -199,7 +199,7 @@ class IdmParameters(Model):
 
 
 class IdmDriver(IdmParameters):
-    """Follows a path behind whoever is ahead (Treiber et al. 2000)."""
+    """Follows a path and the lead vehicle (Treiber et al. 2000)."""
 
     kind: Literal["idm"] = "idm"
     path: Literal["recorded", "route"] = Field(
@@ -210,8 +210,8 @@ class IdmDriver(IdmParameters):
 
 
 class LaneDriver(IdmParameters):
-    """Follows the lanes of the scene's map behind whoever is ahead, and changes lanes where that
-    pays (MOBIL: Kesting, Treiber and Helbing 2007)."""
+    """Follows the lanes of the scene's map and the lead vehicle, and changes lanes if beneficial
+    (MOBIL: Kesting, Treiber and Helbing 2007)."""
 
     kind: Literal["lanes"] = "lanes"
     desired_speed: Speed | None = Field(
@@ -235,7 +235,7 @@ class LaneDriver(IdmParameters):
 
 
 class CutInDriver(Model):
-    """Drives beside the ego's route, then moves into its lane close ahead of it."""
+    """Drives next to the ego's route, then cuts in close ahead of the ego."""
 
     kind: Literal["cut_in"] = "cut_in"
     offset: Annotated[float, Field(ge=-20, le=20)] = Field(
@@ -263,7 +263,7 @@ class HardBrakeDriver(Model):
 
 
 class JunctionCrossingDriver(Model):
-    """Crosses the ego's route so that both arrive together."""
+    """Crosses the ego's route, timed to arrive together with the ego."""
 
     kind: Literal["junction_crossing"] = "junction_crossing"
     ahead: Metre = Field(
@@ -285,7 +285,7 @@ class JunctionCrossingDriver(Model):
 
 
 class ExternalDriver(Model):
-    """Driven by another client: `agent` messages say where it goes."""
+    """Driven by another client with `agent` messages."""
 
     kind: Literal["external"] = "external"
 
@@ -304,7 +304,7 @@ AgentDriver = Annotated[
 
 
 class LaneSpec(Model):
-    """A lane along the ego's route in which road users come and go."""
+    """A lane along the ego's route in which road users appear and disappear."""
 
     offset: Annotated[float, Field(ge=-20, le=20)] = Field(
         default=0.0, description="of its middle from the route, positive on the left [m]"
@@ -313,10 +313,10 @@ class LaneSpec(Model):
 
 
 class SpawnSpec(Model):
-    """Road users that come and go along the ego's route; drawn by the episode's seed.
+    """Road users that appear and disappear along the ego's route; sampled with the episode's seed.
 
-    One appears at the edge of the stretch around the ego, where the way is free, and leaves once
-    it is `margin` beyond the stretch. It looks like a vehicle of the scene and drives by IDM.
+    A road user appears at the edge of the stretch around the ego, where the road is free, and is
+    removed `margin` beyond the stretch. It looks like a vehicle of the scene and drives by IDM.
     """
 
     density: Annotated[float, Field(gt=0, le=200)] = Field(
@@ -351,7 +351,7 @@ class SpawnSpec(Model):
 
 
 class AgentsSpec(Model):
-    """Who drives the other road users."""
+    """Drivers of the other road users."""
 
     default: Literal["log", "constant_velocity", "idm", "lanes"] = Field(
         default="log",
@@ -369,11 +369,12 @@ class AgentsSpec(Model):
     )
 
 
-# --- what the seed draws ----------------------------------------------------------------------
+# --- randomization ----------------------------------------------------------------------------
 
 
 class StartRandomization(Model):
-    """Where and how fast the ego begins: uniform around the recorded start, this far either way."""
+    """Uniform offsets of the ego's initial position and speed, up to these values in either
+    direction."""
 
     longitudinal: Annotated[float, Field(ge=0, le=50)] = Field(
         default=0.0, description="along the recorded drive [m]"
@@ -389,8 +390,8 @@ Fraction = Annotated[float, Field(ge=0, le=0.9)]
 
 
 class TrafficRandomization(Model):
-    """Parameters of IDM drivers: each is multiplied by a factor that is drawn once per object,
-    uniform within 1 plus or minus this."""
+    """Parameters of IDM drivers: each is multiplied by a factor sampled once per object, uniform
+    within 1 plus or minus this value."""
 
     desired_speed: Fraction = 0.0
     headway: Fraction = 0.0
@@ -400,11 +401,11 @@ class TrafficRandomization(Model):
 
 
 class EstimateRandomization(Model):
-    """Errors of the ego's estimate of itself, normal with these standard deviations.
+    """Errors of the ego's localization, normal with these standard deviations.
 
-    Observations then hold the estimate: `ego`, `route`, `command` and `T_world_sensor` of frames.
-    Images, contact and scores are of the truth, which `ego_truth` holds where the episode is
-    `privileged`. Plans in the vehicle's frame go from where the vehicle is.
+    Observations then contain the estimate: `ego`, `route`, `command` and `T_world_sensor` of
+    frames. Images, contact and scores use the true state, which `ego_truth` has in `privileged`
+    episodes. Plans in the vehicle's frame start from the true pose.
     """
 
     position: Annotated[float, Field(ge=0, le=5)] = Field(
@@ -419,7 +420,7 @@ class EstimateRandomization(Model):
 
 
 class Randomization(Model):
-    """What the episode's seed draws; nothing by default."""
+    """Values sampled with the episode's seed; none by default."""
 
     start: StartRandomization = StartRandomization()
     traffic: TrafficRandomization = TrafficRandomization()
@@ -436,7 +437,7 @@ class Randomization(Model):
 
 
 class LatencySpec(Model):
-    """How long a plan takes to have effect; meanwhile the one before it holds."""
+    """Delay before a plan takes effect; the previous plan applies meanwhile."""
 
     model: Literal["zero", "fixed", "measured"] = Field(
         default="zero", description="'measured': from sending obs to receiving the action"
@@ -446,7 +447,7 @@ class LatencySpec(Model):
 
 
 class ContactSpec(Model):
-    """What counts as contact, and what happens then where `on_collision` is 'continue'."""
+    """Definition of contact, and its consequences if `on_collision` is 'continue'."""
 
     restitution: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.1, description="separation speed per approach speed along the normal"
@@ -507,7 +508,7 @@ class ContactSpec(Model):
 
 
 class ScoringSpec(Model):
-    """What the scores need to know beside the log."""
+    """Inputs of the scores in addition to the log."""
 
     speed_limit: Speed | None = Field(default=None, description="[m/s]; None: no limit is known")
     corridor: Annotated[float, Field(gt=0.5, le=50)] = Field(
@@ -519,13 +520,13 @@ class ScoringSpec(Model):
 
 
 ENDLESS_US = 3_600_000_000
-"""Length of episodes beyond the log that name no horizon: an hour, unless the client ends them."""
+"""Length of episodes beyond the log without a horizon, unless the client ends them: an hour."""
 
 MAX_HORIZON = 1_000_000
 
 
 class ResetSpec(Model):
-    """How an episode begins and runs."""
+    """Options of an episode."""
 
     @model_validator(mode="before")
     @classmethod

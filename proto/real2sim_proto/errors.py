@@ -1,4 +1,4 @@
-"""Stable error codes, their HTTP status, and the RFC 9457 problem document that carries them."""
+"""Stable error codes, their HTTP status, and the RFC 9457 problem document."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PROBLEM_MEDIA_TYPE = "application/problem+json"
 
 
 class ErrorCode(StrEnum):
-    """What went wrong, for programs. Codes are never renamed."""
+    """Machine-readable error codes. Codes are never renamed."""
 
     INVALID_REQUEST = "INVALID_REQUEST"
     UNAUTHORIZED = "UNAUTHORIZED"
@@ -143,7 +143,7 @@ RETRYABLE = frozenset(
         ErrorCode.SESSION_ELSEWHERE,
     }
 )
-"""Codes after which the same request may succeed later, unchanged."""
+"""Codes after which the unchanged request may succeed later."""
 
 
 class ProblemDetail(BaseModel):
@@ -156,7 +156,7 @@ class ProblemDetail(BaseModel):
 
 
 class Problem(BaseModel):
-    """RFC 9457 problem document; the body of every answer with status 400 or above.
+    """RFC 9457 problem document; the body of every reply with status 400 or above.
 
     Readers ignore unknown members, so that newer workers can add some.
     """
@@ -178,5 +178,5 @@ class Problem(BaseModel):
 
 
 def title_of(code: ErrorCode) -> str:
-    """Human form of a code: ``Unknown scene``."""
+    """Readable form of a code: ``Unknown scene``."""
     return code.value.replace("_", " ").capitalize()

@@ -1,4 +1,4 @@
-"""REST models of jobs: long work that answers at once and reports as it goes."""
+"""REST models of jobs: long-running work with progress reports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .scenes import Reply
 
 
 class JobState(StrEnum):
-    """Where a job is."""
+    """State of a job."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -22,20 +22,20 @@ class JobState(StrEnum):
     FAILED = "failed"
     CANCELLED = "cancelled"
     INTERRUPTED = "interrupted"
-    """The worker stopped while it ran; start it again."""
+    """The worker stopped while the job was running; start the job again."""
 
 
 OVER = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED})
-"""States that last."""
+"""Final states."""
 
 JobKind = Literal["load_scene", "simulate", "calibrate", "export", "drive", "sweep"]
 
 PlannerName = Literal["follow_route", "pid", "idm", "depth_sampling"]
-"""Planners of the SDK that a worker starts itself."""
+"""Planners of the SDK that a worker can start."""
 
 
 class JobFile(Reply):
-    """A file that a job left: `GET /v1/jobs/{id}/files/{name}`."""
+    """A result file of a job: `GET /v1/jobs/{id}/files/{name}`."""
 
     name: str
     media_type: str
@@ -43,7 +43,7 @@ class JobFile(Reply):
 
 
 class JobInfo(Reply):
-    """A job as it is now; also the data of each of its events."""
+    """Current state of a job; also the data of each of its events."""
 
     _instead: ClassVar = {"done": "job.over", "id": "job.job_id", "status": "job.state"}
 
@@ -70,7 +70,7 @@ class JobInfo(Reply):
 
     @property
     def over(self) -> bool:
-        """Whether it will not change any more."""
+        """Whether the state is final."""
         return self.state in OVER
 
 
@@ -81,7 +81,7 @@ class JobList(Reply):
 
 
 class DriveRequest(Model):
-    """Body of `POST /v1/sessions/{id}/drive`: a planner drives the session, and is recorded."""
+    """Body of `POST /v1/sessions/{id}/drive`: a planner drives the session, with a recording."""
 
     planner: PlannerName | None = Field(
         default="follow_route",
@@ -152,7 +152,7 @@ Sigma = Annotated[float, Field(gt=0, le=100)]
 
 
 class ObservedBox(Model):
-    """Where a tracker saw an object."""
+    """Position of an object from a tracker."""
 
     t_us: Microseconds
     position: Vector3 = Field(description="of the box centre, world [m]")
@@ -163,21 +163,21 @@ class ObservedBox(Model):
 
 
 class SeenPoint(Model):
-    """Where a marked point was seen."""
+    """Position of a marked point."""
 
     t_us: Microseconds
     position: Vector3 = Field(description="world [m]")
 
 
 class ObservedPoint(Model):
-    """A point of an object that was followed; left out at times when it was not seen."""
+    """A tracked point of an object; omit times at which it was not visible."""
 
     place: Vector3 = Field(description="on the object before anything happens, object frame [m]")
     seen: list[SeenPoint] = Field(min_length=1, max_length=1000)
 
 
 class ObservedImage(Model):
-    """A picture of a camera of the scene, from where the recording vehicle was."""
+    """An image from a camera of the scene, at the recording vehicle's pose."""
 
     t_us: Microseconds
     camera: Identifier
@@ -185,7 +185,7 @@ class ObservedImage(Model):
 
 
 class Observations(Model):
-    """What was seen of an object; all of it is taken together."""
+    """Observations of an object; all of them are used together."""
 
     recorded: bool = Field(
         default=False, description="the boxes of its own recorded track, in the simulated span"
@@ -210,7 +210,7 @@ CalibratedName = Literal["stiffness", "yield_stress", "viscosity", "friction", "
 
 
 class CalibrateRequest(Model):
-    """Body of `POST /v1/scenarios/{id}/calibrate`: values of an object from what was seen of it."""
+    """Body of `POST /v1/scenarios/{id}/calibrate`: fit parameters of an object to observations."""
 
     object_id: Identifier
     parameters: list[CalibratedName] = Field(
@@ -253,7 +253,7 @@ Pair = tuple[float, float]
 
 
 class SweptValues(Model):
-    """What a parameter of a sweep is: exactly one of these."""
+    """Values of a sweep's parameter: exactly one of these."""
 
     values: list[SweptValue] | None = Field(default=None, min_length=1, max_length=1000)
     range: tuple[float, float, Annotated[int, Field(ge=1, le=1000)]] | None = Field(
@@ -280,7 +280,7 @@ class SweptValues(Model):
 
 
 class DatasetSweep(Model):
-    """The same drive many times over, each with other values in its edits."""
+    """Repeats the same drive with other parameter values in its edits."""
 
     parameters: dict[Identifier, SweptValues] = Field(min_length=1, max_length=16)
     draws: int = Field(
@@ -294,7 +294,7 @@ class DatasetSweep(Model):
 
 
 class DatasetPerturbation(Model):
-    """Clips whose ego starts beside its path and finds back to it, which is its future."""
+    """Clips whose ego starts off its path and returns to it in its future trajectory."""
 
     lateral_sigma: float = Field(default=0.5, ge=0, le=5, description="beside the path [m]")
     heading_sigma: float = Field(default=0.07, ge=0, le=0.6, description="against it [rad]")
@@ -303,7 +303,7 @@ class DatasetPerturbation(Model):
 
 
 class DatasetNoise(Model):
-    """Boxes as a detector would give them, beside the true ones."""
+    """Simulated detections, in addition to the true boxes."""
 
     position: float = Field(default=0.0, ge=0, le=10, description="standard deviation [m]")
     size: float = Field(default=0.0, ge=0, le=1, description="of each edge, as a share of it")
@@ -317,7 +317,8 @@ SplitName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]{1,32}$")]
 Share = Annotated[float, Field(ge=0, le=1e6)]
 
 MAX_RECORDING_TEXT = 3_500_000
-"""Characters of a recording in a request: what leaves room for the rest of its body."""
+"""Maximum length of a recording in a request, in characters; leaves room for the rest of the
+body."""
 
 
 class DatasetRequest(Model):
@@ -408,6 +409,6 @@ ExportBody = Annotated[
         custom_error_message="kind is video (default) or dataset",
     ),
 ]
-"""What `POST /v1/exports` takes, by its `kind`; video where that is left out."""
+"""Body of `POST /v1/exports`, by `kind`; default: video."""
 
 EXPORT_BODY: TypeAdapter[ExportRequest | DatasetRequest] = TypeAdapter(ExportBody)

@@ -1,6 +1,6 @@
-"""Lanes of a scene: answer of `GET /v1/scenes/{scene}/lanes`, and the file `lanes.json`.
+"""Lanes of a scene: reply of `GET /v1/scenes/{scene}/lanes`, and the file `lanes.json`.
 
-All places are in the world frame of the scene [m]; lanes run as their traffic drives.
+All positions are in the world frame of the scene [m]; lanes point in driving direction.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class LaneInfo(_Part):
 
 
 class AreaInfo(_Part):
-    """A marked part of the ground."""
+    """A marked area on the ground."""
 
     area_id: str
     kind: AreaKind
@@ -45,7 +45,7 @@ class AreaInfo(_Part):
 
 
 class StopLineInfo(_Part):
-    """Where the traffic of lanes waits."""
+    """Stop line of lanes."""
 
     stop_line_id: str
     points: list[Place] = Field(min_length=2)
@@ -53,7 +53,7 @@ class StopLineInfo(_Part):
 
 
 class SignalInfo(_Part):
-    """A traffic light or sign, with the lanes that it rules."""
+    """A traffic light or sign, with the lanes that it controls."""
 
     signal_id: str
     kind: SignalKind
@@ -65,7 +65,7 @@ class SignalInfo(_Part):
 
 
 class RoadLaneInfo(_Part):
-    """A stretch of a numbered lane of a road."""
+    """A section of a numbered lane of a road."""
 
     number: int = Field(description="negative to the right of the reference line")
     lane_id: str
@@ -75,7 +75,7 @@ class RoadLaneInfo(_Part):
 
 
 class RoadInfo(_Part):
-    """A reference line that lanes are numbered from."""
+    """Reference line of numbered lanes."""
 
     road_id: str
     s: list[float]
@@ -88,7 +88,7 @@ class RoadInfo(_Part):
 
 
 class SceneLanes(_Part):
-    """All lanes of a scene and what rules them."""
+    """All lanes of a scene and their traffic rules."""
 
     format: Literal["real2sim-lanes"] = "real2sim-lanes"
     version: Literal[1] = 1

@@ -1,7 +1,7 @@
 """Edits of a scenario, as a discriminated union on ``op``.
 
-Every operation names what it changes by id, never carries it, and has an inverse. Ids of objects,
-erased regions and colliders share one name space.
+Every operation refers to its target by id, contains no asset data, and has an inverse. Ids of
+objects, erased regions and colliders share one name space.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .storyboard import Storyboard, stored_storyboard
 Frame = Literal["world", "object"]
 
 DRAWN_PREFIX = "spawned:"
-"""Of the ids of road users that `agents.spawn` lets come and go."""
+"""Prefix of the ids of road users created by `agents.spawn`."""
 
 
 def _not_drawn(object_id: Any) -> Any:
@@ -31,10 +31,10 @@ def _not_drawn(object_id: Any) -> Any:
 
 
 ObjectId = Annotated[Identifier, BeforeValidator(_not_drawn)]
-"""Id of an object that edits can name."""
+"""Id of an editable object."""
 
 MaterialName = Literal["rigid", "metal", "foam", "rubber", "jelly", "sand", "snow"]
-"""What an object may be made of; the numbers behind the names belong to the physics."""
+"""Materials of an object; the physics defines their parameters."""
 
 Size3 = tuple[
     Annotated[float, Field(gt=0, le=1000.0)],
@@ -53,8 +53,8 @@ Snap = Annotated[
 
 
 class TimeRange(Model):
-    """When an edit has effect: it grows smoothly from 0 at `start_us` to the whole `blend_us`
-    later, and falls back to 0 at `end_us` in the same way."""
+    """Time range of an edit: it grows smoothly from 0 at `start_us` to its full amount `blend_us`
+    later, and decreases to 0 at `end_us` in the same way."""
 
     start_us: Microseconds | None = Field(default=None, description="default: from the beginning")
     end_us: Microseconds | None = Field(default=None, description="default: to the end")
@@ -83,8 +83,8 @@ class Translate(Model):
 
 
 class Rotate(Model):
-    """Turn an object, at all times or in a time range with smooth ends: in place at each of its
-    poses, so that one that moves then goes sideways; or with its path, see `about_us`."""
+    """Rotate an object, at all times or in a time range with smooth ends. By default it rotates in
+    place at each of its poses, so a moving object drives sideways; `about_us` rotates its path."""
 
     op: Literal["rotate"] = "rotate"
     object_id: ObjectId
@@ -120,7 +120,7 @@ class Scale(Model):
 
 
 class SetPose(Model):
-    """Place an object; it stands there for the whole time range of the scene."""
+    """Place an object at a fixed pose for the whole time range of the scene."""
 
     op: Literal["set_pose"] = "set_pose"
     object_id: ObjectId
@@ -138,7 +138,7 @@ class SetTrajectory(Model):
 
 
 class Retime(Model):
-    """Let an object do the same earlier, later, faster or slower."""
+    """Delay or advance an object's motion, or change its speed."""
 
     op: Literal["retime"] = "retime"
     object_id: ObjectId
@@ -162,21 +162,21 @@ class Duplicate(Model):
 
 
 class Delete(Model):
-    """Remove an object, erased region or collider. Its id stays reserved for `restore`."""
+    """Remove an object, erased region or collider. Its id is reserved for `restore`."""
 
     op: Literal["delete"] = "delete"
     object_id: ObjectId
 
 
 class Restore(Model):
-    """Bring a deleted object, erased region or collider back as it was."""
+    """Restore a deleted object, erased region or collider."""
 
     op: Literal["restore"] = "restore"
     object_id: ObjectId
 
 
 class Insert(Model):
-    """Add an object from the asset library, standing at a pose or following a trajectory."""
+    """Add an object from the asset library, at a pose or on a trajectory."""
 
     op: Literal["insert"] = "insert"
     asset_id: Identifier
@@ -196,7 +196,7 @@ class Insert(Model):
 
 
 class RoutePlace(Model):
-    """A place beside the ego's route, in a session that runs."""
+    """A position relative to the ego's route, in a running session."""
 
     ahead: Annotated[float, Field(ge=-500, le=500)] = Field(
         description="of the ego's rear axle along the route [m]"
@@ -208,9 +208,9 @@ class RoutePlace(Model):
 
 
 class Spawn(Model):
-    """Add a road user that drives, with the look of an asset or of an object of the scene.
+    """Add a driven road user, with the appearance of an asset or of an object of the scene.
 
-    Its own track goes straight on at `speed`; `driver` moves it in sessions. `delete` removes it.
+    Its own track is straight at `speed`; `driver` moves it in sessions. `delete` removes it.
     """
 
     op: Literal["spawn"] = "spawn"
@@ -246,7 +246,7 @@ class Spawn(Model):
 
 
 class Replace(Model):
-    """Give an object another look, fitted into its box: an asset's, or a recorded object's."""
+    """Replace an object's appearance with an asset's or a recorded object's, fitted to its box."""
 
     op: Literal["replace"] = "replace"
     object_id: ObjectId
@@ -268,7 +268,7 @@ class Replace(Model):
 
 
 class EraseRegion(Model):
-    """Hide the Gaussians of the background whose centres lie in a box."""
+    """Hide the Gaussians of the background with centres in a box."""
 
     op: Literal["erase_region"] = "erase_region"
     region_id: Identifier | None = Field(default=None, description="default: region_<n>")
@@ -281,10 +281,10 @@ YIELDING: tuple[MaterialName, ...] = ("metal", "foam")
 
 
 class PhysicsValues(Model):
-    """What an object is for the physics; what is left out has its default.
+    """Physical properties of an object; omitted ones have defaults.
 
-    `young`, `poisson`, `density` or `yield_stress` make it of one material throughout, instead of
-    what its category is built of: `material` with these values in place of its own.
+    `young`, `poisson`, `density` or `yield_stress` make it a body of one `material`, with these
+    values instead of the material's, rather than the default structure of its category.
     """
 
     mass: Annotated[float, Field(gt=0, le=1e7)] | None = Field(
@@ -329,14 +329,14 @@ class PhysicsValues(Model):
 
 
 class SetPhysics(PhysicsValues):
-    """Say what an object is for the physics. What is left out goes back to its default."""
+    """Set physical properties of an object. Omitted ones return to their defaults."""
 
     op: Literal["set_physics"] = "set_physics"
     object_id: ObjectId
 
 
 class SetVelocity(Model):
-    """Velocity with which an object enters the physics; left out, that of its trajectory."""
+    """Initial velocity of an object in the physics; default: that of its trajectory."""
 
     op: Literal["set_velocity"] = "set_velocity"
     object_id: ObjectId
@@ -346,7 +346,7 @@ class SetVelocity(Model):
 
 
 class SetGait(Model):
-    """How a person walks; what is left out goes back to what the person was made with."""
+    """Gait of a person; omitted values return to those of the asset."""
 
     op: Literal["set_gait"] = "set_gait"
     object_id: ObjectId
@@ -362,7 +362,7 @@ class SetGait(Model):
 
 
 class PlaneShape(Model):
-    """A half-space; objects stay on the side that the normal points to."""
+    """A half-space; objects stay on the side of its normal."""
 
     kind: Literal["plane"] = "plane"
     point: Vector3 = Field(description="on the plane [m]")
@@ -375,7 +375,7 @@ class PlaneShape(Model):
 
 
 class BoxShape(Model):
-    """A solid box."""
+    """A rigid box."""
 
     kind: Literal["box"] = "box"
     position: Vector3 = Field(description="centre [m]")
@@ -384,7 +384,7 @@ class BoxShape(Model):
 
 
 class CylinderShape(Model):
-    """A solid post or drum with flat ends; its axis is the z axis of its pose."""
+    """A rigid post or drum with flat ends; its axis is the z axis of its pose."""
 
     kind: Literal["cylinder"] = "cylinder"
     position: Vector3 = Field(description="centre [m]")
@@ -394,7 +394,8 @@ class CylinderShape(Model):
 
 
 class CapsuleShape(Model):
-    """All within a radius of a line along the z axis of its pose; a ball where length is 0."""
+    """A capsule: all points within a radius of a line along the z axis of its pose; with length 0 a
+    ball."""
 
     kind: Literal["capsule"] = "capsule"
     position: Vector3 = Field(description="middle of the line [m]")
@@ -409,7 +410,7 @@ VertexIndex = Annotated[int, Field(ge=0, lt=4096)]
 
 
 class MeshShape(Model):
-    """A body of triangles; or a sheet of them with a thickness."""
+    """A closed triangle mesh, or a sheet of triangles with a thickness."""
 
     kind: Literal["mesh"] = "mesh"
     position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="of its origin [m]")
@@ -426,7 +427,7 @@ class MeshShape(Model):
 
 
 class GroundShape(Model):
-    """The recorded ground, moved up or down."""
+    """The recorded ground, with a vertical offset."""
 
     kind: Literal["ground"] = "ground"
     offset: Metres = Field(default=0.0, description="[m]")
@@ -439,7 +440,7 @@ ColliderShape = Annotated[
 
 
 class AddCollider(Model):
-    """Add something invisible that does not yield, for the physics."""
+    """Add an invisible rigid collider, for the physics."""
 
     op: Literal["add_collider"] = "add_collider"
     collider_id: Identifier | None = Field(default=None, description="default: collider_<n>")
@@ -448,7 +449,7 @@ class AddCollider(Model):
 
 
 class SetTime(Model):
-    """The span in which the scenario plays: where previews, physics and exports begin and end."""
+    """Time span of the scenario: of previews, physics and exports."""
 
     op: Literal["set_time"] = "set_time"
     start_us: Microseconds | None = Field(default=None, description="default: of the recording")
@@ -462,15 +463,14 @@ class SetTime(Model):
 
 
 class SetStoryboard(Model):
-    """What road users do in sessions of the scenario, and when; a reset may bring its own."""
+    """Set the storyboard of the scenario's sessions; a reset may replace it."""
 
     op: Literal["set_storyboard"] = "set_storyboard"
     storyboard: Storyboard | None = Field(default=None, description="default: none")
 
 
 def stored_operations(stored: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Fields of operations as a log or file holds them, with the meaning that they had when they
-    were written."""
+    """Fields of operations from a log or file, with the meaning they had when they were written."""
     return [
         {**each, "storyboard": stored_storyboard(each["storyboard"])}
         if each.get("op") == "set_storyboard" and isinstance(each.get("storyboard"), Mapping)
@@ -513,7 +513,7 @@ OPERATIONS: TypeAdapter[list[Operation]] = TypeAdapter(list[Operation])
 
 
 def subject_of(operation: Operation) -> str | None:
-    """Id that an operation names; None where it leaves the choice of a new one open."""
+    """Id in an operation: object, region or collider; None if the worker chooses it."""
     for field in ("object_id", "region_id", "collider_id"):
         if field in type(operation).model_fields:
             subject: str | None = getattr(operation, field)

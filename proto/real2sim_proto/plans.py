@@ -1,4 +1,4 @@
-"""What a planner answers with."""
+"""Plans: a planner's answers to observations."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PlanPoses = Annotated[
 
 
 def check_times(times_us: list[int], poses: int) -> None:
-    """Raises ValueError unless there is one time for each pose and they increase."""
+    """Check that there is one time per pose and that times increase; else raise ValueError."""
     if len(times_us) != poses:
         raise ValueError(f"{len(times_us)} times for {poses} poses")
     if any(map(operator.ge, times_us, times_us[1:])):
@@ -35,9 +35,9 @@ def check_times(times_us: list[int], poses: int) -> None:
 
 
 class TrajectoryPlan(Model):
-    """Where the vehicle should be, tracked by the worker's controller until the next plan.
+    """Target poses of the vehicle, tracked by the worker's controller until the next plan.
 
-    Poses are (x, y, yaw) at ``times_us``, which increase and lie after the observation.
+    Poses are (x, y, yaw) at ``times_us``, which increase and are later than the observation.
     """
 
     kind: Literal["trajectory"] = "trajectory"
@@ -74,7 +74,7 @@ class Control(Model):
 
 
 class PoseCommand(Model):
-    """Puts the vehicle there at the next time stamp, whatever its dynamics; on the ground."""
+    """Sets the vehicle's pose at the next step, regardless of its dynamics; on the ground."""
 
     kind: Literal["pose"] = "pose"
     x: Metres = Field(description="world [m]")

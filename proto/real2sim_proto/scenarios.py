@@ -29,7 +29,7 @@ class ScenarioRename(Model):
 
 
 class ScenarioInfo(Reply):
-    """A scenario and what it looks like after all its operations."""
+    """A scenario, and the scene after all its operations."""
 
     scenario_id: str
     name: str
@@ -51,7 +51,7 @@ class ScenarioInfo(Reply):
 
 
 class ScenarioFork(Model):
-    """Body of `POST /v1/scenarios/{id}/fork`: a new scenario with the same history."""
+    """Body of `POST /v1/scenarios/{id}/fork`: create a scenario with the same history."""
 
     name: str | None = Field(default=None, max_length=200, description="default: the same")
     revision: int | None = Field(default=None, ge=0, description="up to this one; default: all")
@@ -64,14 +64,14 @@ class ScenarioList(Reply):
 
 
 class OperationBatch(Model):
-    """Body of `POST /v1/scenarios/{id}/operations`; all of them apply, or none."""
+    """Body of `POST /v1/scenarios/{id}/operations`; all operations apply, or none."""
 
     operations: list[Operation] = Field(min_length=1, max_length=MAX_OPERATIONS_PER_REQUEST)
     dry_run: bool = Field(default=False, description="check and answer, change nothing")
 
 
 class EditWarning(Reply):
-    """Something a person should look at; the operation took effect all the same."""
+    """A warning for the user; the operation took effect."""
 
     code: str = one_of(Literal["overlap", "off_ground", "outside_map", "sideways"])
     object_id: str
@@ -98,7 +98,7 @@ class StoryboardResult(OperationResult):
 
 
 class CornerCaseInfo(Reply):
-    """A ready corner case of the gallery."""
+    """A predefined corner case of the gallery."""
 
     name: str
     title: str = Field(description="what happens, in a sentence")
@@ -147,9 +147,9 @@ class History(Reply):
 
 
 class ScenarioDocument(Reply):
-    """A whole scenario in one file: `GET .../export` gives it, `POST .../import` takes it.
+    """A whole scenario in one file, for `GET .../export` and `POST .../import`.
 
-    It names its scene by hash and its assets by id and hash; it holds no Gaussians.
+    It refers to its scene by hash and to its assets by id and hash; it contains no Gaussians.
     """
 
     format: Literal["real2sim.scenario"] = "real2sim.scenario"

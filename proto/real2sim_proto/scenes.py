@@ -12,17 +12,17 @@ from .operations import SetGait, SetPhysics, SetVelocity
 from .sensors import OpticsSpec
 
 WITHOUT_SCENES = "`real2sim serve --demo` shows a street at once; your own: `real2sim reconstruct`"
-"""What to do about a worker that has none."""
+"""Hint for a worker without scenes."""
 
 
 class Reply(Guided, BaseModel):
-    """Base of answers. Readers ignore unknown members, so that newer workers can add some."""
+    """Base of replies. Readers ignore unknown members, so that newer workers can add some."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
 class SceneState(StrEnum):
-    """Where a scene is on its way into memory."""
+    """Loading state of a scene."""
 
     AVAILABLE = "available"
     LOADING = "loading"
@@ -117,14 +117,14 @@ class SceneInfo(Reply):
 
 
 class SceneList(Reply):
-    """All scenes below the worker's scene folder."""
+    """All scenes in the worker's scene folder."""
 
     scenes: list[SceneInfo]
 
 
 class SceneImport(BaseModel):
-    """Body of `POST /v1/scenes`: a bundle or splat file below the worker's import folder, or the
-    demo street, which comes with the worker."""
+    """Body of `POST /v1/scenes`: a bundle or splat file in the worker's import folder, or the
+    included demo street."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -144,7 +144,7 @@ class SceneImport(BaseModel):
 
 
 class Limits(Reply):
-    """What a worker refuses to exceed."""
+    """Limits of a worker."""
 
     max_sessions: int
     max_request_bytes: int
@@ -159,7 +159,7 @@ class Limits(Reply):
 
 
 class DeviceInfo(Reply):
-    """Where scenes live and what draws them."""
+    """Device that stores and renders scenes."""
 
     backend: str
     reason: str = Field(description="why this backend was chosen")
@@ -188,7 +188,7 @@ class ServerInfo(Reply):
 
 
 class FleetMember(Reply):
-    """A worker of several that share a store, as it last told of itself."""
+    """A worker of a fleet with a shared store, with its last reported status."""
 
     worker_id: str
     alive: bool = Field(description="whether its lease runs; if not, others may have its sessions")
@@ -246,7 +246,7 @@ _NUMBERS: dict[str, Any] = {"type": "array", "minItems": 3, "maxItems": 3}
 Triple = Annotated[
     tuple[float, float, float], WithJsonSchema(_NUMBERS | {"items": {"type": "number"}})
 ]
-"""Told as a list of fixed length, since programs that check answers do not all know tuples."""
+"""Described as a list of fixed length, because some validators do not support tuples."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Colour = Annotated[
     tuple[Share, Share, Share],
@@ -255,7 +255,7 @@ Colour = Annotated[
 
 
 class AssetPerson(Model):
-    """Body of `POST /v1/assets` as JSON: a person who walks wherever a trajectory leads."""
+    """JSON body of `POST /v1/assets`: a person that walks along any trajectory."""
 
     asset_id: Identifier
     build: Build
@@ -270,7 +270,7 @@ class AssetPerson(Model):
 
 
 class AssetUpload(Model):
-    """Fields of `POST /v1/assets` as a form, beside the part `file`."""
+    """Form fields of `POST /v1/assets`, in addition to the part `file`."""
 
     asset_id: Identifier | None = Field(default=None, description="default: the file's name")
     category: Category = "car"

@@ -102,7 +102,7 @@ UNIONS: dict[str, TypeAdapter[Any]] = {
 }
 
 SHARED = ("Storyboard",)
-"""Messages that others hold and that are long: a file that holds one refers to its file."""
+"""Long messages that others contain; schemas refer to their files."""
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -116,7 +116,8 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 
 def _referring(schema: dict[str, Any]) -> dict[str, Any]:
-    """The schema with references to the files of SHARED, and without what only those need."""
+    """The schema with references to the files of SHARED, without definitions that only they
+    need."""
     files = {f"#/$defs/{name}": f"{name}.json" for name in SHARED}
     definitions = _renamed(schema.pop("$defs", {}), files)
     found: dict[str, Any] = _renamed(schema, files)

@@ -25,7 +25,7 @@ class PinholeLens(Model):
 
 
 class BrownConradyLens(Model):
-    """OpenCV's rational model; refused where the image reaches beyond where it folds."""
+    """OpenCV's rational model; refused if the image extends beyond its valid radius."""
 
     model: Literal["brown_conrady"] = "brown_conrady"
     radial: tuple[Number, Number, Number, Number, Number, Number] = Field(
@@ -79,7 +79,7 @@ LensSpec = Annotated[
 
 
 class ShutterSpec(Model):
-    """How an image is read out. Its instant is the middle of the read-out."""
+    """Readout of an image. The time of the image is the middle of the readout."""
 
     direction: ShutterDirection = "global"
     readout_us: int = Field(
@@ -92,7 +92,7 @@ Row = tuple[Pixels, Pixels, Pixels]
 
 
 class OpticsSpec(Model):
-    """A device of one's own in the place of a recorded camera."""
+    """A custom camera in place of a recorded one."""
 
     K: tuple[Row, Row, Row] | None = Field(
         default=None, description="3x3 at the recorded size [px]; default: the camera's own"
@@ -107,8 +107,8 @@ Gain = Annotated[float, Field(ge=0.05, le=20)]
 
 
 class NoiseSpec(Model):
-    """Noise of a sensor in linear light, where white is 1: of variance
-    `photon` x signal + `read`^2; the same for the same seed, camera and instant."""
+    """Sensor noise in linear light, where white is 1, with variance `photon` x signal + `read`^2;
+    reproducible for the same seed, camera and time."""
 
     photon: float = Field(default=0.0, ge=0, le=0.1)
     read: float = Field(default=0.0, ge=0, le=0.5)
@@ -116,14 +116,15 @@ class NoiseSpec(Model):
 
 
 class MotionBlurSpec(Model):
-    """The mean light of several images within an exposure, each drawn: `samples` times the work."""
+    """The mean light of several rendered images within an exposure; costs `samples` times as
+    much."""
 
     exposure_us: int = Field(ge=1, le=200_000)
     samples: int = Field(default=5, ge=2, le=16)
 
 
 class CameraEffects(Model):
-    """What a real camera does to its colour images, each off unless given; in this order."""
+    """Effects of a real camera on its colour images, applied in this order; off by default."""
 
     motion_blur: MotionBlurSpec | None = None
     vignetting: tuple[float, float, float] | None = Field(
@@ -157,7 +158,7 @@ class CameraEffects(Model):
 
     @property
     def names(self) -> list[str]:
-        """Those that are on, in their order."""
+        """Names of the enabled effects, in order."""
         return [name for name in type(self).model_fields if getattr(self, name) not in (None, 0.0)]
 
 
@@ -166,7 +167,7 @@ class CameraEffects(Model):
 MAX_LIDARS = 8
 MAX_RADARS = 8
 MAX_RAYS = 1 << 19
-"""Rays of one sweep; the densest sensors sold today fire less than half as many."""
+"""Maximum number of rays per sweep; the densest current sensors use less than half."""
 
 CloudCodec = Literal["raw", "deflate"]
 CloudModality = Literal["lidar", "radar"]
@@ -189,7 +190,7 @@ Hertz = Annotated[float, Field(ge=0.1, le=1000)]
 
 
 class SpinningBeams(Model):
-    """Rows that turn about the sensor's z axis; angles in degrees."""
+    """Rows that rotate about the sensor's z axis; angles in degrees."""
 
     kind: Literal["spinning"]
     elevation_deg: Numbers = Field(description="of each row")
@@ -204,7 +205,7 @@ class SpinningBeams(Model):
 
 
 class TableBeams(Model):
-    """Every ray by itself."""
+    """Beams listed individually."""
 
     kind: Literal["table"]
     azimuth_deg: Numbers
@@ -213,7 +214,7 @@ class TableBeams(Model):
 
 
 class GridBeams(Model):
-    """A solid-state sensor that scans rows of even steps, top row first, left to right."""
+    """A solid-state sensor that scans evenly spaced rows, top row first, left to right."""
 
     kind: Literal["grid"]
     azimuth_deg: Span = Field(description="from edge to edge")
@@ -224,7 +225,7 @@ class GridBeams(Model):
 
 
 class RosetteBeams(Model):
-    """Two prisms that turn at different speeds: petals about the sensor's x axis."""
+    """Two prisms that rotate at different speeds: petals about the sensor's x axis."""
 
     kind: Literal["rosette"]
     radius_deg: Annotated[float, Field(gt=0, lt=90)]
@@ -234,7 +235,7 @@ class RosetteBeams(Model):
 
 
 class DetectionSpec(Model):
-    """What a LiDAR's detector sees."""
+    """Detection model of a LiDAR."""
 
     range_m: float = Field(default=120.0, description="where `reflectivity` is just seen")
     reflectivity: float = Field(default=0.1, description="0 to 1")
@@ -245,7 +246,7 @@ class DetectionSpec(Model):
 
 
 class LidarModel(Model):
-    """A LiDAR of one's own."""
+    """A custom LiDAR."""
 
     name: Annotated[str, Field(min_length=1, max_length=64)]
     source: str = Field(default="", description="where the numbers come from")
@@ -273,7 +274,7 @@ Metres = Annotated[float, Field(gt=0, le=2000)]
 
 class RadarModel(Model):
     """A radar that resolves range, azimuth, elevation and radial velocity. The defaults are those
-    of a front radar of 77 GHz and middle range."""
+    of a 77 GHz mid-range front radar."""
 
     range_m: tuple[float, float] = Field(default=(0.5, 160.0), description="nearest, farthest")
     field_of_view_deg: tuple[Degrees, Degrees] = Field(
@@ -327,7 +328,7 @@ class RadarModel(Model):
 
     @property
     def ray_count(self) -> int:
-        """Rays of one scan."""
+        """Number of rays per scan."""
         wide, high = (max(round(a / self.ray_spacing_deg), 1) for a in self.field_of_view_deg)
         return int(wide * high)
 
@@ -396,7 +397,7 @@ class RadarSpec(Model):
 
 
 class CloudField(Model):
-    """A column of a cloud: one number of each point, or several."""
+    """A column of a cloud, with one or more numbers per point."""
 
     name: str
     dtype: Literal["float32", "uint8", "uint16", "int32"]

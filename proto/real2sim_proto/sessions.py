@@ -1,4 +1,4 @@
-"""REST models of sessions: the same world as the drive socket, by plain requests."""
+"""REST models of sessions, which share their world with the drive socket."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_STEPS_PER_REQUEST = 1000
 
 
 class SessionCreate(Model):
-    """Optional body of `POST /v1/sessions?scene=` or `?scenario=`; the episode is reset with it."""
+    """Optional body of `POST /v1/sessions?scene=` or `?scenario=`; starts the first episode."""
 
     reset: ResetSpec = ResetSpec()
 
@@ -50,16 +50,16 @@ class SessionInfo(Reply):
 
 
 class SessionList(Reply):
-    """All sessions of a worker. Tokens are left empty."""
+    """All sessions of a worker. Tokens are empty."""
 
     sessions: list[SessionInfo]
 
 
 class SessionClock(Model):
-    """Body of `PUT /v1/sessions/{id}/clock`: what the clock of a driven session may do.
+    """Body of `PUT /v1/sessions/{id}/clock`: pause, resume or pace the clock of a driven session.
 
-    A held clock lets actions on the drive socket wait; nothing is lost, and nobody times out.
-    Steps by REST, and those of many sessions by one message, do not ask it.
+    While the clock is held, actions on the drive socket wait; none is lost or times out.
+    Steps by REST and batched steps of many sessions ignore it.
     """
 
     state: Literal["running", "held", "ended"] = Field(
@@ -91,8 +91,8 @@ class StepRequest(Model):
 
 
 class SessionEdit(Model):
-    """Body of `POST /v1/sessions/{id}/operations`: edits of the running world, before its next
-    step; all of them apply, or none."""
+    """Body of `POST /v1/sessions/{id}/operations`: edits of the running world before its next step;
+    all operations apply, or none."""
 
     operations: list[Operation] = Field(min_length=1, max_length=MAX_OPERATIONS_PER_REQUEST)
     base_rev: int | None = Field(
@@ -176,7 +176,7 @@ def _intrinsics(K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
 
 
 class FreeCamera(Model):
-    """A camera somewhere in the world."""
+    """A camera with an arbitrary pose in the world."""
 
     name: Identifier = Field(description="of its frames")
     width: int = Field(ge=16, le=8192, description="[px]")
@@ -195,14 +195,14 @@ class FreeCamera(Model):
 
 
 class PosedObject(Model):
-    """Where an object is in one picture."""
+    """Pose of an object in one image."""
 
     object_id: Identifier
     pose: Pose = Field(description="T_world_object; its origin is the box centre")
 
 
 class SceneView(Model):
-    """Body of `POST /v1/scenes/{scene}/render`: one instant, from cameras anywhere."""
+    """Body of `POST /v1/scenes/{scene}/render`: one instant, from any cameras."""
 
     t_us: Microseconds | None = Field(
         default=None, description="where objects are that are not posed; default: the start"

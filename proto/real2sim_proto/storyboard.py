@@ -1,8 +1,8 @@
-"""What happens in an episode: entities, and acts of events that conditions set off.
+"""Storyboard of an episode: entities, and acts of events triggered by conditions.
 
-The model keeps to OpenSCENARIO XML 1.3 (ASAM 2024): what a storyboard holds can be written as such
-a file and read again without loss, save for what OpenSCENARIO has no words for (shape ``quintic``).
-Numbers may be expressions of ``parameters``, so that a sweep sets those alone.
+The model follows OpenSCENARIO XML 1.3 (ASAM 2024). A storyboard can be written as such a file and
+read again without loss, except for features that OpenSCENARIO lacks (shape ``quintic``). Numbers
+may be expressions of ``parameters``, so a sweep only needs to set parameters.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ ElementName = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class BoundingBox(Model):
-    """(length, width, height) [m], and where its middle is from the reference point [m]."""
+    """(length, width, height) [m], and the box centre relative to the reference point [m]."""
 
     size: tuple[Value, Value, Value]
     centre: tuple[Value, Value, Value]
 
 
 class Entity(Model):
-    """Who takes part. An object of the scene, the ego, or somebody new.
+    """A participant: an object of the scene, the ego, or a new road user.
 
-    Somebody new looks like `asset_id` of the library or `look` of the scene, by default like the
-    object of the scene that is most alike in category and size, fitted to the box.
+    A new road user looks like `asset_id` of the library or `look` of the scene. By default it looks
+    like the object of the scene with the most similar category and size, scaled to the box.
     """
 
     name: Reference
@@ -86,10 +86,10 @@ class Entity(Model):
 
 
 class RouteLanes(Model):
-    """Lanes along the ego's route, where no map says otherwise.
+    """Lanes along the ego's route, for scenes without a map.
 
-    Lanes on the right of the reference line have ids -1, -2 and so on from there, those on the left
-    1, 2; right-hand traffic: the left ones are oncoming.
+    Lanes right of the reference line have ids -1, -2 and so on outwards, those on the left 1, 2 ...
+    Traffic is right-hand: the left lanes are oncoming.
     """
 
     kind: Literal["route"] = "route"
@@ -101,7 +101,7 @@ class RouteLanes(Model):
 
 
 class MapRoads(Model):
-    """Roads of the scene's map, or of a map that comes with the file."""
+    """Roads of the scene's map, or of a map included in the file."""
 
     kind: Literal["map"] = "map"
     file: str = Field(default="", max_length=1000, description="as the file names it")
@@ -114,7 +114,7 @@ Roads = Annotated[RouteLanes | MapRoads, Field(discriminator="kind")]
 
 
 class SignalHead(Model):
-    """A traffic signal: where vehicles are to stop for it."""
+    """A traffic signal, with its stop position."""
 
     signal_id: Reference
     stop_line: WorldPosition | None = Field(default=None, description="None: not known")
@@ -122,7 +122,7 @@ class SignalHead(Model):
 
 
 class Phase(Model):
-    """What signals show for a while."""
+    """States of signals for a duration."""
 
     name: ElementName
     duration: Value = Field(description="[s]")
@@ -130,7 +130,7 @@ class Phase(Model):
 
 
 class SignalController(Model):
-    """Lets signals go through phases, over and over."""
+    """Cycles signals through phases."""
 
     name: ElementName
     delay: Value = Field(default=0.0, description="before its first phase, after `reference` [s]")
@@ -144,21 +144,21 @@ class SignalController(Model):
 
 
 class InitAction(Model):
-    """What holds when the episode begins."""
+    """Initial state of the episode."""
 
     entity: Reference
     action: PrivateAction
 
 
 class Action(Model):
-    """Part of an event."""
+    """An action of an event."""
 
     name: ElementName
     action: AnyAction
 
 
 class Event(Model):
-    """Actions that begin together."""
+    """Actions that start together."""
 
     name: ElementName
     priority: Literal["override", "skip", "parallel"] = Field(
@@ -170,7 +170,7 @@ class Event(Model):
 
 
 class Maneuver(Model):
-    """Events of one purpose."""
+    """A sequence of events."""
 
     name: ElementName
     events: list[Event] = Field(min_length=1, max_length=200)
@@ -186,7 +186,7 @@ class ManeuverGroup(Model):
 
 
 class Act(Model):
-    """Groups that begin together."""
+    """Maneuver groups that start together."""
 
     name: ElementName
     groups: list[ManeuverGroup] = Field(min_length=1, max_length=100)
@@ -195,7 +195,7 @@ class Act(Model):
 
 
 class Story(Model):
-    """Acts of one topic."""
+    """A group of acts."""
 
     name: ElementName
     acts: list[Act] = Field(min_length=1, max_length=100)
@@ -205,14 +205,14 @@ class Story(Model):
 
 
 class ValueSet(Model):
-    """These values, one after the other."""
+    """These values, in order."""
 
     kind: Literal["set"] = "set"
     values: list[Plain] = Field(min_length=1, max_length=100_000)
 
 
 class ValueRange(Model):
-    """From lowest to highest in steps."""
+    """Values from lowest to highest with a constant step."""
 
     kind: Literal["range"] = "range"
     low: float
@@ -221,7 +221,7 @@ class ValueRange(Model):
 
 
 class Uniform(Model):
-    """Drawn from low to high."""
+    """Uniform distribution between low and high."""
 
     kind: Literal["uniform"] = "uniform"
     low: float
@@ -229,7 +229,7 @@ class Uniform(Model):
 
 
 class Normal(Model):
-    """Drawn normally, again until it is within the range, where there is one."""
+    """Normal distribution, truncated to the range by rejection if there is one."""
 
     kind: Literal["normal"] = "normal"
     mean: float
@@ -240,7 +240,7 @@ class Normal(Model):
 
 
 class Poisson(Model):
-    """Drawn as the number of events, `mean` of them expected."""
+    """Poisson distribution with the given mean."""
 
     kind: Literal["poisson"] = "poisson"
     mean: Annotated[float, Field(gt=0, le=1e6)]
@@ -256,7 +256,7 @@ class Weighted(Model):
 
 
 class Choice(Model):
-    """Drawn from these by their weights."""
+    """Discrete distribution with weights."""
 
     kind: Literal["choice"] = "choice"
     values: list[Weighted] = Field(min_length=1, max_length=100_000)
@@ -271,7 +271,7 @@ class Bin(Model):
 
 
 class Histogram(Model):
-    """Drawn from ranges by their weights, uniform in each."""
+    """Histogram distribution: ranges with weights, uniform in each."""
 
     kind: Literal["histogram"] = "histogram"
     bins: list[Bin] = Field(min_length=1, max_length=100_000)
@@ -282,14 +282,14 @@ Distribution = Annotated[
     Field(discriminator="kind"),
 ]
 DRAWN = (Uniform, Normal, Poisson, Choice, Histogram)
-"""Distributions that the seed of an episode draws from; a sweep goes through the others."""
+"""Distributions sampled with the episode's seed; a sweep enumerates the others."""
 
 
 class Storyboard(Model):
-    """What happens in an episode.
+    """Storyboard of an episode.
 
-    Attributes that hold names are checked: an unknown entity or parameter is a ValueError. So are
-    times and distances: a negative one is refused by its name. Of rates the magnitude counts.
+    Attributes that refer to names are checked: an unknown entity or parameter is a ValueError, and
+    so is a negative time or distance. Rates use their magnitude.
     """
 
     version: Literal[1, 2] = Field(
@@ -337,12 +337,12 @@ class Storyboard(Model):
 
 
 def resolved(board: Storyboard) -> Storyboard:
-    """The storyboard with the values of its parameters instead of expressions.
+    """The storyboard with parameter values instead of expressions.
 
     Raises:
-        ValueError: an expression that has none, or leads to a value that is not allowed.
+        ValueError: an expression without a value, or with an invalid one.
     """
-    # What holds no expression is left as it is, so that most are checked once.
+    # Content without expressions is shared, so that it is validated once.
     if not any(_has_expression(getattr(board, name)) for name in _RESOLVED):
         return board
     fields = {name: _plain(getattr(board, name)) for name in type(board).model_fields}
@@ -357,7 +357,7 @@ _RESOLVED = (
 
 
 def stored_storyboard(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a storyboard as a log or file holds them: without a version, of version 1."""
+    """Fields of a storyboard from a log or file; without a version number it is version 1."""
     return {"version": 1, **fields}
 
 

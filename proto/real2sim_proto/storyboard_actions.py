@@ -1,7 +1,7 @@
 """Positions and actions of a storyboard, after OpenSCENARIO XML 1.3 (ASAM 2024).
 
-Positions are of an entity's reference point: of vehicles the middle of the rear axle on the ground,
-as the file's bounding box says. All in metres, seconds, radians.
+Positions refer to an entity's reference point: for vehicles, the centre of the rear axle on the
+ground, as defined by the file's bounding box. Units are metres, seconds and radians.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Reference = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Orientation(Model):
-    """A heading [rad]; of relative ones against the frame that the position is given in."""
+    """A heading [rad]; a relative one is relative to the frame of the position."""
 
     h: Value = 0.0
     relative: bool = False
@@ -30,7 +30,7 @@ DRIVING = Field(
 
 
 class WorldPosition(Model):
-    """In the frame of the road network's map; without one, of the scene's world."""
+    """In the frame of the road network's map, or of the scene's world if there is none."""
 
     kind: Literal["world"] = "world"
     x: Value
@@ -40,7 +40,7 @@ class WorldPosition(Model):
 
 
 class RelativeWorldPosition(Model):
-    """Beside an entity, along the axes of the world."""
+    """Relative to an entity, along the axes of the world."""
 
     kind: Literal["relative_world"] = "relative_world"
     entity: Reference
@@ -50,7 +50,7 @@ class RelativeWorldPosition(Model):
 
 
 class RelativeObjectPosition(Model):
-    """Beside an entity, along its own axes."""
+    """Relative to an entity, along its own axes."""
 
     kind: Literal["relative_object"] = "relative_object"
     entity: Reference
@@ -60,7 +60,7 @@ class RelativeObjectPosition(Model):
 
 
 class RoadPosition(Model):
-    """Along a road's reference line and beside it, positive on its left."""
+    """Distance along a road's reference line and lateral offset, positive to the left."""
 
     kind: Literal["road"] = "road"
     road: str = Field(max_length=80)
@@ -70,7 +70,7 @@ class RoadPosition(Model):
 
 
 class RelativeRoadPosition(Model):
-    """Along and beside the road from where an entity is."""
+    """Relative to an entity's road position."""
 
     kind: Literal["relative_road"] = "relative_road"
     entity: Reference
@@ -80,7 +80,7 @@ class RelativeRoadPosition(Model):
 
 
 class LanePosition(Model):
-    """In a lane; without a map `road` is of no account, and lanes are those along the route."""
+    """In a lane; without a map, `road` is ignored and lanes are those along the route."""
 
     kind: Literal["lane"] = "lane"
     road: str = Field(max_length=80)
@@ -91,8 +91,8 @@ class LanePosition(Model):
 
 
 class RelativeLanePosition(Model):
-    """In the lane so many to the left (positive, in the sense of the reference line) of an
-    entity's, so far along it in the direction in which the entity drives."""
+    """In the lane `lanes` to the left (positive, in the sense of the reference line) of an
+    entity's, at a distance along it in the entity's direction of travel."""
 
     kind: Literal["relative_lane"] = "relative_lane"
     entity: Reference
@@ -118,7 +118,7 @@ PlainPlace = Annotated[PlainPosition, Field(discriminator="kind")]
 
 
 class Route(Model):
-    """The way through places, along lanes between them."""
+    """A path through waypoints, along lanes between them."""
 
     name: str = Field(default="route", max_length=200)
     closed: bool = False
@@ -126,7 +126,7 @@ class Route(Model):
 
 
 class RoutePosition(Model):
-    """Along a route, in the lane of its way there."""
+    """Along a route, in its lane there."""
 
     kind: Literal["route"] = "route"
     route: Route
@@ -139,7 +139,7 @@ class RoutePosition(Model):
 
 
 class TrajectoryPosition(Model):
-    """Along a curve, and beside it."""
+    """Along a curve, with a lateral offset."""
 
     kind: Literal["trajectory"] = "trajectory"
     curve: Curve
@@ -159,10 +159,10 @@ Shape = Literal["step", "linear", "cubic", "sinusoidal", "quintic"]
 
 
 class Dynamics(Model):
-    """How a value goes from what it is to what it is to be, f(0) = 0 to f(1) = 1.
+    """Transition of a value from its start to its target, f(0) = 0 to f(1) = 1.
 
     'linear' f = u; 'cubic' 3 u^2 - 2 u^3; 'sinusoidal' (1 - cos pi u) / 2; 'quintic' 10 u^3 -
-    15 u^4 + 6 u^5, which OpenSCENARIO does not know; 'step' at once.
+    15 u^4 + 6 u^5, which OpenSCENARIO lacks; 'step' immediately.
     """
 
     shape: Shape = "linear"
@@ -174,7 +174,7 @@ STEP = Dynamics(shape="step")
 
 
 class SpeedLimits(Model):
-    """What an action may use to reach its aim; None: as much as it takes."""
+    """Limits of the motion during an action; None: unlimited."""
 
     acceleration: Value | None = Field(default=None, description="[m/s^2]")
     deceleration: Value | None = Field(default=None, description="[m/s^2], positive")
@@ -182,7 +182,7 @@ class SpeedLimits(Model):
 
 
 class SpeedAction(Model):
-    """To a speed, in a form of time."""
+    """Change to a target speed, with a given transition."""
 
     kind: Literal["speed"] = "speed"
     speed: Value = Field(description="[m/s]; or difference, or factor")
@@ -193,14 +193,14 @@ class SpeedAction(Model):
 
 
 class SpeedPoint(Model):
-    """So long after the one before, this speed."""
+    """Target speed, and the time since the previous one."""
 
     time: Value
     speed: Value
 
 
 class SpeedProfileAction(Model):
-    """Through speeds, changing linearly between them."""
+    """Speed profile with linear changes between entries."""
 
     kind: Literal["speed_profile"] = "speed_profile"
     points: list[SpeedPoint] = Field(min_length=1, max_length=10_000)
@@ -208,7 +208,7 @@ class SpeedProfileAction(Model):
 
 
 class LaneChangeAction(Model):
-    """Into another lane: the one of an id, or so many to the left of an entity's."""
+    """Change to the lane with an id, or to a lane relative to an entity's."""
 
     kind: Literal["lane_change"] = "lane_change"
     lane: int | Value = Field(description="id; or number of lanes, positive on the left")
@@ -218,7 +218,7 @@ class LaneChangeAction(Model):
 
 
 class LaneOffsetAction(Model):
-    """Beside the middle of its lane, or so far beside where another is in its."""
+    """Lateral offset from the centre of its lane, or from an entity's offset."""
 
     kind: Literal["lane_offset"] = "lane_offset"
     offset: Value = Field(description="positive on the left [m]")
@@ -231,7 +231,7 @@ class LaneOffsetAction(Model):
 
 
 class LateralDistanceAction(Model):
-    """Keeps a distance sideways from an entity."""
+    """Keeps a lateral distance to an entity."""
 
     kind: Literal["lateral_distance"] = "lateral_distance"
     entity: Reference
@@ -245,7 +245,7 @@ class LateralDistanceAction(Model):
 
 
 class LongitudinalDistanceAction(Model):
-    """Keeps a distance or a gap in time to an entity, along the road."""
+    """Keeps a distance or a time gap to an entity, along the road."""
 
     kind: Literal["longitudinal_distance"] = "longitudinal_distance"
     entity: Reference
@@ -264,10 +264,10 @@ class LongitudinalDistanceAction(Model):
 
 
 class SynchronizeAction(Model):
-    """Arrives where it is to be when another arrives at its place.
+    """Arrives at its target when another entity arrives at its own.
 
-    Its acceleration is solved anew in every step: a constant one, or where it is to arrive with a
-    speed one that changes linearly.
+    The acceleration is solved in every step: constant, or linear in time if the final speed is also
+    given.
     """
 
     kind: Literal["synchronize"] = "synchronize"
@@ -288,21 +288,21 @@ class SynchronizeAction(Model):
 
 
 class Vertex(Model):
-    """A place on a polyline, and when to be there."""
+    """A vertex of a polyline, and its time."""
 
     time: Value = 0.0
     position: Position
 
 
 class Polyline(Model):
-    """Straight between places."""
+    """Straight lines between vertices."""
 
     shape: Literal["polyline"] = "polyline"
     vertices: list[Vertex] = Field(min_length=2, max_length=20_000)
 
 
 class Clothoid(Model):
-    """Curvature that changes linearly with the way."""
+    """Curvature that changes linearly with distance."""
 
     shape: Literal["clothoid"] = "clothoid"
     position: Position
@@ -314,7 +314,7 @@ class Clothoid(Model):
 
 
 class ControlPoint(Model):
-    """Of a NURBS."""
+    """Control point of a NURBS."""
 
     position: Position
     weight: Value = 1.0
@@ -340,7 +340,7 @@ class Nurbs(Model):
 
 
 class ClothoidPiece(Model):
-    """Of a spline: curvature [1/m] that changes linearly over its length [m]."""
+    """Segment of a spline: curvature [1/m] changes linearly over its length [m]."""
 
     start: Value
     end: Value
@@ -349,7 +349,7 @@ class ClothoidPiece(Model):
 
 
 class ClothoidSpline(Model):
-    """Clothoids, each from where the one before ends, as it heads there."""
+    """Clothoid segments, each continuing the previous one in position and heading."""
 
     shape: Literal["clothoid_spline"] = "clothoid_spline"
     position: Position
@@ -369,7 +369,7 @@ class Timing(Model):
 
 
 class FollowTrajectoryAction(Model):
-    """Along a curve, at its own speed or by the curve's times."""
+    """Follows a curve, at its own speed or at the curve's times."""
 
     kind: Literal["follow_trajectory"] = "follow_trajectory"
     name: str = Field(default="trajectory", max_length=200)
@@ -380,35 +380,36 @@ class FollowTrajectoryAction(Model):
 
 
 class AssignRouteAction(Model):
-    """A route that it takes from now on."""
+    """Sets the route of the entity."""
 
     kind: Literal["assign_route"] = "assign_route"
     route: Route
 
 
 class AcquirePositionAction(Model):
-    """The way along lanes to a place."""
+    """Drives along lanes to a position."""
 
     kind: Literal["acquire_position"] = "acquire_position"
     position: Position
 
 
 class TeleportAction(Model):
-    """There at once."""
+    """Moves the entity to a position immediately."""
 
     kind: Literal["teleport"] = "teleport"
     position: Position
 
 
 class VisibilityAction(Model):
-    """Whether it is in the world: shown, measured and hit. All three go together here."""
+    """Whether the entity is in the world: visible, measured and collidable, always together."""
 
     kind: Literal["visibility"] = "visibility"
     visible: bool
 
 
 class FollowingParameters(Model):
-    """Of the intelligent driver model (Treiber et al. 2000), as of the driver ``idm``."""
+    """Parameters of the intelligent driver model (Treiber et al. 2000), as for the driver
+    ``idm``."""
 
     desired_speed: Annotated[float, Field(ge=0, le=150)] | None = Field(
         default=None, description="[m/s]; default: its speed when the action begins"
@@ -423,7 +424,7 @@ class FollowingParameters(Model):
 
 
 class ControllerAction(Model):
-    """Drives by the intelligent driver model in its lane, until an action moves it otherwise."""
+    """Drives by the intelligent driver model in its lane, until another action controls it."""
 
     kind: Literal["controller"] = "controller"
     active: bool = True
@@ -446,11 +447,11 @@ PrivateAction = Annotated[
     | ControllerAction,
     Field(discriminator="kind"),
 ]
-"""Of each entity of a maneuver group."""
+"""Actions of each entity of a maneuver group."""
 
 
 class AddEntityAction(Model):
-    """Lets an entity appear."""
+    """Adds an entity to the world."""
 
     kind: Literal["add_entity"] = "add_entity"
     entity: Reference
@@ -458,14 +459,14 @@ class AddEntityAction(Model):
 
 
 class DeleteEntityAction(Model):
-    """Takes an entity out of the world."""
+    """Removes an entity from the world."""
 
     kind: Literal["delete_entity"] = "delete_entity"
     entity: Reference
 
 
 class SignalStateAction(Model):
-    """A traffic signal shows a state from now on."""
+    """Sets the state of a traffic signal."""
 
     kind: Literal["signal_state"] = "signal_state"
     signal: Reference
@@ -473,7 +474,7 @@ class SignalStateAction(Model):
 
 
 class SignalPhaseAction(Model):
-    """A controller of traffic signals goes on from the start of a phase."""
+    """Sets a controller of traffic signals to the start of a phase."""
 
     kind: Literal["signal_phase"] = "signal_phase"
     controller: Reference
@@ -481,7 +482,7 @@ class SignalPhaseAction(Model):
 
 
 class SetVariableAction(Model):
-    """A variable holds a value; or what it held plus, or times, a number."""
+    """Sets a variable, or adds to it, or multiplies it."""
 
     kind: Literal["set_variable"] = "set_variable"
     variable: Name
@@ -497,7 +498,7 @@ GlobalAction = Annotated[
     | SetVariableAction,
     Field(discriminator="kind"),
 ]
-"""Of nobody."""
+"""Actions without an entity."""
 
 AnyAction = Annotated[
     SpeedAction

@@ -24,15 +24,15 @@ Frame = Literal["entity", "lane", "road"]
 
 
 class Entities(Model):
-    """Whose conditions count: of any of them, or of all."""
+    """Triggering entities: the condition must hold for any of them, or for all."""
 
     entities: list[Reference] = Field(min_length=1, max_length=64)
     of: Literal["any", "all"] = "any"
 
 
 class Distances(Model):
-    """How a distance is measured: from reference points or between boxes (`freespace`); straight,
-    or along or across the frame of the entity, or the lane or road that it is in."""
+    """Definition of a distance: between reference points or boxes (`freespace`); Euclidean, or
+    along or across the frame of the entity, or of its lane or road."""
 
     measure: Measure = "euclidean"
     frame: Frame = "entity"
@@ -42,7 +42,7 @@ class Distances(Model):
 
 
 class SimulationTime(Model):
-    """Time since the episode began [s]."""
+    """Time since the start of the episode [s]."""
 
     kind: Literal["simulation_time"] = "simulation_time"
     rule: Rule
@@ -50,7 +50,7 @@ class SimulationTime(Model):
 
 
 class TimeToCollision(Entities, Distances):
-    """Distance over the speed at which it shrinks [s], to an entity or a place."""
+    """Distance divided by closing speed [s], to an entity or a position."""
 
     kind: Literal["time_to_collision"] = "time_to_collision"
     entity: Reference | None = None
@@ -58,28 +58,28 @@ class TimeToCollision(Entities, Distances):
 
 
 class TimeHeadway(Entities, Distances):
-    """Distance to another over one's own speed [s]."""
+    """Distance to another entity divided by own speed [s]."""
 
     kind: Literal["time_headway"] = "time_headway"
     entity: Reference
 
 
 class RelativeDistance(Entities, Distances):
-    """To another entity [m]."""
+    """Distance to another entity [m]."""
 
     kind: Literal["relative_distance"] = "relative_distance"
     entity: Reference
 
 
 class Distance(Entities, Distances):
-    """To a place [m]."""
+    """Distance to a position [m]."""
 
     kind: Literal["distance"] = "distance"
     position: Position
 
 
 class ReachPosition(Entities):
-    """Within a tolerance [m] of a place."""
+    """Within a tolerance [m] of a position."""
 
     kind: Literal["reach_position"] = "reach_position"
     position: Position
@@ -87,7 +87,7 @@ class ReachPosition(Entities):
 
 
 class Speed(Entities):
-    """[m/s], along its heading, or sideways; `relative_to`: less that of another."""
+    """[m/s], along its heading or lateral; `relative_to` subtracts the speed of another entity."""
 
     kind: Literal["speed"] = "speed"
     rule: Rule
@@ -97,7 +97,7 @@ class Speed(Entities):
 
 
 class Acceleration(Entities):
-    """[m/s^2]."""
+    """Acceleration [m/s^2]."""
 
     kind: Literal["acceleration"] = "acceleration"
     rule: Rule
@@ -106,7 +106,7 @@ class Acceleration(Entities):
 
 
 class Collision(Entities):
-    """With an entity, or with any of a category; None: with anybody."""
+    """Collision with an entity, or with any of a category; None: with any entity."""
 
     kind: Literal["collision"] = "collision"
     entity: Reference | None = None
@@ -114,35 +114,35 @@ class Collision(Entities):
 
 
 class TraversedDistance(Entities):
-    """At least so far since the condition is looked at [m]."""
+    """Minimum distance travelled since the condition became active [m]."""
 
     kind: Literal["traversed_distance"] = "traversed_distance"
     value: Value
 
 
 class StandStill(Entities):
-    """For so long [s]."""
+    """Standing still for this duration [s]."""
 
     kind: Literal["stand_still"] = "stand_still"
     duration: Value
 
 
 class Offroad(Entities):
-    """Beside every lane for so long [s]."""
+    """Outside every lane for this duration [s]."""
 
     kind: Literal["offroad"] = "offroad"
     duration: Value
 
 
 class EndOfRoad(Entities):
-    """At the end of the road for so long [s]."""
+    """At the end of the road for this duration [s]."""
 
     kind: Literal["end_of_road"] = "end_of_road"
     duration: Value
 
 
 class Angle(Entities):
-    """Heading in the world, or against another entity's, within a tolerance [rad]."""
+    """Heading in the world, or relative to another entity's, within a tolerance [rad]."""
 
     kind: Literal["angle"] = "angle"
     entity: Reference | None = None
@@ -163,7 +163,7 @@ ElementState = Literal[
 
 
 class StoryboardElementState(Model):
-    """An element of the storyboard, by its name or by names joined with '::', is in a state."""
+    """State of a storyboard element, by its name or by names joined with '::'."""
 
     kind: Literal["element_state"] = "element_state"
     element_type: ElementType
@@ -172,7 +172,7 @@ class StoryboardElementState(Model):
 
 
 class VariableValue(Model):
-    """A parameter or variable compares so with a value."""
+    """Comparison of a parameter or variable with a value."""
 
     kind: Literal["variable"] = "variable"
     variable: Name
@@ -181,7 +181,7 @@ class VariableValue(Model):
 
 
 class SignalState(Model):
-    """A traffic signal shows a state."""
+    """State of a traffic signal."""
 
     kind: Literal["signal_state"] = "signal_state"
     signal: Reference
@@ -189,7 +189,7 @@ class SignalState(Model):
 
 
 class SignalPhase(Model):
-    """A controller of traffic signals is in a phase."""
+    """Phase of a controller of traffic signals."""
 
     kind: Literal["signal_phase"] = "signal_phase"
     controller: Reference
@@ -220,8 +220,8 @@ Test = Annotated[
 
 
 class Condition(Model):
-    """A test, and when its outcome counts: while it holds, or when it begins or ceases to; later
-    by a delay."""
+    """A test, and when it triggers: while it is true, or on a rising or falling edge; after a
+    delay."""
 
     name: str = Field(default="", max_length=200)
     edge: Literal["none", "rising", "falling", "rising_or_falling"] = "none"
@@ -230,12 +230,12 @@ class Condition(Model):
 
 
 class ConditionGroup(Model):
-    """All of them at once."""
+    """Conditions that must all hold."""
 
     conditions: list[Condition] = Field(min_length=1, max_length=100)
 
 
 class Trigger(Model):
-    """Any of the groups; without groups never."""
+    """True if any of the groups is; without groups never."""
 
     groups: list[ConditionGroup] = Field(default_factory=list, max_length=100)

@@ -1,6 +1,6 @@
 """Values of a storyboard: numbers, parameters, and expressions of them.
 
-An expression is a text that begins with ``$``: ``$gap`` is the parameter of that name, and
+An expression is a string that begins with ``$``: ``$gap`` is the parameter of that name, and
 ``${2 * $gap + 1}`` an expression, with the operators and functions of OpenSCENARIO XML 1.3 (ASAM
 2024, section 9.1): ``+ - * / %``, ``== != < <= > >=``, ``and or not``, ``round floor ceil sqrt abs
 sign pow min max sin cos tan asin acos atan``, parentheses, numbers, ``true``, ``false``, and pi.
@@ -19,7 +19,7 @@ from pydantic import Field
 NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_]{0,79}$"
 
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
-"""Of a parameter or variable."""
+"""Name of a parameter or variable."""
 
 Expression = Annotated[str, Field(pattern=r"^\$", max_length=8000)]
 
@@ -27,10 +27,10 @@ Value = Annotated[float, Field(ge=-1e9, le=1e9)] | Expression
 """A number, or an expression of parameters such as ``$gap`` or ``${2 * $gap}``."""
 
 Plain = bool | Annotated[float, Field(ge=-1e15, le=1e15)] | Annotated[str, Field(max_length=1000)]
-"""What a parameter or variable holds."""
+"""Value of a parameter or variable."""
 
 MAX_DEPTH = 40
-"""Of parentheses in an expression."""
+"""Maximum nesting of parentheses in an expression."""
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>\$?[A-Za-z_]\w*)"
@@ -65,14 +65,14 @@ _CONSTANTS = {"true": True, "false": False, "pi": math.pi}
 
 
 def evaluated(text: str, parameters: Mapping[str, Any]) -> Any:
-    """The value of an expression that begins with ``$``; of other texts the text itself.
+    """Evaluate an expression that begins with ``$``; other strings are returned unchanged.
 
     Args:
         text: ``$name`` or ``${expression}``.
-        parameters: by name.
+        parameters: values by name.
 
     Raises:
-        ValueError: it names an unknown parameter, cannot be read, or has no finite value.
+        ValueError: an unknown parameter, a syntax error, or a result that is not finite.
     """
     if not text.startswith("$"):
         return text
@@ -90,10 +90,10 @@ def evaluated(text: str, parameters: Mapping[str, Any]) -> Any:
 
 
 def with_values(fields: Any, parameters: Mapping[str, Any]) -> Any:
-    """Plain data (maps, lists, texts, numbers) with every text that begins with ``$`` evaluated.
+    """Plain data (maps, lists, strings, numbers) with all expressions evaluated.
 
     Raises:
-        ValueError: as :func:`evaluated`.
+        ValueError: see :func:`evaluated`.
     """
     if isinstance(fields, str):
         return evaluated(fields, parameters)

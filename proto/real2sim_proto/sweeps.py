@@ -26,11 +26,11 @@ MAX_EPISODES = 10_000
 """That one job drives; a sweep of the command may be larger."""
 
 SET_BY_SWEEPS = frozenset({"seed", "sensors", "action", "privileged"})
-"""Fields of reset that are not the case's: the seed, and what the planner needs."""
+"""Fields of reset that a case cannot set: the seed, and those that depend on the planner."""
 
 
 class CaseParameter(Model):
-    """What all parameters have."""
+    """Members of all parameters."""
 
     path: str | list[str] | None = Field(
         default=None,
@@ -41,7 +41,8 @@ class CaseParameter(Model):
 
     @property
     def paths(self) -> list[str]:
-        """Where its value is put in a case; none for one that only others are derived from."""
+        """Paths in a case that receive its value; empty if only other parameters are derived from
+        it."""
         if self.path is None:
             return []
         return [self.path] if isinstance(self.path, str) else self.path
@@ -127,7 +128,7 @@ class GridMethod(Model):
 
 
 class SpreadMethod(Model):
-    """So many points: independent ones, a Latin hypercube, or a low-discrepancy sequence."""
+    """A number of points: independent, a Latin hypercube, or a low-discrepancy sequence."""
 
     kind: Literal["random", "latin_hypercube", "sobol", "halton"] = "sobol"
     count: int = Field(default=64, ge=1, le=MAX_POINTS)
@@ -135,7 +136,8 @@ class SpreadMethod(Model):
 
 
 class ImportanceBump(Model):
-    """Where importance sampling looks: a normal of values, cut off at the parameter's ends."""
+    """A component of importance sampling: a normal distribution truncated to the parameter's
+    range."""
 
     mean: float
     std: Annotated[float, Field(gt=0)]
@@ -156,7 +158,8 @@ class ImportanceMethod(Model):
 
 
 class SearchMethod(Model):
-    """Points that are chosen by what came of the others: avoidable failures of one planner."""
+    """Adaptive search: points depend on earlier results, to find avoidable failures of one
+    planner."""
 
     kind: Literal["search"]
     episodes: int = Field(default=300, ge=20, le=MAX_EPISODES)
@@ -174,7 +177,7 @@ SweepMethod = Annotated[
 
 
 class StopRule(Model):
-    """When enough is known. Episodes are counted in the order of the table, whoever drives them."""
+    """Stopping rule. Episodes count in the order of the table, independent of the worker."""
 
     at_fault: int | None = Field(default=None, ge=1, description="so many at-fault collisions")
     collisions: int | None = Field(default=None, ge=1)
@@ -278,8 +281,8 @@ def _grid_points(method: GridMethod, parameters: Mapping[str, SweepParameter]) -
 
 
 def with_kinds(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a sweep with the kinds that may be left out where they are plain: of parameters
-    by what they have, of the method where only that is given."""
+    """Fields of a sweep with omitted kinds filled in: of parameters from their members, of the
+    method if only its kind is given."""
     filled = dict(fields)
     given = fields.get("parameters")
     if isinstance(given, Mapping):

@@ -28,21 +28,21 @@ POLL_SECONDS = 0.25
 
 
 class AsyncClient(Handle):
-    """A worker's scenes, scenarios and sessions; :func:`connect_async` is the same.
+    """A client of one worker: scenes, scenarios and sessions; :func:`connect_async` makes one.
 
-    Nothing is sent yet. Arguments take precedence over the environment, and the environment over
-    the defaults.
+    The constructor sends nothing. Arguments take precedence over the environment, and the
+    environment over the defaults.
 
     Args:
         url: ``http://host:port`` or ``https://...``; default: ``$REAL2SIM_URL``, else
             ``http://127.0.0.1:8600``.
         token: bearer token of the worker; default: ``$REAL2SIM_TOKEN``, else none. ``""`` sends
-            none whatever the environment says.
-        name: who is calling; the history of scenarios names it.
-        timeout: seconds that a reply may take; calls that may load a scene or
-            compile kernels have at least 300.
-        retries: more tries of requests that may safely be sent again.
-        shared_memory: of sessions that do not say so themselves, see :meth:`AsyncClient.session`.
+            no token, even if the environment has one.
+        name: name of the caller, shown in the history of scenarios.
+        timeout: maximum seconds to wait for a reply; calls that may load a scene or
+            compile kernels wait at least 300.
+        retries: number of retries of requests that are safe to repeat.
+        shared_memory: default for sessions, see :meth:`AsyncClient.session`.
         transport: replaces the network, for tests of programs that use the SDK.
 
     Attributes:
@@ -54,14 +54,14 @@ class AsyncClient(Handle):
         sweeps: :class:`AsyncSweeps`.
 
     Raises:
-        ValueError: not such an address.
+        ValueError: invalid address.
 
     Examples:
         >>> client = real2sim.connect_async(timeout=10.0, name="anna")
         >>> [scene.scene for scene in await client.scenes.list()]
         ['street']
 
-        Used as ``async with real2sim.connect_async() as client:`` it closes by itself.
+        As a context manager, ``async with real2sim.connect_async() as client:`` closes it.
     """
 
     _instead: ClassVar = {
@@ -111,8 +111,8 @@ class AsyncClient(Handle):
         """Versions, device, limits, conventions.
 
         Raises:
-            UnreachableError: no worker answers.
-            ProtocolMismatchError: the worker speaks another protocol version.
+            UnreachableError: no worker responds.
+            ProtocolMismatchError: the worker has another protocol version.
 
         Examples:
             >>> info = await client.server()
@@ -122,7 +122,7 @@ class AsyncClient(Handle):
         return _same_protocol(await self._transport.send(_requests.server_info()))
 
     async def fleet(self) -> Fleet:
-        """The workers that share the worker's store, with what each last told of itself.
+        """The workers that share the worker's store, with the last status each reported.
 
         Examples:
             >>> [(w.worker_id, w.alive) for w in (await client.fleet()).workers]
@@ -131,7 +131,7 @@ class AsyncClient(Handle):
         return await self._transport.send(_requests.fleet())
 
     async def readiness(self) -> Readiness:
-        """Whether the worker takes new sessions now, and if not, why.
+        """Whether the worker accepts new sessions, and the reason if it does not.
 
         Examples:
             >>> (await client.readiness()).ready
@@ -140,10 +140,10 @@ class AsyncClient(Handle):
         return await self._transport.send(_requests.readiness())
 
     async def wait_ready(self, timeout: float = 120.0) -> ServerInfo:
-        """Wait until the worker is ready; it may still be starting.
+        """Wait until the worker is ready, also while it is starting.
 
         Raises:
-            ReplyTimeoutError: it did not become ready; the hint says what was in the way.
+            ReplyTimeoutError: it did not become ready in time; the hint gives the reason.
 
         Examples:
             >>> info = await client.wait_ready(timeout=60.0)
@@ -164,23 +164,23 @@ class AsyncClient(Handle):
         reconnect: float = 60.0,
         shared_memory: bool | None = None,
     ) -> AsyncDriveSession:
-        """A new session on a scene or a scenario, to be opened by ``async with``.
+        """A new session on a scene or a scenario, to be opened with ``async with``.
 
         Args:
             scene: a scene or its name; or
             scenario: a scenario or its id.
-            codec: of cameras that name none: ``auto`` (raw when the worker is on this machine,
+            codec: codec of cameras that set none: ``auto`` (raw if the worker is on this machine,
                 else jpeg), ``raw``, ``jpeg`` or ``png``.
-            reconnect: seconds for which a lost connection is tried again, and for which a message
-                is sent again that the worker refuses for now, because its store is away or a limit
-                of the token is reached. The session goes on as if nothing had happened, also after
-                the worker was restarted. 0 gives up.
-            shared_memory: raw images come by memory shared with a worker on this machine: None,
-                where both can; True, or opening the session fails; False, never. The images are
-                the same, and are good for as long as anybody holds them.
+            reconnect: seconds to retry a lost connection, or a message that the worker refuses
+                temporarily (its store is unreachable, or a limit of the token is reached). The
+                session then continues unchanged, even after a restart of the worker. 0 disables
+                retries.
+            shared_memory: transfer of raw images through memory shared with a worker on this
+                machine. None uses it if both sides can; True requires it to open the session;
+                False never uses it. The images are identical and stay valid while referenced.
 
         Raises:
-            TypeError: something else than a scene or a scenario.
+            TypeError: neither a scene nor a scenario.
 
         Examples:
             >>> scenario = await client.scenarios.create(scene="street", name="no red car")
@@ -208,13 +208,13 @@ class AsyncClient(Handle):
         codec: str = "auto",
         shared_memory: bool | None = None,
     ) -> AsyncDriveSession:
-        """A session that exists already; closing leaves it running.
+        """An existing session; closing the handle leaves it running.
 
         Args:
-            session_id: of that session.
-            token: of that session.
-            role: ``controller`` or ``observer``, which sees what the controller sees.
-            codec, shared_memory: as of :meth:`session`.
+            session_id: id of the session.
+            token: token of the session.
+            role: ``controller``, or ``observer``, which receives the controller's observations.
+            codec, shared_memory: see :meth:`session`.
 
         Examples:
             >>> async with client.session(scene="street") as session:

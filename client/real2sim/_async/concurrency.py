@@ -18,7 +18,7 @@ __all__ = ["AsyncSocket", "Lookup", "connect_socket", "receive", "run_blocking",
 
 
 class Lookup(Handle):
-    """What the sync client's collections have and an async one cannot have."""
+    """Lookup methods of the sync client's collections, which an async client cannot offer."""
 
     def __getitem__(self, key: Any) -> Any:
         raise TypeError(f"{key!r} is fetched from the worker; write await ....get({key!r})")
@@ -30,11 +30,11 @@ async def sleep(seconds: float) -> None:
 
 
 async def receive(socket: AsyncSocket, timeout: float) -> bytes | str:
-    """The next message of a socket. Raises TimeoutError where none comes in ``timeout`` seconds."""
+    """The next message of a socket. Raises TimeoutError if none arrives in ``timeout`` seconds."""
     async with asyncio.timeout(timeout):
         return await socket.recv()
 
 
 async def run_blocking(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """The result of a function that blocks on files, called where it holds nobody up."""
+    """Run a function that blocks on files in a thread, and return its result."""
     return await asyncio.to_thread(function, *args, **kwargs)

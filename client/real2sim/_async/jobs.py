@@ -63,7 +63,7 @@ class AsyncJobs(AsyncCollection[JobInfo]):
         return AsyncJob(self._transport, await self._transport.send(_requests.get_job(job_id)))
 
     async def list(self, *, subject: str | None = None) -> Sequence[JobInfo]:
-        """Jobs of the worker, newest first; those of one scene or scenario on request.
+        """Jobs of the worker, newest first; ``subject`` selects those of one scene or scenario.
 
         Examples:
             >>> newest = (await client.jobs.list(subject="street"))[0]
@@ -85,17 +85,17 @@ class AsyncJobs(AsyncCollection[JobInfo]):
         end_us: int | None = None,
         fps: float = 10.0,
     ) -> AsyncJob:
-        """Start making a video.
+        """Start a video export.
 
         Args:
-            camera: recorded camera that it is seen from.
+            camera: name of the recorded camera.
             scenario, scene, simulation: exactly one of them, or its id.
             width: pixels; default: as recorded.
-            start_us, end_us: default: as long as there is something.
-            fps: frames a second.
+            start_us, end_us: default: the full available span.
+            fps: frames per second.
 
         Raises:
-            ValueError: a field that is not allowed.
+            ValueError: an invalid field.
 
         Examples:
             >>> job = await client.jobs.export_video(scene="street", camera="left", end_us=200_000)
@@ -141,33 +141,33 @@ class AsyncJobs(AsyncCollection[JobInfo]):
         noise: DatasetNoise | Mapping[str, Any] | None = None,
         dry_run: bool = False,
     ) -> AsyncJob:
-        """Start making a labelled data set: images with boxes, masks, depth, flow, points, tracks.
+        """Start a data set export: images with boxes, masks, depth, flow, points and tracks.
 
         Args:
             formats: ``labels``, ``kitti``, ``coco``, ``nuscenes``, ``argoverse2``,
                 ``webdataset``, ``pictures``.
-            scenario, scene, session: exactly one of them, or its id; of a session its episode so
-                far.
+            scenario, scene, session: exactly one of them, or its id; a session exports its current
+                episode.
             recording: an episode on ``scene`` instead of the recorded drive, see
                 ``DriveSession.recording``.
             cameras: names; default: all.
             width: pixels; default: as recorded.
-            period_us: from one frame to the next.
-            start_us, end_us: default: as long as there is something.
+            period_us: time between frames.
+            start_us, end_us: default: the full available span.
             clip_s: length of a clip in seconds; a clip is in one split.
             splits: share of the clips by name; default: all in ``train``.
-            seed: draws which clip is in which split.
-            flow: whether optical flow is made.
-            lidar: such as ``hdl-64e``: its returns are the labelled points; default: points of
-                what the cameras see.
-            rig: cameras and LiDAR of one's own, instead of ``cameras``, ``width`` and ``lidar``.
-            sweep: parameters, and edits in which ``"$name"`` stands for one's value.
-            perturb: the ego starts beside its path and finds back: recovery data.
-            noise: errors of a detector, whose boxes are written beside the true ones.
-            dry_run: only tell frames, images, bytes and minutes in ``info.result``.
+            seed: seed of the assignment of clips to splits.
+            flow: whether to export optical flow.
+            lidar: a model such as ``hdl-64e``, whose returns become the labelled points; default:
+                points sampled from the cameras.
+            rig: custom cameras and LiDAR, instead of ``cameras``, ``width`` and ``lidar``.
+            sweep: parameters, and edits in which ``"$name"`` is replaced by a parameter's value.
+            perturb: the ego starts off its path and returns to it (recovery data).
+            noise: detector errors; the noisy boxes are written next to the true ones.
+            dry_run: only report frames, images, bytes and minutes in ``info.result``.
 
         Raises:
-            ValueError: a field that is not allowed.
+            ValueError: an invalid field.
 
         Examples:
             >>> job = await client.jobs.export_dataset(
@@ -210,7 +210,7 @@ class AsyncJobs(AsyncCollection[JobInfo]):
 
 
 class AsyncJob(JobBase):
-    """One job as this client last saw it.
+    """A job in its last fetched state.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -222,7 +222,7 @@ class AsyncJob(JobBase):
         self._transport = transport
 
     async def refresh(self) -> AsyncJob:
-        """See how far it is; returns itself.
+        """Fetch the current state; returns itself.
 
         Examples:
             >>> job = await job.refresh()
@@ -235,15 +235,15 @@ class AsyncJob(JobBase):
     async def wait(
         self, *, timeout: float | None = None, on_progress: OnProgress | None = None
     ) -> AsyncJob:
-        """Wait until it has succeeded; returns itself.
+        """Wait until the job has succeeded; returns itself.
 
         Args:
-            timeout: seconds; default: without limit.
-            on_progress: called with every change that is seen.
+            timeout: seconds; default: no limit.
+            on_progress: called on each observed change.
 
         Raises:
-            ReplyTimeoutError: it goes on for longer.
-            Real2SimError: it failed, was cancelled or interrupted; of the kind of its problem.
+            ReplyTimeoutError: the job did not end in time.
+            Real2SimError: it failed, was cancelled or interrupted; the subclass tells which.
 
         Examples:
             >>> stages = []
@@ -263,7 +263,7 @@ class AsyncJob(JobBase):
         return self
 
     async def cancel(self) -> AsyncJob:
-        """Ask it to end; returns itself.
+        """Request cancellation; returns itself.
 
         Examples:
             >>> job = await job.cancel()
@@ -272,7 +272,7 @@ class AsyncJob(JobBase):
         return await self.refresh()
 
     async def download(self, name: str, path: str | os.PathLike[str]) -> Path:
-        """Fetch a file that it left, and write it to ``path``.
+        """Download a result file of the job to ``path``.
 
         Examples:
             >>> job = await job.wait(timeout=60.0)
@@ -323,32 +323,33 @@ class AsyncSweeps:
         worst: int = 3,
         rank_by: str = "criticality",
     ) -> AsyncJob:
-        """Start driving points of a parameter space, without images unless planners need some.
+        """Start a sweep over a parameter space; images are rendered only if a planner needs them.
 
-        The job leaves ``episodes.parquet``, a row an episode, and of the ``worst`` in its result
-        ``EPISODE.r2e`` (a recording) and, of a scenario, ``EPISODE.xosc``.
+        The job writes ``episodes.parquet``, with one row per episode. For each of the ``worst``
+        episodes in its result it also writes ``EPISODE.r2e`` (a recording) and, for a scenario,
+        ``EPISODE.xosc``.
 
         Args:
             scene: its name.
-            parameters: by name, as of ``real2sim sweep``: ``{"low": 2, "high": 20}`` and others,
-                with a ``path`` into ``reset``, or without one where the scenario has the parameter.
+            parameters: by name, as in ``real2sim sweep``: ``{"low": 2, "high": 20}`` and others,
+                with a ``path`` into ``reset``, or without one if the scenario has the parameter.
             corner_case, openscenario, storyboard: what happens, at most one: a case of the gallery,
-                the text of an OpenSCENARIO file or its path, a storyboard in the scene's frame.
+                the text or path of an OpenSCENARIO file, a storyboard in the scene's frame.
             ego: entity of the file that is the ego; default: ``Ego``.
-            leave_out: elements of the file to leave out.
+            leave_out: elements of the file to ignore.
             reset: options of the episodes.
             operations: edits of the scene.
             method: ``sobol``, ``halton``, ``latin_hypercube``, ``random``, ``grid``, or one with
                 its fields: ``{"kind": "grid", "levels": 5}``.
-            seeds: each point is driven with each.
+            seeds: every point is driven with each seed.
             planners: ``follow_route``, ``pid``, ``idm``, ``depth_sampling``.
-            stop: when enough is known, such as ``{"at_fault": 10}``.
-            metrics: scores that get columns.
-            worst: so many episodes leave recordings, by ``rank_by`` from the highest on.
+            stop: stopping criterion, such as ``{"at_fault": 10}``.
+            metrics: scores to add as columns.
+            worst: number of episodes to save as recordings, with the highest ``rank_by``.
             rank_by: a column.
 
         Raises:
-            ValueError: a field that is not allowed.
+            ValueError: an invalid field.
 
         Examples:
             >>> method = {"kind": "grid", "levels": 2}
@@ -392,23 +393,23 @@ class AsyncSweeps:
         probability: int = 0,
         films: int = 0,
     ) -> AsyncJob:
-        """Start looking for collisions that are a planner's fault and could have been avoided.
+        """Start a search for avoidable collisions that are the planner's fault.
 
-        The job leaves ``failures.json``, each failure as ``failure_01.xosc`` and ``.r2e``, and
+        The job writes ``failures.json``, each failure as ``failure_01.xosc`` and ``.r2e``, and
         ``failures.tar`` with a page, cases and films.
 
         Args:
-            scene, parameters, corner_case, openscenario: as of :meth:`start`.
-            storyboard, ego, leave_out, reset, operations: likewise.
+            scene, parameters, corner_case, openscenario: see :meth:`start`.
+            storyboard, ego, leave_out, reset, operations: see :meth:`start`.
             planner: ``follow_route``, ``pid``, ``idm`` or ``depth_sampling``.
-            episodes: that are driven at most, 20 or more.
-            seed: the same one finds the same failures.
-            shrink: failures whose boundary to going well is sought.
-            probability: episodes for how often the planner is at fault; 0: none.
-            films: failures that are filmed.
+            episodes: maximum number of episodes, 20 or more.
+            seed: makes the search repeatable.
+            shrink: number of failures for which to find the boundary to success.
+            probability: episodes for estimating the at-fault probability; 0 skips it.
+            films: number of failures to film.
 
         Raises:
-            ValueError: a field that is not allowed.
+            ValueError: an invalid field.
 
         Examples:
             >>> asked = {"planner": "idm", "parameters": {"gap": gap}, "episodes": 20}

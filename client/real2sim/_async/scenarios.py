@@ -1,8 +1,8 @@
 """Scenarios: a scene and the edits made to it.
 
-A handle sends the revision it knows with every edit. When somebody else has edited in between,
-the edit is refused with :class:`~real2sim.errors.StaleRevisionError`, which names what was
-missed; ``refresh()`` and decide again.
+A handle sends its revision with every edit. If someone else has edited the scenario since, the
+worker refuses the edit with :class:`~real2sim.errors.StaleRevisionError`, which lists the missed
+edits. Call ``refresh()`` and decide again.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
     """
 
     async def create(self, scene: SceneRef, name: str = "") -> AsyncScenario:
-        """A new scenario without edits on a scene.
+        """Create a scenario without edits on a scene.
 
         Raises:
             NotFoundError: no such scene.
@@ -62,13 +62,13 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
             (0, ['car_red', 'car_blue', 'post'])
         """
         info = await self._transport.send(_requests.create_scenario(scene_name(scene), name))
-        # The answer to a creation leaves trajectories out; a handle always has them.
+        # The reply to a creation omits trajectories; a handle always has them.
         return await AsyncScenario(self._transport, info).refresh()
 
     async def import_document(
         self, document: ScenarioDocument | Mapping[str, Any]
     ) -> AsyncScenario:
-        """A new scenario from what :meth:`AsyncScenario.export` gave, here or elsewhere.
+        """Create a scenario from the output of :meth:`AsyncScenario.export` of any worker.
 
         Examples:
             >>> document = await scenario.export()
@@ -105,7 +105,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         return found.scenarios
 
     async def rename(self, scenario: ScenarioRef, name: str) -> ScenarioInfo:
-        """Give a scenario another name; its id and its history stay.
+        """Rename a scenario; its id and its history do not change.
 
         Examples:
             >>> (await client.scenarios.rename(scenario, "in the rain")).name
@@ -115,7 +115,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         return await self._transport.send(call)
 
     async def gallery(self) -> Sequence[CornerCaseInfo]:
-        """Ready corner cases, for :meth:`AsyncScenario.apply_corner_case`.
+        """Predefined corner cases, for :meth:`AsyncScenario.apply_corner_case`.
 
         Examples:
             >>> cases = {case.name: case for case in await client.scenarios.gallery()}
@@ -125,8 +125,8 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         return (await self._transport.send(_requests.gallery())).cases
 
     async def gallery_picture(self, name: str) -> bytes:
-        """A corner case from above, an SVG document: who comes from where, and where an ego that
-        goes straight on (blue) meets them.
+        """A corner case from above, as an SVG document: the paths of the road users and where they
+        meet an ego that drives straight on (blue).
 
         Raises:
             NotFoundError: the gallery has no such case.
@@ -139,7 +139,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
         return await self._transport.send(_requests.gallery_picture(name))
 
     async def delete(self, scenario: ScenarioRef) -> None:
-        """Remove a scenario and its history.
+        """Delete a scenario and its history.
 
         Examples:
             >>> await client.scenarios.delete(scenario)
@@ -148,7 +148,7 @@ class AsyncScenarios(AsyncCollection[ScenarioInfo]):
 
 
 class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
-    """One scenario as this client last saw it.
+    """A scenario in its last fetched state.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -180,9 +180,9 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
             dry_run: check them and change nothing.
 
         Raises:
-            ValueError: an operation that is not valid.
-            StaleRevisionError: somebody else edited first.
-            InvalidOperationError: an unknown object, or a result that is not allowed.
+            ValueError: an invalid operation.
+            StaleRevisionError: someone else edited first.
+            InvalidOperationError: an unknown object, or an invalid result.
 
         Examples:
             >>> result = await scenario.apply(
@@ -211,10 +211,10 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
 
         Args:
             asset: id in the library.
-            position, quaternion: where its box is, for the whole time range.
-            size: box to fit [m]; default: the asset's own.
+            position, quaternion: pose of its box, for the whole time range.
+            size: box size to fit [m]; default: the asset's own.
             object_id: default: the asset's id with a number.
-            snap: put it onto the ground, whatever z is.
+            snap: place it on the ground, regardless of z.
 
         Raises:
             InvalidOperationError: no such asset.
@@ -239,14 +239,14 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return self.objects[result.created[0]]
 
     async def apply_corner_case(self, name: str, **parameters: float) -> OperationResult:
-        """Let a corner case of the gallery happen in sessions of the scenario.
+        """Apply a corner case of the gallery to sessions of the scenario.
 
         Args:
-            name: of the gallery, see :meth:`AsyncScenarios.gallery`.
-            parameters: other values than its default ones [m], [m/s], [s].
+            name: name in the gallery, see :meth:`AsyncScenarios.gallery`.
+            parameters: values that replace the defaults [m], [m/s], [s].
 
         Raises:
-            InvalidRequestError: no such case, or it has no such parameter.
+            InvalidRequestError: no such case or parameter.
 
         Examples:
             >>> result = await scenario.apply_corner_case("cut_in", gap=6.0)
@@ -263,18 +263,18 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         leave_out: Sequence[str] = (),
         ego: str | None = None,
     ) -> StoryboardResult:
-        """Let an OpenSCENARIO file say what happens in sessions of the scenario.
+        """Use an OpenSCENARIO file as the storyboard of the scenario's sessions.
 
-        Its roads are laid along the recorded drive, so that the ego begins where it was recorded.
+        Its roads are aligned with the recorded drive, so the ego starts where it was recorded.
 
         Args:
-            path: of a file of version 1.0 to 1.3, without catalogs.
-            leave_out: names of elements to leave out that are not supported.
-            ego: entity that is the ego; default: the one that is called so.
+            path: a file of version 1.0 to 1.3, without catalogs.
+            leave_out: names of unsupported elements to ignore.
+            ego: entity that is the ego; default: ``Ego``.
 
         Raises:
-            InvalidRequestError: no such scenario, or something in it that is not supported, with
-                its name and line.
+            InvalidRequestError: not a valid scenario, or an unsupported element, with its name and
+                line.
 
         Examples:
             >>> result = await scenario.apply_corner_case("ccrb")
@@ -290,11 +290,10 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return result
 
     async def write_xosc(self, path: str | os.PathLike[str]) -> Path:
-        """Write what happens in the scenario as an OpenSCENARIO 1.3 file.
+        """Write the scenario's storyboard as an OpenSCENARIO 1.3 file.
 
         Raises:
-            InvalidRequestError: nothing is written that happens, or OpenSCENARIO has no words for
-                it.
+            InvalidRequestError: the scenario has no storyboard, or OpenSCENARIO cannot express it.
 
         Examples:
             >>> result = await scenario.apply_corner_case("cut_in")
@@ -322,27 +321,27 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         backend: str = "auto",
         background: bool | None = None,
     ) -> AsyncJob:
-        """Start a physics rollout of the scenario as it is now.
+        """Start a physics rollout of the scenario's current revision.
 
         Args:
             start_us, end_us: default: the scenario's span.
-            frame_us: from one kept frame to the next.
-            objects: what the physics moves; default: what has a velocity or physics of its own.
-                ``ego`` is the recording vehicle.
+            frame_us: time between stored frames.
+            objects: objects that the physics moves; default: those with a velocity or physics of
+                their own. ``ego`` is the recording vehicle.
             preset: how objects become bodies: ``vehicle`` (default) or ``paper`` (default of the
                 paper's experiments).
             physics: by object, or ``"*"`` for all: values as in ``set_physics``, for this rollout.
             gravity: [m/s^2]; default: 9.81 downwards.
-            max_particles: of all bodies together.
+            max_particles: maximum for all bodies together.
             experiment: ``wall``, ``pair``, ``drop`` of the paper, ``frontal``, ``t_bone``, ``pole``
                 or ``roof``.
-            speed: of an experiment [m/s].
+            speed: speed of an experiment [m/s].
             backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
-            background: whether walls, poles and trees of the scene stop what hits them; default:
-                true. The job's ``figures.background`` says which.
+            background: whether objects collide with walls, poles and trees of the scene; default:
+                true. The job's ``figures.background`` reports it.
 
         Raises:
-            ValueError: a field that is not allowed.
+            ValueError: an invalid field.
 
         Examples:
             >>> post = scenario.objects["post"]
@@ -380,18 +379,18 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         simulate: Mapping[str, Any] | SimulateRequest | None = None,
         steps: int = 12,
     ) -> AsyncJob:
-        """Start to find values of an object with which physics shows what was seen of it.
+        """Start fitting physics parameters of an object to observations of it.
 
         Args:
-            object_id: whose values are found.
-            parameters: out of ``stiffness``, ``yield_stress``, ``viscosity``, ``friction`` and
-                ``speed``: factors on what it is given.
+            object_id: the object.
+            parameters: any of ``stiffness``, ``yield_stress``, ``viscosity``, ``friction`` and
+                ``speed``: factors on the initial values.
             observations: ``boxes``, ``points``, ``images``, or ``recorded`` for its own track.
-            simulate: what is simulated, as of :meth:`simulate`, with initial values.
-            steps: of the search at most.
+            simulate: the simulation with its initial values, as in :meth:`simulate`.
+            steps: maximum number of search steps.
 
         Raises:
-            ValueError: a field that is not allowed.
+            ValueError: an invalid field.
 
         Examples:
             >>> places = [{"t_us": t, "position": (20.0, 0.0, 0.8)} for t in (100_000, 200_000)]
@@ -414,7 +413,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return AsyncJob(self._transport, info)
 
     async def fork(self, *, name: str | None = None, revision: int | None = None) -> AsyncScenario:
-        """A new scenario with the same history, up to a revision.
+        """Create a scenario with the same history, up to a revision.
 
         Examples:
             >>> result = await scenario.remove("post")
@@ -426,7 +425,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return await AsyncScenario(self._transport, await self._transport.send(call)).refresh()
 
     async def export(self) -> ScenarioDocument:
-        """The whole scenario as one document; ``model_dump_json()`` makes a file of it.
+        """Export the whole scenario as one document; ``model_dump_json()`` converts it to a file.
 
         Examples:
             >>> result = await scenario.remove("post")
@@ -444,11 +443,11 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         t_us: int | None = None,
         part: str = "all",
     ) -> Path:
-        """Write a point cloud with colour, normal, class and instance: the centres of Gaussians.
+        """Write the centres of the Gaussians as a ply with colour, normal, class and instance.
 
         Args:
             path: of the ply file.
-            t, t_us: instant in seconds or in microseconds; default: the start.
+            t, t_us: time in seconds or in microseconds; default: the start.
             part: ``all``, ``background`` or ``objects``.
 
         Examples:
@@ -464,13 +463,13 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
     async def splats(
         self, object_id: str, *, t: float | None = None, t_us: int | None = None
     ) -> bytes:
-        """The Gaussians of an object as it is now, as an spz file (version 3, axes kept: z up) in
-        the frame of its box, those that cover most first.
+        """The current Gaussians of an object as an spz file (version 3, z up), in the frame of its
+        box, sorted by decreasing coverage.
 
         Args:
-            object_id: of the scenario.
-            t, t_us: how far a person is in walking, in seconds or in microseconds; default: the
-                start.
+            object_id: object of the scenario.
+            t, t_us: time that sets the pose of a walking person, in seconds or in microseconds;
+                default: the start.
 
         Raises:
             NotFoundError: no such object.
@@ -484,10 +483,10 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return await self._transport.send(call)
 
     async def undo(self, count: int = 1) -> OperationResult:
-        """Take the newest edit back, or the newest ``count``, one after the other.
+        """Undo the newest edit, or the newest ``count`` edits.
 
         Raises:
-            ConflictError: there is nothing to take back.
+            ConflictError: there is nothing to undo.
 
         Examples:
             >>> result = await scenario.remove("post")
@@ -498,10 +497,10 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return await self._repeated(_requests.undo, count)
 
     async def redo(self, count: int = 1) -> OperationResult:
-        """Make the edit again that was taken back last, or the last ``count``.
+        """Redo the edit that was undone last, or the last ``count`` edits.
 
         Raises:
-            ConflictError: nothing was taken back.
+            ConflictError: there is nothing to redo.
 
         Examples:
             >>> result = await scenario.remove("post")
@@ -524,7 +523,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         return await self._transport.send(_requests.history(self.scenario_id, after))
 
     async def refresh(self) -> AsyncScenario:
-        """See what the scenario is now; returns itself.
+        """Fetch the current state of the scenario; returns itself.
 
         Examples:
             >>> theirs = await client.scenarios.get(scenario.scenario_id)
@@ -545,7 +544,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         modality: str = "rgb",
         codec: str = "auto",
     ) -> Image:
-        """What a recorded camera would see now; arguments as of :meth:`AsyncScenes.render`.
+        """A preview image of a recorded camera; arguments as in :meth:`AsyncScenes.render`.
 
         Examples:
             >>> image = await scenario.preview(camera="front", codec="jpeg")
@@ -559,12 +558,12 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
     async def sweep(
         self, lidar: str, *, t: float | None = None, t_us: int | None = None
     ) -> LidarCloud:
-        """What a LiDAR on the recording vehicle would measure now.
+        """Simulate one sweep of a LiDAR on the recording vehicle.
 
         Args:
             lidar: name in the worker's catalogue.
-            t, t_us: when its last ray is fired, in seconds or in microseconds; default: start of
-                the scenario.
+            t, t_us: time of the last ray, in seconds or in microseconds; default: start of the
+                scenario.
 
         Raises:
             InvalidRequestError: no such LiDAR, or a time outside the recording.
@@ -620,7 +619,7 @@ class AsyncSceneObject(ObjectEdits[Awaitable[OperationResult]]):
         frame: str = "world",
         snap: bool = False,
     ) -> AsyncSceneObject:
-        """Add a copy, shifted [m], and return its handle; ``snap`` puts it onto the ground.
+        """Add a copy, shifted [m], and return its handle; ``snap`` places it on the ground.
 
         Examples:
             >>> copy = await car.duplicate(x=9.0)

@@ -33,7 +33,7 @@ POLL_SECONDS = 0.2
 
 
 class AsyncScenes(AsyncCollection[SceneInfo]):
-    """``client.scenes``. Where a scene is asked for, its name or its ``SceneInfo`` will do.
+    """``client.scenes``. Methods accept a scene's name or its ``SceneInfo``.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -90,13 +90,13 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         first: int = 0,
         count: int = 32_768,
     ) -> bytes:
-        """Gaussians as an spz file (version 3, axes kept: z up), those that cover most first.
+        """Gaussians as an spz file (version 3, z up), sorted by decreasing coverage.
 
         Args:
             scene: a scene or its name.
-            object_id: of which, in the frame of its box; default: of the background, in the world.
-            first: how many of the more important ones to skip.
-            count: at most, up to 262144; empty files follow the last one.
+            object_id: object, in the frame of its box; default: the background, in the world frame.
+            first: number of Gaussians to skip from the start.
+            count: maximum number, up to 262144; past the end the file is empty.
 
         Raises:
             NotFoundError: no such scene or object.
@@ -123,11 +123,11 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         return await self._transport.send(_requests.scene_sky(scene_name(scene)))
 
     async def load(self, scene: SceneRef, *, timeout: float | None = None) -> SceneInfo:
-        """Bring a scene into the worker's memory and wait until it is there.
+        """Load a scene into the worker's memory and wait until it is resident.
 
         Raises:
             ReplyTimeoutError: it takes longer than ``timeout`` seconds.
-            Real2SimError: the scene is broken.
+            Real2SimError: the scene cannot be loaded.
 
         Examples:
             >>> (await client.scenes.load("street")).state.value
@@ -144,7 +144,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         return info
 
     async def unload(self, scene: SceneRef) -> None:
-        """Free the memory of a scene that no session uses.
+        """Unload a scene from memory.
 
         Raises:
             ConflictError: a session uses it.
@@ -155,11 +155,11 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         await self._transport.send(_requests.unload_scene(scene_name(scene)))
 
     async def import_path(self, path: str, *, scene: str | None = None) -> SceneInfo:
-        """Import a bundle or splat file that lies below the worker's import folder.
+        """Import a bundle or splat file from the worker's import folder.
 
         Args:
             path: relative to that folder.
-            scene: name to give it; default: the file's name.
+            scene: name of the new scene; default: the file's name.
 
         Examples:
             >>> (await client.scenes.import_path("corner.ply", scene="corner")).gaussians
@@ -168,7 +168,7 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         return await self._transport.send(_requests.import_scene(path, scene))
 
     async def upload(self, path: str | os.PathLike[str], *, scene: str | None = None) -> SceneInfo:
-        """Send a bundle or splat file of this machine to the worker and import it there.
+        """Upload a bundle or splat file of this machine to the worker and import it.
 
         Examples:
             >>> (await client.scenes.upload(folder / "corner.ply", scene="mine")).gaussians
@@ -187,12 +187,12 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         modality: str = "rgb",
         codec: str = "auto",
     ) -> Image:
-        """One image of a recorded camera at an instant of the recording.
+        """Render one image of a recorded camera at a time of the recording.
 
         Args:
             scene: a scene or its name.
             camera: name of one of its cameras.
-            t, t_us: instant in seconds or in microseconds; default: the start of the recording.
+            t, t_us: time in seconds or in microseconds; default: the start of the recording.
             width: pixels; default: as recorded.
             modality: ``rgb``, ``depth``, ``instance``, ``median_depth``, ``semantic`` or
                 ``uncertainty``.
@@ -221,20 +221,20 @@ class AsyncScenes(AsyncCollection[SceneInfo]):
         objects: Mapping[str, Pose | Mapping[str, Any]] | None = None,
         others: Literal["recorded", "parked", "none"] = "recorded",
     ) -> View:
-        """One instant from cameras anywhere, with objects anywhere; nothing is kept of it.
+        """Render one instant from any cameras, with objects at any poses; stores nothing.
 
         Args:
             scene: a scene or its name.
             cameras: models of ``real2sim_proto.sessions.FreeCamera``, or their fields.
-            t, t_us: instant for the objects that are not posed, in seconds or in microseconds;
+            t, t_us: time for objects without a given pose, in seconds or in microseconds;
                 default: the start of the recording.
             objects: poses of box centres in the world by object id.
-            others: objects that are not posed: ``recorded`` as at ``t_us``, only those that are
+            others: objects without a given pose: ``recorded`` as at ``t_us``, only those that are
                 ``parked``, or ``none``.
 
         Raises:
             NotFoundError: no such scene or object.
-            ValueError: a field that is not allowed.
+            ValueError: an invalid field.
 
         Examples:
             >>> street = await client.scenes.get("street")
@@ -328,14 +328,14 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
         clothes: Mapping[str, tuple[float, float, float]] | None = None,
         worn: Sequence[str] = (),
     ) -> AssetInfo:
-        """Make a person who walks wherever a trajectory leads, at its speed.
+        """Create a person that walks along any trajectory, at its speed.
 
         Args:
-            asset_id: a free id.
+            asset_id: an unused id.
             build: for example ``woman``, ``tall_man``, ``old_woman``, ``boy``.
-            height: of the person [m]; default: of the build.
+            height: height of the person [m]; default: that of the build.
             clothes: RGB in [0, 1] of ``skin``, ``hair``, ``top``, ``trousers``, ``shoes``.
-            worn: ``long_hair``, ``skirt``.
+            worn: any of ``long_hair``, ``skirt``.
 
         Raises:
             ConflictError: the id is taken.
@@ -366,17 +366,17 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
         yaw: float = 0.0,
         length: float | None = None,
     ) -> AssetInfo:
-        """Send a splat file (.ply, .compressed.ply, .spz, .splat) to the library.
+        """Upload a splat file (.ply, .compressed.ply, .spz, .splat) to the library.
 
         Args:
             path: the file.
             asset_id: default: the file's name.
             category: for example ``car``, ``truck``, ``pedestrian``.
-            up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``; default: what the file
-                says, as spz and exported ply do, else ``-y``. ``provenance["up_axis"]`` of the
-                asset is the one that was taken.
-            yaw: turn about z after that [rad], to bring the front to x.
-            length: real length [m]; default: usual for the category.
+            up_axis: axis of the file that points up: ``z``, ``y`` or ``-y``; default: as declared
+                in the file (spz and exported ply), else ``-y``. ``provenance["up_axis"]`` of the
+                asset reports it.
+            yaw: rotation about z after that [rad], to align the front with x.
+            length: real length [m]; default: typical for the category.
 
         Examples:
             >>> path = folder / "corner.ply"
@@ -396,10 +396,10 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
         return await self._transport.send(_requests.upload_asset(Path(path), upload))
 
     async def delete(self, asset_id: str) -> None:
-        """Remove one that no scenario has in its history.
+        """Delete an asset that no scenario's history refers to.
 
         Raises:
-            ConflictError: a scenario has it in its history.
+            ConflictError: a scenario's history refers to it.
 
         Examples:
             >>> await client.assets.delete("hatch")
@@ -407,7 +407,7 @@ class AsyncAssets(AsyncCollection[AssetInfo]):
         await self._transport.send(_requests.delete_asset(asset_id))
 
     async def thumbnail(self, asset_id: str, *, width: int = 256) -> Image:
-        """A picture of it (png).
+        """A picture of the asset (png).
 
         Examples:
             >>> (await client.assets.thumbnail("hatch", width=64)).codec

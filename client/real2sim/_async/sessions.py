@@ -1,4 +1,4 @@
-"""Drive sessions: over a socket in lock step, or by plain requests.
+"""Drive sessions: over a socket in lockstep, or over REST.
 
 A session is used by one thread or task at a time.
 """
@@ -83,12 +83,12 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         sensors: Sequence[Sensor] = (),
         **options: Unpack[ResetOptions],
     ) -> SessionInfo:
-        """A new session, its episode started.
+        """Create a session and start its episode.
 
         Args:
             scene, scenario: exactly one of them, or its name or id.
-            sensors: as of ``DriveSession.reset``.
-            options: as of ``DriveSession.reset``.
+            sensors: as in ``DriveSession.reset``.
+            options: as in ``DriveSession.reset``.
 
         Examples:
             >>> info = await client.sessions.create(scene="street", dt_us=50_000)
@@ -137,7 +137,7 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
     async def step(
         self, session_id: str, *, n: int = 1, plan: Plan | Mapping[str, Any] | None = None
     ) -> SessionState:
-        """``n`` clock steps under one plan; default: the last plan, else along the log.
+        """Run ``n`` clock steps under one plan; default: the last plan, else along the log.
 
         Examples:
             >>> state = await client.sessions.step(info.session_id, n=5)
@@ -149,11 +149,11 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         return await self._transport.send(call)
 
     async def state(self, session_id: str, *, after: int | None = None) -> SessionState:
-        """Where everything is now, and the newest plan.
+        """Current poses of all objects, and the newest plan.
 
         Args:
-            session_id: of the session.
-            after: wait until the clock has left this step, 10 s at most.
+            session_id: the session.
+            after: wait until the clock has passed this step, 10 s at most.
 
         Examples:
             >>> state = await client.sessions.state(info.session_id)
@@ -166,16 +166,16 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
     async def drive(
         self, session_id: str, planner: str | None = "follow_route", *, steps: int | None = None
     ) -> AsyncJob:
-        """Let a planner drive the session: a job that leaves a recording and ``playback.json``.
+        """Let a planner drive the session: a job that writes a recording and ``playback.json``.
 
         Args:
-            session_id: of the session; it stays.
-            planner: of the SDK, by name, from a reset on; None waits for one of yours, on the drive
-                socket or by :meth:`step`.
-            steps: of the episode; default: to its end.
+            session_id: the session; it stays open.
+            planner: name of a planner of the SDK, which starts with a reset; None waits for your
+                planner on the drive socket or in :meth:`step`.
+            steps: number of steps; default: to the end of the episode.
 
         Raises:
-            ConflictError: somebody drives it already.
+            ConflictError: another planner already drives it.
 
         Examples:
             >>> job = await client.sessions.drive(info.session_id, planner=None, steps=3)
@@ -195,13 +195,13 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         steps: int | None = None,
         pace: float | None = None,
     ) -> SessionInfo:
-        """Hold the clock while a planner drives, let it go, or end the episode.
+        """Pause or resume the clock while a planner drives, or end the episode.
 
         Args:
-            session_id: of the session.
+            session_id: the session.
             state: "held", "running" or "ended".
-            steps: of "held": so many more before it holds.
-            pace: of "running": simulated seconds in a second; default: as fast as it can.
+            steps: with "held": number of steps to run before the clock pauses.
+            pace: with "running": simulated seconds per second; default: as fast as possible.
 
         Examples:
             >>> (await client.sessions.set_clock(info.session_id, "held")).held
@@ -214,11 +214,11 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         return await self._transport.send(call)
 
     async def fork(self, session_id: str, *, step: int | None = None) -> SessionInfo:
-        """A new session that goes on from an instant of this one.
+        """Create a session that continues from one step of this session.
 
         Args:
-            session_id: of the session.
-            step: of the running episode; default: the present one.
+            session_id: the session.
+            step: step of the current episode; default: the newest.
 
         Examples:
             >>> state = await client.sessions.step(info.session_id, n=4)
@@ -237,7 +237,7 @@ class AsyncSessions(AsyncCollection[SessionInfo]):
         radars: Sequence[RadarSensor] = (),
         codec: str = "auto",
     ) -> View:
-        """Images of the current instant; never moves time.
+        """Render images of the current step, without advancing it.
 
         Examples:
             >>> view = await client.sessions.render(info.session_id, ["front"])
@@ -256,7 +256,7 @@ A = TypeVar("A", bound=Envelope)
 
 
 class AsyncDriveSession(SessionBase):
-    """A session in lock step; made by :meth:`AsyncClient.session`.
+    """A session in lockstep; made by :meth:`AsyncClient.session`.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -265,7 +265,7 @@ class AsyncDriveSession(SessionBase):
         >>> obs.step, obs.image("front").shape
         (0, (64, 96, 3))
 
-        Used as ``async with client.session(scene="street") as session:`` it closes by itself.
+        As a context manager, ``async with client.session(scene="street") as session:`` closes it.
     """
 
     def __init__(self, transport: AsyncTransport, plan: SessionPlan) -> None:
@@ -275,10 +275,10 @@ class AsyncDriveSession(SessionBase):
         self._socket_stack = contextlib.AsyncExitStack()
 
     async def open(self) -> Self:
-        """Create or join the session and shake hands; loading is over when this returns.
+        """Create or join the session and shake hands; returns once the scene is loaded.
 
         Raises:
-            UnreachableError: no worker answers.
+            UnreachableError: no worker responds.
             NotFoundError: no such scene, scenario or session.
             CapacityError: the worker is full.
 
@@ -307,14 +307,14 @@ class AsyncDriveSession(SessionBase):
         """Start an episode and return its first observation.
 
         Args:
-            sensors: camera names or specs; what every observation shows.
+            sensors: camera names or specs to include in every observation.
             options: seed, start_us, dt_us, horizon, ego, action, agents, privileged, deadline_ms,
                 on_timeout, latency, on_collision and more; see
-                ``real2sim_proto.episode.ResetSpec``. ``lidars`` and ``radars`` are names of the
+                ``real2sim_proto.episode.ResetSpec``. ``lidars`` and ``radars`` are names in the
                 worker's catalogues, or specs.
 
         Raises:
-            ValueError: an option that is not allowed.
+            ValueError: an invalid option.
 
         Examples:
             >>> obs = await session.reset(
@@ -338,13 +338,13 @@ class AsyncDriveSession(SessionBase):
     async def step(self, plan: Plan | Mapping[str, Any]) -> Observation:
         """Send the plan for the newest observation; returns the next one.
 
-        After a ReplyTimeoutError the same plan may be sent again: the worker moves only once. A
-        plan that misses the episode's deadline is not applied; the observation that the worker
-        went on to is returned, with a ``deadline_missed`` event.
+        After a ReplyTimeoutError you may send the same plan again: the worker applies it only once.
+        A plan that misses the episode's deadline is not applied; the worker advances, and its
+        observation is returned with a ``deadline_missed`` event.
 
         Raises:
-            NotResetError: no episode runs.
-            InvalidActionError: a plan of another kind than ``reset(action=...)`` said.
+            NotResetError: no episode is running.
+            InvalidActionError: the plan's kind differs from ``reset(action=...)``.
             EpisodeOverError: the episode has ended.
 
         Examples:
@@ -357,13 +357,13 @@ class AsyncDriveSession(SessionBase):
         return await self._observe(self._protocol.action(plan))
 
     async def receive(self, timeout: float | None = None) -> Observation:
-        """The next unsolicited observation: what an observer sees of the controller's loop.
+        """The next unsolicited observation; observers receive the controller's observations.
 
         Args:
             timeout: seconds to wait; default: the client's.
 
         Raises:
-            ReplyTimeoutError: none came in time.
+            ReplyTimeoutError: none arrived in time.
 
         Examples:
             >>> spectator = client.join(session.session_id, token=session.token, role="observer")
@@ -386,11 +386,11 @@ class AsyncDriveSession(SessionBase):
         return observation_from_wire(message)
 
     async def edit(self, operations: Sequence[Operation | Mapping[str, Any]]) -> Edited:
-        """Change this session's world before the next step; all operations apply, or none.
+        """Edit this session's world before the next step; all operations apply, or none.
 
         Raises:
-            ValueError: an operation that is not valid.
-            InvalidOperationError: an unknown object, or a result that is not allowed.
+            ValueError: an invalid operation.
+            InvalidOperationError: an unknown object, or an invalid result.
 
         Examples:
             >>> edited = await session.edit([{"op": "duplicate", "object_id": "car_red", "x": 9.0}])
@@ -406,7 +406,7 @@ class AsyncDriveSession(SessionBase):
         lidars: Sequence[LidarSensor] = (),
         radars: Sequence[RadarSensor] = (),
     ) -> View:
-        """Images of the current instant, and clouds of LiDARs and radars; never moves time.
+        """Render images and LiDAR and radar clouds of the current time, without advancing it.
 
         Examples:
             >>> view = await session.render(["left"])
@@ -433,12 +433,12 @@ class AsyncDriveSession(SessionBase):
         times_us: Sequence[int],
         poses: Sequence[tuple[float, float, float]],
     ) -> int:
-        """Drive an object whose driver is ``external``; from which step on the plan holds.
+        """Drive an object whose driver is ``external``; returns the step at which the plan applies.
 
         Args:
-            object_id: named as external in ``reset(agents=...)``.
+            object_id: object set to external in ``reset(agents=...)``.
             times_us: [N] absolute simulation times after the newest observation [us].
-            poses: [N] x [m], y [m], yaw [rad] of its box, world.
+            poses: [N] x [m], y [m], yaw [rad] of its box, world frame.
 
         Examples:
             >>> drivers = {"car_blue": {"kind": "external"}}
@@ -450,7 +450,7 @@ class AsyncDriveSession(SessionBase):
         return driven.step
 
     async def snapshot(self, name: str) -> Kept:
-        """Keep the present instant under a name, to return to by :meth:`restore`.
+        """Save the current state under a name, to return to with :meth:`restore`.
 
         Examples:
             >>> kept = await session.snapshot("before")
@@ -460,7 +460,7 @@ class AsyncDriveSession(SessionBase):
         return await self._request(self._protocol.snapshot(name))
 
     async def restore(self, name: str) -> Observation:
-        """Go back to a snapshot; its observation.
+        """Return to a snapshot; returns its observation.
 
         Examples:
             >>> kept = await session.snapshot("before")
@@ -472,7 +472,7 @@ class AsyncDriveSession(SessionBase):
         return await self._observe(self._protocol.restore(name))
 
     async def fork(self) -> Forked:
-        """Another session that goes on from this instant.
+        """Create another session that continues from the current state.
 
         Examples:
             >>> forked = await session.fork()
@@ -484,11 +484,11 @@ class AsyncDriveSession(SessionBase):
         return await self._request(self._protocol.fork())
 
     async def save_recording(self, path: Path | str, *, frames: bool = False) -> Path:
-        """Write the running episode to a file, to be replayed and scored again.
+        """Write the current episode to a file, for replay and scoring.
 
         Args:
             path: for example ``drive.r2e``.
-            frames: whether the images of its sensors are drawn once more and kept too.
+            frames: whether to render the images of its sensors again and include them.
 
         Examples:
             >>> path = await session.save_recording(folder / "drive.r2e")
@@ -500,10 +500,10 @@ class AsyncDriveSession(SessionBase):
         return Path(path)
 
     async def close(self) -> Result | None:
-        """End a session that this handle made, or leave one that it joined; idempotent.
+        """End a session that this handle created, or leave one that it joined; idempotent.
 
         Returns:
-            Final scores, where the worker could still give them.
+            Final scores, if the worker was still able to compute them.
 
         Examples:
             >>> result = await session.close()
@@ -511,7 +511,7 @@ class AsyncDriveSession(SessionBase):
             0
         """
         if self._socket is not None and self._plan.session_id is None:
-            # A worker that is no longer there must not hold up who wants to leave.
+            # A worker that has stopped must not block the close.
             with contextlib.suppress(Real2SimError):
                 self._result = await self._request(self._protocol.bye())
         await self._release()
@@ -533,7 +533,7 @@ class AsyncDriveSession(SessionBase):
         return observation_from_wire(obs, self._pixels_of(obs.frames))
 
     async def _request(self, request: PendingRequest[A]) -> A:
-        """The answer to a request, once the worker takes it."""
+        """The answer to a request, retried while the worker refuses it temporarily."""
         seconds = self._plan.reconnect
         return await outlast(partial(self._sent, request), seconds=seconds, passes=is_passing)
 
@@ -563,7 +563,7 @@ class AsyncDriveSession(SessionBase):
                     return answer
 
     async def _connect_first(self, session_id: str) -> None:
-        """Connect; again where the connection is lost on the way, as later on."""
+        """Connect, and retry if the connection is lost during the handshake."""
         connect = partial(self._connect, session_id)
         try:
             await connect()

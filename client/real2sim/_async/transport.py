@@ -1,4 +1,4 @@
-"""Sends requests and waits for their answers; collections; reconnecting."""
+"""Sends requests and waits for the answers; collections; reconnecting."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 class AsyncTransport:
-    """The way to one worker."""
+    """Connection to one worker."""
 
     def __init__(
         self, target: Target, *, transport: httpx2.AsyncBaseTransport | None = None
@@ -27,7 +27,7 @@ class AsyncTransport:
         self._http = httpx2.AsyncClient(transport=transport, **client_options(target))
 
     async def send(self, call: Call[T]) -> T:
-        """The parsed answer; retried where that is safe.
+        """The parsed answer; retried if that is safe.
 
         Raises:
             Real2SimError: no answer, or the worker refuses.
@@ -39,7 +39,7 @@ class AsyncTransport:
             except Real2SimError as error:
                 delay = attempts.delay_after(error)
                 if delay is None:
-                    # The caller's lines say where it happened; those below are always the same.
+                    # The traceback of the caller is useful; the frames below are always the same.
                     raise error.with_traceback(None) from error.__cause__
             await sleep(delay)
 
@@ -57,7 +57,7 @@ class AsyncTransport:
 
 
 class AsyncCollection(Lookup, Generic[T]):
-    """Lists what the worker has; iterating over it asks the worker once.
+    """Lists a kind of object of the worker; iterating over it sends one request.
 
     Examples:
         >>> client = real2sim.connect_async()
@@ -88,15 +88,15 @@ A = TypeVar("A")
 async def outlast(
     ask: Callable[[], Awaitable[A]], *, seconds: float, passes: Callable[[Real2SimError], bool]
 ) -> A:
-    """Ask again while the worker refuses for now; each time nothing has happened.
+    """Retry while the worker refuses temporarily; a refused request has no effect.
 
     Args:
         ask: sends the same request each time.
-        seconds: within which the last try begins.
-        passes: whether an error is one to wait for.
+        seconds: period in which retries start.
+        passes: whether an error is temporary.
 
     Raises:
-        Real2SimError: of the last try, or one that does not pass.
+        Real2SimError: from the last try, or not temporary.
     """
     until = time.monotonic() + seconds
     for attempt in range(MAX_RECONNECTS):
@@ -114,15 +114,15 @@ async def outlast(
 async def reconnect(
     close: Callable[[], Awaitable[None]], connect: Callable[[], Awaitable[None]], *, seconds: float
 ) -> None:
-    """Close what is left of a connection and connect again; the worker may be restarting.
+    """Close the old connection and connect again; the worker may be restarting.
 
     Args:
-        close: ends the connection as it is.
-        connect: makes the next one.
-        seconds: within which the last try begins.
+        close: ends the current connection.
+        connect: opens the next one.
+        seconds: period in which retries start.
 
     Raises:
-        UnreachableError, CapacityError, ReplyTimeoutError: of the last try.
+        UnreachableError, CapacityError, ReplyTimeoutError: from the last try.
         Real2SimError: the worker refuses.
     """
     until = time.monotonic() + seconds

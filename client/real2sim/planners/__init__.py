@@ -1,7 +1,7 @@
 """Planners and the loop that runs them.
 
 A planner is any class with ``reset(obs)`` and ``plan(obs)``. This one keeps the wheel straight
-and 5 m/s::
+and drives at 5 m/s::
 
     import real2sim
     from real2sim.planners import run_episode
@@ -17,7 +17,7 @@ and 5 m/s::
         summary = run_episode(session, Cruise(), steps=50, action="control")
     print(summary.reason, summary.distance, summary.stages["step"].p50)
 
-Saved as ``my.py`` (its class alone), it also runs as ``real2sim drive --planner my:Cruise``.
+Saved as ``my.py`` (only the class), it also runs as ``real2sim drive --planner my:Cruise``.
 """
 
 from .depth_sampling import DepthSampling

@@ -1,8 +1,8 @@
-"""What agents of the CARLA leaderboard import, where CARLA itself is not installed.
+"""Stand-ins for the CARLA modules that leaderboard agents import, if CARLA is not installed.
 
-Only what an agent needs to take a route and to answer with a command: value types of the module
-``carla``, ``RoadOption``, ``Track`` and the base class ``AutonomousAgent``. Names and meanings are
-CARLA's (leaderboard 2); a simulator to connect to is not there.
+They cover the types that an agent needs to receive a route and return a command: value types of
+the module ``carla``, ``RoadOption``, ``Track`` and the base class ``AutonomousAgent``. Names and
+meanings are CARLA's (leaderboard 2). There is no simulator to connect to.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from .._session_state import Matrix
 
 WAY_BETWEEN = 50.0
-"""An agent keeps points of its route so far apart, and those where its option changes [m]."""
+"""Spacing of an agent's route points [m]; points where the option changes are added."""
 
 
 @dataclass
@@ -78,7 +78,7 @@ class VehicleControl:
 
 
 class RoadOption(enum.IntEnum):
-    """What to do at the next place of a route."""
+    """The manoeuvre at the next route point."""
 
     VOID = -1
     LEFT = 1
@@ -90,17 +90,17 @@ class RoadOption(enum.IntEnum):
 
 
 class Track(enum.Enum):
-    """Of the leaderboard: with sensors alone, or with a map as well."""
+    """Track of the leaderboard: sensors only, or with a map."""
 
     SENSORS = "SENSORS"
     MAP = "MAP"
 
 
 class AutonomousAgent:
-    """Base class of agents, which overwrite what they need."""
+    """Base class of agents, which override its methods."""
 
     def __init__(self, carla_host: str = "", carla_port: int = 0, debug: bool = False) -> None:
-        """Neither host nor port leads anywhere here."""
+        """Host and port are ignored."""
         self.track = Track.SENSORS
         self._global_plan: list[Any] | None = None
         self._global_plan_world_coord: list[Any] | None = None
@@ -109,7 +109,7 @@ class AutonomousAgent:
         """Read the agent's own configuration."""
 
     def sensors(self) -> list[dict[str, Any]]:
-        """What the agent wants to see."""
+        """Sensors that the agent requires."""
         return []
 
     def set_global_plan(
@@ -144,11 +144,11 @@ STAND_INS: dict[str, tuple[Any, ...]] = {
     "agents.navigation.local_planner": (RoadOption,),
     "leaderboard.autoagents.autonomous_agent": (AutonomousAgent, Track),
 }
-"""What modules offer, where they cannot be imported."""
+"""Members of the stand-in modules."""
 
 
 def offer_stand_ins() -> None:
-    """Let agents import the modules of :data:`STAND_INS`; installed ones are left alone."""
+    """Make the modules of :data:`STAND_INS` importable; installed ones take precedence."""
     for name, members in STAND_INS.items():
         try:
             importlib.import_module(name)
@@ -206,12 +206,12 @@ class PinholeView:
 
 @dataclass(frozen=True, eq=False)
 class Lookup:
-    """Where the pixels of a wanted view are seen.
+    """Source pixels of a requested view.
 
     Attributes:
-        size: of the view, width, height [px].
-        parts: of each camera that sees some: its name, rows of the view's pixels [N], and for each
-            four pixels around and their weights [N, 4].
+        size: width and height of the view [px].
+        parts: for each contributing camera its name, the indices of the view's pixels [N], and for
+            each the four surrounding pixels and their weights [N, 4].
         covered: fraction of the view that any camera sees.
     """
 
@@ -221,7 +221,7 @@ class Lookup:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Those that see any of it."""
+        """Cameras that see any part of the view."""
         return tuple(name for name, *_ in self.parts)
 
     def image(self, images: Mapping[str, Pixels]) -> Pixels:
@@ -236,8 +236,8 @@ class Lookup:
 
 
 def lookup_of(wanted: PinholeView, cameras: Mapping[str, PinholeView]) -> Lookup:
-    """Where the pixels of ``wanted`` are seen: by the camera that looks most nearly the same way,
-    and what that does not see by the next one."""
+    """For each pixel of ``wanted``, the source camera and pixel: the camera with the most similar
+    direction first, then the next one for the remaining pixels."""
     rays = wanted.rays().reshape(-1, 3)
     free = np.ones(len(rays), np.bool_)
     parts = []

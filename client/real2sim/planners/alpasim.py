@@ -1,7 +1,8 @@
 """Planners made for AlpaSim (NVIDIA 2025), unchanged: gRPC, ``EgodriverService``.
 
-AlpaSim's local frame is here the world, shifted so that an episode begins at its origin: its
-numbers are single precision. Its rig frame is the vehicle frame. Needs the ``alpasim`` extra.
+AlpaSim's local frame is our world frame, shifted so that an episode begins at its origin, because
+its numbers are single precision. Its rig frame is the vehicle frame. Requires the ``alpasim``
+extra.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 PATIENCE = 50
 """Answers without a plan at the start of a session, before it is given up."""
 WAYPOINTS, WAYPOINT_SPACING = 20, 80 / 19
-"""Of the route as AlpaSim sends it [m]; what is missing at its end is not a number."""
+"""Route points as AlpaSim sends them, and their spacing [m]; missing points are NaN."""
 ALPASIM_CAMERAS = {
     "camera_front_wide_120fov": Look(0.0, math.radians(120)),
     "camera_front_tele_30fov": Look(0.0, math.radians(30)),
@@ -54,16 +55,16 @@ ALPASIM_CAMERAS = {
     "camera_rear_right_70fov": Look(math.radians(-150), math.radians(70)),
     "camera_rear_tele_30fov": Look(math.pi, math.radians(30)),
 }
-"""The cameras that AlpaSim's drivers know; directions to some ten degrees."""
+"""Camera names of AlpaSim's drivers; directions to about ten degrees."""
 
 
 class AlpasimDriver:
-    """Asks a planner behind AlpaSim's interface.
+    """A planner behind AlpaSim's driver interface.
 
-    It is shown the cameras that it wants, under the names by which it knows them. NVIDIA's own
-    service says which these are when a session lacks them; other drivers are shown every camera
-    unless ``cameras`` says which. While a driver has no plan yet, for want of images or of a past,
-    the vehicle keeps to its route at its speed.
+    It sends the images of the cameras that the driver requires, under the driver's names. NVIDIA's
+    own service lists them when a session lacks them. Other drivers receive every camera, unless
+    ``cameras`` selects some. While a driver has no plan yet, because it needs more images or more
+    history, the vehicle follows its route at its current speed.
     """
 
     def __init__(
@@ -76,21 +77,21 @@ class AlpasimDriver:
         cameras: Mapping[str, str] | Sequence[str] = (),
         patience: int = PATIENCE,
     ) -> None:
-        """Reach a driver; it may take ``timeout`` seconds to come up, and as long for an answer.
+        """Connect to a driver; ``timeout`` limits its startup and each answer.
 
         Args:
-            target: host and port; ``?cameras=NAME:CAMERA,NAME`` behind them says what ``cameras``
-                does.
+            target: host and port; the suffix ``?cameras=NAME:CAMERA,NAME`` has the meaning of
+                ``cameras``.
             timeout: [s].
-            step_us: when it will be asked again [us]; default: what lay between the last two
+            step_us: time until the next request [us]; default: the time between the last two
                 observations.
-            seed: of the session; sent to the driver.
-            cameras: names by which the driver knows cameras; of a mapping, to the scene's.
-            patience: how many answers may lack a plan at the start of a session.
+            seed: seed of the session; sent to the driver.
+            cameras: the driver's camera names; as a mapping, to the scene's cameras.
+            patience: maximum number of answers without a plan at the start of a session.
 
         Raises:
-            PeerError: it does not come up, or the ``alpasim`` extra is not installed.
-            ValueError: an option behind the target that is unknown.
+            PeerError: it does not start in time, or the ``alpasim`` extra is not installed.
+            ValueError: an unknown option in the target.
         """
         try:
             self._grpc, self._messages = importlib.import_module("grpc"), messages()
@@ -129,10 +130,10 @@ class AlpasimDriver:
         self._begin_session(obs)
 
     def plan(self, obs: Observation) -> TrajectoryPlan:
-        """Show the driver what its cameras see, its motion and route; where it wants to be.
+        """Send the driver its images, motion and route; return its plan.
 
         Raises:
-            PeerError: it cannot be reached, ends the session, or answers with what is no way.
+            PeerError: it is unreachable, ends the session, or returns an invalid trajectory.
         """
         self._show_images(obs)
         self._call("submit_egomotion_observation", self._motion(obs))
@@ -145,7 +146,7 @@ class AlpasimDriver:
         try:
             answer = self._call("drive", request)
         except _RefusalError as refusal:
-            # NVIDIA's models say so while the past that they are shown is too short.
+            # NVIDIA's models report this while their history is too short.
             if refusal.status != "FAILED_PRECONDITION" or self._planned:
                 raise
             return self._meanwhile(obs, refusal.details)
@@ -164,7 +165,7 @@ class AlpasimDriver:
             self._channel.close()
 
     def _asked_for(self) -> tuple[str, ...]:
-        """Names of the cameras that the driver says it lacks in a session without any."""
+        """Names of the cameras that the driver reports missing in a session without cameras."""
         session = uuid.uuid4().hex
         try:
             self._call(
@@ -199,7 +200,8 @@ class AlpasimDriver:
         except _RefusalError as refusal:
             if self._in_ftheta or "f-theta" not in refusal.details:
                 raise
-            # A driver that rectifies says so at the first image, and not when a session begins.
+            # A driver that rectifies images reports this at the first image, not at the session
+            # start.
             self._in_ftheta = True
             self._end_session()
             self._begin_session(obs)
@@ -285,7 +287,7 @@ class AlpasimDriver:
         else:
             focal = {"focal_length_x": frame.K[0, 0], "focal_length_y": frame.K[1, 1]}
             intrinsics.opencv_pinhole_param.CopyFrom(m.OpenCVPinholeCameraParam(**centre, **focal))
-        # In spite of its name this is where the camera is in the rig; see AlpaSim's comment on it.
+        # Despite its name this is the camera's pose in the rig; see AlpaSim's comment on it.
         pose = self._pose(T_ego_camera(obs, frame))
         return m.AvailableCamera(intrinsics=intrinsics, rig_to_camera=pose, logical_id=name)
 
@@ -343,11 +345,11 @@ ANGLE_TO_PIXELS = 2
 
 
 class _RefusalError(PeerError):
-    """A call that the driver did not answer.
+    """A failed call to the driver.
 
     Attributes:
-        status: name of gRPC's.
-        details: the driver's words.
+        status: gRPC's status name.
+        details: the driver's message.
     """
 
     def __init__(self, what: str, *, status: str, details: str) -> None:
@@ -357,10 +359,10 @@ class _RefusalError(PeerError):
 
 @dataclass(frozen=True)
 class _DriverNeeds(Needs):
-    """Needs of a driver that names its cameras in its own way.
+    """Needs of a driver that has its own camera names.
 
     Attributes:
-        names: by which it knows them; empty: every camera under its own.
+        names: the driver's camera names; empty: every camera under its own name.
         given: cameras of the scene by these names.
     """
 

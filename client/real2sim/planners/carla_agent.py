@@ -1,9 +1,9 @@
 """Agents of the CARLA leaderboard, unchanged and without CARLA.
 
 An agent is a class with ``setup``, ``sensors``, ``set_global_plan`` and ``run_step``, in a file
-whose ``get_entry_point()`` names it. CARLA's vehicle frame is left-handed: x forward, y to the
-right, z up, with its origin in the middle of the vehicle on the ground; its world is ours with y
-the other way.
+whose ``get_entry_point()`` returns the class name. CARLA's vehicle frame is left-handed: x
+forward, y right, z up, with its origin at the centre of the vehicle on the ground. Its world is
+ours with y negated.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ REAR_OVERHANG = 0.95
 """Rear axle to the rear end of the ego's box [m]; CARLA's origin is the middle of the box."""
 
 MIN_SEEN, MAX_UNSEEN = 0.2, 0.1
-"""Of the image of a wanted camera: what must be seen at least, and what may be black unsaid."""
+"""Fractions of an agent's image: minimum seen, and maximum unseen without a warning."""
 
 EARTH_RADIUS = 6_378_137.0
 """[m]"""
@@ -61,7 +61,7 @@ ROLLING, AIR = 0.15, 6e-4
 STEER_ANGLE = math.radians(70.0)
 """Of the road wheels at full steer, of most of CARLA's cars [rad]."""
 STEERING_CURVE = ((0.0, 20.0, 60.0, 120.0), (1.0, 0.9, 0.8, 0.7))
-"""Part of it that is left at speeds [km/h], as in CARLA."""
+"""Fraction of full steering at speeds [km/h], as in CARLA."""
 
 TURN_OVER, TURN = 15.0, 0.5
 """A route turns where its heading changes by more than this [rad] so far before and behind [m]."""
@@ -69,10 +69,10 @@ TURN_OVER, TURN = 15.0, 0.5
 
 @dataclass(frozen=True)
 class _AgentNeeds(Needs):
-    """Needs of an agent: cameras of the scene that see what its own would.
+    """Needs of an agent: the cameras of the scene that cover those of the agent.
 
     Attributes:
-        views: cameras that the agent wants, by id.
+        views: cameras that the agent requires, by id.
     """
 
     views: Mapping[str, PinholeView] = field(default_factory=dict)
@@ -99,8 +99,8 @@ class _AgentNeeds(Needs):
 class CarlaAgent:
     """Runs an agent of the CARLA leaderboard against a session.
 
-    Images of its cameras are put together out of those of the scene, by direction and field of
-    view. ``gnss``, ``imu`` and ``speedometer`` are exact; other sensors are refused.
+    Images of its cameras are assembled from those of the scene, by direction and field of view.
+    ``gnss``, ``imu`` and ``speedometer`` are exact; other sensors are refused.
     """
 
     def __init__(self, target: str) -> None:
@@ -108,12 +108,12 @@ class CarlaAgent:
 
         Args:
             target: ``FILE`` with a ``get_entry_point()``, or ``module:Class``; ``?config=PATH`` is
-                handed to its ``setup``, ``&lat=`` and ``&lon=`` say where the world's origin is
-                (42, 2 degrees, as CARLA's leaderboard has it).
+                passed to its ``setup``, ``&lat=`` and ``&lon=`` set the world's origin
+                (default: 42, 2 degrees, as in CARLA's leaderboard).
 
         Raises:
-            PeerError: there is no such agent, or it wants what is not there.
-            ValueError: an option that is unknown.
+            PeerError: there is no such agent, or it requires something unavailable.
+            ValueError: an unknown option.
         """
         where, options = _split(target)
         self._config = options.pop("config", "")
@@ -138,7 +138,7 @@ class CarlaAgent:
         self._route = None if route is None else np.asarray(route, np.float64)
 
     def reset(self, obs: Observation) -> None:
-        """An agent of its own for each episode, with its route."""
+        """Create a new agent for the episode, with its route."""
         agent, self._spare = self._spare or self._made(), None
         self.close()
         self._agent, self._start_us = agent, obs.t_us
@@ -156,13 +156,13 @@ class CarlaAgent:
                 )
 
     def plan(self, obs: Observation) -> Control:
-        """Show the agent what its sensors see; its command. Raises PeerError."""
+        """Pass the sensor data to the agent and return its command. Raises PeerError."""
         timestamp = (obs.t_us - self._start_us) * 1e-6
         answer = self._agent.run_step(self._inputs(obs), timestamp)
         return command_of(answer, obs.ego.speed)
 
     def close(self) -> None:
-        """Let the agent clean up."""
+        """Call the agent's cleanup."""
         for agent in (self._agent, self._spare):
             if agent is not None:
                 agent.destroy()
@@ -184,7 +184,7 @@ class CarlaAgent:
         """An agent that is set up."""
         parameters = list(inspect.signature(self._class).parameters)
         if len(parameters) == 1 and parameters[0] != "carla_host":
-            # Leaderboard 1: whoever makes an agent says with what, and it sets itself up.
+            # Leaderboard 1 passes the configuration to the constructor, which calls setup.
             return self._class(self._config)
         agent = self._class("127.0.0.1", 2000) if parameters else self._class()
         agent.setup(self._config)
@@ -242,8 +242,9 @@ def camera_rotation(pitch: float, yaw: float, roll: float) -> Matrix:
 
 
 def geographic(x: float, y: float, lat: float, lon: float) -> tuple[float, float]:
-    """Latitude and longitude [degrees] of a place x (east), y (north) [m] of a world whose origin
-    is at ``lat``, ``lon``: Mercator's projection on a sphere, scaled to the origin, as in CARLA."""
+    """Latitude and longitude [degrees] of a point x (east), y (north) [m] of a world with its
+    origin at ``lat``, ``lon``: Mercator projection on a sphere, scaled to the origin, as in
+    CARLA."""
     scale = EARTH_RADIUS * math.cos(math.radians(lat))
     north = scale * math.log(math.tan(math.pi / 4 + math.radians(lat) / 2)) + y
     found = 2 * math.atan(math.exp(north / scale)) - math.pi / 2
@@ -251,8 +252,8 @@ def geographic(x: float, y: float, lat: float, lon: float) -> tuple[float, float
 
 
 def imu(ego: EgoState) -> NDArray[np.float64]:
-    """Accelerometer [m/s^2], gyroscope [rad/s] and compass [rad] on axes x forward, y to the right,
-    z up; at rest it feels gravity upwards, and the compass is 0 to the north, which is our y."""
+    """Accelerometer [m/s^2], gyroscope [rad/s] and compass [rad] on axes x forward, y right, z up.
+    At rest the accelerometer measures gravity upwards; the compass is 0 to the north, our y."""
     compass = (math.pi / 2 - ego.yaw) % math.tau
     sideways = ego.speed * ego.yaw_rate
     return np.array([ego.acceleration, -sideways, GRAVITY, 0.0, 0.0, -ego.yaw_rate, compass])
@@ -279,14 +280,15 @@ def global_plan(
 
 
 def command_of(control: Any, speed: float) -> Control:
-    """The command of throttle, brake, steer and reverse of CARLA's ``VehicleControl``.
+    """Convert throttle, brake, steer and reverse of CARLA's ``VehicleControl`` to a command.
 
-    Throttle gives up to 4 m/s^2, less towards 50 m/s; rolling and air take 0.15 m/s^2 and 0.0006 of
-    the squared speed while the vehicle moves; brake takes up to 8 m/s^2, the hand brake all of it.
-    Full steer is 70 degrees of the road wheels, less the faster it goes, as far as the vehicle can.
+    Throttle gives up to 4 m/s^2, decreasing towards 50 m/s. Rolling and air resistance are
+    0.15 m/s^2 and 0.0006 times the squared speed while the vehicle moves. Brake gives up to
+    8 m/s^2, the hand brake all of it. Full steer is 70 degrees at the road wheels, less at higher
+    speed, and within the vehicle's limit.
 
     Raises:
-        PeerError: it is none, or holds values that are not finite.
+        PeerError: not a command, or not finite.
     """
     try:
         throttle, brake, steer = (
@@ -310,11 +312,11 @@ def command_of(control: Any, speed: float) -> Control:
     )
 
 
-# --- what is handed over --------------------------------------------------------------------------
+# --- data passed to the agent ---------------------------------------------------------------------
 
 
 def _turns(route: Matrix) -> list[int]:
-    """At each point 1 where the route turns left, -1 where right, 0 elsewhere."""
+    """1 at points where the route turns left, -1 where it turns right, 0 elsewhere."""
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(route[:, :2], axis=0).T))])
     yaws = np.unwrap(route[:, 3])
     turned = np.interp(way + TURN_OVER, way, yaws) - np.interp(way - TURN_OVER, way, yaws)
@@ -322,7 +324,7 @@ def _turns(route: Matrix) -> list[int]:
 
 
 def _route_seen(obs: Observation) -> Matrix:
-    """What an observation knows of the route, where the worker does not tell all of it."""
+    """The route in an observation, for workers that do not send the whole route."""
     x, y, z = obs.ego.position
     cos, sin = math.cos(obs.ego.yaw), math.sin(obs.ego.yaw)
     ahead, left = np.vstack([np.zeros(2), obs.route]).T
@@ -333,7 +335,7 @@ def _route_seen(obs: Observation) -> Matrix:
 
 
 def _middle(size: Sequence[float]) -> float:
-    """Where CARLA's origin lies before the rear axle [m]."""
+    """Distance of CARLA's origin in front of the rear axle [m]."""
     return size[0] / 2 - REAR_OVERHANG
 
 
@@ -399,7 +401,7 @@ def _module_of(file: Path) -> Any:
     spec = importlib.util.spec_from_file_location(file.stem, file)
     if spec is None or spec.loader is None or not file.is_file():
         raise FileNotFoundError(f"there is no file {str(file)!r}")
-    # Agents import the files beside theirs.
+    # Agents import files from their own folder.
     if (folder := str(file.resolve().parent)) not in sys.path:
         sys.path.insert(0, folder)
     module = importlib.util.module_from_spec(spec)

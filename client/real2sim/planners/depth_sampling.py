@@ -23,28 +23,28 @@ if TYPE_CHECKING:
 DT = 0.2
 """Between the poses of a drive [s]."""
 LANE_CHANGE = 12.0
-"""Way over which an offset is reached [m]."""
+"""Distance over which an offset is reached [m]."""
 REAR = 0.25
 """Fraction of the vehicle's length behind its rear axle."""
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Which drives are tried, and what they cost; SI units.
+    """Candidate drives and their costs; SI units.
 
     Attributes:
-        offsets: from the route at the end of the lane change [m].
-        accelerations: held over the drive.
-        reaction: how long an acceleration is held before braking in the check that one can stop.
-        stopping: braking in that check; a car can brake harder, which is the reserve.
-        margins: free space to the front and to either side of the vehicle [m].
-        heights: of points that are obstacles, above the road [m].
-        cell: side of the squares that points are gathered in [m].
-        progress: worth of a metre driven.
-        aside: cost of a metre beside the route, squared.
-        discomfort: cost of acceleration along and across, squared.
-        swerve: cost of a metre by which the offset differs from the last choice.
-        collision: cost of hitting something; more the faster.
+        offsets: offsets from the route at the end of the lane change [m].
+        accelerations: constant accelerations of the candidates.
+        reaction: duration of an acceleration before braking, in the check for a safe stop.
+        stopping: braking in that check; a car can brake harder, which leaves a margin.
+        margins: free space in front of and on either side of the vehicle [m].
+        heights: height range of obstacle points above the road [m].
+        cell: side of the squares that group points [m].
+        progress: reward per metre driven.
+        aside: cost of the squared distance from the route.
+        discomfort: cost of the squared longitudinal and lateral acceleration.
+        swerve: cost per metre of change from the last chosen offset.
+        collision: cost of a collision; grows with speed.
     """
 
     offsets: tuple[float, ...] = (0.0, -0.6, 0.6, -1.2, 1.2, -1.8, 1.8)
@@ -62,14 +62,14 @@ class Lattice:
 
 
 class DepthSampling:
-    """A planner that sees by depth alone.
+    """A planner that only uses depth images.
 
-    Points of the depth images that stand above the road are obstacles where they are now. A drive
-    is admissible when the vehicle can go on with it for a moment and then stop without touching
-    any (after the dynamic window of Fox, Burgard, Thrun 1997); of the admissible ones the best by
-    progress, comfort and nearness to the route is driven. What moves is taken for what stands, so
-    that it keeps a stopping distance behind a car rather than a time, and crossing traffic is only
-    seen where it is.
+    Points above the road in the depth images are treated as static obstacles. A drive is admissible
+    if the vehicle can continue on it for a moment and then stop without contact (after the dynamic
+    window of Fox, Burgard, Thrun 1997). The planner chooses the admissible drive that is best in
+    progress, comfort and nearness to the route. It does not predict motion: behind a car it keeps a
+    stopping distance rather than a time gap, and it sees crossing traffic only at its current
+    position.
 
     Examples:
         >>> planner = DepthSampling(speed=6.0)
@@ -92,13 +92,13 @@ class DepthSampling:
         lattice: Lattice | None = None,
         comfort: Comfort | None = None,
     ) -> None:
-        """Make a planner.
+        """Create a planner.
 
         Args:
             speed: cruising speed [m/s].
             horizon: length of a plan [s].
             lattice: drives and their costs; default: ``Lattice()``.
-            comfort: of bends and of the way; default: ``Comfort()``.
+            comfort: limits in bends and along the path; default: ``Comfort()``.
         """
         self.speed = speed
         self.lattice, self.comfort = lattice or Lattice(), comfort or Comfort()
@@ -165,13 +165,13 @@ class DepthSampling:
 def obstacle_points(
     obs: Observation, *, heights: tuple[float, float], cell: float, reach: float = 40.0
 ) -> Array:
-    """[P, 2] float64, x and y in the vehicle frame [m] of what stands above the road.
+    """[P, 2] float64, x and y in the vehicle frame [m] of points above the road.
 
     Args:
-        obs: with depth images.
-        heights: lowest and highest above the plane that the vehicle stands on [m].
-        cell: points are gathered in squares of this side; a square counts with two of them [m].
-        reach: farthest ahead and aside [m].
+        obs: observation with depth images.
+        heights: lowest and highest above the plane under the vehicle's wheels [m].
+        cell: side of the squares that group points; a square needs two of them [m].
+        reach: maximum distance ahead and to the side [m].
     """
     clouds = [
         _in_vehicle(frame["depth"], obs.ego) for frame in obs.frames.values() if "depth" in frame
@@ -218,6 +218,7 @@ def _way(speed: float, acceleration: float, times: Array, *, limit: float) -> Ar
     """[K, 2] metres travelled and speed [m/s] at ``times``; speed between 0 and ``limit``.
 
     Above the limit the drive brakes at least gently until it is reached.
+    Above the limit the drive brakes at least gently until the limit is reached.
     """
     if speed > limit:
         acceleration, limit = min(acceleration, -1.0), speed
@@ -230,8 +231,8 @@ def _way(speed: float, acceleration: float, times: Array, *, limit: float) -> Ar
 def _poses(path: Path, way: Array, offsets: Sequence[float]) -> Array:
     """[O, K, 3] poses of drives that end at each of the offsets from the route.
 
-    The offset is a cubic of the way that begins where and as the vehicle stands, so that a drive
-    chosen again and again is driven to its end.
+    The offset is a cubic of the distance that starts at the vehicle's offset and direction, so a
+    drive that is chosen repeatedly is completed.
     """
     middle = np.stack([np.interp(way[:, 0], path.arc, path.points[:, k]) for k in (0, 1)])
     last, beyond = (

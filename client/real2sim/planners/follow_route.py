@@ -28,15 +28,15 @@ WINDOW = np.ones(5) / 5
 
 @dataclass(frozen=True)
 class Comfort:
-    """How a :class:`FollowRoute` drives; SI units.
+    """Driving limits of a :class:`FollowRoute`; SI units.
 
     Attributes:
-        lateral: largest acceleration sideways; sets the speed in bends.
-        acceleration, braking: largest along the route, ``braking`` where it can be chosen.
-        gap: metres kept free between bumpers at standstill.
-        headway: seconds kept behind another who moves.
-        clearance: metres to either side of the vehicle that must be free.
-        recovery: metres along the route over which an offset from it is driven back.
+        lateral: maximum lateral acceleration; sets the speed in bends.
+        acceleration, braking: maximum along the route; an obstacle too near may need more.
+        gap: bumper-to-bumper distance at standstill [m].
+        headway: time gap to a moving lead vehicle [s].
+        clearance: free space required on either side of the vehicle [m].
+        recovery: distance along the route over which an offset decays [m].
     """
 
     lateral: float = 2.0
@@ -49,9 +49,9 @@ class Comfort:
 
 
 class FollowRoute:
-    """A planner for examples and tests: the route as a path, a speed limit at each point of it.
+    """A planner for examples and tests: follows the route within a speed limit at each point.
 
-    Others are only seen in sessions that are reset with ``privileged=True``.
+    It only sees other road users in sessions that are reset with ``privileged=True``.
 
     Examples:
         >>> planner = FollowRoute(speed=5.0)
@@ -73,7 +73,7 @@ class FollowRoute:
         spacing: float = 0.25,
         comfort: Comfort | None = None,
     ) -> None:
-        """Make a planner.
+        """Create a planner.
 
         Args:
             speed: cruising speed [m/s].
@@ -82,7 +82,7 @@ class FollowRoute:
             comfort: accelerations and gaps; default: ``Comfort()``.
 
         Raises:
-            ValueError: as :func:`delays_of_poses` does.
+            ValueError: see :func:`delays_of_poses`.
         """
         self._delays = delays_of_poses(speed=speed, horizon=horizon, spacing=spacing)
         self.speed = speed
@@ -107,10 +107,10 @@ class FollowRoute:
 
 
 def delays_of_poses(*, speed: float, horizon: float, spacing: float) -> Array:
-    """[K] float64 seconds from now at which a plan has poses.
+    """[K] float64 delays of a plan's poses [s].
 
     Raises:
-        ValueError: a speed, a horizon or a spacing with which no plan can be made.
+        ValueError: a speed, horizon or spacing that allows no plan.
     """
     if not (speed > 0 and 0 < spacing <= horizon):
         raise ValueError(
@@ -123,11 +123,11 @@ def delays_of_poses(*, speed: float, horizon: float, spacing: float) -> Array:
 
 @dataclass(frozen=True)
 class Path:
-    """The part of a route that lies ahead, as a polyline with arc length.
+    """The route ahead, as a polyline with arc length.
 
     Attributes:
-        arc: [N] float64, metres from the point of the route nearest to the vehicle; from 0, evenly
-            spaced.
+        arc: [N] float64, metres from the point of the route nearest to the vehicle; starts at 0,
+            evenly spaced.
         points: [N, 2] float64, vehicle frame [m].
         offset: [2] float64, from that nearest point to the vehicle [m].
     """
@@ -167,9 +167,9 @@ class Path:
         return unit
 
     def poses(self, travelled: Array, recovery: float) -> Array:
-        """[K, 3] x [m], y [m], yaw [rad] after so many metres [K]; the offset from the route fades.
+        """[K, 3] x [m], y [m], yaw [rad] after the distances ``travelled`` [K]; the offset decays.
 
-        Yaw is the direction of the path driven, so that it is what a car can do.
+        Yaw is the direction of the resulting path, so that a car can follow it.
         """
         reach = 0.25
         both = self._at(np.concatenate([travelled, travelled + reach]), recovery)
@@ -177,14 +177,14 @@ class Path:
         direction = ahead - here
         moving = _lengths(direction) > 1e-6
         yaw = np.where(moving, np.arctan2(direction[:, 1], direction[:, 0]), 0.0)
-        # A vehicle that stands cannot turn; its heading reaches the path's within a metre or two.
+        # A stationary vehicle cannot turn; its heading reaches the path's within a metre or two.
         turned = _unwrapped(yaw) * (1.0 - np.exp(-travelled))
         return np.concatenate([here, turned[:, None]], axis=1)
 
     def _at(self, travelled: Array, recovery: float) -> Array:
         inside = _interpolated(travelled, self.arc, self.points)
         beyond = np.maximum(travelled - self.arc[-1], 0.0)[:, None] * self._last_direction()
-        # Its slope is 0 at the start: the way back begins along the route, not across it.
+        # Slope 0 at the start: the return to the route begins along it, not across it.
         fade = ((1.0 + travelled / recovery) * np.exp(-travelled / recovery))[:, None]
         points: Array = inside + beyond + self.offset * fade
         return points
@@ -207,7 +207,7 @@ class Path:
 
 
 class Profile:
-    """A function along a path, asked for one place after the other: linear between its points."""
+    """A function along a path, evaluated at single points: linear between its samples."""
 
     def __init__(self, arc: Array, values: Array) -> None:
         """The function with ``values`` [N] at increasing ``arc`` [N]; constant beyond both."""
@@ -228,7 +228,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Something in the way: where it begins along the path [m], and its speed along it [m/s]."""
+    """An obstacle: its start along the path [m], and its speed along it [m/s]."""
 
     arc: float
     speed: float
@@ -257,9 +257,9 @@ def brake_ahead(arc: Array, limits: Array, *, braking: float) -> Array:
 def obstacles_on(
     path: Path, ego: EgoState, agents: Sequence[AgentState], *, clearance: float
 ) -> list[Obstacle]:
-    """Agents whose box reaches into the strip that the vehicle sweeps along the path.
+    """Agents whose box overlaps the strip that the vehicle sweeps along the path.
 
-    Their places are those of the vehicle's origin at which its front touches.
+    Distances are those of the vehicle's origin at contact with its front.
     """
     if len(path.arc) < 2 or not agents:
         return []
@@ -297,7 +297,7 @@ def drive_profile(
 ) -> Array:
     """[K] float64 metres travelled after each delay [s], from ``speed``, within limits.
 
-    Braking may exceed ``comfort.braking`` where somebody is already too near.
+    Braking may exceed ``comfort.braking`` if an obstacle is already too near.
     """
     travelled: list[float] = []
     profile, position, now, speed = Profile(arc, limits), 0.0, 0.0, max(speed, 0.0)
@@ -316,7 +316,7 @@ def drive_profile(
 
 
 def _from_vehicle_on(route: Array) -> Array:
-    """The route [R, 2] with the point beside the vehicle where it begins farther ahead."""
+    """The route [R, 2], extended back to the vehicle if it starts farther ahead."""
     if len(route) < 2 or not (length := float(np.linalg.norm(route[1] - route[0]))) > 0.0:
         return route
     direction = (route[1] - route[0]) / length
@@ -372,6 +372,6 @@ def _lengths(vectors: Array) -> Array:
 
 
 def _unwrapped(angles: Array) -> Array:
-    """Angles [N] without jumps of a turn [rad]; most paths have none, and are left as they are."""
+    """Angles [N] without jumps of a full turn [rad]; unchanged if there are none."""
     steps = np.abs(angles[1:] - angles[:-1])
     return np.unwrap(angles) if len(steps) and steps.max() > math.pi else angles

@@ -1,4 +1,4 @@
-"""Follows the route behind whoever is ahead, by the intelligent driver model."""
+"""Follows the route and the lead vehicle with the intelligent driver model."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Follower:
     """Parameters of the model (Treiber, Hennecke, Helbing 2000), SI units.
 
     Attributes:
-        acceleration: largest, a.
-        braking: comfortable, b.
-        hardest: braking beyond which the model's answer is cut.
-        headway: T, seconds kept behind who is ahead.
-        gap: s0, metres between bumpers at standstill.
-        clearance: metres to either side of the vehicle that must be free.
+        acceleration: maximum acceleration, a.
+        braking: comfortable deceleration, b.
+        hardest: limit of the deceleration.
+        headway: time gap to the lead vehicle, T [s].
+        gap: bumper-to-bumper distance at standstill, s0 [m].
+        clearance: free space required on either side of the vehicle [m].
     """
 
     acceleration: float = 1.5
@@ -50,7 +50,7 @@ class Follower:
     clearance: float = 0.3
 
     def answer(self, speed: float, desired: float, gap: float, closing: float) -> float:
-        """Acceleration [m/s^2] at ``gap`` metres behind a leader that one closes in on.
+        """Acceleration [m/s^2] at ``gap`` metres behind an approached lead vehicle.
 
         ``a (1 - (v/v0)^4 - (s*/s)^2)`` with ``s* = s0 + v T + v dv / (2 sqrt(a b))``.
         """
@@ -65,9 +65,9 @@ class Follower:
 
 
 class Idm:
-    """A planner that knows all objects: along the route, as fast as the one ahead lets it.
+    """A planner with ground-truth objects: follows the route behind the lead vehicle.
 
-    Others are taken to keep their speed along the route for the length of the plan.
+    It assumes that others keep their speed along the route for the length of the plan.
 
     Examples:
         >>> planner = Idm(speed=6.0, follower=Follower(headway=1.5))
@@ -90,17 +90,17 @@ class Idm:
         follower: Follower | None = None,
         comfort: Comfort | None = None,
     ) -> None:
-        """Make a planner.
+        """Create a planner.
 
         Args:
             speed: desired speed, v0 [m/s].
             horizon: length of a plan [s].
             spacing: time between its poses [s].
             follower: parameters of the model; default: ``Follower()``.
-            comfort: of bends and of the way back to the route; default: ``Comfort()``.
+            comfort: limits in bends and on the return to the route; default: ``Comfort()``.
 
         Raises:
-            ValueError: as :func:`~.follow_route.delays_of_poses` does.
+            ValueError: see :func:`~.follow_route.delays_of_poses`.
         """
         self._delays = delays_of_poses(speed=speed, horizon=horizon, spacing=spacing)
         self.speed = speed

@@ -1,6 +1,6 @@
-"""A small network that drives by one camera; learned from recorded drives.
+"""A small network that drives with one camera, trained on recorded drives.
 
-``real2sim train-policy`` makes the file of weights. Needs torch and safetensors.
+``real2sim train-policy`` writes the file of weights. Requires torch and safetensors.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ REACH = 20.0
 
 @dataclass(frozen=True)
 class PolicyShape:
-    """What the network sees and answers.
+    """Inputs and outputs of the network.
 
     Attributes:
         camera: name of its camera.
-        width, height: that images are brought to [px].
+        width, height: size to which images are resized [px].
         poses: number of poses of a plan.
         spacing: time between them [s].
     """
@@ -57,7 +57,7 @@ class PolicyShape:
         """The shape in the header of a file.
 
         Raises:
-            ValueError: a file of another kind.
+            ValueError: a different kind of file.
         """
         found = (metadata or {}).get("format")
         if found != FORMAT:
@@ -66,7 +66,7 @@ class PolicyShape:
 
 
 class LearnedPolicy:
-    """A planner that sees one camera, its speed, and which way to turn.
+    """A planner whose inputs are one camera, its speed, and the route command.
 
     Examples:
         >>> from safetensors.torch import save_file
@@ -137,14 +137,14 @@ def shrink(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.floa
 
 
 def state_of(speed: float, command: str) -> NDArray[np.float32]:
-    """[4] float32: speed in its unit, then left, straight or right."""
+    """[4] float32: normalised speed, then left, straight or right, one-hot."""
     return np.array([speed / SPEED_UNIT, *(float(command == c) for c in COMMANDS)], np.float32)
 
 
 def network(shape: PolicyShape) -> Any:
     """A ``torch.nn.Module`` (images [N, 3, H, W], states [N, 4]) -> poses [N, K, 3] in units.
 
-    Four convolutions of stride 2 and two layers beside the state: about 0.3 million weights.
+    Four convolutions of stride 2, and two layers for the state: about 0.3 million weights.
     """
     torch = _torch()
     nn = torch.nn
@@ -152,7 +152,7 @@ def network(shape: PolicyShape) -> Any:
     class Policy(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
-            # Files of weights name the layers as the attributes are named here.
+            # The attribute names are the layer names in files of weights.
             widths = (3, 16, 24, 32, 48)
             layers: list[Any] = []
             for before, after in itertools.pairwise(widths):

@@ -1,7 +1,7 @@
 """Planners made for NeuroNCAP (Ljungbergh et al. 2024), unchanged: HTTP with ``/infer``.
 
-The planner serves ``GET /alive``, ``POST /reset`` and ``POST /infer``. Images go to it as it
-expects them, as tensors written by ``torch.save``, so torch must be installed here.
+The planner serves ``GET /alive``, ``POST /reset`` and ``POST /infer``. It expects images as
+tensors written by ``torch.save``, so torch must be installed here.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ NUSCENES_CAMERAS = {
     "CAM_BACK_RIGHT": math.radians(-110),
     "CAM_BACK": math.pi,
 }
-"""Directions of the cameras that these planners know, positive to the left [rad]."""
+"""Directions of nuScenes' cameras, positive to the left [rad]."""
 NUSCENES_LIDAR = (
     (0.0, 1.0, 0.0, 0.94),
     (-1.0, 0.0, 0.0, 0.0),
@@ -56,10 +56,10 @@ NUSCENES_LIDAR = (
 
 
 class NeuroNcap:
-    """Asks a planner behind NeuroNCAP's interface.
+    """A planner behind NeuroNCAP's interface.
 
-    Cameras keep their name where it is one of nuScenes'; others get the one that looks most nearly
-    the same way.
+    Cameras with one of nuScenes' names keep it; others get the name with the most similar
+    direction.
     """
 
     needs = Needs(modalities=("rgb",), all_cameras=True)
@@ -71,10 +71,10 @@ class NeuroNcap:
         timeout: float = 60.0,
         T_ego_lidar: Sequence[Sequence[float]] = NUSCENES_LIDAR,
     ) -> None:
-        """Reach a planner; it may take ``timeout`` seconds to come up, and as long for an answer.
+        """Connect to a planner; ``timeout`` [s] limits its startup and each answer.
 
         Raises:
-            PeerError: it does not come up.
+            PeerError: it does not start in time.
         """
         self.url = url.rstrip("/")
         self._http = httpx2.Client(base_url=self.url, timeout=timeout)
@@ -83,15 +83,15 @@ class NeuroNcap:
         self._wait(timeout)
 
     def reset(self, obs: Observation) -> None:
-        """Let the planner forget the last episode. Raises PeerError."""
+        """Reset the planner. Raises PeerError."""
         self._names = named_as(rgb_frames(obs), obs, NUSCENES_CAMERAS)
         self._post("/reset", {})
 
     def plan(self, obs: Observation) -> TrajectoryPlan:
-        """The planner's way ahead, with headings along it.
+        """The planner's trajectory, with headings along it.
 
         Raises:
-            PeerError: it cannot be reached, or answers with what is no way.
+            PeerError: it is unreachable, or returns an invalid trajectory.
         """
         answer = self._post("/infer", self._inputs(obs))
         given = answer.get("trajectory") if isinstance(answer, dict) else None
@@ -152,7 +152,7 @@ class NeuroNcap:
 
 
 def _canbus(obs: Observation) -> list[float]:
-    """nuScenes' vehicle bus as these planners count it.
+    """nuScenes' vehicle bus in these planners' conventions.
 
     Position [m], orientation wxyz, acceleration [m/s^2], rotation rate [rad/s], velocity [m/s],
     the last three in the vehicle frame.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class PeerError(Real2SimError):
-    """The planner elsewhere cannot be reached, or answers with what is no plan."""
+    """The external planner is unreachable, or returns an invalid plan."""
 
 
 def T_world_ego(ego: EgoState) -> Matrix:
@@ -50,9 +50,9 @@ def rgb_frames(obs: Observation) -> dict[str, Frame]:
 
 
 def headings(points: NDArray[np.floating[Any]], *, moved: float = 0.1) -> list[float]:
-    """Directions of travel [N] at points [N, 2] of a way that begins at the origin along x [rad].
+    """Directions of travel [N] at points [N, 2] of a path that starts at the origin along x [rad].
 
-    From the point before to the point after; kept where they are within ``moved`` metres.
+    Each is the direction from the previous to the next point; within ``moved`` metres it is held.
     """
     way = np.vstack([np.zeros(2), points])
     found, last = [], 0.0
@@ -80,15 +80,15 @@ def checked_points(answer: Any, *, columns: int, what: str) -> NDArray[np.float6
 def named_as(
     frames: Mapping[str, Frame], obs: Observation, names: Mapping[str, float]
 ) -> dict[str, str]:
-    """Names that another simulator gives to the cameras.
+    """Names that another simulator uses for the cameras.
 
-    Cameras that have one of these names keep it; others get the free name whose direction is
-    nearest to theirs, and none where all are taken.
+    Cameras that have one of these names keep it. Others get the free name with the nearest
+    direction, or none if all are taken.
 
     Args:
-        frames: one of each camera, by its name here.
-        obs: whose frames they are.
-        names: direction by name there [rad], positive to the left.
+        frames: one frame per camera, by its name in the scene.
+        obs: observation of the frames.
+        names: direction by external name [rad], positive to the left.
     """
     found = {name: name for name in frames if name in names}
     turns = {n: _turn(T_ego_camera(obs, f)) for n, f in frames.items() if n not in found}
@@ -105,7 +105,7 @@ def named_as(
 
 @dataclass(frozen=True)
 class Look:
-    """Where a camera looks and how much of it: radians, ``turn`` positive to the left."""
+    """Direction and field of view of a camera [rad]; ``turn`` is positive to the left."""
 
     turn: float
     field: float
@@ -124,7 +124,7 @@ def looks_of(cameras: Iterable[CameraInfo]) -> dict[str, Look]:
 
 
 def looks_in(obs: Observation) -> dict[str, Look]:
-    """Of the cameras whose images an observation has, by their names."""
+    """Looks of the cameras with images in an observation, by name."""
     return {
         name: Look.of(frame.K, frame.shape[1], T_ego_camera(obs, frame))
         for name, frame in rgb_frames(obs).items()
@@ -138,20 +138,20 @@ def cameras_for(
     known: Mapping[str, Look],
     given: Mapping[str, str],
 ) -> dict[str, str]:
-    """The camera here that serves for each name elsewhere.
+    """The scene camera for each external name.
 
-    That is the one of the same name, or which ``given`` says, or, for names whose look is
-    ``known``, the one that looks most nearly the same way; of two that look the same way, the one
-    that sees most nearly as much. One camera may serve for several names.
+    This is the camera of the same name, or the one in ``given``. For names in ``known``, it is the
+    camera with the most similar direction, then the most similar field of view. One camera may
+    serve several names.
 
     Raises:
-        PeerError: none does.
+        PeerError: no camera fits a name.
     """
     return {name: _camera_for(name, there, known, given) for name in names}
 
 
 MAX_ANGLE = math.radians(60)
-"""Between the axes of two cameras that stand for each other [rad]."""
+"""Maximum angle between the axes of two matching cameras [rad]."""
 
 
 def _camera_for(

@@ -1,4 +1,4 @@
-"""Follows the route by two PID controllers, and sees nobody."""
+"""Follows the route with two PID controllers; ignores other objects."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Gains:
 
 
 class Pid:
-    """``u = Kp e + Ki integral(e) + Kd de/dt``; the integral stands still while ``u`` is cut."""
+    """``u = Kp e + Ki integral(e) + Kd de/dt``; no integration while ``u`` saturates."""
 
     def __init__(self, gains: Gains, *, low: float, high: float) -> None:
-        """A controller whose output stays within ``low`` and ``high``."""
+        """A controller with output limits ``low`` and ``high``."""
         self._gains, self._low, self._high = gains, low, high
         self._integral, self._before = 0.0, float("nan")
 
@@ -48,9 +48,8 @@ class Pid:
 class PidFollowRoute:
     """A baseline: accelerates to a cruising speed, slows in bends, steers towards the route.
 
-    The error that steers is how far to the side the route lies a preview distance ahead, so that
-    it holds offset and heading at once. Blind for everything else: it runs into whatever stands on
-    the route.
+    The steering error is the lateral offset of the route at a preview distance, which combines
+    offset and heading. The planner ignores everything else and collides with objects on the route.
 
     Examples:
         >>> planner = PidFollowRoute(speed=6.0)
@@ -74,14 +73,14 @@ class PidFollowRoute:
         wheelbase: float = 2.8,
         comfort: Comfort | None = None,
     ) -> None:
-        """Make a planner.
+        """Create a planner.
 
         Args:
             speed: cruising speed [m/s].
-            longitudinal: from an error of speed [m/s] to an acceleration [m/s^2].
-            lateral: from an error of curvature [1/m], times ``wheelbase``, to a wheel angle [rad].
-            preview: seconds that the preview distance is driven in; at least 4 m.
-            wheelbase: of the vehicle [m].
+            longitudinal: gains from speed error [m/s] to acceleration [m/s^2].
+            lateral: gains from curvature error [1/m], times ``wheelbase``, to steering angle [rad].
+            preview: preview time [s]; the preview distance is at least 4 m.
+            wheelbase: wheelbase of the vehicle [m].
             comfort: limits of acceleration; default: ``Comfort()``.
         """
         self.speed, self.comfort = speed, comfort or Comfort()
@@ -91,7 +90,7 @@ class PidFollowRoute:
         self._forget()
 
     def reset(self, obs: Observation) -> None:
-        """Forget what was summed up."""
+        """Reset the integrals."""
         self._forget()
 
     def plan(self, obs: Observation) -> Control:

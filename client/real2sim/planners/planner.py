@@ -37,10 +37,10 @@ BUILT_IN = {
 
 @runtime_checkable
 class Planner(Protocol):
-    """Drives: sees observations, answers with plans.
+    """Converts observations into plans.
 
-    One that must see more than the ego and its route has an attribute ``needs``: :class:`Needs`.
-    One that must know the session's cameras or its whole route has a method ``begin(welcome)``,
+    A planner that needs more than the ego and its route has an attribute ``needs``: :class:`Needs`.
+    A planner that needs the session's cameras or its whole route has a method ``begin(welcome)``,
     which is called before ``reset``.
     """
 
@@ -53,13 +53,13 @@ class Planner(Protocol):
 
 @dataclass(frozen=True)
 class Needs:
-    """What a planner must be shown, and how it drives.
+    """Inputs that a planner needs, and the kind of its plans.
 
     Attributes:
-        modalities: of its cameras; empty where it is blind.
-        cameras: by name; empty: the one that looks most nearly straight ahead.
-        all_cameras: whether it wants every camera of the scene instead.
-        width: of its images [px]; None: as recorded.
+        modalities: modalities of its cameras; empty if it uses no images.
+        cameras: camera names; empty: the camera that points most nearly straight ahead.
+        all_cameras: whether it uses every camera of the scene instead.
+        width: image width [px]; None: as recorded.
         privileged: whether observations list all objects.
         action: kind of its plans.
     """
@@ -72,7 +72,7 @@ class Needs:
     all_cameras: bool = False
 
     def sensors(self, cameras: Sequence[CameraInfo]) -> list[dict[str, Any]]:
-        """Sensors to reset with, out of a session's cameras.
+        """Sensors to pass to reset, from a session's cameras.
 
         Raises:
             ValueError: a camera that the scene lacks.
@@ -99,7 +99,7 @@ class Needs:
 
 
 def needs_of(planner: Planner) -> Needs:
-    """What a planner asks for; nothing where it does not say.
+    """Needs of a planner; by default it needs nothing.
 
     Examples:
         >>> needs_of(load_planner("depth_sampling")).modalities
@@ -116,11 +116,11 @@ def forward_camera(cameras: Sequence[CameraInfo]) -> str:
 
 
 def load_planner(name: str) -> Planner:
-    """A planner by name: a built-in one, or ``module:Class``.
+    """Load a planner by name: a built-in one, or ``module:Class``.
 
-    It is made without arguments; what follows a ``=`` becomes its one argument, as in
-    ``learned=policy.safetensors`` or ``neuroncap=http://127.0.0.1:9000``. Modules are looked for
-    in the working folder too.
+    It is constructed without arguments, or with the text after ``=`` as its only argument, as in
+    ``learned=policy.safetensors`` or ``neuroncap=http://127.0.0.1:9000``. Modules are also found in
+    the working directory.
 
     Raises:
         ValueError: no such module or class, or it is not a planner.
@@ -180,18 +180,18 @@ class StageTimes:
 
 @dataclass(frozen=True)
 class EpisodeSummary:
-    """What happened in an episode, and what it cost.
+    """Results and timing of an episode.
 
     Attributes:
-        steps: clock steps driven.
-        start_us, end_us: first and last instant.
+        steps: number of driven steps.
+        start_us, end_us: first and last time.
         distance: metres that the rear axle moved.
-        terminated, truncated, reason: how it ended; none of them when the steps ran out first.
+        terminated, truncated, reason: how it ended; all unset if the steps ran out first.
         metrics: the worker's scores at the end.
-        events: what happened, oldest first.
+        events: all events, oldest first.
         wall_seconds: duration of the loop, without reset.
         stages: milliseconds by stage. ``plan``, ``step`` (round trip) and ``loop`` (both) are
-            measured here; ``worker.*`` are the worker's own figures.
+            measured here; ``worker.*`` are the worker's figures.
     """
 
     steps: int
@@ -233,16 +233,16 @@ def run_episode(
     """Reset the session and let the planner drive.
 
     Args:
-        session: open.
-        planner: who drives, or its name as of :func:`load_planner`.
-        steps: stop after so many; default: when the episode is over.
-        sensors: what every observation shows; default: what the planner needs.
-        on_observation: called with every observation, the first included; its time is not counted.
-        options: of reset; ``action`` and ``privileged`` are those of the planner's ``needs``, and a
-            planner that has none is shown everything.
+        session: an open session.
+        planner: the planner, or its name as in :func:`load_planner`.
+        steps: maximum number of steps; default: to the end of the episode.
+        sensors: sensors of every observation; default: those the planner needs.
+        on_observation: called with every observation, including the first; its time is not counted.
+        options: options of reset; ``action`` and ``privileged`` come from the planner's ``needs``,
+            and a planner without ``needs`` is privileged.
 
     Raises:
-        TypeError: a class, or something else that does not plan.
+        TypeError: a class, or an object that is not a planner.
 
     Examples:
         >>> planner = real2sim.planners.FollowRoute(speed=5.0)

@@ -1,6 +1,6 @@
-"""A worker's pictures behind the interfaces of other simulators.
+"""Renderer interfaces of other simulators, served by a worker.
 
-Each is a process of its own between a simulator that drives and a worker that draws: it speaks the
-simulator's protocol on one side and the SDK on the other. The worker knows nothing of it, one
-worker serves several, and what fails in one touches no session.
+Each adapter is a separate process between a simulator and a worker. It speaks the simulator's
+protocol on one side and the SDK on the other. One worker can serve several adapters, and a failure
+of an adapter affects no session.
 """

@@ -1,9 +1,9 @@
 """AlpaSim's renderer interface (NVIDIA 2025): gRPC, ``SensorsimService``.
 
-AlpaSim's runtime drives and asks for pictures; here they come from a worker's scenes instead of the
-closed renderer's. Cameras are pinholes with a global shutter, as ``get_available_cameras`` says;
-f-theta, fisheye, lens distortion, windshields, lidars and ego masks are refused by name. Needs the
-``alpasim`` extra.
+AlpaSim's runtime drives and requests images; this renderer takes them from a worker's scenes
+instead of the closed renderer. Cameras are pinholes with a global shutter, as reported by
+``get_available_cameras``. F-theta, fisheye, lens distortion, windshields, lidars and ego masks are
+refused by name. Requires the ``alpasim`` extra.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ API = (0, 54, 0)
 """Of the messages that are spoken here, as AlpaSim counts it."""
 THREADS = 8
 CODECS = {0: "png", 1: "png", 2: "jpeg", 4: "raw"}
-"""By AlpaSim's number of an image format; 0 says none, and 4 is planar RGB."""
+"""Codecs by AlpaSim's image format number; 0 is unspecified, and 4 is planar RGB."""
 PLANAR = 4
 DEFAULT_QUALITY = 95
 
@@ -44,10 +44,10 @@ log = logging.getLogger(__name__)
 
 
 class Refusal(Exception):
-    """A request that is not served.
+    """A refused request.
 
     Attributes:
-        status: name of gRPC's.
+        status: gRPC's status name.
     """
 
     def __init__(self, status: str, said: str) -> None:
@@ -56,12 +56,12 @@ class Refusal(Exception):
 
 
 class AlpasimRenderer:
-    """Serves ``SensorsimService`` out of a worker.
+    """Serves ``SensorsimService`` from a worker.
 
     Args:
-        client: of the worker.
-        links: by AlpaSim's scene ids; empty: every scene of the worker under its own name.
-        strict: refuse objects that the scene lacks; else they are left out, with a warning each.
+        client: client of the worker.
+        links: links by AlpaSim's scene id; empty: every scene of the worker under its own name.
+        strict: refuse objects that the scene lacks; else skip each with a warning.
 
     Raises:
         PeerError: the ``alpasim`` extra is not installed.
@@ -105,7 +105,7 @@ class AlpasimRenderer:
         return port
 
     def stop(self, grace: float = 2.0) -> None:
-        """Answer what was asked, and listen no longer."""
+        """Finish running requests, and stop listening."""
         self._server.stop(grace).wait()
 
     # --- the calls ------------------------------------------------------------------------------
@@ -125,7 +125,7 @@ class AlpasimRenderer:
         m, known = self._messages, self._known()
         states = {info.scene: info.state for info in self._client.scenes.list()}
         loaded = [i for i in sorted(known) if states.get(known[i].scene) is SceneState.RESIDENT]
-        # A scene in memory serves any number of rollouts at once.
+        # A loaded scene serves any number of rollouts.
         entries = [
             m.LoadedSceneEntry(scene_id=i, loaded_instance_count=1, reusable_instance_count=1)
             for i in loaded
@@ -151,7 +151,7 @@ class AlpasimRenderer:
                     focal_length_y=K[1][1],
                 )
             )
-            # In spite of its name this is where the camera is in the rig.
+            # Despite its name this is the camera's pose in the rig.
             pose = self._pose(np.array(camera.T_vehicle_camera))
             available.append(
                 m.AvailableCamera(intrinsics=spec, rig_to_camera=pose, logical_id=name)
@@ -199,14 +199,14 @@ class AlpasimRenderer:
     def _render_lidar(self, _request: Any) -> Any:
         raise _no_lidar()
 
-    # --- pictures -------------------------------------------------------------------------------
+    # --- images ---------------------------------------------------------------------------------
 
     def _each(self, items: Sequence[Any]) -> list[tuple[str, bytes | Refusal]]:
-        """The image of each item of a batch, or why there is none."""
+        """The image of each item of a batch, or the reason for its failure."""
         try:
             images: Sequence[bytes | Refusal] = self._images([item.request for item in items])
         except Exception:
-            # One that cannot be drawn must not take the others with it.
+            # One failed image must not fail the batch.
             images = [self._alone(item.request) for item in items]
         return [(item.camera_name, image) for item, image in zip(items, images, strict=True)]
 
@@ -217,7 +217,7 @@ class AlpasimRenderer:
             return refusal_of(error)
 
     def _images(self, requests: Sequence[Any]) -> list[bytes]:
-        """Of requests, those of one instant in one call of the worker."""
+        """Images of the requests; those of one instant share a call to the worker."""
         images: dict[int, bytes] = {}
         for members in _instants(requests).values():
             first = requests[members[0]]
@@ -322,7 +322,7 @@ class AlpasimRenderer:
 
 
 def refusal_of(error: Exception) -> Refusal:
-    """What gRPC is told of an error."""
+    """The gRPC status and details of an error."""
     if isinstance(error, Refusal):
         return error
     status = "INTERNAL"
@@ -340,7 +340,7 @@ def refusal_of(error: Exception) -> Refusal:
 
 
 def _cameras(scene: LinkedScene) -> dict[str, CameraInfo]:
-    """By their names: the link's, AlpaSim's for cameras that look that way, and the scene's own."""
+    """By name: the link's, AlpaSim's for cameras of similar direction, and the scene's own."""
     own = {camera.name: camera for camera in scene.info.cameras}
     looks, given = looks_of(scene.info.cameras), scene.link.cameras
     named: dict[str, CameraInfo] = {}
@@ -381,7 +381,7 @@ def _camera_named(scene: LinkedScene, name: str) -> CameraInfo:
 
 
 def _instants(requests: Sequence[Any]) -> dict[tuple[str, int, bytes], list[int]]:
-    """Places of requests that differ by their cameras alone."""
+    """Indices of requests that differ only in their cameras."""
     groups: dict[tuple[str, int, bytes], list[int]] = {}
     for k, request in enumerate(requests):
         objects = b"\0".join(o.SerializeToString() for o in request.dynamic_objects)
@@ -414,9 +414,10 @@ def _check_supported(request: Any, spec: Any) -> None:
 
 
 def _size(request: Any, native_width: int, native_height: int) -> tuple[int, int, float, float]:
-    """Width and height [px], and by how much they scale the native ones.
+    """Width and height [px], and their scale factors relative to the native ones.
 
-    Like AlpaSim's own renderer: the height is that asked for, and the width keeps the native shape.
+    As in AlpaSim's renderer, the height is the requested one, and the width keeps the native
+    aspect.
     """
     if not (native_width and native_height):
         raise Refusal("INVALID_ARGUMENT", "camera_intrinsics give no resolution")

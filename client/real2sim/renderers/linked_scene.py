@@ -34,15 +34,15 @@ IDENTITY: tuple[Row, Row, Row, Row] = (
 
 
 class SceneLink(BaseModel):
-    """One scene of the worker, as another simulator counts in it.
+    """Mapping between a scene of the worker and another simulator.
 
     Attributes:
-        scene: its name here.
-        T_world_theirs: from their world to the scene's; None: as the scene says that it was made,
-            else the same.
-        offset_us: their time less the scene's [us].
+        scene: name of the worker's scene.
+        T_world_theirs: from their world to the scene's; None: the scene's own metadata, else the
+            identity.
+        offset_us: their time minus the scene's [us].
         cameras: the scene's cameras by their names.
-        objects: the scene's objects by their ids; besides those that the scene knows from its log.
+        objects: the scene's objects by their ids, in addition to the ids from the scene's log.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -65,10 +65,10 @@ class SceneLink(BaseModel):
 
 
 def read_links(path: Path) -> dict[str, SceneLink]:
-    """Links by their scene's id, out of a JSON file.
+    """Read links by their scene id from a JSON file.
 
     Raises:
-        ValueError: the file holds something else.
+        ValueError: the file has other content.
         OSError: it cannot be read.
     """
     try:
@@ -84,7 +84,7 @@ def frame_of(link: SceneLink, info: SceneInfo) -> Matrix:
 
 
 def object_ids(link: SceneLink, info: SceneInfo) -> dict[str, str]:
-    """The scene's objects by their ids: those of the log that it was made of, and its own."""
+    """The scene's objects by their ids: the log's ids, and those of the link."""
     there = [found.object_id for found in info.objects]
     keys = info.provenance.get("track_ids")
     named = {str(key): name for name, key in _pairs(keys) if name in there}
@@ -92,7 +92,7 @@ def object_ids(link: SceneLink, info: SceneInfo) -> dict[str, str]:
 
 
 def camera_names(link: SceneLink, wanted: Iterable[str], info: SceneInfo) -> dict[str, str]:
-    """The link's names, and those of ``wanted`` that differ from a camera's by case alone."""
+    """The link's names, and those of ``wanted`` that differ from a camera's only in case."""
     by_case = {camera.name.lower(): camera.name for camera in info.cameras}
     alike = {name: by_case[name.lower()] for name in wanted if name.lower() in by_case}
     return alike | dict(link.cameras)
@@ -108,14 +108,14 @@ MAX_CAMERAS = 16
 
 @dataclass(frozen=True)
 class CameraView:
-    """One picture that somebody wants.
+    """A requested image.
 
     Attributes:
         width, height: [px].
         K: [3, 3] intrinsics [px].
-        pose: [4, 4] of the camera in their world; x right, y down, z forward.
+        pose: [4, 4] pose of the camera in their world; x right, y down, z forward.
         codec: ``raw``, ``jpeg`` or ``png``.
-        quality: of jpeg.
+        quality: quality of jpeg.
     """
 
     width: int
@@ -165,14 +165,14 @@ class LinkedScene:
         """The frames of ``views``, in order, in as few requests as the worker allows.
 
         Args:
-            views: all of one instant.
-            their_us: that instant on their clock [us].
+            views: all of one time.
+            their_us: that time on their clock [us].
             poses: [4, 4] of box centres in their world, by the scene's object ids.
-            others: as of ``client.scenes.view``.
+            others: as in ``client.scenes.view``.
 
         Raises:
             Real2SimError: as ``client.scenes.view`` does.
-            ValueError: a size that no worker draws.
+            ValueError: a size that workers do not support.
         """
         placed = {name: self._pose(pose) for name, pose in poses.items()}
         frames: list[Frame] = []

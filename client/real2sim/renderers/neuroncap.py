@@ -1,9 +1,9 @@
 """NeuroNCAP's renderer interface (Ljungbergh et al. 2024; NeuRAD's closed-loop server): HTTP.
 
-NeuroNCAP drives and asks for pictures; here they come from a scene of a worker. Served are
+NeuroNCAP drives and requests images of a worker's scene, through
 ``GET /alive``, ``GET /get_actors``, ``POST /update_actors``, ``POST /render_image`` and
-``GET /start_time``. Like its model, it is one scene and one run at a time. Images in its own form,
-``raw``, are tensors written by ``torch.save``, so torch must be installed here.
+``GET /start_time``. Like NeuRAD's server, it serves one scene and one run at a time. Its image
+format ``raw`` is a tensor written by ``torch.save``, which requires torch in this process.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ Rows = list[tuple[float, float, float, float]]
 
 
 class _Actor(BaseModel):
-    """One of ``/update_actors``; what else is said of it is ignored."""
+    """An item of ``/update_actors``; unknown members are ignored."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -74,7 +74,7 @@ _ACTORS = TypeAdapter(list[_Actor])
 
 @dataclass(frozen=True)
 class Answer:
-    """What goes back over HTTP."""
+    """An HTTP response."""
 
     content: bytes
     media_type: str = "application/json"
@@ -102,11 +102,11 @@ class ActorTrack:
 
 
 class NeuroNcapRenderer:
-    """Serves NeuroNCAP's renderer interface out of one scene of a worker.
+    """Serves NeuroNCAP's renderer interface from one scene of a worker.
 
-    What moves are the objects of the scene, under the ids of its log where the scene knows them.
-    Until ``/update_actors`` they move as recorded; from then on there are those that it names,
-    where it has them. A box that it gives another size keeps its own.
+    The actors are the scene's objects, under the ids of its log if the scene has them. They move as
+    recorded until ``/update_actors``; from then on only the listed ones exist, at the listed poses.
+    An object keeps its own size.
     """
 
     def __init__(self, client: Client, link: SceneLink) -> None:
@@ -137,13 +137,13 @@ class NeuroNcapRenderer:
         return int(self._server.server_address[1])
 
     def stop(self) -> None:
-        """Listen no longer."""
+        """Stop listening."""
         if self._server is not None:
             self._server.shutdown()
             self._server.server_close()
 
     def answer(self, method: str, path: str, body: bytes) -> Answer:
-        """What is said to a request; never raises."""
+        """The response to a request; never raises."""
         routes: dict[tuple[str, str], Callable[[bytes], Answer]] = {
             ("GET", "/alive"): lambda _body: _json(True),
             ("GET", "/start_time"): lambda _body: _json(self._start_time()),

@@ -37,11 +37,11 @@ COMMANDS: dict[str, tuple[str, str, Callable[[Any, Observation], Plan]]] = {
 """Topic, type and meaning of each kind of command."""
 
 STANDS_STILL = frozenset({"/tf_static"})
-"""Topics whose last message newcomers get."""
+"""Latched topics: new subscribers receive the last message."""
 
 
 class Node(Protocol):
-    """What the bridge needs of ROS."""
+    """The functions of ROS that the bridge uses."""
 
     types: MessageTypes
 
@@ -52,23 +52,23 @@ class Node(Protocol):
         """Call ``receive`` with every message, while the node spins."""
 
     def spin(self, seconds: float) -> bool:
-        """Receive for at most so long, or until a message has come; whether ROS still runs."""
+        """Receive until a message arrives, at most ``seconds``; returns whether ROS still runs."""
 
 
 @dataclass
 class Ros2Bridge:
     """A session driven by messages.
 
-    In lock-step, which is the default, every observation waits for a command that comes after it.
-    With ``real_time`` the clock goes on at that multiple of wall-clock time under the newest
-    command, and the vehicle stands before the first.
+    In lockstep, the default, every observation waits for a later command. With ``real_time`` the
+    clock advances at that multiple of wall-clock time under the newest command, and the vehicle
+    brakes to a stop before the first one.
 
     Attributes:
-        session: open.
-        node: of ROS.
+        session: an open session.
+        node: the ROS node.
         commands: kind of commands, of :data:`COMMANDS`.
-        real_time: multiple of wall-clock time; None: lock-step.
-        report: told of commands that are none.
+        real_time: multiple of wall-clock time; None: lockstep.
+        report: called with a message for each invalid command.
     """
 
     session: DriveSession
@@ -91,13 +91,13 @@ class Ros2Bridge:
     def run(
         self, *, sensors: Sequence[Sensor] = (), steps: int | None = None, **options: Any
     ) -> Observation:
-        """Reset the session and drive until the episode, the steps or ROS end; the last
+        """Reset the session and drive until the episode, the steps or ROS end; returns the last
         observation.
 
         Args:
-            sensors: what is published.
-            steps: stop after so many; None: when the episode is over.
-            options: of reset.
+            sensors: sensors to publish.
+            steps: maximum number of steps; None: to the end of the episode.
+            options: options of reset.
         """
         topic, type_name, _ = COMMANDS[self.commands]
         self.node.subscribe(topic, type_name, self._receive)
@@ -126,7 +126,8 @@ class Ros2Bridge:
         self._is_fresh = self._is_fresh and self.real_time is not None
         while True:
             left = due - time.monotonic() if self.real_time else 0.2
-            # Also with no time left: a simulation behind its clock still hears what was said.
+            # Also without remaining time: a simulation behind its clock must still receive
+            # commands.
             if not self.node.spin(min(max(left, 0.0), 0.2)):
                 return None
             if self.real_time and left <= 0:
@@ -138,7 +139,7 @@ class Ros2Bridge:
                     return plan
 
     def _plan(self, obs: Observation) -> Plan | None:
-        """Of the newest command; None where there is none, or it is no plan."""
+        """The plan of the newest command; None without a valid one."""
         if self._newest is None:
             return None
         try:
@@ -149,7 +150,7 @@ class Ros2Bridge:
             return None
 
     def _publish(self, builder: MessageBuilder, obs: Observation) -> None:
-        # The clock comes first, so that nothing else is from the future.
+        # The clock is published first, so that no other message is from the future.
         publish = self.node.publish
         publish("/clock", "rosgraph_msgs/msg/Clock", builder.clock(obs.t_us))
         publish("/tf", "tf2_msgs/msg/TFMessage", builder.ego_transform(obs))
@@ -180,7 +181,7 @@ class RosNode:
     """
 
     def __init__(self) -> None:
-        """Begin ROS.
+        """Initialize ROS.
 
         Raises:
             NoRosError: a package of ROS cannot be imported.
@@ -195,7 +196,7 @@ class RosNode:
         self.types = MessageTypes(of=message_class, octets=_octets, numbers=list)
 
     def publish(self, topic: str, type_name: str, message: Any) -> None:
-        """Send a message; newcomers get the last one of topics that stand still."""
+        """Publish a message; latched topics keep the last one for new subscribers."""
         publisher = self._publishers.get(topic)
         if publisher is None:
             durable = self._qos.DurabilityPolicy
@@ -210,7 +211,7 @@ class RosNode:
         self._node.create_subscription(message_class(type_name), topic, receive, 1)
 
     def spin(self, seconds: float) -> bool:
-        """Receive for at most so long, or until a message has come; whether ROS still runs."""
+        """Receive until a message arrives, at most ``seconds``; returns whether ROS still runs."""
         if not self._rclpy.ok():
             return False
         self._rclpy.spin_once(self._node, timeout_sec=max(seconds, 0.0))

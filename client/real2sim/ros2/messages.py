@@ -1,6 +1,6 @@
 """Observations as ROS 2 messages.
 
-Frames are those of REP 103 and REP 105, which are ours: ``map`` is the world (z up), ``base_link``
+Frames follow REP 103 and REP 105, as ours do: ``map`` is the world (z up), ``base_link``
 the rear axle's centre on the ground (x forward, y left, z up), and ``CAMERA_optical`` a camera (x
 right, y down, z forward). Times are simulation times.
 """
@@ -41,12 +41,12 @@ ENCODINGS = {
 
 @dataclass(frozen=True)
 class MessageTypes:
-    """The message classes of whoever serialises them.
+    """Message classes of a serialiser.
 
     Attributes:
-        of: the class of a type such as ``sensor_msgs/msg/Image``; made with its fields by keyword.
-        octets: what its arrays of uint8 are made of bytes by.
-        numbers: what its arrays of float64 are made of numbers by.
+        of: the class of a type such as ``sensor_msgs/msg/Image``, constructed with keyword fields.
+        octets: converts bytes to its uint8 arrays.
+        numbers: converts numbers to its float64 arrays.
     """
 
     of: Callable[[str], Any]
@@ -56,7 +56,7 @@ class MessageTypes:
 
 @dataclass(frozen=True)
 class MessageBuilder:
-    """Makes messages of one kind of classes.
+    """Creates messages of one family of message classes.
 
     Attributes:
         types: the classes.
@@ -193,10 +193,10 @@ SPEED_TIME = 0.3
 """Within which a wanted speed is to be reached [s]."""
 
 MAX_ACCELERATION, MAX_BRAKING = 4.0, 8.0
-"""Where a message asks for no acceleration of its own [m/s^2]."""
+"""Limits for messages without an acceleration [m/s^2]."""
 
 MIN_TURN_SPEED = 0.1
-"""Below this speed a turn rate says nothing about the wheels [m/s]."""
+"""Below this speed the turn rate does not determine the steering angle [m/s]."""
 
 
 class CommandError(Real2SimError):
@@ -212,8 +212,8 @@ def of_ackermann(message: Any, obs: Observation) -> Control:
 
 
 def of_twist(message: Any, obs: Observation, *, wheelbase: float = 2.8) -> Control:
-    """Of geometry_msgs/Twist, also stamped: speed along x [m/s], below 0 backwards, and turn rate
-    about z [rad/s], which becomes the angle of the wheels of a vehicle of a ``wheelbase`` [m]."""
+    """Convert geometry_msgs/Twist, also stamped: speed along x [m/s], negative for reverse, and yaw
+    rate about z [rad/s], which becomes the steering angle for ``wheelbase`` [m]."""
     twist = getattr(message, "twist", message)
     speed, turn = float(twist.linear.x), float(twist.angular.z)
     steering = math.atan(wheelbase * turn / speed) if abs(speed) > MIN_TURN_SPEED else 0.0
@@ -221,12 +221,11 @@ def of_twist(message: Any, obs: Observation, *, wheelbase: float = 2.8) -> Contr
 
 
 def of_path(message: Any, obs: Observation) -> TrajectoryPlan:
-    """Of nav_msgs/Path in ``map`` or ``base_link``: poses at the times of their headers; what is
-    over already is left out.
+    """Convert nav_msgs/Path in ``map`` or ``base_link``: poses at the times of their headers; past
+    poses are dropped.
 
     Raises:
-        CommandError: another frame, or no pose that is still to come, or times that do not
-            increase.
+        CommandError: another frame, no future pose, or times that do not increase.
     """
     frame = message.header.frame_id or MAP
     if frame not in {MAP, BASE}:
@@ -249,7 +248,7 @@ def of_path(message: Any, obs: Observation) -> TrajectoryPlan:
 
 
 def standing(action: str, obs: Observation) -> Control | TrajectoryPlan:
-    """What is done before there is any command: stop."""
+    """The plan before the first command: stop."""
     if action == "control":
         return Control(acceleration=-MAX_ACCELERATION, steering=0.0)
     return TrajectoryPlan(times_us=[obs.t_us + 1_000_000], poses=[(0.0, 0.0, 0.0)])

@@ -1,28 +1,28 @@
-"""The worker on the network; the only package that knows HTTP.
+"""The HTTP and WebSocket service of a worker; the only package that uses HTTP.
 
-Its parts, lowest first; each imports only those before it, and no file is part of a circle:
+Its parts, lowest first. Each imports only earlier ones; there are no import cycles:
 
-- ``clock``: time as the worker reads it.
+- ``clock``: the worker's clock.
 - ``storage``: a ``Database`` that executes statements, and a ``Store`` of scenarios, sessions, jobs
-  and stored answers.
-- ``shared_objects``: bundles and files that workers share, stored by content.
-- ``accounts``: named tokens with roles and limits, and what their holders use.
-- ``preflight``: checks, and a second process that compiles kernels, before heavy imports.
-- ``warm_up``: kernels compiled or loaded before they are needed.
+  and stored replies.
+- ``shared_objects``: content-addressed bundles and files shared by workers.
+- ``accounts``: named tokens with roles and limits, and their usage.
+- ``preflight``: checks before heavy imports, and a second process that compiles kernels.
+- ``warm_up``: compiles or loads kernels ahead of use.
 - ``engine``: the thread that owns the device, and its queue.
-- ``http``: what all replies share: errors, authorisation, idempotency, limits, telemetry and
+- ``http``: shared by all replies: errors, authorisation, idempotency, limits, telemetry and
   connections.
 - ``library``: scenes and assets, on disk and in memory.
-- ``rendering``: render requests, and images as frames of the wire.
-- ``scenarios``: edited under a lock each, cached, recorded before they take effect.
-- ``jobs``: long work: rollouts, videos, data sets.
-- ``sessions``: closed loops; ``pipeline`` takes a step from the socket to the bytes of its answer.
-- ``drives``: planners that drive sessions as jobs.
-- ``sweeps``: sweeps and searches, in processes of their own, as jobs.
+- ``rendering``: render requests, and images as frames of the protocol.
+- ``scenarios``: edits under one lock per scenario, cached, stored before they take effect.
+- ``jobs``: long-running work: rollouts, videos, data sets.
+- ``sessions``: closed loops; ``pipeline`` processes a step from the socket to the encoded reply.
+- ``drives``: jobs in which planners drive sessions.
+- ``sweeps``: sweeps and searches as jobs, in separate processes.
 - ``membership``: a worker in a fleet: its lease, shared objects, prewarmed scenes, reports.
 - ``audit``: the audit log.
-- ``maintenance``: removes leftovers and whatever exceeds the limits.
-- ``worker``: puts all of it together.
-- ``routes``: calls and sockets; ``ui`` is the studio that they serve as files.
+- ``maintenance``: removes leftovers and data above the limits.
+- ``worker``: assembles the parts.
+- ``routes``: REST calls and sockets; ``ui`` is the studio, served as files.
 - ``app``, ``serve``: the ASGI application, and the server that runs it.
 """

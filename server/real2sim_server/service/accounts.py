@@ -1,6 +1,6 @@
-"""Tokens with roles and limits, and what the account of each token uses.
+"""Tokens with roles and limits, and the usage of each token's account.
 
-Limits are checked before work begins. All state belongs to the event loop.
+Limits are checked before work begins. All state is used only on the event loop.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from .._files import atomic_file
 from . import clock
 
-# Tokens: the file of named tokens and the worker's secrets. The file holds hashes; a token is only
-# shown when it is created.
+# The file of named tokens and the worker's secrets. The file has hashes; a token is only shown when
+# it is created.
 
 # --- Hashes and sealed answers -------------------------------------------------------------------
 
@@ -34,11 +34,11 @@ KEY_BYTES = 32
 NONCE_BYTES = 16
 
 _SEALED = b"\x01"
-"""First byte of a sealed body; one that is not sealed is JSON."""
+"""First byte of a sealed body; an unsealed body is JSON."""
 
 
 def token_hash(token: str) -> str:
-    """What is kept of a token. It has 192 random bits: nobody can guess it from its hash."""
+    """Hash of a token for storage. A token has 192 random bits, so its hash can be public."""
     return hashlib.sha256(b"token:" + token.encode()).hexdigest()
 
 
@@ -49,7 +49,7 @@ def sealed(body: bytes, secret: str) -> bytes:
 
 
 def unsealed(stored: bytes, secret: str) -> bytes:
-    """The body that was sealed with ``secret``."""
+    """Open a body that was sealed with ``secret``."""
     if not stored.startswith(_SEALED):
         return stored
     nonce = stored[1 : 1 + NONCE_BYTES]
@@ -64,7 +64,7 @@ def _masked(body: bytes, nonce: bytes, secret: str) -> bytes:
 
 
 def worker_key(folder: Path) -> bytes:
-    """The key of a state folder, made the first time; only its owner can read it.
+    """The key of a state folder, created on first use; only its owner can read it.
 
     Raises:
         OSError: the folder cannot be written to.
@@ -84,21 +84,21 @@ def worker_key(folder: Path) -> bytes:
 
 
 DEFAULT_NAME = "default"
-"""Of ``REAL2SIM_TOKEN``, and of everybody where a worker wants no token."""
+"""Account name of ``REAL2SIM_TOKEN``, and of all requests if the worker requires no token."""
 MAX_TOKENS = 1000
 TOKEN_BYTES = 24
 MAX_FILE_BYTES = 1 << 20
 
 Role = Literal["observe", "drive", "edit", "administer"]
-"""What the holder of a token may do."""
+"""Permissions of a token."""
 ROLES: tuple[Role, ...] = ("observe", "drive", "edit", "administer")
-"""Each may all that the one before it may."""
+"""In increasing order; each role includes the previous ones."""
 
 Rate = Annotated[float, Field(gt=0, le=1e15, allow_inf_nan=False)]
 
 
 class TokenFileError(ValueError):
-    """A file of tokens that cannot be used; the message says why and what to do."""
+    """An unusable token file; the message states the reason and the remedy."""
 
 
 class _Strict(BaseModel):
@@ -106,12 +106,12 @@ class _Strict(BaseModel):
 
 
 class TokenLimits(_Strict):
-    """What the holder of a token may take; None is no limit.
+    """Limits of a token's usage; None is no limit.
 
     Attributes:
-        requests_per_second: requests and messages of sockets; a second's worth at once.
-        sessions: open at a time.
-        jobs: not over, at a time.
+        requests_per_second: requests and socket messages; bursts of one second's worth.
+        sessions: open sessions.
+        jobs: unfinished jobs.
     """
 
     requests_per_second: Rate | None = None
@@ -123,11 +123,11 @@ class NamedToken(_Strict):
     """One token.
 
     Attributes:
-        name: of whoever holds it; metrics, logs, sessions and jobs name it so.
-        hash: of the token, as :func:`~.storage.tokens.token_hash` makes it.
+        name: name of the holder, in metrics, logs, sessions and jobs.
+        hash: hash of the token, from :func:`~.storage.tokens.token_hash`.
         created_at: UTC, ISO 8601.
-        limits: what its holder may take.
-        role: what its holder may do.
+        limits: limits of its usage.
+        role: its permissions.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,39}$")]
@@ -160,10 +160,10 @@ class TokenFile(_Strict):
 
 
 def read_token_file(path: Path) -> TokenFile:
-    """The tokens of a file.
+    """Read the tokens of a file.
 
     Raises:
-        TokenFileError: it is missing, cannot be read, or says something else.
+        TokenFileError: it is missing, unreadable or invalid.
     """
     try:
         with path.open("rb") as file:
@@ -188,13 +188,13 @@ def read_token_file(path: Path) -> TokenFile:
 
 
 def add_token(path: Path, name: str, limits: TokenLimits, *, role: Role = "administer") -> str:
-    """Make a token, and add its hash to a file, which is made where it is missing.
+    """Create a token and add its hash to a file, which is created if missing.
 
     Returns:
-        The token, which is written nowhere.
+        The token, which is not stored anywhere.
 
     Raises:
-        TokenFileError: the name is taken or none, or the file cannot be used.
+        TokenFileError: the name is taken or invalid, or the file is unusable.
     """
     present = read_token_file(path) if path.exists() else TokenFile()
     if any(token.name == name for token in present.tokens):
@@ -216,7 +216,7 @@ def add_token(path: Path, name: str, limits: TokenLimits, *, role: Role = "admin
 
 
 def remove_token(path: Path, name: str) -> None:
-    """Take a token out of a file. Raises TokenFileError where there is none of that name."""
+    """Remove a token from a file. Raises TokenFileError if there is none with that name."""
     present = read_token_file(path)
     left = tuple(token for token in present.tokens if token.name != name)
     if len(left) == len(present.tokens):
@@ -238,13 +238,13 @@ def _write(path: Path, tokens: TokenFile) -> None:
 
 
 RELOAD_S = 1.0
-"""Between looks whether the file of tokens has changed."""
+"""Interval between checks of the token file for changes [s]."""
 
 log = structlog.get_logger(__name__)
 
 
 class Limit(StrEnum):
-    """What can be used up."""
+    """Limited resources."""
 
     REQUESTS = "requests"
     SESSIONS = "sessions"
@@ -252,12 +252,12 @@ class Limit(StrEnum):
 
 
 class OverLimitError(Exception):
-    """The holder of a token has taken what they may; nothing has happened.
+    """An account has reached a limit; the request had no effect.
 
     Args:
-        limit: which one.
-        detail: what was taken and what is allowed.
-        retry_after_s: when it may be asked again.
+        limit: the limit.
+        detail: usage and limit.
+        retry_after_s: seconds until a retry may succeed.
     """
 
     def __init__(self, limit: Limit, detail: str, *, retry_after_s: float) -> None:
@@ -267,17 +267,17 @@ class OverLimitError(Exception):
 
 
 class RevokedError(Exception):
-    """The token was removed while its holder was connected, or had a session."""
+    """The token was removed while its holder was connected or had a session."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"the token {name!r} is no longer valid")
 
 
 class Meter:
-    """A bucket that leaks as fast as is allowed.
+    """A leaky bucket.
 
     Args:
-        rate: per second; as much may also come at once, and one at least.
+        rate: rate per second; also the burst size, at least one.
     """
 
     def __init__(self, rate: float) -> None:
@@ -286,7 +286,7 @@ class Meter:
         self._at = clock.monotonic()
 
     def take(self) -> float:
-        """Take one; 0, or the seconds until there is one to take [s]."""
+        """Take one unit; returns 0, or the seconds until one is available [s]."""
         now = clock.monotonic()
         self._level = max(0.0, self._level - (now - self._at) * self._rate)
         self._at = now
@@ -298,7 +298,7 @@ class Meter:
 
 
 class Held(NamedTuple):
-    """What somebody has that is limited in number."""
+    """Numbers of an account's limited resources."""
 
     sessions: int = 0
     jobs: int = 0
@@ -309,17 +309,17 @@ NOTHING = Held()
 
 @dataclass(eq=False)
 class Account:
-    """What the holder of a token has taken since the worker started.
+    """Usage of a token since the worker started.
 
     Attributes:
-        name: of the token.
-        limits: what its holder may take.
-        role: what its holder may do.
-        requests: and messages of sockets, those that were let in.
-        refusals: by limit.
-        elsewhere: sessions and unfinished jobs on other workers of the fleet, as they last told.
-        revoked: whether the token is no more.
-        on_revoked: called on the event loop when that comes to be.
+        name: name of the token.
+        limits: limits of its usage.
+        role: its permissions.
+        requests: admitted requests and socket messages.
+        refusals: refusals by limit.
+        elsewhere: sessions and unfinished jobs on other workers of the fleet, as last reported.
+        revoked: whether the token has been removed.
+        on_revoked: called on the event loop when the token is removed.
     """
 
     name: str
@@ -335,17 +335,17 @@ class Account:
         self.limit(self.limits)
 
     def limit(self, limits: TokenLimits) -> None:
-        """Other limits from now on; what was taken up to now does not count against them."""
+        """Change the limits; earlier usage does not count against them."""
         self.limits = limits
         rate = limits.requests_per_second
         self._requests = None if rate is None else Meter(rate)
 
     def admit(self) -> None:
-        """Let one request or message in, and count it. On the event loop.
+        """Admit and count one request or message. On the event loop.
 
         Raises:
-            RevokedError: the token is no more.
-            OverLimitError: it has had its requests.
+            RevokedError: the token has been removed.
+            OverLimitError: the request limit is reached.
         """
         if self.revoked:
             raise RevokedError(self.name)
@@ -355,16 +355,16 @@ class Account:
         self.requests += 1
 
     def check_sessions(self, present: int) -> None:
-        """Raises OverLimitError where ``present`` sessions of this worker, with those of others,
-        are as many as may be open."""
+        """Raises OverLimitError if ``present`` sessions on this worker, plus those on others, reach
+        the limit."""
         most, present = self.limits.sessions, present + self.elsewhere.sessions
         if most is not None and present >= most:
             detail = f"{present} sessions are open, {most} may be"
             raise self._over(Limit.SESSIONS, detail, 5.0)
 
     def check_jobs(self, present: int) -> None:
-        """Raises OverLimitError where ``present`` unfinished jobs of this worker, with those of
-        others, are as many as there may be."""
+        """Raises OverLimitError if ``present`` unfinished jobs on this worker, plus those on
+        others, reach the limit."""
         most, present = self.limits.jobs, present + self.elsewhere.jobs
         if most is not None and present >= most:
             detail = f"{present} jobs are not over, {most} may be"
@@ -377,31 +377,31 @@ class Account:
 
 
 ACCOUNT: ContextVar[Account | None] = ContextVar("account", default=None)
-"""For whom the running task works; tasks that it starts work for the same one."""
+"""Account of the running task; tasks that it starts inherit it."""
 
 
 def admit_message() -> None:
-    """Let a message of a socket in; see :meth:`Account.admit`."""
+    """Admit a socket message; see :meth:`Account.admit`."""
     account = ACCOUNT.get()
     if account is not None:
         account.admit()
 
 
 def owner_name() -> str:
-    """Name of the account that the running task makes things for."""
+    """Name of the account that owns objects created by the running task."""
     account = ACCOUNT.get()
     return account.name if account is not None else DEFAULT_NAME
 
 
 class Accounts:
-    """All accounts of a worker. Belongs to the event loop.
+    """All accounts of a worker, for use on the event loop.
 
     Args:
-        token: the worker's single token, whose account is ``default``.
-        file: of named tokens; it may change at any time.
+        token: the worker's single token, with the account ``default``.
+        file: file of named tokens; it may change at any time.
 
     Raises:
-        TokenFileError: the file cannot be used.
+        TokenFileError: the file is unusable.
     """
 
     def __init__(self, *, token: str | None, file: Path | None) -> None:
@@ -415,24 +415,24 @@ class Accounts:
         self._load()
 
     def __iter__(self) -> Iterator[Account]:
-        """All that were ever there since the start, for metrics."""
+        """All accounts since the start, including removed ones, for metrics."""
         return iter(list(self._by_name.values()))
 
     def of_token(self, given: str | None) -> Account | None:
-        """The account that a token opens; None for a wrong one.
+        """The account of a token; None for a wrong one.
 
-        Where the worker wants no token, that of everybody.
+        If the worker requires no token, this is the default account.
         """
         if not self.wants_token:
             return self.default
-        # Looked up by hash: how long that takes tells nothing of the tokens there are.
+        # Looked up by hash, so that the duration reveals nothing about existing tokens.
         return self._by_hash.get(token_hash(given)) if given is not None else None
 
     def of_owner(self, name: str) -> Account:
-        """The account of whoever made something.
+        """The account of an owner.
 
         Raises:
-            RevokedError: their token is no more.
+            RevokedError: the owner's token has been removed.
         """
         account = self._by_name.get(name)
         if account is None or account.revoked:
@@ -441,11 +441,11 @@ class Accounts:
 
     @property
     def counts(self) -> bool:
-        """Whether anybody's sessions or jobs are limited in number."""
+        """Whether any account has a limited number of sessions or jobs."""
         return any(a.limits.sessions is not None or a.limits.jobs is not None for a in self)
 
     def take_word(self, told: Iterable[Mapping[str, Any]]) -> None:
-        """Take over what other workers have told of who has how much on them.
+        """Update the usage on other workers from their reports.
 
         Args:
             told: by worker ``{name: [sessions, jobs]}``.
@@ -459,7 +459,7 @@ class Accounts:
             account.elsewhere = sums.get(account.name, NOTHING)
 
     async def watch(self) -> None:
-        """Follow the file of tokens for ever; one that cannot be used changes nothing."""
+        """Reload the token file on changes, until cancelled; an unusable file changes nothing."""
         while self._file is not None:
             await asyncio.sleep(RELOAD_S)
             await asyncio.to_thread(self.reload)
@@ -469,7 +469,7 @@ class Accounts:
                         tell()
 
     def reload(self) -> None:
-        """Take over the file's tokens if it has changed; on any thread."""
+        """Reload the file's tokens if it has changed; on any thread."""
         try:
             self._load()
         except TokenFileError as error:
@@ -498,7 +498,7 @@ class Accounts:
             log.info("tokens reloaded", tokens=len(tokens))
 
     def _again(self, before: Account | None, name: str) -> Account:
-        """A new account, which goes on counting where one of its name has ended."""
+        """A new account, which continues the counters of a removed one with the same name."""
         account = Account(name)
         if before is not None:
             account.requests, account.refusals = before.requests, dict(before.refusals)

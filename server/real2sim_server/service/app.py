@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from opentelemetry.sdk.trace import TracerProvider
 
 STEPS = ("/step", "/render", "/reset")
-"""Ends of paths of what happens many times a second, and changes nothing that others see."""
+"""Path suffixes of frequent calls without shared effects."""
 
 PROTECTED: tuple[APIRouter, ...] = (
     server.router,
@@ -58,11 +58,11 @@ OPEN: tuple[APIRouter, ...] = (
     server.ui_router,
     server.docs_router,
 )
-"""Routers that ask for a token themselves, where they want one."""
+"""Routers that check tokens themselves."""
 
 
 def operation_id(route: APIRoute) -> str:
-    """Name of a call in OpenAPI, stable as long as its function's name is: ``scenes-render``."""
+    """Operation id in OpenAPI, which depends only on the function's name: ``scenes-render``."""
     subject = str(route.tags[0]) if route.tags else "worker"
     return f"{subject}-{route.name}"
 
@@ -90,8 +90,8 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        # Before anything else runs: FastAPI builds its routes at the first request, by way of
-        # warnings.catch_warnings(), which other threads must not use at the same time.
+        # Before anything else runs: FastAPI builds its routes at the first request and uses
+        # warnings.catch_warnings(), which is not thread-safe.
         await _build_routes(app)
         app.openapi_schema = published(app)
         async with AsyncExitStack() as at_exit:
@@ -128,13 +128,13 @@ def create_app(settings: Settings) -> FastAPI:
 
 
 async def _build_routes(app: FastAPI) -> None:
-    """Let a request that no route matches pass all of them."""
+    """Pass a request that matches no route through all of them."""
 
     async def receive() -> Message:
         return {"type": "http.disconnect"}
 
     async def send(_message: Message) -> None:
-        """Nobody listens."""
+        """Discard the message."""
 
     unmatched = {"type": "http", "method": "GET", "path": "/unmatched", "headers": [], "app": app}
     with suppress(HTTPException):
@@ -142,14 +142,14 @@ async def _build_routes(app: FastAPI) -> None:
 
 
 def trace(app: FastAPI, worker: Worker, provider: TracerProvider) -> None:
-    """Let requests and what the engine does for them leave spans."""
+    """Create spans for requests and their engine jobs."""
     app.add_middleware(Tracing, provider=provider)
     worker.engine.on_queued = engine_spans(provider)
 
 
 def note_request(worker: Worker, scope: Scope, method: str, status: int, request_id: str) -> None:
-    """Put on record who changed something, and who was refused for their token or role. What a
-    session does step by step is on record with the session."""
+    """Log changes and refusals for a token or role in the audit log. The steps of a session are
+    recorded with the session."""
     path = scope["path"]
     refused = status in (401, 403)
     if not refused and (method in READING or status >= 400 or path.endswith(STEPS)):
@@ -170,7 +170,7 @@ def note_request(worker: Worker, scope: Scope, method: str, status: int, request
 
 
 async def _work_again(worker: Worker, info: JobInfo) -> Work:
-    """The work of a job on record, for the account that it was asked for with."""
+    """Rebuild the work of a stored job, for its original account."""
     ACCOUNT.set(worker.accounts.of_owner(info.owner))
     if info.kind == "simulate":
         return await worker.simulations.rebuild(info)

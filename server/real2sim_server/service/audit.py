@@ -1,6 +1,6 @@
 """The audit log: every request that changes something or is refused for its token or role.
 
-Entries are written beside the requests, so that no request waits for them.
+Entries are written in the background, so that no request waits for them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .storage.store import Store, StoreError, Write
 # --- The log in the store ------------------------------------------------------------------------
 
 RETENTION_US = 365 * 24 * 3600 * 1_000_000
-"""For which entries are kept."""
+"""Retention time of entries [us]."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class AuditEntry:
     """A request that changed something, or was refused for its token or role.
 
     Attributes:
-        account: name of the token; empty where there was none that is valid.
-        client: address that it came from.
-        worker_id: that answered.
+        account: name of the token; empty without a valid one.
+        client: address of the client.
+        worker_id: worker that answered.
         method, path: of the request.
-        status: of the answer.
-        request_id: as in the answer and the log.
-        at_us: when, wall clock [us].
+        status: status of the reply.
+        request_id: as in the reply and the log.
+        at_us: wall clock [us].
     """
 
     account: str
@@ -49,7 +49,7 @@ class AuditEntry:
 
 
 class AuditLog:
-    """Entries beyond the life of a process.
+    """Stored entries.
 
     Args:
         store: open while this is used.
@@ -59,7 +59,7 @@ class AuditLog:
         self._store = store
 
     async def add(self, entries: Sequence[AuditEntry]) -> None:
-        """Put entries on record, and forget those of more than a year ago."""
+        """Store entries, and delete those older than a year."""
         old = t.audit.c.at_us < now_us() - RETENTION_US
         rows = [asdict(entry) for entry in entries]
         await self._store.write(
@@ -70,8 +70,8 @@ class AuditLog:
         """Entries, newest first.
 
         Args:
-            account: only of this token; None for all.
-            limit: so many at most.
+            account: only entries of this token; None for all.
+            limit: maximum number.
         """
         a = t.audit.c
         query = sa.select(*(a[name] for name in AuditEntry.__dataclass_fields__))
@@ -82,18 +82,18 @@ class AuditLog:
 
 
 FLUSH_S = 1.0
-"""Between writes; the last second is lost with a worker that is killed."""
+"""Interval of writes [s]; a killed worker loses the last one."""
 MAX_WAITING = 10_000
-"""Entries that wait while the store is in trouble; older ones are dropped then."""
+"""Maximum number of pending entries while the store fails; older ones are dropped."""
 
 log = structlog.get_logger(__name__)
 
 
 class Audit:
-    """Gathers entries and puts them on record. Belongs to the event loop.
+    """Collects entries and stores them, for use on the event loop.
 
     Args:
-        audit_log: keeps them.
+        audit_log: stores them.
     """
 
     def __init__(self, audit_log: AuditLog) -> None:
@@ -101,14 +101,14 @@ class Audit:
         self._waiting: deque[AuditEntry] = deque(maxlen=MAX_WAITING)
 
     def note(self, entry: AuditEntry) -> None:
-        """Remember an entry; it is on record a second later."""
+        """Queue an entry; it is stored within a second."""
         if len(self._waiting) == MAX_WAITING:
             log.error("audit entry dropped", entry=vars(self._waiting[0]))
         self._waiting.append(entry)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Writes for the length of the block, and what is left at its end."""
+        """Write entries during the block, and the remaining ones at its end."""
         writing = asyncio.create_task(self._write_for_ever(), name="audit")
         try:
             yield
@@ -120,7 +120,7 @@ class Audit:
                 await self.flush()
 
     async def flush(self) -> None:
-        """Write what waits. Raises StoreError: it waits on."""
+        """Write pending entries. Raises StoreError: they stay pending."""
         entries = list(self._waiting)
         if not entries:
             return

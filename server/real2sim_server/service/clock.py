@@ -1,6 +1,6 @@
-"""Time as the worker reads it: one place, so that tests can move it.
+"""The worker's clock, in one module so that tests can replace it.
 
-Call these through the module, ``clock.monotonic()``: a test that replaces one replaces it for all.
+Call these through the module, ``clock.monotonic()``, so that a replacement applies everywhere.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import time
 
 
 def monotonic() -> float:
-    """Seconds that never go back; only differences have a meaning [s]."""
+    """Monotonic time [s]; only differences are meaningful."""
     return time.monotonic()
 
 

@@ -1,4 +1,4 @@
-"""Drives: jobs in which a planner drives a session and leaves a recording."""
+"""Drives: jobs in which a planner drives a session and stores a recording."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ from .sessions.session import Session
 
 CLOSE_S = 3.0
 NICENESS = 10
-"""Of a command that gives way."""
+"""Niceness of a process that yields to urgent work."""
 
 MAX_ERROR_BYTES = 16_384
 MAX_LINE_BYTES = 65_536
 
 
 class CommandProcess:
-    """``real2sim ...``, started by :meth:`run`.
+    """A ``real2sim`` command in a child process, started by :meth:`run`.
 
     Attributes:
-        told: the newest line of JSON on its standard output, where that is read; None before one.
+        told: newest line of JSON on its standard output, if followed; None before the first.
     """
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
@@ -66,13 +66,13 @@ class CommandProcess:
         environment: Mapping[str, str] | None = None,
         follow: bool = False,
     ) -> Self:
-        """Start it.
+        """Start the process.
 
         Args:
-            arguments: behind ``real2sim``.
-            environment: variables that it has beside those of this process.
-            follow: whether its standard output is read, and its standard input ends with this
-                process, as ``--follow`` wants it.
+            arguments: arguments after ``real2sim``.
+            environment: additional environment variables.
+            follow: whether to read its standard output, and to close its standard input when this
+                process ends, as ``--follow`` requires.
         """
         pipe, nothing = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
         process = await asyncio.create_subprocess_exec(
@@ -87,17 +87,17 @@ class CommandProcess:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the process is running."""
         return self._process.returncode is None
 
     def yield_to_urgent(self) -> None:
-        """Let it have what processor time others leave."""
-        # It has ended, or the system has no such thing.
+        """Lower its scheduling priority."""
+        # The process has ended, or the system does not support it.
         with contextlib.suppress(OSError, AttributeError):
             os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
 
     async def error(self) -> str | None:
-        """What it said last, where it failed; after its end."""
+        """Its last error output if it failed; after its end."""
         if await self._process.wait() == 0:
             return None
         said = (await self._errors).decode("utf-8", "replace").split("\n")
@@ -105,7 +105,7 @@ class CommandProcess:
         return lines[-1] if lines else f"the process ended with {self._process.returncode}"
 
     async def close(self) -> None:
-        """End it, whatever it does."""
+        """Kill the process."""
         for end in (self._process.terminate, self._process.kill):
             if not self.running:
                 break
@@ -120,7 +120,7 @@ class CommandProcess:
     async def _listen(self) -> None:
         if self._process.stdout is None:
             return
-        # A line that is too long, or none of JSON, is not of those that are followed.
+        # A line that is too long or not JSON is not a progress line.
         while True:
             try:
                 line = await self._process.stdout.readline()
@@ -134,7 +134,7 @@ class CommandProcess:
 
 
 async def _last_of(stream: asyncio.StreamReader) -> bytes:
-    """The end of a stream, once it has ended."""
+    """The last part of a stream, at its end."""
     kept = b""
     while data := await stream.read(65_536):
         kept = (kept + data)[-MAX_ERROR_BYTES:]
@@ -144,13 +144,13 @@ async def _last_of(stream: asyncio.StreamReader) -> bytes:
 # --- The planner's process -----------------------------------------------------------------------
 
 EPISODE_STEPS = 100_000
-"""More than any recording has: it ends with its episode."""
+"""More steps than any recording has: the drive ends with its episode."""
 
 OF_THE_PLANNER = {
     *("sensors", "lidars", "radars", "action", "privileged"),
     *("seed", "dt_us", "warmup_us"),
 }
-"""Of a reset: what a planner says itself, and what the command has options of its own for."""
+"""Options of a reset that the planner sets itself, or that the command has options for."""
 
 
 async def start_planner(
@@ -159,10 +159,10 @@ async def start_planner(
     """Start `real2sim drive --session`.
 
     Args:
-        request: which planner, and for how long.
-        session: that it drives, reset as it was made.
-        url: of the worker.
-        token: of the session; handed over in the environment, which other users cannot read.
+        request: the planner, and the number of steps.
+        session: the session to drive, with its own reset options.
+        url: address of the worker.
+        token: token of the session; passed in the environment, which other users cannot read.
     """
     environment = {"REAL2SIM_SESSION_TOKEN": token}
     return await CommandProcess.run(_command(request, session, url), environment=environment)
@@ -189,12 +189,11 @@ def _command(request: DriveRequest, session: Session, url: str) -> list[str]:
 
 
 def playback_of(recording: Recording, drive: EpisodeDrive, *, reason: str | None) -> dict[str, Any]:
-    """Times, poses, scores, plans and events by instant.
+    """Times, poses, scores, plans and events of a drive, by step.
 
-    ``tracks``, ``ego`` and ``times_us`` are as those of a physics rollout (`rollouts.describe`);
-    ``metrics`` has a list for each score, ``plans`` poses (x [m], y [m], yaw [rad], world) that
-    were planned from each instant, ``speeds`` is of the ego [m/s];
-    ``reason`` says why the episode is over.
+    ``tracks``, ``ego`` and ``times_us`` are as in a physics rollout (`rollouts.describe`).
+    ``metrics`` has a list per score; ``plans`` has the planned poses (x [m], y [m], yaw [rad],
+    world) of each step; ``speeds`` are those of the ego [m/s]; ``reason`` is why the episode ended.
     """
     worlds = drive.worlds
     seen = [world.observe() for world in worlds]
@@ -249,7 +248,7 @@ def _tracks(worlds: tuple[World, ...]) -> dict[str, Any]:
 
 
 def _plans(recording: Recording, worlds: tuple[World, ...]) -> list[Any]:
-    """What was planned from each instant; none where a plan was kept, or is no trajectory."""
+    """Planned poses of each step; none if the plan is held, or is not a trajectory."""
     by_step = {world.steps: world for world in worlds}
     plans = dict[int, Any]()
     for entry in recording.entries:
@@ -274,17 +273,17 @@ def _rounded(values: Any) -> Any:
 PLAYBACK, RECORDED = "playback.json", "recording.r2e"
 CHECK_S = 0.1
 MAX_CACHED_DRIVES = 4
-"""Finished drives kept open; others are replayed from their files again."""
+"""Cached finished drives; others are replayed from their files."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seat:
-    """Where a planner may sit down.
+    """Session and address for a planner.
 
     Attributes:
-        session: that it drives.
-        url: of this worker, as seen from this machine.
-        token: that opens the session.
+        session: session to drive.
+        url: address of this worker, from this machine.
+        token: token of the session.
     """
 
     session: Session
@@ -293,7 +292,7 @@ class Seat:
 
 
 class Drives:
-    """Starts drives and shows finished ones. Belongs to the event loop."""
+    """Starts drives and shows finished ones, for use on the event loop."""
 
     def __init__(
         self, jobs: Jobs, sessions: Sessions, scene_cache: SceneCache, assets: AssetLookup
@@ -307,10 +306,10 @@ class Drives:
     async def start(
         self, seat: Seat, request: DriveRequest, *, who: str, idempotent: IdempotentRequest
     ) -> JobInfo:
-        """Let a planner drive; its recording is kept when the episode is over.
+        """Let a planner drive, and save the recording when the episode ends.
 
         Raises:
-            ServiceError: as jobs do.
+            ServiceError: as for jobs.
         """
         row = seat.session.row
 
@@ -347,10 +346,10 @@ class Drives:
         )
 
     async def video_source(self, job_id: str) -> VideoSource:
-        """What a finished drive shows, from its own vehicle.
+        """Video source of a finished drive, seen from its own vehicle.
 
         Raises:
-            ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; as the scene cache does.
+            ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; or as for the scene cache.
         """
         drive = self._opened.get(job_id)
         if drive is None:
@@ -385,13 +384,13 @@ def _figures(recording: Recording, session: Session) -> dict[str, object]:
     }
 
 
-# --- at the wheel -------------------------------------------------------------------------------
+# --- driving ------------------------------------------------------------------------------------
 
 
 async def _driven(
     sessions: Sessions, seat: Seat, request: DriveRequest, context: JobContext
 ) -> str | None:
-    """Wait until the drive is over; what the planner failed with, if it did.
+    """Wait until the drive ends; returns the planner's error, if any.
 
     Raises:
         ServiceError: JOB_FAILED, the planner did not drive a single step.
@@ -418,7 +417,7 @@ async def _driven(
 
 @asynccontextmanager
 async def _planner(seat: Seat, request: DriveRequest) -> AsyncIterator[CommandProcess | None]:
-    """The planner's process while it drives; None where somebody else brings theirs."""
+    """The planner's process during the drive; None if an external planner drives."""
     if request.planner is None:
         yield None
         return

@@ -1,4 +1,4 @@
-"""Maintenance of a worker: removes leftovers of killed runs and whatever exceeds the limits."""
+"""Maintenance of a worker: removes leftovers of killed runs and data above the limits."""
 
 from __future__ import annotations
 
@@ -23,27 +23,26 @@ from .storage.store import Claim, Store, Write
 
 # --- Retention -----------------------------------------------------------------------------------
 
-# Scenarios stay until somebody deletes them. Rows go in small pieces with pauses between
-# them, so that a step waits for one piece at most.
+# Scenarios stay until somebody deletes them. Rows are deleted in small batches with pauses between
+# them, so that a step waits for one batch at most.
 
 DAY_US = 86_400 * 1_000_000
 PIECE_ROWS = 1000
 PIECE_PAGES = 256
 SESSIONS_AT_ONCE = 8
 BREATH_S = 0.01
-"""Between two pieces."""
+"""Pause between batches [s]."""
 
 log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True)
 class RetentionLimits:
-    """What a store may keep.
+    """Limits of a store.
 
     Attributes:
-        session_days: an ended session is kept for so long after its end, and one that nobody uses
-            is ended after so long.
-        max_bytes: above which the oldest ended sessions go earlier.
+        session_days: days after which an ended session is deleted, and an unused one is ended.
+        max_bytes: size above which the oldest ended sessions are deleted earlier.
     """
 
     session_days: float
@@ -51,12 +50,12 @@ class RetentionLimits:
 
 
 class Retention:
-    """Keeps the store of a worker within its limits.
+    """Limits the store of a worker.
 
     Args:
-        store: open while this is used.
-        limits: what it may keep.
-        worker_id: whose unused sessions are ended.
+        store: open during use.
+        limits: the limits.
+        worker_id: worker whose unused sessions are ended.
     """
 
     def __init__(self, store: Store, limits: RetentionLimits, *, worker_id: str) -> None:
@@ -65,13 +64,13 @@ class Retention:
         self._worker_id = worker_id
 
     async def tidy(self, *, in_use: Collection[str] = ()) -> int:
-        """Let go of what is beyond the limits; the sessions that went.
+        """Delete data beyond the limits; returns the number of deleted sessions.
 
         Args:
-            in_use: open sessions that are in memory.
+            in_use: open sessions in memory.
 
         Raises:
-            StoreTroubleError: the store is in trouble; the rest goes another time.
+            StoreTroubleError: the store fails; the next run deletes the rest.
         """
         cutoff_us = now_us() - round(self._limits.session_days * DAY_US)
         await self._end_unused(cutoff_us, in_use)
@@ -97,7 +96,7 @@ class Retention:
         return removed
 
     async def _end_unused(self, cutoff_us: int, in_use: Collection[str]) -> None:
-        """End the sessions that nobody has used since ``cutoff_us``."""
+        """End the sessions unused since ``cutoff_us``."""
         s, entry = t.sessions, t.session_log
         newest = (
             sa.select(entry.c.created_us)
@@ -116,7 +115,7 @@ class Retention:
                 await self._store.close_session(Claim(**row), reason=reason)
 
     async def _ended(self, *, before_us: int | None = None) -> Sequence[str]:
-        """Some ended sessions, those that ended first."""
+        """Some ended sessions, oldest end first."""
         closed = t.sessions.c.closed_us
         query = sa.select(t.sessions.c.session_id).where(closed.is_not(None))
         if before_us is not None:
@@ -144,16 +143,16 @@ class Retention:
 PERIOD_S = 3600.0
 UPLOADS = ".upload-"
 OTHERS_UNUSED_S = 3600.0
-"""What may belong to another process counts as left behind when nobody has written for so long."""
+"""Age after which another process's unfinished files count as abandoned [s]."""
 
 
 class Maintenance:
-    """Keeps the folders and the store of a worker in order, at its start and every hour.
+    """Cleans up the folders and the store of a worker, at startup and every hour.
 
     Args:
         settings: folders and limits.
         store: open while this runs.
-        jobs: whose old ones go, with their files.
+        jobs: its old jobs are deleted, with their files.
         sessions: those in memory are not ended.
     """
 
@@ -165,7 +164,7 @@ class Maintenance:
         self._retention = Retention(store, limits, worker_id=settings.worker_id)
 
     async def run(self) -> None:
-        """Do all of it, now and every hour, for ever."""
+        """Run maintenance now and every hour, until cancelled."""
         while True:
             try:
                 await self.once()
@@ -176,7 +175,7 @@ class Maintenance:
             await asyncio.sleep(PERIOD_S)
 
     async def once(self) -> None:
-        """Do all of it. Raises StoreTroubleError: the store is in trouble."""
+        """Run all tasks. Raises StoreTroubleError: the store fails."""
         await asyncio.to_thread(self.sweep)
         await self._retention.tidy(in_use={session.session_id for session in self._sessions})
         days = self._settings.job_retention_days
@@ -184,16 +183,16 @@ class Maintenance:
             log.info("ended jobs forgotten", jobs=forgotten)
 
     def sweep(self, *, at_start: bool = False) -> None:
-        """Remove what killed runs have left half done.
+        """Remove unfinished files of killed runs.
 
         Args:
-            at_start: nothing of this worker is under way, so what lies in its own folders was left
-                behind, however young it is.
+            at_start: nothing of this worker is in progress, so all files in its own folders are
+                abandoned, regardless of age.
         """
         settings = self._settings
         removed: list[Path] = []
         for folder in (settings.assets_path, settings.scenes_path):
-            # What lies in our state folder is ours alone.
+            # The state folder is ours alone.
             own = folder.resolve().is_relative_to(settings.data_dir.resolve())
             unused_s = 0.0 if own and at_start else OTHERS_UNUSED_S
             removed += sweep_leftovers(folder, unused_s=unused_s, prefix=UPLOADS)

@@ -29,32 +29,33 @@ from .storage.connection import StoreError
 from .storage.fleet import Leases, WorkerRow
 from .storage.job_log import JobLog
 
-# Sharing: uploads what the worker has made to the object store and fetches what others have. Steps
-# never wait for that store.
+# Sharing: uploads this worker's bundles and files to the object store and fetches those of others.
+# Steps never wait for that store.
 
 T = TypeVar("T")
 
 SHARING_PERIOD_S = 2.0
-"""Between looks for what is new, here and elsewhere."""
+"""Interval of checks for new items, here and elsewhere [s]."""
 SWEEP_S = 3600.0
-"""Between looks for objects that nobody needs."""
+"""Interval of checks for unused objects [s]."""
 
 log = structlog.get_logger(__name__)
 
 
 class Sharing:
-    """Scenes, assets and files of jobs that workers on one store have in common.
+    """Scenes, assets and job files shared by workers with one store.
 
-    Belongs to the event loop; what waits for the store of objects has threads of its own.
+    For use on the event loop; calls to the object store run on separate threads.
 
     Args:
-        folders: of bundles, and the store of objects.
-        bundle_log: what there is.
-        job_log: says which jobs have left something.
-        catalog, assets: what there is here.
+        folders: folders of bundles, and the object store.
+        bundle_log: lists shared bundles.
+        job_log: lists jobs with files.
+        catalog, assets: local scenes and assets.
 
     Attributes:
-        listen: makes a function that waits for word from other workers, for some seconds at most.
+        listen: creates a function that waits for notifications of other workers, with a timeout
+            [s].
     """
 
     def __init__(
@@ -79,7 +80,7 @@ class Sharing:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Shares for the length of the block."""
+        """Share during the block."""
         tasks = [asyncio.create_task(self._share(), name="sharing")]
         tasks.append(asyncio.create_task(self._sweep(), name="sweeping objects"))
         try:
@@ -91,10 +92,10 @@ class Sharing:
             self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def take_out(self, kind: str, name: str) -> bool:
-        """Fetch what another worker has shared; whether there is such a thing.
+        """Fetch an item that another worker has shared; returns whether it exists.
 
         Raises:
-            ServiceError: STORAGE_UNAVAILABLE: the store of objects does not give it.
+            ServiceError: STORAGE_UNAVAILABLE: the object store fails.
         """
         row = await self._log.get(kind, name)
         if row is None or row.deleted:
@@ -107,8 +108,8 @@ class Sharing:
         return True
 
     async def signed_url(self, kind: str, name: str, file: str, *, seconds: float) -> str | None:
-        """Where anybody may fetch a file for a while; None where it is not in the store of objects,
-        or that gives no such addresses.
+        """A temporary public URL of a file; None if it is not in the object store, or if the store
+        does not support such URLs.
 
         Raises:
             ServiceError: STORAGE_UNAVAILABLE.
@@ -126,18 +127,18 @@ class Sharing:
         return None
 
     async def forget(self, kind: str, name: str) -> None:
-        """Share something no more; its objects go once nobody has needed them for a day."""
+        """Stop sharing an item; its objects are deleted after a day without use."""
         if kind == "asset":
             await self._log.mark_deleted(kind, name)
         else:
             await self._log.remove(kind, name)
 
     async def look(self) -> None:
-        """Put what is new here into the store of objects, and take new assets out of it.
+        """Upload new local items to the object store, and download new assets.
 
         Raises:
-            StoreError: of the database.
-            ObjectStoreError: of the store of objects.
+            StoreError: from the database.
+            ObjectStoreError: from the object store.
         """
         state = await self._log.state()
         if state != self._state:
@@ -188,8 +189,8 @@ class Sharing:
             log.info("bundle shared", kind=kind, name=name, bytes=bundle.bytes)
 
     async def _follow_assets(self) -> None:
-        """All assets of the fleet are here, since an edit must not wait for them; those that were
-        deleted elsewhere go."""
+        """Download all assets of the fleet, so that edits need not wait for them, and delete those
+        that were deleted elsewhere."""
         rows = [row for (kind, _), row in self._known.items() if kind == "asset"]
         for row in rows:
             if not row.deleted:
@@ -204,7 +205,7 @@ class Sharing:
             self._assets.remove(asset_id)
 
     def _unshared(self) -> list[tuple[str, str, Path]]:
-        """Whole bundles that were made here and are not on record."""
+        """Complete local bundles that are not yet listed."""
         listed = [("scene", listing) for listing in self._catalog.scan().values()]
         whole = {listing.path for _, listing in listed if listing.reason is None}
         whole |= {self._assets.bundle(info.asset_id) for info in self._assets.list()}
@@ -224,7 +225,7 @@ class Sharing:
 
 
 def _made_before(folder: Path, row: BundleRow) -> bool:
-    """Whether a folder is there, and older than a row."""
+    """Whether a folder exists, and is older than a row."""
     try:
         return folder.stat().st_mtime * 1e6 < row.created_us
     except OSError:
@@ -240,18 +241,18 @@ def _unavailable(what: str, error: ObjectStoreError) -> ServiceError:
 
 
 RENEWALS = 4
-"""Of each lease, so that some may be late."""
+"""Renewals per lease duration, so that some may be late."""
 
 
 class Membership:
-    """Keeps a worker's lease for as long as it runs.
+    """Renews a worker's lease while it runs.
 
     Args:
-        leases: of the worker.
-        sessions: that it has by them.
-        seconds: of a lease.
-        document: what the fleet is told about the worker, made anew for each renewal.
-        accounts: told what others say of who has how much.
+        leases: leases of the worker.
+        sessions: its sessions under these leases.
+        seconds: duration of a lease.
+        document: creates the status document for the fleet; called for each renewal.
+        accounts: receives the usage reported by other workers.
     """
 
     def __init__(
@@ -273,10 +274,10 @@ class Membership:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """The lease holds for the length of the block, and ends with it.
+        """Hold the lease during the block.
 
         Raises:
-            StoreError: the first promise cannot be made.
+            StoreError: the first lease cannot be obtained.
         """
         await self._renew()
         renewing = asyncio.create_task(self._renew_for_ever(), name="lease")
@@ -290,12 +291,12 @@ class Membership:
                 await self.leave()
 
     async def tell(self) -> None:
-        """Let others know at once what has become of the worker."""
+        """Publish the worker's status immediately."""
         with contextlib.suppress(StoreError):
             await self._renew()
 
     async def leave(self) -> None:
-        """Keep no lease any more: others may have the sessions at once."""
+        """Give up the lease: other workers may take the sessions immediately."""
         self._left = True
         with contextlib.suppress(StoreError):
             await self._leases.give_up(self._document())
@@ -306,10 +307,10 @@ class Membership:
             try:
                 await self._renew()
             except StoreError:
-                # The store tells of its trouble itself; without it others cannot take over either.
+                # The store logs its own failures; without it others cannot take over either.
                 continue
             except Exception:
-                # Whatever it was: without its lease the worker would lose its sessions.
+                # Any error: without its lease the worker would lose its sessions.
                 log.exception("renewing the lease failed")
 
     async def _renew(self) -> None:
@@ -325,7 +326,7 @@ class Membership:
             await self._sessions.let_go_of_lost()
 
     async def _hear_of_others(self) -> None:
-        """What they say of who has how much, where that is limited."""
+        """Read other workers' account usage, if it is limited."""
         if self._accounts.counts:
             rows = await self._leases.workers()
             others = [w for w in rows if w.alive and w.worker_id != self._leases.worker_id]
@@ -334,19 +335,19 @@ class Membership:
 
 # --- Agent check ---------------------------------------------------------------------------------
 
-# Reports in the words of HAProxy's ``agent-check`` how much new work the worker takes. A draining
-# worker keeps its sessions and gets no new ones. The weight does not follow the load, since that
-# would move scenes between workers; the proxy's bounded hashing balances the load.
+# Reports the worker's readiness in the format of HAProxy's ``agent-check``. A draining worker keeps
+# its sessions and gets no new ones. The weight does not follow the load, because that would move
+# scenes between workers; the proxy's bounded hashing balances the load.
 
 
 @dataclass(frozen=True)
 class Willingness:
-    """What a worker takes.
+    """Readiness of a worker.
 
     Attributes:
-        ready: whether new work is welcome at all.
-        full: whether as many sessions are open as may be.
-        handed_over: whether its sessions are others' by now: nothing may be sent here any more.
+        ready: whether it accepts new work.
+        full: whether the maximum number of sessions is open.
+        handed_over: whether other workers have its sessions: no more requests may be sent to it.
     """
 
     ready: bool
@@ -358,8 +359,8 @@ class Agent:
     """Answers every connection with one line, and closes it.
 
     Args:
-        willingness: of the worker, asked for each answer.
-        weight: of the worker among others, in per cent of what its proxy gives it.
+        willingness: returns the worker's readiness; called for each answer.
+        weight: weight of the worker, in percent of the one its proxy configures.
     """
 
     def __init__(self, willingness: Callable[[], Willingness], *, weight: int) -> None:
@@ -377,17 +378,17 @@ class Agent:
 
     @contextlib.asynccontextmanager
     async def running(self, host: str, port: int) -> AsyncIterator[int]:
-        """Listens for the length of the block.
+        """Listen during the block.
 
         Args:
             host: address to listen on.
-            port: 0 takes a free one.
+            port: 0 uses a free one.
 
         Yields:
             The port.
 
         Raises:
-            OSError: the address is taken, or none of this machine.
+            OSError: the address is in use, or not of this machine.
         """
         server = await asyncio.start_server(self._answer, host, port)
         try:
@@ -406,21 +407,21 @@ class Agent:
 
 # --- Prewarming ----------------------------------------------------------------------------------
 
-# The proxy sends new sessions to the worker that has their scene, until that one has half as many
-# again as the others. The next worker then already has the scene in memory.
+# The proxy sends new sessions to the worker that has their scene, until that worker has 1.5 times
+# as many as the others. The next worker then already has the scene in memory.
 
 LOOK_S = 5.0
-"""Between looks at what the fleet drives in."""
+"""Interval of checks for the fleet's hot scenes [s]."""
 
 
 class Prewarming:
-    """Loads what other workers are busy with, where this one is next in turn.
+    """Loads scenes that are in demand on other workers, if it is this worker's turn.
 
     Args:
-        leases: tell of the workers.
-        scene_cache: gets the scenes; they leave it again when memory is needed.
-        worker_id: of this one.
-        hot: sessions in a scene, over all workers, from which on two of them have it.
+        leases: list the workers.
+        scene_cache: receives the scenes; they are evicted if memory is short.
+        worker_id: id of this worker.
+        hot: sessions of a scene, over all workers, from which two workers load it.
     """
 
     def __init__(
@@ -432,7 +433,7 @@ class Prewarming:
         self._hot = hot
 
     async def run(self) -> None:
-        """Look again and again, for ever."""
+        """Check periodically, until cancelled."""
         while self._hot:
             await asyncio.sleep(LOOK_S)
             try:
@@ -443,7 +444,7 @@ class Prewarming:
                 log.info("scene not loaded ahead", reason=str(error))
 
     async def look(self) -> None:
-        """Load the scenes that are this worker's to load.
+        """Load the scenes assigned to this worker.
 
         Raises:
             StoreError: of the database.
@@ -455,10 +456,10 @@ class Prewarming:
 
 
 def loads_of(worker_id: str, workers: Sequence[WorkerRow], *, hot: int) -> list[str]:
-    """Hot scenes that one worker alone has, and that ``worker_id`` is the one to load.
+    """Hot scenes that only one worker has, and that ``worker_id`` should load.
 
-    All workers find the same, from what each has told of itself: of those without the scene the
-    first in an order that differs from scene to scene.
+    All workers compute the same result from the reported statuses: the first of the workers without
+    the scene, in an order that depends on the scene.
     """
     living = {w.worker_id: w.document for w in workers if w.alive and takes_work(w.document)}
     driven: Counter[str] = Counter()
@@ -478,5 +479,5 @@ def _order(scene: str, worker_id: str) -> bytes:
 
 
 def takes_work(document: Mapping[str, Any]) -> bool:
-    """Whether a worker that tells this of itself takes new sessions and jobs."""
+    """Whether a worker with this status accepts new sessions and jobs."""
     return bool(document.get("ready")) and not document.get("draining")

@@ -1,4 +1,4 @@
-"""What a worker does before heavy libraries are loaded: check its arguments, compile kernels."""
+"""Steps before heavy libraries are loaded: check the arguments, compile kernels."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from .storage.connection import check_state_folder
 
 
 class SceneFolderError(ValueError):
-    """The folder of scenes that was named is not there."""
+    """The named scene folder does not exist."""
 
 
 class AddressError(OSError):
-    """The address cannot be listened on."""
+    """The address is not available."""
 
 
 def check_start(settings: Settings) -> None:
-    """Refuse to start where it cannot go well.
+    """Refuse to start if the settings cannot work.
 
     Raises:
-        SceneFolderError: the folder of scenes is missing.
-        StateFolderError: another worker is on the state folder, or it cannot be written to.
-        AddressError: the address is taken, or none of this machine.
+        SceneFolderError: the scene folder is missing.
+        StateFolderError: another worker uses the state folder, or it is not writable.
+        AddressError: the address is in use, or not of this machine.
     """
     check_scenes(settings)
     check_state_folder(settings.data_dir)
@@ -42,7 +42,7 @@ def check_start(settings: Settings) -> None:
 
 
 def check_scenes(settings: Settings) -> None:
-    """Raises SceneFolderError where a folder of scenes is named that is not there."""
+    """Raises SceneFolderError if a named scene folder does not exist."""
     folder = settings.scenes_dir
     if folder is None or folder.is_dir():
         return
@@ -54,17 +54,17 @@ def check_scenes(settings: Settings) -> None:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A socket bound to the address, not listening yet; port 0 takes a free one.
+    """A socket bound to the address, not yet listening; port 0 uses a free one.
 
     Raises:
-        AddressError: saying which address, and what to do.
+        AddressError: with the address and the remedy.
     """
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except OSError as error:
         raise _unusable(host, port, error) from error
-    # Named as TCP, or asyncio would not turn Nagle's algorithm off on accepted connections, and
-    # every answer would wait 40 ms for an acknowledgement.
+    # Named as TCP, or asyncio would not disable Nagle's algorithm on accepted connections, and
+    # every reply would wait 40 ms for an acknowledgement.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -76,7 +76,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def listen(listener: socket.socket) -> None:
-    """Accept connections on a bound socket. Raises AddressError: it was taken since."""
+    """Accept connections on a bound socket. Raises AddressError: it has been taken since."""
     host, port = listener.getsockname()[:2]
     try:
         listener.listen(2048)
@@ -86,7 +86,7 @@ def listen(listener: socket.socket) -> None:
 
 
 def url_of(host: str, listener: socket.socket) -> str:
-    """How clients reach a bound socket, for example ``http://127.0.0.1:8600``."""
+    """Address of a bound socket for clients, for example ``http://127.0.0.1:8600``."""
     return f"http://{_in_url(host)}:{listener.getsockname()[1]}"
 
 
@@ -118,7 +118,7 @@ def _in_url(host: str) -> str:
 # cores. ``real2sim serve`` starts it before its own imports if no compiled kernels are on disk.
 
 KEPT = "entries.advance_vehicle-*.nbi"
-"""Index of the kernel that takes longest, as Numba names it."""
+"""Numba's index of the slowest kernel to compile."""
 
 SERVER = Path(__file__).parents[1]
 LOWEST_PRIORITY = 19
@@ -128,22 +128,22 @@ _begun: list[subprocess.Popen[bytes]] = []
 
 
 def begin_compiling() -> None:
-    """Let the second process begin if no earlier run has left kernels. Reads no kernel's sources:
-    whether those on disk are still good is found out later."""
+    """Start the second process if there are no kernels of an earlier run. Reads no kernel sources:
+    whether the cached ones are valid is checked later."""
     if (os.cpu_count() or 1) > 1 and not _any_on_disk():
         _begun.append(compile_beside("warm_up"))
 
 
 def take_begun() -> subprocess.Popen[bytes] | None:
-    """The process of :func:`begin_compiling`, for whoever waits for it; None if it began none."""
+    """The process of :func:`begin_compiling` to wait for; None if none was started."""
     return _begun.pop() if _begun else None
 
 
 def compile_beside(
     function: str, *arguments: str, package: str = "world", niceness: int = 0
 ) -> subprocess.Popen[bytes]:
-    """A process that runs a warm-up of ``package``. Its failure is left to those who load its
-    work. It writes a line of two numbers for each kernel: those that are ready, and all."""
+    """A process that runs a warm-up of ``package``. Its failure is reported by the later load.
+    It writes a line of two numbers for each kernel: those that are ready, and the total."""
     return subprocess.Popen(
         [sys.executable, "-c", _PROGRAM, str(niceness), package, function, *arguments],
         stdin=subprocess.DEVNULL,
@@ -154,7 +154,7 @@ def compile_beside(
 
 @asynccontextmanager
 async def awaited(process: subprocess.Popen[bytes]) -> AsyncIterator[None]:
-    """A process beside the block, which is waited for at its end and does not outlive it."""
+    """A process that runs during the block; its end waits for the process."""
     try:
         yield
         while process.poll() is None:
@@ -166,11 +166,11 @@ async def awaited(process: subprocess.Popen[bytes]) -> AsyncIterator[None]:
 
 
 class Counter:
-    """How many kernels a process of :func:`compile_beside` has made ready.
+    """Progress of a process of :func:`compile_beside`.
 
     Attributes:
-        done: so far.
-        expected: of all; 0 before it begins.
+        done: number of kernels that are ready.
+        expected: total number; 0 before it begins.
     """
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
@@ -181,7 +181,7 @@ class Counter:
         self.done = self.expected = 0
 
     def read(self) -> None:
-        """Take in what it has written."""
+        """Read its new output."""
         with contextlib.suppress(BlockingIOError, ValueError):
             while part := os.read(self._output, 4096):
                 *lines, self._rest = (self._rest + part).split(b"\n")

@@ -1,4 +1,4 @@
-"""Starting a worker: for good, or for the length of a ``with`` block."""
+"""Runs a worker: until a signal, or during a ``with`` block."""
 
 from __future__ import annotations
 
@@ -33,23 +33,22 @@ from .worker import Worker
 
 # --- Garbage collection --------------------------------------------------------------------------
 
-# A full collection takes 0.2 s, during which no session is answered. With the default thresholds
-# one is due every few thousand steps, although nearly all objects were there before the first
-# step and stay.
+# A full collection takes 0.2 s and blocks all sessions. The default thresholds trigger one every
+# few thousand steps, although nearly all objects exist before the first step and stay.
 
 YOUNG = 20_000
-"""New objects between two small searches; a step makes some 200, nearly all of which go by
-themselves."""
+"""New objects between two young collections; a step creates about 200, nearly all freed by
+reference counting."""
 
 
 def search_seldom() -> None:
-    """Let many steps pass between searches."""
+    """Raise the thresholds, so that collections are many steps apart."""
     gc.set_threshold(YOUNG, *gc.get_threshold()[1:])
 
 
 def spare_what_is_there() -> None:
-    """Search no more through what is there now. Once, when a worker has all that it starts with:
-    what of it becomes garbage in a cycle stays."""
+    """Exclude all current objects from collections. Call once, when a worker has started: current
+    objects that become cyclic garbage are never freed."""
     gc.collect(1)
     gc.freeze()
 
@@ -58,11 +57,11 @@ def spare_what_is_there() -> None:
 
 
 def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
-    """Send structlog and the standard library's loggers to stderr in one form.
+    """Send logs of structlog and the standard library to stderr in one format.
 
     Args:
-        level: lowest level that is written.
-        log_format: ``text``, ``json``, or ``auto``: text when stderr is a terminal.
+        level: minimum level.
+        log_format: ``text``, ``json``, or ``auto``: text if stderr is a terminal.
     """
     text = log_format == "text" or (log_format == "auto" and sys.stderr.isatty())
     shared: list[Any] = [
@@ -81,7 +80,7 @@ def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
         wrapper_class=structlog.stdlib.BoundLogger,
         cache_logger_on_first_use=True,
     )
-    # Tracebacks as plain text: prettier ones print local variables, tokens among them.
+    # Plain tracebacks: prettier ones print local variables, which may contain tokens.
     render: list[Any] = (
         [structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)]
         if text
@@ -97,7 +96,7 @@ def configure_logging(*, level: str = "info", log_format: str = "auto") -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level.upper())
-    # One line a request is ours; the server's own would double it.
+    # We log one line per request; the server's access log would duplicate it.
     logging.getLogger("uvicorn.access").disabled = True
     for name in ("uvicorn", "uvicorn.error", "asyncio", "alembic"):
         logging.getLogger(name).setLevel(max(logging.WARNING, root.level))
@@ -107,7 +106,8 @@ PING_INTERVAL_S = 10.0
 PING_TIMEOUT_S = 20.0
 POLL_S = 0.02
 LINGER_S = 1.5
-"""For which a worker that has handed its sessions over tells clients so, until its proxy knows."""
+"""Time for which a worker that has handed over its sessions tells clients so, until its proxy has
+noticed [s]."""
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,9 @@ class RunningWorker:
     """A worker in a thread of this process.
 
     Attributes:
-        url: where it listens, for example ``http://127.0.0.1:41234``.
-        token: what it wants from clients.
-        worker: its inside.
+        url: its address, for example ``http://127.0.0.1:41234``.
+        token: token that it requires.
+        worker: the worker object.
     """
 
     url: str
@@ -126,14 +126,14 @@ class RunningWorker:
 
 
 def run(settings: Settings) -> int:
-    """Serve until SIGINT or SIGTERM; the exit code: 1 where the device was lost.
+    """Serve until SIGINT or SIGTERM; returns the exit code: 1 if the device was lost.
 
     Raises:
-        OpenBindError: another address than loopback, and no token.
-        SceneFolderError: the folder of scenes is missing.
-        AddressError: the address is taken, or none of this machine.
-        RenderError: the backend of the settings cannot be used here.
-        StateFolderError: another worker is on the state folder, or it cannot be written to.
+        OpenBindError: an address other than loopback, without a token.
+        SceneFolderError: the scene folder is missing.
+        AddressError: the address is in use, or not of this machine.
+        RenderError: the backend of the settings is not available here.
+        StateFolderError: another worker uses the state folder, or it is not writable.
         StoreError: the store cannot be opened.
     """
     check_bind(settings.host, settings.wants_token)
@@ -145,11 +145,11 @@ def run(settings: Settings) -> int:
     worker: Worker = app.state.worker
     print(_announcement(worker, url_of(settings.host, listener)), file=sys.stderr, flush=True)
     server = DrainingServer(server_config(app, settings), worker)
-    # A lost device poisons the process: it ends, so that its supervisor starts a new one.
+    # A lost device makes the process unusable: it ends, and its supervisor starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
     search_seldom()
     worker.on_ready = spare_what_is_there
-    # The server stops gracefully at a signal and then raises it once more for us.
+    # The server stops gracefully at a signal and then raises it again for us.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt), _start_errors_told_once(worker):
         server.run(sockets=[listener])
@@ -160,16 +160,16 @@ def run(settings: Settings) -> int:
 
 @contextmanager
 def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[RunningWorker]:
-    """A worker in a background thread, ready to be used; for tests, demo and benches.
+    """A ready worker in a background thread; for tests, demos and benchmarks.
 
     Args:
-        settings: ``port`` 0 takes a free one.
-        timeout_s: for it to become ready.
+        settings: ``port`` 0 uses a free one.
+        timeout_s: maximum startup time.
 
     Raises:
-        OpenBindError: another address than loopback, and no token.
-        SceneFolderError: the folder of scenes is missing.
-        AddressError: the address is taken, or none of this machine.
+        OpenBindError: an address other than loopback, without a token.
+        SceneFolderError: the scene folder is missing.
+        AddressError: the address is in use, or not of this machine.
         RuntimeError: it ended, or was not ready in time; with its reasons.
     """
     check_bind(settings.host, settings.wants_token)
@@ -197,7 +197,7 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
 
 @contextmanager
 def _start_errors_told_once(worker: Worker) -> Iterator[None]:
-    """Whoever starts the worker is told what is in its way: no traceback in the log besides."""
+    """Report startup errors once, without an additional traceback in the log."""
 
     def is_news(_record: logging.LogRecord) -> bool:
         return worker.start_error is None or not is_expected(worker.start_error)
@@ -207,7 +207,7 @@ def _start_errors_told_once(worker: Worker) -> Iterator[None]:
     try:
         yield
     except SystemExit:
-        # The server's way to say that it has not started.
+        # How uvicorn reports that it has not started.
         if worker.start_error is None:
             raise
     finally:
@@ -215,11 +215,12 @@ def _start_errors_told_once(worker: Worker) -> Iterator[None]:
 
 
 class DrainingServer(uvicorn.Server):
-    """uvicorn's server; after SIGTERM it serves on for a while, not ready, before it stops.
+    """uvicorn's server; after SIGTERM it continues to serve for a while, not ready, before it
+    stops.
 
     Args:
-        config: of the server.
-        worker: drains; its settings say for how long.
+        config: config of the server.
+        worker: drains; its settings limit the duration.
     """
 
     def __init__(self, config: uvicorn.Config, worker: Worker) -> None:
@@ -228,7 +229,7 @@ class DrainingServer(uvicorn.Server):
         self._stops_at: float | None = None
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """A signal: the first SIGTERM begins to drain, any other one stops."""
+        """Handle a signal: the first SIGTERM starts draining, any other one stops."""
         if sig == signal.SIGTERM and self._stops_at is None and self.started:
             self._worker.drain()
             self._stops_at = time.monotonic() + self._worker.settings.drain_seconds
@@ -237,7 +238,7 @@ class DrainingServer(uvicorn.Server):
             super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
-        """Ten times a second: whether it is time to stop."""
+        """Check ten times a second whether to stop."""
         if self._stops_at is not None and time.monotonic() >= self._stops_at:
             if not self._worker.handed_over and await self._handed_over():
                 self._stops_at = time.monotonic() + LINGER_S
@@ -246,7 +247,7 @@ class DrainingServer(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def _handed_over(self) -> bool:
-        """Whether other workers have what this one had."""
+        """Whether other workers have taken over this one's sessions."""
         try:
             return await self._worker.hand_over()
         except StoreError:
@@ -254,7 +255,7 @@ class DrainingServer(uvicorn.Server):
 
 
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
-    """How uvicorn serves a worker."""
+    """uvicorn's configuration for a worker."""
     config = uvicorn.Config(
         app,
         http="h11",
@@ -263,7 +264,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         server_header=False,
         lifespan="on",
         ws="websockets-sansio",
-        # Deflating a frame takes 20 ms and gains nothing: images do not compress.
+        # Deflating a frame takes 20 ms for nothing: images do not compress.
         ws_per_message_deflate=False,
         ws_max_size=MAX_CLIENT_MESSAGE_BYTES,
         ws_ping_interval=PING_INTERVAL_S,
@@ -297,7 +298,7 @@ def _wait_until_ready(
         if not thread.is_alive():
             reason = worker.start_error or "see its log"
             raise RuntimeError(f"the worker ended while it started: {reason}")
-        # Short, because a worker that has died leaves the connection open and silent.
+        # Short, because a dead worker leaves the connection open without data.
         ready, answer = _ask_readiness(address, timeout_s=0.5)
         if ready:
             return

@@ -1,4 +1,4 @@
-"""Objects that workers share: bundles of scenes and assets and files of jobs, stored by content."""
+"""Objects shared by workers: scene and asset bundles and job files, stored by content."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ if TYPE_CHECKING:
 
 # --- Object store ---------------------------------------------------------------------------------
 
-# Files named by the SHA-256 of their content, so an object never changes. A store may be slow or
-# unreachable: call it only on threads that nothing else waits for.
+# Files are named by the SHA-256 of their content, so an object never changes. A store may be slow
+# or unreachable: call it only on threads that may block.
 
 DIGEST = re.compile(r"[0-9a-f]{64}")
 FRESH_S = 12 * 3600.0
-"""Age from which on an object that is put again is written again, so that it looks young."""
+"""Age from which an object is written again when it is put, to renew its age [s]."""
 RETRIES = 3
-"""Of a request that a store has not answered, or has refused for being busy."""
+"""Retries of a request that timed out, or that a busy store refused."""
 PIECE_BYTES = 4 << 20
-"""That is read from a store at a time."""
+"""Size of one read from a store [bytes]."""
 
 
 class ObjectStoreError(Exception):
-    """The store of objects cannot be used, or does not have the object; nothing has happened."""
+    """The object store fails, or does not have the object; the call had no effect."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class StoredObject:
     Attributes:
         digest: SHA-256 of its content, hexadecimal.
         bytes: size.
-        age_s: since it was last put [s].
+        age_s: time since it was last put [s].
     """
 
     digest: str
@@ -64,36 +64,36 @@ class StoredObject:
 
 
 class ObjectStore(Protocol):
-    """A store of objects; safe to use on any thread, never on the event loop.
+    """An object store. Thread-safe, but not for the event loop.
 
-    Every method raises :class:`ObjectStoreError` where the store cannot be used.
+    Every method raises :class:`ObjectStoreError` if the store fails.
     """
 
     def put(self, file: Path, digest: str) -> None:
-        """Keep the content of a file whose digest is known."""
+        """Store the content of a file whose digest is known."""
 
     def read(self, digest: str, start: int, end: int) -> bytes:
-        """Bytes ``start`` to ``end`` of an object, the last excluded."""
+        """Bytes ``start`` to ``end`` of an object, end-exclusive."""
 
     def find(self, digest: str) -> StoredObject | None:
-        """What the store knows of an object; None where it has none."""
+        """Metadata of an object; None if the store does not have it."""
 
     def signed_url(self, digest: str, seconds: float) -> str | None:
-        """Where anybody may fetch the object for a while; None where that cannot be had."""
+        """A temporary public URL of the object; None if not supported."""
 
     def list(self) -> Iterator[StoredObject]:
         """All objects, in any order."""
 
     def remove(self, digest: str) -> None:
-        """Forget an object; nothing where there is none."""
+        """Delete an object; no effect if there is none."""
 
 
 def open_objects(url: str) -> ObjectStore:
-    """The store that a URL names.
+    """The store at a URL.
 
     Args:
         url: ``file:///shared/objects``, or ``s3://bucket/prefix`` with ``endpoint`` and ``region``
-            as a query where it is not AWS itself; keys come from ``AWS_ACCESS_KEY_ID`` and
+            as a query for services other than AWS; keys come from ``AWS_ACCESS_KEY_ID`` and
             ``AWS_SECRET_ACCESS_KEY``, or from the machine's role.
 
     Raises:
@@ -114,17 +114,17 @@ def open_objects(url: str) -> ObjectStore:
 
 
 class FolderObjects:
-    """Objects as files of a folder, which workers on one machine or one file system share.
+    """Objects as files of a folder, shared by workers on one machine or file system.
 
     Args:
-        folder: of the objects; it is made with the first.
+        folder: folder of the objects; created with the first.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def put(self, file: Path, digest: str) -> None:
-        """Keep the content of a file."""
+        """Store the content of a file."""
         path = self._path(digest)
         try:
             if path.is_file():
@@ -145,7 +145,7 @@ class FolderObjects:
             raise _unusable(error) from error
 
     def find(self, digest: str) -> StoredObject | None:
-        """What is known of an object."""
+        """Metadata of an object."""
         path = self._path(digest)
         try:
             found = path.stat()
@@ -156,7 +156,7 @@ class FolderObjects:
         return StoredObject(digest, found.st_size, time.time() - found.st_mtime)
 
     def signed_url(self, digest: str, seconds: float) -> str | None:
-        """None: nobody but workers reaches the folder."""
+        """None: only workers can access the folder."""
         return None
 
     def list(self) -> Iterator[StoredObject]:
@@ -166,7 +166,7 @@ class FolderObjects:
                 yield found
 
     def remove(self, digest: str) -> None:
-        """Forget an object."""
+        """Delete an object."""
         try:
             self._path(digest).unlink(missing_ok=True)
         except OSError as error:
@@ -177,13 +177,13 @@ class FolderObjects:
 
 
 class S3Objects:
-    """Objects in a bucket of S3, or of anything that speaks its protocol.
+    """Objects in an S3 bucket, or in a compatible service.
 
     Args:
         bucket: its name.
-        prefix: of the objects' names.
-        endpoint: where it is served; AWS by default.
-        region: of the bucket.
+        prefix: prefix of the objects' names.
+        endpoint: address of the service; default: AWS.
+        region: region of the bucket.
 
     Raises:
         ValueError: obstore is not installed, or refuses the options.
@@ -217,7 +217,7 @@ class S3Objects:
             raise ValueError(f"the bucket {bucket!r} cannot be used: {error}") from error
 
     def put(self, file: Path, digest: str) -> None:
-        """Keep the content of a file."""
+        """Store the content of a file."""
         import obstore
 
         found = self.find(digest)
@@ -236,7 +236,7 @@ class S3Objects:
             return bytes(obstore.get_range(self._store, _key(digest), start=start, end=end))
 
     def find(self, digest: str) -> StoredObject | None:
-        """What is known of an object."""
+        """Metadata of an object."""
         import obstore
 
         try:
@@ -247,7 +247,7 @@ class S3Objects:
         return _stored(found)
 
     def signed_url(self, digest: str, seconds: float) -> str | None:
-        """Where anybody may fetch it for a while."""
+        """A temporary public URL."""
         import obstore
 
         with _refusals():
@@ -262,7 +262,7 @@ class S3Objects:
                 yield from (_stored(one) for one in some if DIGEST.search(str(one["path"])))
 
     def remove(self, digest: str) -> None:
-        """Forget an object."""
+        """Delete an object."""
         import obstore
 
         with _refusals():
@@ -270,7 +270,7 @@ class S3Objects:
 
 
 class _refusals:
-    """Errors of the client as this module has them; that there is no such object stays as it is."""
+    """Convert errors of the client; a missing object keeps its error."""
 
     def __enter__(self) -> None:
         return None
@@ -306,13 +306,13 @@ def _unusable(error: OSError) -> ObjectStoreError:
 # --- Shared bundles -------------------------------------------------------------------------------
 
 # The database lists bundles (``shared_bundles``: kind, name, files with digests); the object store
-# holds the contents. A worker keeps fetched bundles in its folders, marked by a hidden file, and
+# has the contents. A worker stores fetched bundles in its folders, marked by a hidden file, and
 # deletes the least recently used ones when they exceed the limit.
 
 MARK = ".taken-out"
-"""File of a bundle that came out of the store of objects; its time is that of the last use."""
+"""Marker file of a bundle from the object store; its time is that of the last use."""
 UNREFERENCED_S = 24 * 3600.0
-"""Age from which on an object that no bundle has is removed."""
+"""Age after which an unused object is deleted [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -322,7 +322,7 @@ class BundleFile:
     """A file of a bundle.
 
     Attributes:
-        path: below the bundle's folder, with ``/``.
+        path: relative to the bundle's folder, with ``/``.
         digest: SHA-256 of its content.
         bytes: size.
     """
@@ -334,13 +334,13 @@ class BundleFile:
 
 @dataclass(frozen=True)
 class SharedBundle:
-    """A bundle as the database has it.
+    """A bundle in the database.
 
     Attributes:
         kind: ``scene``, ``asset`` or ``job``.
-        name: of the scene, asset or job.
-        folder: its name on the disk.
-        files: what it is made of.
+        name: name of the scene, asset or job.
+        folder: name of its folder on disk.
+        files: its files.
     """
 
     kind: str
@@ -355,7 +355,7 @@ class SharedBundle:
 
     @property
     def content(self) -> str:
-        """Digest of what is in it."""
+        """Digest of its content."""
         return hashlib.sha256(self.document().encode()).hexdigest()
 
     def document(self) -> str:
@@ -371,12 +371,12 @@ class SharedBundle:
 
 
 class BundleFolders:
-    """Puts folders into a store of objects and takes them out. For threads that may wait.
+    """Uploads folders to an object store and downloads them. For threads that may block.
 
     Args:
         objects: the store.
-        folders: of bundles, by kind.
-        max_bytes: that what was taken out may take on the disk.
+        folders: folders of bundles, by kind.
+        max_bytes: disk space limit for downloaded bundles.
     """
 
     def __init__(
@@ -388,14 +388,14 @@ class BundleFolders:
         self._lock = threading.Lock()
 
     def own(self, kind: str) -> list[Path]:
-        """Bundles of a kind that were made here."""
+        """Local bundles of a kind, without downloaded ones."""
         return [path for path in self._all(kind) if not (path / MARK).exists()]
 
     def put(self, kind: str, name: str, folder: Path) -> SharedBundle:
-        """Put the files of a folder into the store; those of a job without its workshop below.
+        """Upload the files of a folder; for a job, only those at the top level.
 
         Raises:
-            ObjectStoreError: the store cannot be used.
+            ObjectStoreError: the store fails.
             OSError: the folder cannot be read.
         """
         files = []
@@ -408,11 +408,11 @@ class BundleFolders:
         return SharedBundle(kind, name, folder.name, tuple(files))
 
     def take_out(self, bundle: SharedBundle) -> Path:
-        """The folder of a bundle, fetched where it is not there.
+        """The folder of a bundle, downloaded if missing.
 
         Raises:
-            ObjectStoreError: the store cannot be used, or what it has is damaged.
-            OSError: the disk takes nothing.
+            ObjectStoreError: the store fails, or its data is damaged.
+            OSError: the disk is full or fails.
         """
         target = self._folders[bundle.kind] / bundle.folder
         with self._lock:
@@ -437,13 +437,14 @@ class BundleFolders:
         return target
 
     def sweep(self, wanted: set[str]) -> int:
-        """Remove objects that no bundle has and that nobody has put for a day; how many.
+        """Delete objects that no bundle uses and that nobody has put for a day; returns their
+        number.
 
         Args:
             wanted: digests of all bundles.
 
         Raises:
-            ObjectStoreError: the store cannot be used.
+            ObjectStoreError: the store fails.
         """
         left = [
             one.digest
@@ -470,7 +471,7 @@ class BundleFolders:
         for path in sorted(taken, key=lambda p: (p / MARK).stat().st_mtime):
             if held + more <= self._max_bytes:
                 return
-            # Whoever has its files open or mapped keeps them.
+            # Processes with open or mapped files keep them.
             shutil.rmtree(path, ignore_errors=True)
             held -= sizes[path]
             log.info("bundle dropped", folder=path.name, bytes=sizes[path])
@@ -489,7 +490,7 @@ class BundleFolders:
 
 
 def mark_used(folder: Path) -> None:
-    """Note that a bundle is in use: of those that were taken out others go before it."""
+    """Mark a bundle as used, so that others are deleted first."""
     with contextlib.suppress(FileNotFoundError):
         os.utime(folder / MARK)
 
@@ -512,15 +513,15 @@ def _inside(folder: Path, path: str) -> Path:
 
 @dataclass(frozen=True)
 class BundleRow:
-    """A bundle on record.
+    """A listed bundle.
 
     Attributes:
         kind: ``scene``, ``asset`` or ``job``.
-        name: of the scene, asset or job.
-        content: digest of all that is in it.
+        name: name of the scene, asset or job.
+        content: digest of its content.
         document: its files and their digests, JSON.
-        bytes: of all files.
-        created_us: when it was put on record, or deleted.
+        bytes: size of all files.
+        created_us: time at which it was listed, or deleted.
     """
 
     kind: str
@@ -532,12 +533,12 @@ class BundleRow:
 
     @property
     def deleted(self) -> bool:
-        """Whether it was deleted: whoever has a copy of before removes it."""
+        """Whether it was deleted: workers delete their copies."""
         return not self.content
 
 
 class BundleLog:
-    """Bundles beyond the folders of one worker.
+    """The list of shared bundles.
 
     Args:
         store: open while this is used.
@@ -547,7 +548,7 @@ class BundleLog:
         self._store = store
 
     async def add(self, row: BundleRow) -> bool:
-        """Put a bundle on record; False where there is one of that name, which stays."""
+        """Add a bundle; False if there is one of that name, which is not changed."""
         values = vars(row) | {"created_us": now_us()}
         with contextlib.suppress(ConflictError):
             await self._store.write(Write(sa.insert(t.shared_bundles), [values]), *self._notice())
@@ -567,7 +568,7 @@ class BundleLog:
         return await self._rows(sa.true())
 
     async def state(self) -> tuple[int, int]:
-        """Changes whenever a bundle comes or goes."""
+        """A value that changes whenever a bundle is added or removed."""
         b = t.shared_bundles.c
         newest = sa.func.coalesce(sa.func.max(b.created_us), 0).label("newest")
         query = sa.select(sa.func.count().label("many"), newest).select_from(t.shared_bundles)
@@ -575,13 +576,13 @@ class BundleLog:
         return int(row["many"]), int(row["newest"])
 
     async def mark_deleted(self, kind: str, name: str) -> None:
-        """Leave word that a bundle was deleted."""
+        """Mark a bundle as deleted."""
         empty = {"content": "", "document": "", "bytes": 0, "created_us": now_us()}
         change = sa.update(t.shared_bundles).where(self._is(kind, name)).values(empty)
         await self._store.write(Write(change), *self._notice())
 
     async def remove(self, kind: str, name: str) -> None:
-        """Forget a bundle."""
+        """Remove a bundle from the list."""
         gone = Write(sa.delete(t.shared_bundles).where(self._is(kind, name)))
         await self._store.write(gone, *self._notice())
 

@@ -1,4 +1,4 @@
-"""Sweeps and searches as jobs: `real2sim sweep` and `real2sim search` in processes of their own."""
+"""Sweeps and searches as jobs: `real2sim sweep` and `real2sim search` in child processes."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ PARQUET, XML, JSON, TAR = (
     "application/x-tar",
 )
 SUMMED_UP = ("name", "cell", "score", "values", "impact", "avoidable_until")
-"""Of a failure, in the result of the job; the rest is in its files."""
+"""Members of a failure in the job's result; the rest is in its files."""
 
 
 def check_scenario(request: SweepRequest) -> None:
-    """Refuse a scenario that cannot be read, before the job begins.
+    """Refuse an unreadable scenario before the job begins.
 
     Raises:
         ServiceError: INVALID_REQUEST.
@@ -63,12 +63,12 @@ def check_scenario(request: SweepRequest) -> None:
 
 
 def write_spec(request: SweepRequest, folder: Path, scene: Path) -> None:
-    """Write what the command reads.
+    """Write the input of the command.
 
     Args:
-        request: of the sweep.
-        folder: of the job.
-        scene: bundle.
+        request: the sweep.
+        folder: folder of the job.
+        scene: bundle of the scene.
     """
     folder.mkdir(parents=True, exist_ok=True)
     given = request.model_dump(mode="json", exclude_unset=True)
@@ -85,7 +85,7 @@ def write_spec(request: SweepRequest, folder: Path, scene: Path) -> None:
 
 
 def _storyboard(request: SweepRequest, folder: Path) -> dict[str, Any] | None:
-    """How the command reads the scenario, which is written beside what names it."""
+    """The command's scenario input; the scenario's file is written next to it."""
     common: dict[str, Any] = {"leave_out": request.leave_out, "ego": request.ego}
     if request.corner_case is not None:
         return common | {"file": f"gallery:{request.corner_case}"}
@@ -100,7 +100,7 @@ def _storyboard(request: SweepRequest, folder: Path) -> dict[str, Any] | None:
 
 
 def left_by_sweep(context: JobContext) -> JobResult:
-    """What a sweep leaves: its table, and recordings and scenario files of the worst."""
+    """Files of a sweep: its table, and recordings and scenario files of the worst episodes."""
     folder, out = context.folder, context.folder / OUT
     figures = json.loads((folder / FIGURES).read_bytes())
     figures.pop("table")
@@ -115,13 +115,13 @@ def left_by_sweep(context: JobContext) -> JobResult:
 
 
 def left_by_search(context: JobContext, scene: str) -> JobResult:
-    """What a search leaves: its failures as data, as scenario files and recordings, and all of it
-    packed."""
+    """Files of a search: its failures as data, scenario files and recordings, and an archive of
+    them."""
     folder, out = context.folder, context.folder / OUT
     found = json.loads((folder / FIGURES).read_bytes())
     bundle = json.loads((folder / SPEC).read_bytes())["case"]["scene"]
     for name in (FAILURES, PAGE):
-        # Where the worker keeps its scenes is nobody else's concern.
+        # The paths of the worker's scenes are not disclosed.
         text = (out / name).read_text(encoding="utf-8").replace(bundle, scene)
         (out / name).write_text(text, encoding="utf-8")
     files: dict[str, str] = {}
@@ -146,7 +146,7 @@ def _moved(path: Path, folder: Path) -> dict[str, str]:
 
 
 def _copied(path: Path, folder: Path) -> dict[str, str]:
-    """A file among those that the job leaves, and its media type; nothing where there is none."""
+    """Copy a file to the job's results; returns its name and media type, or nothing if missing."""
     types = {".r2e": RECORDING, ".xosc": XML, ".json": JSON}
     if not path.is_file() or path.suffix not in types:
         return {}
@@ -162,10 +162,10 @@ def _tidy(folder: Path) -> None:
 
 CHECK_S = 0.2
 ROOM_CHECKS_S = 5.0
-"""Between two looks at the disk."""
+"""Interval of disk space checks [s]."""
 
 MAX_RECORDED = 64_000
-"""Characters of a request that are put on record; jobs of longer ones are not begun anew."""
+"""Maximum length of a stored request, in characters; jobs with longer ones cannot be restarted."""
 
 SHARES = {
     "episodes": (0.0, 0.95),
@@ -174,15 +174,14 @@ SHARES = {
     "failures": (0.7, 0.9),
     "probability": (0.9, 0.99),
 }
-"""Of the whole work, by stage: from, to."""
+"""Range of the whole work, by stage: from, to."""
 
 
 class Sweeps:
-    """Starts sweeps and searches. Belongs to the event loop.
+    """Starts sweeps and searches, for use on the event loop.
 
-    Each is a process that drives on the world itself, beside the engine and behind it: it has what
-    processor time others leave. Its episodes are kept as they come, so that a worker that was
-    stopped goes on where it was.
+    Each is a separate process that simulates worlds directly, at a lower priority than the engine.
+    Its episodes are stored as they finish, so that a restarted worker resumes it.
     """
 
     def __init__(self, jobs: Jobs, scene_cache: SceneCache) -> None:
@@ -192,11 +191,11 @@ class Sweeps:
     async def start(
         self, request: SweepRequest, *, who: str, idempotent: IdempotentRequest
     ) -> JobInfo:
-        """Begin one.
+        """Start a sweep or search.
 
         Raises:
-            ServiceError: UNKNOWN_SCENE, INVALID_REQUEST for a scenario that cannot be read; as jobs
-                do.
+            ServiceError: UNKNOWN_SCENE, INVALID_REQUEST for an unreadable scenario; or as for
+                jobs.
         """
         await self._scene_cache.listing(request.scene)
         await asyncio.to_thread(check_scenario, request)
@@ -208,7 +207,7 @@ class Sweeps:
         return await self._jobs.start(new, self._work(request), idempotent=idempotent)
 
     async def rebuild(self, info: JobInfo) -> Work:
-        """The work of a job on record."""
+        """The work of a stored job."""
         return self._work(SweepRequest.model_validate(info.request))
 
     def _work(self, request: SweepRequest) -> Work:
@@ -224,10 +223,10 @@ class Sweeps:
         return work
 
     async def _driven(self, request: SweepRequest, context: JobContext, *, scene: Path) -> None:
-        """Wait until all is driven.
+        """Wait until the command ends.
 
         Raises:
-            ServiceError: JOB_FAILED, with what the command said.
+            ServiceError: JOB_FAILED, with the command's error output.
             JobCancelled: the job was cancelled.
         """
         context.progress(0.0, "starting")
@@ -266,14 +265,14 @@ def _command(request: SweepRequest, folder: Path) -> list[str]:
 
 
 class _Telling:
-    """Says how far a job is by what its command told, and how long the stage will still take."""
+    """Reports the progress of a job from the command's output, with the remaining time."""
 
     def __init__(self, context: JobContext) -> None:
         self._context = context
         self._begun: tuple[str, int, float] = ("", 0, 0.0)
 
     def __call__(self, told: Any) -> None:
-        """Args: told, a line of the command, None before there is one. Raises JobCancelled."""
+        """Args: told, a line of the command, None before the first. Raises JobCancelled."""
         if told is None:
             return
         stage, done, total = str(told["stage"]), int(told["done"]), max(int(told["total"]), 1)

@@ -1,4 +1,4 @@
-"""Kernels are ready before they are needed: compiled on the first run, later loaded from disk."""
+"""Prepares kernels ahead of use: compiled on the first run, later loaded from disk."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ log = structlog.get_logger(__name__)
 
 
 class KernelWarmUp:
-    """Gets the kernels of one worker ready, those first that every session needs.
+    """Prepares the kernels of one worker, beginning with those that every session needs.
 
-    On the first run a second process compiles beside this one, which then loads what the other left
-    on disk, see :mod:`.preflight`.
+    On the first run a second process compiles in parallel; this one then loads the cached kernels
+    from disk, see :mod:`.preflight`.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class KernelWarmUp:
         self.deformation = DeformationKernels()
 
     async def run(self, warm_up_renderer: Callable[[], Awaitable[None]]) -> None:
-        """What a worker needs before it takes work."""
+        """Prepare the kernels that the worker needs before it accepts work."""
         telling = asyncio.create_task(self._tell())
         try:
             await self._run_first(warm_up_renderer)
@@ -56,7 +56,7 @@ class KernelWarmUp:
             telling.cancel()
 
     def compiling(self) -> str | None:
-        """How far it is while kernels are compiled; None where they come from disk."""
+        """Progress while kernels are compiled; None while they are loaded from disk."""
         beside = self._beside
         if beside is None:
             return f"{COMPILING}: {made}" if made.compiled and not self._compiled else None
@@ -65,9 +65,10 @@ class KernelWarmUp:
         return f"{COMPILING}: {done} of {max(done, expected)}"
 
     async def run_planning(self) -> None:
-        """What few sessions need, in the background: those that do wait for it, see :meth:`ready`.
+        """Prepare kernels that few sessions need, in the background; those sessions wait, see
+        :meth:`ready`.
 
-        Where this fails, these sessions compile for themselves.
+        If this fails, these sessions compile the kernels themselves.
         """
         try:
             if not planning_on_disk():
@@ -79,7 +80,7 @@ class KernelWarmUp:
             self._planning.set()
 
     async def ready(self, spec: ResetSpec) -> None:
-        """Wait for the kernels that an episode cannot begin without."""
+        """Wait for the kernels that an episode requires."""
         if may_deform(spec):
             self.deformation.begin()
         if plans_ahead(spec.ego):
@@ -93,14 +94,14 @@ class KernelWarmUp:
             with _no_collections():
                 async with awaited(process):
                     await warm_up_renderer()
-            # What comes now lies on disk, if the other process has succeeded.
+            # These are on disk if the other process has succeeded.
             self._beside, self._compiled = None, process.returncode == 0
         else:
             await warm_up_renderer()
         await asyncio.to_thread(warm_up_world)
 
     async def _tell(self) -> None:
-        """Say how far it is: on a terminal in one line, else in the log now and then."""
+        """Report progress: on one line of a terminal, else in the log at intervals."""
         line = StatusLine(log.info)
         try:
             while True:
@@ -112,12 +113,12 @@ class KernelWarmUp:
 
 
 class DeformationKernels:
-    """What images after impacts need. They take as long as all the rest, and few sessions have an
-    impact, so they are made from the first episode on that may have one: in the background, and an
-    image that needs them before waits for them, no other. Belongs to the event loop.
+    """Kernels for images after impacts. They take as long as all others, and few sessions have an
+    impact. They are therefore prepared in the background from the first episode that may have one;
+    only images that need them wait. For use on the event loop.
 
     Attributes:
-        ready: whether images may be drawn after impacts; read on any thread.
+        ready: whether images after impacts can be rendered; read on any thread.
     """
 
     def __init__(self) -> None:
@@ -125,18 +126,18 @@ class DeformationKernels:
         self._making: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
-        """Make them, unless they are there or being made."""
+        """Prepare the kernels, unless they are ready or in progress."""
         if self._making is None:
             self._making = asyncio.create_task(self._make())
 
     async def wait(self) -> None:
-        """Return once they are there, or cannot be made ahead: then they are made when needed."""
+        """Wait until they are ready or preparation fails; then they are compiled on demand."""
         self.begin()
         assert self._making is not None
         await asyncio.wait([self._making])
 
     async def close(self) -> None:
-        """End the process that compiles them, if there is one."""
+        """End the process that compiles them, if any."""
         if self._making is not None:
             self._making.cancel()
             await asyncio.wait([self._making])
@@ -157,7 +158,7 @@ class DeformationKernels:
 
 @contextmanager
 def _no_collections() -> Iterator[None]:
-    """No search for garbage in the block: it takes a tenth of the time of compiling, for 100 MB."""
+    """Disable garbage collection in the block: it takes a tenth of the compile time, for 100 MB."""
     enabled = gc.isenabled()
     gc.disable()
     try:

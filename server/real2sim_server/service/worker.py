@@ -1,4 +1,4 @@
-"""Everything that makes up one worker, put together once."""
+"""A worker: assembles all its parts."""
 
 from __future__ import annotations
 
@@ -62,15 +62,15 @@ log = structlog.get_logger(__name__)
 
 @dataclass(eq=False)
 class Worker:
-    """One worker: what it is made of, and whether it takes work.
+    """One worker: its parts, and whether it accepts work.
 
     Attributes:
-        device: what draws, and why.
-        waiting_for: what has to happen before the worker is ready.
-        draining: whether the worker is on its way out.
-        handed_over: whether its sessions and jobs are others' by now.
+        device: the rendering device, and the reason for its choice.
+        waiting_for: pending steps before the worker is ready.
+        draining: whether the worker is shutting down.
+        handed_over: whether other workers have its sessions and jobs.
         start_error: why it did not start.
-        on_ready: called on the event loop when all is there that the worker starts with.
+        on_ready: called on the event loop when startup is complete.
     """
 
     settings: Settings
@@ -108,12 +108,12 @@ class Worker:
 
     @classmethod
     def build(cls, settings: Settings) -> Worker:
-        """Put a worker together; nothing runs yet.
+        """Assemble a worker; nothing runs yet.
 
         Raises:
-            RenderError: the backend of the settings cannot be used here.
-            TokenFileError: the file of tokens cannot be used.
-            ValueError: the store of objects is none.
+            RenderError: the backend of the settings is not available here.
+            TokenFileError: the token file is unusable.
+            ValueError: invalid URL of the object store.
         """
         metrics = Metrics()
         secret = settings.token.get_secret_value() if settings.token is not None else None
@@ -203,10 +203,10 @@ class Worker:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Worker]:
-        """The worker at work: from the start of its engine to the end of its last job.
+        """Run the worker during the block: from the start of its engine to the end of its last job.
 
         Raises:
-            StateFolderError: another worker is on the state folder, or it cannot be written to.
+            StateFolderError: another worker uses the state folder, or it is not writable.
             StoreError: the store cannot be opened.
         """
         async with AsyncExitStack() as at_exit:
@@ -222,7 +222,7 @@ class Worker:
             at_exit.push_async_callback(_cancel, asyncio.create_task(self.store.watch()))
             at_exit.push_async_callback(self.scenarios.flush)
             maintenance = Maintenance(self.settings, self.store, self.jobs, self.sessions)
-            # Nobody uploads yet: what lies about now was left behind.
+            # No uploads yet: existing temporary files are abandoned.
             await asyncio.to_thread(partial(maintenance.sweep, at_start=True))
             if self.settings.demo:
                 await asyncio.to_thread(self._add_demo)
@@ -258,9 +258,9 @@ class Worker:
             yield self
 
     def readiness(self) -> Readiness:
-        """Whether the worker can work, and if not, why.
+        """Whether the worker can work, and the reason if it cannot.
 
-        A busy worker is ready: it refuses what is too much by request, and metrics tell.
+        A busy worker is ready: it refuses excess work per request, and metrics report it.
         """
         reasons = sorted(self.waiting_for)
         if WARMING_UP in reasons and (compiling := self.kernels.compiling()) is not None:
@@ -275,13 +275,13 @@ class Worker:
 
     @property
     def scene_limits(self) -> StagingLimits:
-        """Of the process that reads an imported scene."""
+        """Limits of the process that reads an imported scene."""
         largest = min(self.settings.max_scene_bytes, self.settings.scene_memory_bytes)
         return self._limits(largest)
 
     @property
     def asset_limits(self) -> StagingLimits:
-        """Of the process that reads an uploaded asset."""
+        """Limits of the process that reads an uploaded asset."""
         return self._limits(min(self.settings.max_asset_bytes, self.settings.scene_memory_bytes))
 
     def _limits(self, max_bytes: int) -> StagingLimits:
@@ -290,7 +290,7 @@ class Worker:
 
     @property
     def scenes_quota(self) -> Quota:
-        """Of the scene folder."""
+        """Quota of the scene folder."""
         return Quota(
             self.settings.scenes_path,
             "scenes",
@@ -302,7 +302,7 @@ class Worker:
 
     @property
     def assets_quota(self) -> Quota:
-        """Of the asset library."""
+        """Quota of the asset library."""
         return Quota(
             self.settings.assets_path,
             "assets",
@@ -313,12 +313,12 @@ class Worker:
         )
 
     def replayed(self, answer: Response) -> Response:
-        """Count an answer that was given before."""
+        """Count a repeated reply."""
         self.metrics.replays.inc()
         return answer
 
     async def video_source(self, job_id: str) -> VideoSource:
-        """What a finished simulation or drive shows.
+        """Video source of a finished simulation or drive.
 
         Raises:
             ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED, or INVALID_REQUEST for other jobs.
@@ -327,12 +327,12 @@ class Worker:
         return await shown.video_source(job_id)
 
     def drain(self) -> None:
-        """Show that the worker is on its way out, and begin no sessions; open ones go on."""
+        """Start the shutdown: no new sessions; open ones continue."""
         self.draining = self.sessions.draining = True
 
     @asynccontextmanager
     async def _hear(self) -> AsyncIterator[None]:
-        """Word from other workers reaches who waits for it, for the length of the block."""
+        """Deliver notifications of other workers during the block."""
         settings = self.settings
         notices = Notices(settings.database_url, timeout_s=settings.store_timeout_seconds)
         if notices.can_hear:
@@ -343,7 +343,7 @@ class Worker:
             yield
 
     def _share(self, job_log: JobLog) -> None:
-        """Connect to the store of objects, where there is one."""
+        """Connect to the object store, if there is one."""
         settings = self.settings
         if settings.objects_url is None:
             return
@@ -368,11 +368,11 @@ class Worker:
         self.jobs.on_forget = partial(self.sharing.forget, "job")
 
     async def hand_over(self) -> bool:
-        """Leave sessions and jobs to other workers; False where there are none that would take
-        them: they go on when this one is back.
+        """Hand over sessions and jobs to other workers. False if none would accept them: they
+        continue when this one is back.
 
         Raises:
-            StoreError: of the database; nothing was left.
+            StoreError: from the database; nothing was handed over.
         """
         rows = await self.leases.workers()
         others = [w for w in rows if w.alive and w.worker_id != self.settings.worker_id]
@@ -388,7 +388,7 @@ class Worker:
         return True
 
     def _add_demo(self) -> None:
-        """Put the demo street into the scene folder, unless a scene of its name is there."""
+        """Import the demo street, unless a scene of its name exists."""
         try:
             import_scene(
                 SHIPPED_STREET,
@@ -418,7 +418,7 @@ class Worker:
         )
 
     def _about(self) -> dict[str, Any]:
-        """What the fleet is told about this worker."""
+        """Status of this worker for the fleet."""
         return {
             "version": version("real2sim"),
             "backend": self.backend.name,
@@ -434,14 +434,14 @@ class Worker:
         }
 
     def _held(self) -> dict[str, list[int]]:
-        """Sessions and unfinished jobs by the name of whose they are."""
+        """Sessions and unfinished jobs by name of their owner."""
         sessions, jobs = self.sessions.owned(), self.jobs.unfinished()
         return {
             name: [sessions[name], jobs[name]] for name in sorted(sessions.keys() | jobs.keys())
         }
 
     def _load(self) -> float:
-        """Share of the time since the last call in which the engine worked."""
+        """Utilization of the engine since the last call, 0 to 1."""
         now, worked = time.monotonic(), self.metrics.engine_seconds
         since, before = self._last_load
         self._last_load = (now, worked)

@@ -1,1 +1,1 @@
-"""What every HTTP answer shares: errors, authorisation, idempotency, metrics."""
+"""Shared by all HTTP replies: errors, authorisation, idempotency, metrics."""

@@ -1,8 +1,8 @@
-"""Who may call, and what: bearer tokens, their roles, and no open door beyond this machine.
+"""Authorisation: bearer tokens, their roles, and protection of workers without a token.
 
-Each role may all that the one before it may: ``observe`` reads; ``drive`` has sessions and sweeps;
-``edit`` makes scenarios, assets and jobs; ``administer`` adds scenes and moves them in and out of
-memory.
+Each role includes the previous ones: ``observe`` reads; ``drive`` uses sessions and sweeps;
+``edit`` creates scenarios, assets and jobs; ``administer`` adds scenes and loads or unloads
+them.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from ..accounts import ACCOUNT, ROLES, Account, Role
 from .responses import ServiceError
 
 FOREIGN_PAGE = 4403
-"""Code with which sockets of other sites' pages are closed."""
+"""Close code for sockets of other sites' pages."""
 PAGES = ("/", "/ui", "/ui/", "/docs")
-"""What a link on another site may lead to."""
+"""Pages that other sites may link to."""
 OWN = ("same-origin", "none")
-"""Requests of our own pages, and of persons who type an address."""
+"""Values of Sec-Fetch-Site for our own pages, and for addresses typed by the user."""
 
 
 class OwnPagesOnly:
@@ -56,7 +56,7 @@ class OwnPagesOnly:
 
 
 def same_origin(origin: str, host: str | None) -> bool:
-    """Whether a page of this worker asks; its scheme may be that of a proxy."""
+    """Whether a page of this worker sent the request; a proxy may have changed the scheme."""
     try:
         return host is not None and urlsplit(origin).netloc.lower() == host.lower()
     except ValueError:
@@ -70,7 +70,7 @@ _HINT = (
 
 
 def _refusal(scope: Scope, headers: Headers) -> str | None:
-    """Why a request is refused; None where it is not."""
+    """Reason for refusing a request, or None."""
     origin, host = headers.get("origin"), headers.get("host")
     if origin is not None and not same_origin(origin, host):
         return f"a page of {origin[:200]!r} called a worker at {(host or '')[:200]!r}"
@@ -81,7 +81,7 @@ def _refusal(scope: Scope, headers: Headers) -> str | None:
 
 
 def _is_link(scope: Scope, headers: Headers) -> bool:
-    """Whether a person follows a link to one of our pages, in a window of its own."""
+    """Whether the user follows a link to one of our pages in a top-level window."""
     return (
         scope["type"] == "http"
         and scope["method"] in ("GET", "HEAD")
@@ -102,9 +102,9 @@ def is_loopback(host: str) -> bool:
 
 
 class LoopbackOnly:
-    """ASGI middleware that refuses requests which name another host.
+    """ASGI middleware that refuses requests for another host.
 
-    Any site may point a name of its own at 127.0.0.1 (DNS rebinding); ``Host`` tells.
+    Any site can resolve its own name to 127.0.0.1 (DNS rebinding); the ``Host`` header reveals it.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -157,14 +157,14 @@ _bearer = HTTPBearer(
 
 
 class OpenBindError(ValueError):
-    """An address that others can reach, without a token."""
+    """A public address, without a token."""
 
 
 def check_bind(host: str, token: object) -> None:
-    """Refuse to listen beyond this machine without a token, or a file of tokens.
+    """Refuse to listen on public interfaces without a token or a token file.
 
     Raises:
-        OpenBindError: saying what to do.
+        OpenBindError: with the remedy.
     """
     if token or is_loopback(host):
         return
@@ -176,7 +176,7 @@ def check_bind(host: str, token: object) -> None:
 
 
 def secrets_equal(given: str | None, expected: str) -> bool:
-    """Compare in a time that does not depend on where the two differ."""
+    """Compare in constant time."""
     return hmac.compare_digest((given or "").encode(), expected.encode())
 
 
@@ -184,7 +184,7 @@ async def require_token(
     _credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
     connection: HTTPConnection,
 ) -> None:
-    """Dependency of every route that is not open.
+    """Dependency of every protected route.
 
     Raises:
         ServiceError: UNAUTHORIZED.
@@ -193,14 +193,14 @@ async def require_token(
 
 
 def check_token(connection: HTTPConnection) -> None:
-    """Find the account that a request with a token of the worker is for, and let it in.
+    """Find the account of a request with a token of the worker, and admit the request.
 
     Raises:
         ServiceError: UNAUTHORIZED.
-        OverLimitError: the account has had its requests.
+        OverLimitError: the account's request limit is reached.
     """
     if account_of(connection.scope) is not None:
-        return  # Its route has checked before anything was read.
+        return  # Its route has already checked the token.
     worker = connection.app.state.worker
     given = bearer_token(connection)
     account: Account | None = worker.accounts.of_token(given)
@@ -213,20 +213,20 @@ def check_token(connection: HTTPConnection) -> None:
 
 
 def bearer_token(connection: HTTPConnection) -> str | None:
-    """What stands behind ``Authorization: Bearer``; None where nothing does."""
+    """The token of ``Authorization: Bearer``, or None."""
     scheme, _, given = connection.headers.get("Authorization", "").partition(" ")
     return given.strip() or None if scheme.lower() == "bearer" else None
 
 
 class TokenRoute(APIRoute):
-    """A route that checks the worker's token before anything of the request is read."""
+    """A route that checks the worker's token before reading the request."""
 
     async def check(self, request: Request) -> None:
         """Raises ServiceError: UNAUTHORIZED."""
         check_token(request)
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """FastAPI's handler, behind the check."""
+        """FastAPI's handler, after the check."""
         handle = super().get_route_handler()
 
         async def checked(request: Request) -> Response:
@@ -237,7 +237,7 @@ class TokenRoute(APIRoute):
 
 
 def unauthorized(detail: str) -> ServiceError:
-    """UNAUTHORIZED, with the header that RFC 9110 asks for."""
+    """UNAUTHORIZED, with the header that RFC 9110 requires."""
     return ServiceError(
         ErrorCode.UNAUTHORIZED,
         detail,
@@ -250,17 +250,17 @@ _ACCOUNT_KEY = "real2sim.account"
 
 
 def account_of(scope: Scope) -> Account | None:
-    """The account that a request or a socket is for; None until its token was checked."""
+    """The account of a request or a socket; None until its token is checked."""
     account: Account | None = scope.get(_ACCOUNT_KEY)
     return account
 
 
 def act_for(connection: HTTPConnection, account: Account) -> None:
-    """From now on the running task works for ``account``.
+    """Make the running task work for ``account``.
 
     Raises:
-        RevokedError: its token is no more.
-        OverLimitError: it has had its requests.
+        RevokedError: its token has been removed.
+        OverLimitError: its request limit is reached.
         ServiceError: FORBIDDEN: its role does not allow it.
     """
     connection.scope[_ACCOUNT_KEY] = account
@@ -272,21 +272,21 @@ def act_for(connection: HTTPConnection, account: Account) -> None:
 READING = frozenset({"GET", "HEAD", "OPTIONS"})
 
 _NEEDED: tuple[tuple[re.Pattern[str], Role], ...] = (
-    # Its body says what to draw; nothing is changed.
+    # The body selects the view; the call changes nothing.
     (re.compile(r"/v1/scenes/[^/]+/render"), "observe"),
     (re.compile(r"/v1/scenes(/.*)?"), "administer"),
     (re.compile(r"/v1/sessions(/.*)?"), "drive"),
     (re.compile(r"/v1/sweeps"), "drive"),
 )
-"""Of requests that change something, by path; the first that fits counts."""
+"""Roles of requests that change something, by path; the first match applies."""
 
 
 def needed_role(method: str, path: str) -> Role:
-    """What a request needs.
+    """The role that a request requires.
 
     Args:
-        method: of HTTP; ``WEBSOCKET`` for a socket.
-        path: of the URL.
+        method: HTTP method; ``WEBSOCKET`` for a socket.
+        path: path of the URL.
     """
     if method == "WEBSOCKET":
         return "drive" if path.startswith("/v1/sessions") else "observe"
@@ -296,12 +296,12 @@ def needed_role(method: str, path: str) -> Role:
 
 
 def check_role(connection: HTTPConnection, role: Role, *, name: str) -> None:
-    """Refuse what a token's role does not allow.
+    """Refuse a request that a token's role does not allow.
 
     Args:
         connection: request or socket.
-        role: of the token.
-        name: of the token.
+        role: role of the token.
+        name: name of the token.
 
     Raises:
         ServiceError: FORBIDDEN.

@@ -1,10 +1,10 @@
-"""Connections of clients: how many there may be, and how long one may keep the worker waiting.
+"""Connections of clients: their number, and timeouts for slow clients.
 
-uvicorn's own protocols serve every connection. :class:`Connection` stands in front of them and
-passes on what asyncio says; an ASGI wrapper around the application tells it where a request begins,
-waits for its body and ends. A sweep looks at all connections once a second. When there are too
-many, the connections that have been silent for longest while it was their turn to send are closed;
-WebSockets and requests in progress stay.
+uvicorn's protocols serve every connection. :class:`Connection` wraps them and forwards the events
+of asyncio. An ASGI wrapper around the application reports when a request begins, waits for its body
+and ends. A sweep checks all connections once a second. If there are too many, it closes those that
+have been silent for longest while it was their turn to send. WebSockets and requests in progress
+are not closed.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 SWEEP_S = 1.0
 MIN_BYTES_PER_S = 10_000
-"""A client that sends or reads faster than this is never dropped for being slow."""
+"""Minimum rate; faster clients are never dropped for being slow."""
 NEAR, FAR = 0.8, 0.6
-"""Shares of the limit at which a warning is given, and below which it may be given again."""
+"""Fractions of the limit: a warning is logged above the first, and re-armed below the second."""
 RESERVED_DESCRIPTORS = 256
-"""Kept for the store, scene files, uploads and the pipes of jobs."""
+"""Reserved for the store, scene files, uploads and the pipes of jobs."""
 MAX_CLIENTS_LOGGED = 5
 MAX_REASON_BYTES = 123
 HARMLESS = (
@@ -50,16 +50,16 @@ HARMLESS = (
     "Invalid UTF-8 sequence received from client.",
 )
 """Errors that uvicorn logs when a client leaves or is refused during the handshake, or sends text
-that is not UTF-8. The worker has answered the client, there is nothing to mend."""
+that is not UTF-8. The client has received its reply; there is nothing to fix."""
 
 log = structlog.get_logger(__name__)
 
 _connection: ContextVar[Connection | None] = ContextVar("connection", default=None)
-"""The connection whose bytes are being parsed; tasks that serve its requests inherit it."""
+"""The connection whose bytes are being parsed; tasks of its requests inherit it."""
 
 
 class DropReason(StrEnum):
-    """Why a connection was closed by the worker."""
+    """Reasons for closing a connection."""
 
     HEAD_TIMEOUT = "head_timeout"
     BODY_TIMEOUT = "body_timeout"
@@ -70,13 +70,14 @@ class DropReason(StrEnum):
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """What a connection may take.
+    """Limits of connections.
 
     Attributes:
-        most: connections at a time.
-        head_s: from the first byte of a request, or from the beginning, to the end of its headers.
-        body_s: for the body, beside the time that it takes at the slowest rate allowed.
-        write_s: for a client to read what it was sent, beside the time at that rate.
+        most: number of connections.
+        head_s: time from the first byte of a request, or from connecting, to the end of its
+            headers.
+        body_s: time for the body, in addition to that at the minimum rate.
+        write_s: time for a client to read a reply, in addition to that at the minimum rate.
     """
 
     most: int
@@ -86,18 +87,18 @@ class ConnectionLimits:
 
 
 class Connections:
-    """All connections of a worker. Belongs to the event loop.
+    """All connections of a worker, for use on the event loop.
 
     Args:
-        limits: how many, and how slow.
-        metrics: counts what was dropped.
+        limits: number and timeouts.
+        metrics: counts dropped connections.
     """
 
     def __init__(self, limits: ConnectionLimits, metrics: Metrics) -> None:
         self.limits = limits
         self._metrics = metrics
         self._open: set[Connection] = set()
-        # Those whose turn it is to send; the one that was silent for longest comes first.
+        # Connections whose turn it is to send, longest silent first.
         self._silent: dict[Connection, None] = {}
         self._dropped: Counter[DropReason] = Counter()
         self._dropped_clients: list[str] = []
@@ -109,7 +110,7 @@ class Connections:
         return len(self._open)
 
     def admit(self, connection: Connection) -> None:
-        """A new connection, of which nothing is known yet; it may be dropped at once."""
+        """Register a new connection; it may be dropped immediately."""
         if len(self._open) >= self.limits.most:
             silent = next(iter(self._silent), None)
             if silent is None:
@@ -121,28 +122,28 @@ class Connections:
         self._warn_when_near()
 
     def await_client(self, connection: Connection) -> None:
-        """It is the client's turn to send: the connection may be crowded out."""
+        """It is the client's turn to send: the connection may be dropped for a new one."""
         if connection in self._open:
             self._silent.pop(connection, None)
             self._silent[connection] = None
 
     def keep(self, connection: Connection) -> None:
-        """It is the worker's turn, or a socket is in use: the connection stays."""
+        """Protect the connection: it is the worker's turn, or a socket is in use."""
         self._silent.pop(connection, None)
 
     def forget(self, connection: Connection) -> None:
-        """A connection has ended."""
+        """Remove an ended connection."""
         self._open.discard(connection)
         self._silent.pop(connection, None)
 
     async def watch(self) -> None:
-        """Drop what is overdue, until cancelled."""
+        """Drop overdue connections periodically, until cancelled."""
         while True:
             await asyncio.sleep(SWEEP_S)
             self.sweep()
 
     def sweep(self) -> None:
-        """Drop what is overdue now, and tell the log what was dropped since the last time."""
+        """Drop overdue connections, and log the number dropped since the last call."""
         now = time.monotonic()
         for connection in list(self._open):
             if (reason := connection.overdue(now)) is not None:
@@ -159,7 +160,7 @@ class Connections:
             self._dropped_clients = []
 
     def _drop(self, connection: Connection, reason: DropReason) -> None:
-        # It stays among the open ones until its end: a client that does not read holds it.
+        # It counts as open until its end: a client that does not read holds it.
         self._silent.pop(connection, None)
         if reason is DropReason.CROWDED_OUT:
             self._open.discard(connection)
@@ -184,11 +185,11 @@ class Connections:
 
 
 class Connection(asyncio.Protocol):
-    """One connection of a client: uvicorn's protocol serves it, a worker's connections watch it.
+    """One connection of a client, served by uvicorn's protocol and watched by :class:`Connections`.
 
     Args:
-        protocol: of uvicorn, for HTTP.
-        connections: of the worker.
+        protocol: uvicorn's HTTP protocol.
+        connections: connections of the worker.
     """
 
     def __init__(self, protocol: asyncio.Protocol, connections: Connections) -> None:
@@ -196,12 +197,13 @@ class Connection(asyncio.Protocol):
         self._protocol = protocol
         self._connections = connections
         self._backlog = Backlog(connections.limits.write_s)
-        # When the client began to send a request; None while it need not send one.
+        # When the client's turn to send began; None while it is the worker's.
         self._head_since: float | None = None
-        # Bytes since then, and those that came after the request in progress.
+        # Bytes since then, and bytes after the request in progress.
         self.received = 0
         self._ahead = 0
-        # While a request is in progress: seconds waited for its body, and since when.
+        # While a request is in progress: seconds waited for its body, and the start of the current
+        # wait.
         self._body_pending = False
         self._body_waited_s = 0.0
         self._body_since: float | None = None
@@ -209,7 +211,7 @@ class Connection(asyncio.Protocol):
         self._answering = False
         self._refused = False
 
-    # --- what asyncio says --------------------------------------------------------------------
+    # --- events of asyncio --------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take over a new connection."""
@@ -229,7 +231,7 @@ class Connection(asyncio.Protocol):
         self._protocol.connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Bytes of a client."""
+        """Data from the client."""
         if self._transport.is_closing():
             return
         if not self._busy:
@@ -243,13 +245,13 @@ class Connection(asyncio.Protocol):
         try:
             self._protocol.data_received(data)
         except h11.LocalProtocolError:
-            # What follows a request that is being answered is not HTTP: there is no answer to it.
+            # Bytes after a request in progress are not HTTP; there is no reply to them.
             self._transport.close()
         finally:
             _connection.reset(token)
 
     def eof_received(self) -> bool | None:
-        """The client sends nothing more."""
+        """The client will send no more data."""
         return self._protocol.eof_received()
 
     def pause_writing(self) -> None:
@@ -257,17 +259,17 @@ class Connection(asyncio.Protocol):
         self._protocol.pause_writing()
 
     def resume_writing(self) -> None:
-        """The client has read most of what it was sent."""
+        """The client has read most of the sent data."""
         self._backlog.cleared()
         self._protocol.resume_writing()
 
     def upgraded(self, protocol: asyncio.Protocol) -> None:
-        """Another protocol of uvicorn, of WebSockets, goes on with the connection."""
+        """uvicorn's WebSocket protocol takes over the connection."""
         self._protocol, self._answering = protocol, True
 
     def may_write(self, data: bytes) -> bool:
-        """Whether uvicorn may write ``data``. It refuses bad requests and handshakes in plain
-        text; the client gets a problem document instead."""
+        """Whether uvicorn may write ``data``. It refuses bad requests and handshakes in plain text;
+        the client receives a problem document instead."""
         refusing = self._refused or data.startswith(b"HTTP/1.1 400 ")
         if self._answering or not refusing:
             return True
@@ -276,10 +278,10 @@ class Connection(asyncio.Protocol):
             self._transport.write(bad_request_answer())
         return False
 
-    # --- what the application does ------------------------------------------------------------
+    # --- events of the application ------------------------------------------------------------
 
     async def serve_http(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request, and note whose turn it is."""
+        """Serve a request, and track whose turn it is."""
         self._head_since, self._busy, self._ahead = None, True, 0
         self._body_pending = _has_body(scope)
         self._body_waited_s = 0.0
@@ -317,7 +319,7 @@ class Connection(asyncio.Protocol):
     async def serve_websocket(
         self, app: ASGIApp, scope: Scope, receive: Receive, send: Send
     ) -> None:
-        """Serve a WebSocket; from its first message on it gives way to no other connection."""
+        """Serve a WebSocket; from its first message on it is never dropped for a new connection."""
         self._head_since, self._busy, self._answering = None, True, True
 
         async def receive_noted() -> Message:
@@ -334,10 +336,10 @@ class Connection(asyncio.Protocol):
             self._head_since, self.received = time.monotonic(), self._ahead
         self._connections.await_client(self)
 
-    # --- what the sweep asks ------------------------------------------------------------------
+    # --- queries of the sweep -----------------------------------------------------------------
 
     def overdue(self, now: float) -> DropReason | None:
-        """Why the connection has to go, if it has to; ``now`` in seconds, monotonic clock."""
+        """The reason to drop the connection, or None; ``now`` in seconds, monotonic clock."""
         limits = self._connections.limits
         if self._backlog.overdue(self._transport, now):
             return DropReason.WRITE_TIMEOUT
@@ -352,7 +354,7 @@ class Connection(asyncio.Protocol):
         return None
 
     def drop(self, reason: DropReason) -> None:
-        """Close the connection, with an answer where a request has begun and none is under way."""
+        """Close the connection; send a reply if a request has begun and none is in progress."""
         transport = self._transport
         if reason is DropReason.WRITE_TIMEOUT or transport.get_write_buffer_size():
             transport.abort()
@@ -364,7 +366,7 @@ class Connection(asyncio.Protocol):
 
 
 class _Transport:
-    """A transport as uvicorn's protocols see it: one that changes protocols behind the watch."""
+    """The transport for uvicorn's protocols; protocol changes keep the watch in place."""
 
     def __init__(self, transport: asyncio.Transport, connection: Connection) -> None:
         self._transport = transport
@@ -380,7 +382,7 @@ class _Transport:
 
 
 def watch(config: uvicorn.Config, connections: Connections) -> None:
-    """Let ``connections`` watch what uvicorn serves."""
+    """Make ``connections`` watch the connections of uvicorn."""
     logging.getLogger("uvicorn.error").addFilter(_is_news)
     config.app = _noted(config.app)  # type: ignore[arg-type]
     config.load()
@@ -393,7 +395,7 @@ def _is_news(record: logging.LogRecord) -> bool:
 
 
 def _noted(app: ASGIApp) -> ASGIApp:
-    """``app``, which tells the connection of each request that it serves."""
+    """Wrap ``app`` to report each request to its connection."""
 
     async def served(scope: Scope, receive: Receive, send: Send) -> None:
         connection = _connection.get()
@@ -408,16 +410,16 @@ def _noted(app: ASGIApp) -> ASGIApp:
 
 
 def _has_body(scope: Scope) -> bool:
-    """Whether a request says that a body follows (RFC 9112, 6)."""
+    """Whether a request declares a body (RFC 9112, 6)."""
     headers = dict(scope["headers"])
     return b"transfer-encoding" in headers or headers.get(b"content-length", b"0") != b"0"
 
 
 class Backlog:
-    """What a client has not read yet, as the sweep sees it.
+    """Unread data of a client, as observed by the sweep.
 
     Args:
-        allowed_s: without reading at :data:`MIN_BYTES_PER_S`.
+        allowed_s: maximum time below :data:`MIN_BYTES_PER_S`.
     """
 
     def __init__(self, allowed_s: float) -> None:
@@ -436,12 +438,12 @@ class Backlog:
         return size > 0 and now - self._since > self._allowed_s + self._read / MIN_BYTES_PER_S
 
     def cleared(self) -> None:
-        """The client has read all but what the transport takes without asking."""
+        """The client has read everything above the transport's low-water mark."""
         self._bytes = 0
 
 
 async def receive_text(websocket: WebSocket) -> str:
-    """The next message, where messages are text.
+    """The next message, which must be text.
 
     Raises:
         WebSocketDisconnect: the client has disconnected.
@@ -457,18 +459,18 @@ async def receive_text(websocket: WebSocket) -> str:
 
 
 async def close_quietly(websocket: WebSocket, code: int, reason: str) -> None:
-    """Close a socket, unless its client has left."""
+    """Close a socket, unless the client has left."""
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         await websocket.close(code, close_reason(reason))
 
 
 def close_reason(text: str) -> str:
-    """As much of ``text`` as a close frame holds: 123 bytes (RFC 6455, 5.5)."""
+    """``text`` truncated to the size of a close frame: 123 bytes (RFC 6455, 5.5)."""
     return text.encode("utf-8", "replace")[:MAX_REASON_BYTES].decode("utf-8", "ignore")
 
 
 def connection_limit(wanted: int) -> int:
-    """Connections that the limit of descriptors leaves room for, ``wanted`` at most."""
+    """Number of connections within the limit of file descriptors, at most ``wanted``."""
     try:
         import resource
     except ImportError:  # not on this system
@@ -480,7 +482,7 @@ def connection_limit(wanted: int) -> int:
 
 
 def last_answer(reason: DropReason, limits: ConnectionLimits) -> bytes:
-    """A whole HTTP answer for a connection that is closed with it."""
+    """A complete HTTP reply, after which the connection is closed."""
     failure = _FAILURES[reason](limits)
     problem = problem_of(failure, path="", request_id=None)
     body = json.dumps(problem.model_dump(mode="json", exclude_none=True)).encode()
@@ -488,7 +490,7 @@ def last_answer(reason: DropReason, limits: ConnectionLimits) -> bytes:
 
 
 def bad_request_answer() -> bytes:
-    """A whole HTTP answer to bytes that are not HTTP, or no handshake."""
+    """A complete HTTP reply to data that is not HTTP or not a valid handshake."""
     failure = ServiceError(
         ErrorCode.BAD_MESSAGE,
         "the bytes sent are neither an HTTP/1.1 request nor a WebSocket handshake of version 13",
@@ -537,8 +539,8 @@ _FAILURES = {
 
 
 def _send_unpaced(connection: socket.socket) -> None:
-    """Where the system's congestion control paces what it sends, a timer runs for every 64 kB: a
-    tenth of a millisecond for three images that never leave the machine."""
+    """Disable pacing by the congestion control on loopback: its timer runs for every 64 kB, which
+    adds 0.1 ms for three images."""
     if hasattr(socket, "TCP_CONGESTION"):
         # Reno is part of every Linux and open to every process.
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""The OpenAPI document, the errors that each call may answer with, and the page of calls."""
+"""The OpenAPI document, possible errors of each call, and the API reference page."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ OF_PARAMETER: dict[str, tuple[ErrorCode, ...]] = {
     "camera": (C.UNKNOWN_CAMERA,),
     "t_us": (C.TIME_OUT_OF_RANGE,),
 }
-"""By the names of path, query and header parameters."""
+"""Error codes by name of path, query and header parameters."""
 
 _OF_EDITS = (C.INVALID_OPERATION, C.UNKNOWN_OBJECT, C.UNKNOWN_ASSET, C.ALREADY_EXISTS)
 _OF_EPISODES = (C.NOT_RESET, C.EPISODE_OVER, C.CONTROLLER_TAKEN, C.INVALID_ACTION)
@@ -119,11 +119,11 @@ OF_OPERATION: dict[str, tuple[ErrorCode, ...]] = {
     "storyboards-replace": _OF_EDITS,
     "sweeps-create": (*_OF_SCENES, C.TOO_MANY_JOBS, C.QUOTA_EXCEEDED),
 }
-"""What does not follow from parameters, by operation id."""
+"""Error codes that do not follow from the parameters, by operation id."""
 
 
 def document_errors(operation: dict[str, Any]) -> None:
-    """Give an operation one answer for each status of its errors, and none for others."""
+    """Document one reply per error status of an operation, and remove others."""
     responses = operation["responses"]
     for undocumented in ("422", "default"):
         responses.pop(undocumented, None)
@@ -263,21 +263,21 @@ BODIES: dict[str, Any] = {
 """An example of each JSON body, by the name of its schema."""
 
 FILES = {"application/xml": "scenario.xosc"}
-"""A file of the caller that a sample sends, by its media type."""
+"""Sample upload file by media type."""
 
 SAMPLE_QUERY: dict[str, tuple[str, ...]] = {"sessions-create": ("scene",)}
-"""Query parameters of a call's sample, by operation, though none of them alone is required."""
+"""Query parameters to show in an operation's sample, although none is required."""
 
 TOKEN_OF = {WORKER_SCHEME: "$REAL2SIM_TOKEN", SESSION_SCHEME: "$SESSION_TOKEN"}
-"""Variable of the shell that holds the token of a security scheme."""
+"""Shell variable with the token of each security scheme."""
 
 _published: dict[str, Any] = {}
 
 
 def published(app: FastAPI) -> dict[str, Any]:
-    """The document, made once a process: it is the same for all settings.
+    """The document, computed once per process: it does not depend on settings.
 
-    Made on demand it would keep the event loop busy for tenths of a second.
+    Computing it on a request would block the event loop for tenths of a second.
     """
     if not _published:
         _published.update(document(app))
@@ -299,7 +299,7 @@ def document(app: FastAPI) -> dict[str, Any]:
 
 
 def operations(made: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """(path, method, operation) of everything in a document."""
+    """(path, method, operation) of all calls in a document."""
     for path, item in made["paths"].items():
         for method in METHODS:
             if method in item:
@@ -307,8 +307,8 @@ def operations(made: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]
 
 
 def curl(path: str, method: str, operation: dict[str, Any]) -> str:
-    """A call of the operation for a shell, with ``$WORKER`` as its address, and with the token
-    that it wants in a variable of :data:`TOKEN_OF`."""
+    """A curl call of the operation, with the address ``$WORKER`` and the token in a variable of
+    :data:`TOKEN_OF`."""
     query, in_sample = [], SAMPLE_QUERY.get(operation["operationId"], ())
     for parameter in operation.get("parameters", ()):
         given = parameter.get("example")
@@ -345,7 +345,7 @@ def _add_examples(operation: dict[str, Any]) -> None:
 
 
 def _add_worker_token(operation: dict[str, Any]) -> None:
-    """The worker's token opens sessions, too: either will do."""
+    """Allow the worker's token, too, for calls that accept a session's token."""
     schemes = operation.get("security", [])
     if {SESSION_SCHEME: []} in schemes and {WORKER_SCHEME: []} not in schemes:
         schemes.append({WORKER_SCHEME: []})
@@ -370,7 +370,7 @@ POLICY = (
 
 
 def reference_page(made: dict[str, Any]) -> str:
-    """The page of a document."""
+    """The reference page of a document."""
     info = made["info"]
     found = sorted(operations(made), key=lambda found: _tag(found[2]))
     tags = [(tag, list(group)) for tag, group in groupby(found, key=lambda found: _tag(found[2]))]

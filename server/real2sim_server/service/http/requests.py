@@ -56,16 +56,16 @@ log = structlog.get_logger(__name__)
 
 
 class RequestContext:
-    """ASGI middleware, outermost of ours.
+    """ASGI middleware, the outermost of ours.
 
-    Takes the request id from ``X-Request-Id`` or makes one, sends it back, binds it and the client
-    for logs, measures the request, answers HEAD as GET without its body, and INTERNAL for uncaught
-    errors.
+    Takes the request id from ``X-Request-Id`` or creates one, returns it, and binds it and the
+    client for logs. Also measures the request, answers HEAD as GET without a body, and sends
+    INTERNAL for uncaught errors.
 
     Args:
         app: the application.
-        metrics: of the worker.
-        on_end: told of each request: scope, method, status, request id.
+        metrics: metrics of the worker.
+        on_end: called after each request: scope, method, status, request id.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class RequestContext:
             await self._app(scope, receive, send_with_id)
         except Exception as error:
             failure = service_error(error, log_unexpected=True)
-            if status:  # the answer is under way; the server must cut it short
+            if status:  # the reply has begun; the server must cut it short
                 raise
             response = problem_response(failure, path=scope["path"], request_id=request_id)
             await response(scope, receive, send_with_id)
@@ -148,8 +148,8 @@ class BodyLimit:
 
     Args:
         app: the application.
-        limit: of all requests [bytes].
-        uploads: of multipart forms to these paths instead [bytes].
+        limit: limit for all requests [bytes].
+        uploads: limit for multipart forms to these paths [bytes].
     """
 
     def __init__(self, app: ASGIApp, *, limit: int, uploads: Mapping[str, int]) -> None:
@@ -194,13 +194,13 @@ def _request_id(headers: Headers) -> str:
 
 
 def _session(scope: Scope) -> dict[str, str]:
-    """The session that a request is about, for logs."""
+    """The session of a request, for logs."""
     found = (scope.get("path_params") or {}).get("session_id")
     return {"session_id": str(found)} if found else {}
 
 
 def _client(scope: Scope, headers: Headers) -> dict[str, str]:
-    """Where a request comes from, and the name that the client gives itself, for logs."""
+    """Address of the client, and the name it sends, for logs."""
     address = scope.get("client")
     found = {"client": address[0]} if address else {}
     name = headers.get(CLIENT_HEADER, "")
@@ -226,12 +226,12 @@ IdempotencyKey = Annotated[
 
 @dataclass
 class IdempotentRequest:
-    """One request under its key.
+    """One request with its idempotency key.
 
     Attributes:
-        key: None where the client sent none; then nothing is remembered.
-        secret: the key as the client sent it; the store has only its hash, and answers sealed.
-        replay: the answer given before; send it and do nothing.
+        key: None if the client sent none; then nothing is stored.
+        secret: the key as sent; the store only has its hash, and seals replies with it.
+        replay: the stored reply; send it and do nothing else.
     """
 
     key: str | None = None
@@ -241,13 +241,13 @@ class IdempotentRequest:
 
     @property
     def claim(self) -> str | None:
-        """Names this request and no other; None without a key."""
+        """Unique name of this request; None without a key."""
         return None if self.key is None else f"{self.key} {self.fingerprint}"
 
     def reply(
         self, body: BaseModel, *, status: int, headers: Mapping[str, str] | None = None
     ) -> StoredReply | None:
-        """What to store together with the effect; None without a key."""
+        """The reply to store together with the effect; None without a key."""
         if self.key is None:
             return None
         return self.reply_bytes(body.model_dump_json().encode(), status=status, headers=headers)
@@ -255,7 +255,7 @@ class IdempotentRequest:
     def reply_bytes(
         self, content: bytes, *, status: int, headers: Mapping[str, str] | None = None
     ) -> StoredReply | None:
-        """The same for JSON that is written already."""
+        """The same for encoded JSON."""
         if self.key is None:
             return None
         body = sealed(content, self.secret)
@@ -263,10 +263,10 @@ class IdempotentRequest:
 
 
 class ReplyConflict(Exception):
-    """Another worker has answered the same request meanwhile; what was begun here came too late.
+    """Another worker has answered the same request in the meantime; this attempt is discarded.
 
     Args:
-        answer: that of the other worker.
+        answer: the other worker's reply.
     """
 
     def __init__(self, answer: Response) -> None:
@@ -275,12 +275,13 @@ class ReplyConflict(Exception):
 
 
 class Idempotency:
-    """Answers given under keys, shared by all routes of a worker.
+    """Replies by idempotency key, shared by all routes of a worker.
 
-    The answer is stored in the transaction of the effect, so that a crash leaves both or neither.
-    Refusals are not stored: the same request may succeed later. A request that comes while the
-    first one under its key is still under way waits for that one's answer; one that is under way at
-    another worker with the same store is refused by it, and gets that worker's answer.
+    A reply is stored in the transaction of its effect, so a crash leaves both or neither. Refusals
+    are not stored: the same request may succeed later. A request that arrives while another with
+    the same key is in progress waits for its reply. If the other request is in progress at another
+    worker with the same store, the store refuses this one, and the client receives that worker's
+    reply.
     """
 
     def __init__(self, store: Store) -> None:
@@ -294,13 +295,13 @@ class Idempotency:
         """The request's :class:`IdempotentRequest`, held until the block ends.
 
         Args:
-            request: what is asked for.
-            key: of the client; None guards nothing.
-            content: what stands for the body; None for the body itself. A form, whose boundary
-                differs each time, is told by its parts: :func:`form_digest`.
+            request: the request.
+            key: key of the client; None disables the guard.
+            content: identifies the body; None for the body itself. A form, whose boundary differs
+                each time, is identified by its parts: :func:`form_digest`.
 
         Raises:
-            ServiceError: IDEMPOTENCY_CONFLICT when the key was used for another request.
+            ServiceError: IDEMPOTENCY_CONFLICT if the key was used for another request.
             ReplyConflict: another worker was faster.
         """
         if key is None:
@@ -326,7 +327,7 @@ class Idempotency:
     async def _given(
         self, full_key: str, fingerprint: str, secret: str, key: str
     ) -> Response | None:
-        """The answer given under a key. Raises ServiceError: IDEMPOTENCY_CONFLICT."""
+        """The reply stored under a key. Raises ServiceError: IDEMPOTENCY_CONFLICT."""
         stored = await self._store.reply(full_key)
         if stored is None:
             return None
@@ -339,9 +340,9 @@ class Idempotency:
         return _response(stored, secret)
 
     async def store(self, reply: StoredReply | None) -> None:
-        """Store an answer whose effect is not in the store, once it is there.
+        """Store the reply of an effect outside the store, after the effect.
 
-        A crash in between leaves the effect alone, which therefore bears the claim of its request.
+        A crash in between leaves only the effect, so the effect carries the claim of its request.
         """
         if reply is not None:
             await self._store.write(reply=reply)
@@ -362,7 +363,7 @@ class Idempotency:
 
 
 def install_replay_handler(app: FastAPI, replayed: Callable[[Response], Response]) -> None:
-    """Answer what another worker was faster with by its answer, which passes ``replayed``."""
+    """Answer a ReplyConflict with the other worker's reply, passed through ``replayed``."""
 
     async def respond(_request: Request, error: Exception) -> Response:
         assert isinstance(error, ReplyConflict)
@@ -372,7 +373,8 @@ def install_replay_handler(app: FastAPI, replayed: Callable[[Response], Response
 
 
 async def form_digest(form: FormData) -> bytes:
-    """What a form says, whatever its boundary; reads uploaded files from their beginning."""
+    """Digest of a form's parts, independent of its boundary; reads uploaded files from the
+    start."""
     digest = hashlib.sha256()
     for name, value in form.multi_items():
         _update(digest, name.encode("utf-8", "surrogateescape"))

@@ -40,7 +40,7 @@ from ..storage.connection import (
 )
 
 # Problems. Routes and the classes below them raise :class:`ServiceError`; errors of lower packages
-# are translated here and nowhere else.
+# are converted only here.
 
 # --- Disconnects ---------------------------------------------------------------------------------
 
@@ -49,17 +49,17 @@ T = TypeVar("T")
 
 
 class ClientDisconnectedError(Exception):
-    """The client has closed the connection before its answer."""
+    """The client has closed the connection before its reply."""
 
 
 async def cancel_on_disconnect(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """The result of ``work``, which is cancelled when the client hangs up.
+    """The result of ``work``, which is cancelled when the client disconnects.
 
-    Jobs that still wait for the engine are dropped with it, so that a client which gives up and
-    asks again does not fill the queue.
+    This also drops its jobs in the engine's queue, so a client that gives up and retries does not
+    fill the queue.
 
     Raises:
-        ClientDisconnectedError: the client has hung up.
+        ClientDisconnectedError: the client has disconnected.
     """
     working = asyncio.create_task(work)
     watching = asyncio.create_task(_wait_for_disconnect(request))
@@ -82,10 +82,10 @@ async def _wait_for_disconnect(request: Request) -> None:
 def uncancellable(
     method: Callable[P, Coroutine[Any, Any, T]],
 ) -> Callable[P, Coroutine[Any, Any, T]]:
-    """A coroutine function that goes to its end even when its caller is cancelled meanwhile.
+    """A coroutine function that runs to completion even if its caller is cancelled.
 
-    For changes that are on record before they take effect in memory: one without the other would
-    refuse every later change. The caller waits until then, and keeps its locks.
+    For changes that are stored before they take effect in memory: one without the other would make
+    every later change fail. The caller waits, and holds its locks.
     """
 
     @functools.wraps(method)
@@ -108,15 +108,15 @@ log = structlog.get_logger(__name__)
 
 
 class ServiceError(Exception):
-    """A request that is refused or failed, with its stable code.
+    """A refused or failed request, with its stable code.
 
     Args:
-        code: decides the HTTP status.
-        detail: what was given and what is allowed; sent to the client.
-        hint: what to do next.
+        code: determines the HTTP status.
+        detail: the given value and the allowed ones; sent to the client.
+        hint: how to fix it.
         errors: invalid values by JSON pointer.
         extra: further members of the problem document.
-        headers: of the answer.
+        headers: headers of the reply.
     """
 
     def __init__(
@@ -164,11 +164,11 @@ _KINDS: tuple[tuple[type[Exception], ErrorCode, str | None], ...] = (
     (DatasetError, ErrorCode.INVALID_REQUEST, None),
     (RecordingError, ErrorCode.INVALID_REQUEST, None),
 )
-"""Errors of other packages whose messages are sent as they are; the first that fits counts."""
+"""Errors of other packages whose messages are sent unchanged; the first match applies."""
 
 
 def service_error(error: Exception, *, log_unexpected: bool = False) -> ServiceError:
-    """The error as clients get it. Unexpected ones become INTERNAL and reveal nothing."""
+    """The error for clients. Unexpected ones become INTERNAL and reveal nothing."""
     failure = _translated(error)
     if log_unexpected and failure.code is ErrorCode.INTERNAL:
         log.error("unexpected error", exc_info=error)
@@ -216,7 +216,7 @@ def _of_limit(error: OverLimitError) -> ServiceError:
 
 
 def _of_shortage(error: Exception) -> ServiceError | None:
-    """Of a want of space, of memory, or of what an account has left."""
+    """The error for lack of disk space, memory or account limits."""
     if isinstance(error, OverLimitError):
         return _of_limit(error)
     if isinstance(error, OSError) and is_full(error):
@@ -226,7 +226,7 @@ def _of_shortage(error: Exception) -> ServiceError | None:
         log.error("files in trouble", reason=str(error))
         detail = f"the worker's files cannot be used just now: {error.strerror}"
         return ServiceError(ErrorCode.STORAGE_UNAVAILABLE, detail, hint=_AGAIN)
-    # torch's class is known by its name, so that this module needs no torch.
+    # Compare torch's class by name, so that this module does not import torch.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return ServiceError(
             ErrorCode.OUT_OF_MEMORY,
@@ -261,7 +261,7 @@ def problem_of(error: ServiceError, *, path: str, request_id: str | None) -> Pro
 
 
 def problem_response(error: ServiceError, *, path: str, request_id: str | None) -> Response:
-    """The answer that carries ``error``."""
+    """The reply for ``error``."""
     problem = problem_of(error, path=path, request_id=request_id)
     return Response(
         json.dumps(problem.model_dump(mode="json", exclude_none=True)),
@@ -275,7 +275,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     """Answer every error of ``app`` with a problem document."""
 
     async def closed(_request: Request, _error: Exception) -> Response:
-        # Never sent; the number is what proxies log for it.
+        # Never sent; proxies log this number.
         return Response(status_code=499)
 
     for gone in (ClientDisconnectedError, ClientDisconnect):
@@ -323,7 +323,7 @@ def _message(error: Mapping[str, Any]) -> str:
 
 
 def _pointer(error: Mapping[str, Any], body: Any) -> str:
-    """JSON pointer (RFC 6901) into the body; parts of the request beside it keep their name."""
+    """JSON pointer (RFC 6901) into the body; other parts of the request keep their names."""
     parts = list(error["loc"])
     if error["type"] == "json_invalid":
         return ""
@@ -333,7 +333,7 @@ def _pointer(error: Mapping[str, Any], body: Any) -> str:
 
 
 def _places(parts: Sequence[int | str], body: Any) -> Iterator[int | str]:
-    """Only the parts that are members of ``body``: pydantic names union tags among them."""
+    """Only the parts that are members of ``body``: pydantic also includes union tags."""
     for index, part in enumerate(parts):
         is_last = index == len(parts) - 1
         if isinstance(body, dict) and (part in body or is_last):
@@ -345,7 +345,7 @@ def _places(parts: Sequence[int | str], body: Any) -> Iterator[int | str]:
 
 
 def _allowed_methods(request: Request) -> list[str]:
-    """Methods that some route takes at the path of a request."""
+    """Methods of the routes that match a request's path."""
     allowed = []
     for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"):
         as_routed = "GET" if method == "HEAD" else method
@@ -384,7 +384,7 @@ def _of_http(request: Request, error: HTTPException) -> ServiceError:
 
 
 NOTHING = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-"""Content security policy of answers that are no pages."""
+"""Content security policy of replies that are not pages."""
 
 SECURITY_HEADERS = {
     "Content-Security-Policy": NOTHING,
@@ -395,16 +395,16 @@ SECURITY_HEADERS = {
 
 
 def secure(headers: MutableHeaders) -> None:
-    """Add what is missing; a page brings a policy of its own."""
+    """Add missing security headers; a page sets its own policy."""
     for name, value in SECURITY_HEADERS.items():
         headers.setdefault(name, value)
 
 
 def choose_among(offered: Sequence[str], accept: str | None, *, of: str) -> str:
-    """The one of ``offered``, best first, that the client likes best.
+    """The item of ``offered``, best first, that the client prefers.
 
     Raises:
-        ServiceError: NOT_ACCEPTABLE when it likes none; ``of`` says of what.
+        ServiceError: NOT_ACCEPTABLE if it accepts none; ``of`` names the kind of item.
     """
     ranked = [(_quality(accept or "*/*", media_type), media_type) for media_type in offered]
     best = max(quality for quality, _ in ranked)
@@ -420,7 +420,7 @@ def choose_among(offered: Sequence[str], accept: str | None, *, of: str) -> str:
 def info_response(
     body: BaseModel, *, status: int = 200, headers: Mapping[str, str] | None = None
 ) -> Response:
-    """A model that was made here and needs no second validation."""
+    """A reply with a model that was created here and needs no second validation."""
     return Response(
         body.model_dump_json(),
         status_code=status,
@@ -435,17 +435,17 @@ async def large_response(
     status: int = 200,
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """The answer for a model with many objects, built and written on another thread.
+    """A reply with a large model, built and encoded on another thread.
 
-    It is written in pieces: one call for all of a scene's trajectories would keep every thread
-    waiting for the interpreter for tens of milliseconds, the event loop too.
+    It is encoded in parts: one call for all of a scene's trajectories would hold the GIL for tens
+    of milliseconds and block the event loop.
     """
     content = await asyncio.to_thread(lambda: json_in_pieces(build()))
     return Response(content, status, dict(headers or {}), "application/json")
 
 
 def json_in_pieces(model: BaseModel) -> str:
-    """The same JSON value as ``model_dump_json``, one call for each model in a list."""
+    """The same JSON as ``model_dump_json``, with one call for each model in a list."""
     lists = {
         name: value
         for name, value in model
@@ -465,7 +465,7 @@ def etag(revision: int) -> str:
 
 
 def _quality(accept: str, media_type: str) -> float:
-    """How much ``accept`` likes ``media_type``: the q of the most specific range that fits."""
+    """Quality of ``media_type`` in ``accept``: the q of the most specific matching range."""
     kind = media_type.split("/", maxsplit=1)[0]
     specificity = {media_type: 3, f"{kind}/*": 2, "*/*": 1}
     best, quality = 0, 0.0
@@ -488,7 +488,7 @@ def _q(parameters: list[str]) -> float:
 
 
 HEARTBEAT_S = 10.0
-"""Comments this far apart keep proxies from closing a stream on which nothing happens."""
+"""Interval of comments that keep proxies from closing an idle stream [s]."""
 
 
 async def event_stream(events: AsyncIterator[tuple[int, str, str]]) -> AsyncIterator[bytes]:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # --- Metrics --------------------------------------------------------------------------------------
 
-# Label values come from closed sets, never from clients' text or ids.
+# Label values come from closed sets, never from client text or ids.
 
 FAST_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10)
 LOAD_BUCKETS = (0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120)
@@ -38,7 +38,7 @@ OTHER = "other"
 
 
 class Metrics:
-    """All metrics, on a registry of their own, so that one process may hold several workers."""
+    """All metrics, in a separate registry, so that one process can run several workers."""
 
     def __init__(self) -> None:
         registry = self.registry = CollectorRegistry()
@@ -161,44 +161,44 @@ class Metrics:
         )
 
     def observe_job(self, label: str, waited_s: float, ran_s: float) -> None:
-        """Note one engine job."""
+        """Record an engine job."""
         self.engine_seconds += ran_s
         self.queue_wait.observe(waited_s)
         self.jobs.labels(label).observe(ran_s)
 
     def observe_store(self, call: str, seconds: float, done: bool) -> None:
-        """Note a read or write of the store."""
+        """Record a read or write of the store."""
         self.store_calls.labels(call).observe(seconds)
         if not done:
             self.store_failures.labels(call).inc()
 
     def observe_ended_job(self, kind: str, state: str) -> None:
-        """Note a job that is over."""
+        """Record an ended job."""
         self.ended_jobs.labels(kind, state).inc()
 
     def observe_request(self, method: str, route: str, status: int, seconds: float) -> None:
-        """Note one answer; ``route`` is the path of a route, or what stands for none."""
+        """Record one reply; ``route`` is the path of a route, or a placeholder."""
         known = method if method in METHODS else OTHER
         self.requests.labels(known, route, str(status)).observe(seconds)
 
     @contextmanager
     def open_socket(self, kind: str) -> Iterator[None]:
-        """Count a socket for the length of the block; ``kind``: ``drive`` or ``view``."""
+        """Count a socket during the block; ``kind``: ``drive`` or ``view``."""
         with self.sockets.labels(kind).track_inprogress():
             yield
 
     def watch(self, gauge: Gauge, read: Callable[[], float]) -> None:
-        """Let ``gauge`` call ``read`` whenever metrics are collected."""
+        """Make ``gauge`` call ``read`` whenever metrics are collected."""
         gauge.set_function(read)
 
     def watch_accounts(
         self, accounts: Iterable[Account], sessions: Callable[[], Mapping[str, int]]
     ) -> None:
-        """Tell what was taken by the name of each token; ``sessions`` counts them by owner."""
+        """Export usage by token name; ``sessions`` counts sessions by owner."""
         self.registry.register(_AccountCollector(accounts, sessions))
 
     async def exposition(self) -> tuple[bytes, str]:
-        """Body and media type of ``/metrics``, made on another thread, one at a time."""
+        """Body and media type of ``/metrics``, computed on another thread, one at a time."""
         return await asyncio.to_thread(self._expose), CONTENT_TYPE_LATEST
 
     def _expose(self) -> bytes:
@@ -207,7 +207,7 @@ class Metrics:
 
 
 class Durations:
-    """Counted durations of a :class:`LoopHistogram`, for one value of its label."""
+    """Durations of a :class:`LoopHistogram`, for one label value."""
 
     def __init__(self, bounds: Sequence[float]) -> None:
         self._bounds = bounds
@@ -221,14 +221,14 @@ class Durations:
 
 
 class LoopHistogram(Collector):
-    """A histogram of what the event loop alone counts, several times a step: without the locks of
-    the library's own, which take ten times as long.
+    """A histogram for the event loop, which updates it several times per step. Without the locks of
+    the client library's histogram it is ten times faster.
 
     Args:
-        name, text: as of any metric.
-        label: that it has; None for none.
+        name, text: as for any metric.
+        label: name of its label; None for none.
         buckets: upper bounds, increasing [s].
-        registry: where it is registered.
+        registry: registry of the metric.
     """
 
     def __init__(
@@ -247,7 +247,7 @@ class LoopHistogram(Collector):
         registry.register(self)
 
     def observe_ms(self, named: Mapping[str, float]) -> None:
-        """Count one duration [ms] of each of several values of the label."""
+        """Record one duration [ms] for each of several label values."""
         for name, ms in named.items():
             series = self._series.get((name,)) or self.labels(name)
             seconds = ms / 1e3
@@ -255,7 +255,7 @@ class LoopHistogram(Collector):
             series.total += seconds
 
     def labels(self, *value: str) -> Durations:
-        """Those of a value of the label."""
+        """Durations of a label value."""
         found = self._series.get(value)
         if found is None:
             found = self._series[value] = Durations(self._bounds)
@@ -276,7 +276,7 @@ class LoopHistogram(Collector):
 
 
 class _AccountCollector:
-    """Figures of accounts, read when metrics are: what counts them knows no metric."""
+    """Account metrics, read at collection, so that accounts do not depend on metrics."""
 
     def __init__(
         self, accounts: Iterable[Account], sessions: Callable[[], Mapping[str, int]]
@@ -319,22 +319,22 @@ _FIGURES: tuple[tuple[str, str, Callable[[Account], float]], ...] = (
 
 # --- Traces ---------------------------------------------------------------------------------------
 
-# On if ``REAL2SIM_TRACES_URL`` names a collector. A request continues the trace of its
-# ``traceparent`` header, which the shipped proxy adds where it is missing, so the proxy's log, the
-# worker's log and the spans share an id.
+# Enabled if ``REAL2SIM_TRACES_URL`` names a collector. A request continues the trace of its
+# ``traceparent`` header, which the shipped proxy adds if missing, so the proxy's log, the worker's
+# log and the spans share an id.
 
 OnEngine = Callable[[str, float, float], None]
-"""Told the label of a job, and the seconds that it waited and ran, at its end."""
+"""Called with the label of a job and the seconds it waited and ran, at its end."""
 
 _QUIET = ("/livez", "/readyz", "/metrics")
 
 
 def traces_to(url: str, *, worker_id: str) -> TracerProvider:
-    """Spans that are sent to a collector, in batches, on a thread of their own.
+    """A tracer provider that sends spans to a collector, in batches, on a separate thread.
 
     Args:
-        url: of the collector, which speaks OTLP by HTTP, as ``http://host:4318/v1/traces``.
-        worker_id: of this worker.
+        url: OTLP/HTTP address of the collector, such as ``http://host:4318/v1/traces``.
+        worker_id: id of this worker.
 
     Raises:
         ValueError: the extra ``tracing`` is not installed.
@@ -352,7 +352,7 @@ def traces_to(url: str, *, worker_id: str) -> TracerProvider:
 
 
 def provider_of(worker_id: str) -> TracerProvider:
-    """Where spans of a worker come together; they go nowhere yet."""
+    """Tracer provider of a worker, without an exporter."""
     from opentelemetry.sdk.resources import Resource
     from opentelemetry.sdk.trace import TracerProvider
 
@@ -361,11 +361,11 @@ def provider_of(worker_id: str) -> TracerProvider:
 
 
 class Tracing:
-    """ASGI middleware: a span for each request, under which those of the engine are.
+    """ASGI middleware: one span per request, the parent of its engine spans.
 
     Args:
         app: the application.
-        provider: of spans.
+        provider: the tracer provider.
     """
 
     def __init__(self, app: ASGIApp, *, provider: TracerProvider) -> None:
@@ -403,11 +403,11 @@ class Tracing:
 
 
 def engine_spans(provider: TracerProvider) -> Callable[[], OnEngine | None]:
-    """For :class:`.engine.Engine`: asked where a job is put in the queue, its answer is called when
-    the job is over, on the engine's thread.
+    """For :class:`.engine.Engine`: called when a job is queued. The returned function is called
+    when the job ends, on the engine's thread.
 
     Args:
-        provider: of spans.
+        provider: the tracer provider.
     """
     from opentelemetry import trace
 

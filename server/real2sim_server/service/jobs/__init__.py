@@ -1,1 +1,1 @@
-"""Long work: it answers at once, reports as it goes, and keeps its result."""
+"""Long-running work: jobs reply immediately, report progress, and store their results."""

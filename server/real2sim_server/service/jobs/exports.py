@@ -44,14 +44,14 @@ MAX_VIDEO_FRAMES = 20_000
 
 @dataclass(frozen=True, eq=False)
 class VideoSource:
-    """What a video shows.
+    """Content of a video.
 
     Attributes:
-        scene: gives cameras, sky and the ego trajectory.
-        instances: what is drawn at an instant [us]; called off the event loop.
-        span: first and last instant that can be shown [us].
-        vehicle: where the cameras' vehicle is; None: as it was recorded.
-        outside: the same for who looks on from outside the ego; None where that is the same.
+        scene: provides cameras, sky and the ego trajectory.
+        instances: returns the instances at a time [us]; called off the event loop.
+        span: first and last available time [us].
+        vehicle: trajectory of the cameras' vehicle; None: as recorded.
+        outside: instances for cameras outside the ego; None if they are the same.
     """
 
     scene: Scene
@@ -61,14 +61,14 @@ class VideoSource:
     vehicle: Callable[[int], Float] | None = None
 
     def T_world_vehicle(self, t_us: int) -> Float:
-        """[4, 4] of the vehicle that carries the cameras, at an instant."""
+        """[4, 4] pose of the cameras' vehicle at a time."""
         return self.scene.ego.transform(t_us) if self.vehicle is None else self.vehicle(t_us)
 
 
 async def export_video(
     video_source: VideoSource, request: ExportRequest, *, renderer: Renderer, context: JobContext
 ) -> JobResult:
-    """Draw a video frame by frame, other users of the engine in between.
+    """Render a video frame by frame, interleaved with other work of the engine.
 
     Raises:
         ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST; TIME_OUT_OF_RANGE.
@@ -101,7 +101,7 @@ async def export_video(
 async def _render_frame(
     renderer: Renderer, render_request: RenderRequest, context: JobContext
 ) -> EncodedFrame:
-    """The frame, rendered when interactive requests leave room in the queue."""
+    """The frame, rendered when the queue has room besides interactive requests."""
     while True:
         try:
             return (await renderer.render(render_request, stream="export")).frames[0]
@@ -111,7 +111,7 @@ async def _render_frame(
 
 
 def frame_times(video_source: VideoSource, request: ExportRequest) -> list[int]:
-    """Instants of the frames [us].
+    """Times of the frames [us].
 
     Raises:
         ServiceError: TIME_OUT_OF_RANGE or INVALID_REQUEST.
@@ -154,8 +154,8 @@ def _render_request(video_source: VideoSource, sensor: SensorSpec, t_us: int) ->
 
 
 def pack(folder: Path, archive: Path, context: JobContext) -> None:
-    """Pack all files below a folder; the same bytes for the same files: without the day, the user
-    or the rights. A file that is packed goes, so that the disk holds each once.
+    """Pack all files below a folder, reproducibly: without dates, users or permissions. Each file
+    is deleted once packed, so that the disk stores it only once.
 
     Raises:
         JobCancelled: the job was cancelled.
@@ -181,22 +181,22 @@ ARCHIVE = "dataset.tar"
 FOLDER = "dataset"
 
 LABELLING = 0.9
-"""Share of the work that is over when all frames are labelled."""
+"""Fraction of the work that is done when all frames are labelled."""
 
 ROOM_CHECKS_S = 5.0
-"""Between two looks at the disk while frames are labelled."""
+"""Interval of disk space checks while frames are labelled [s]."""
 
 FEW_FRAMES = 12
-"""Fewer are begun without an estimate, which takes as long as three."""
+"""Smaller exports start without an estimate, which takes as long as three frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class DatasetSource:
-    """What a data set shows.
+    """Content of a data set.
 
     Attributes:
-        variants: what is labelled.
-        made_of: what else decided on it, for the manifest.
+        variants: what to label.
+        made_of: other inputs, for the manifest.
     """
 
     variants: Sequence[Variant]
@@ -205,15 +205,15 @@ class DatasetSource:
 
 @dataclass(eq=False)
 class EngineBackend:
-    """Draws on the engine, whose thread owns the device, between the work of others.
+    """Renders on the engine, whose thread owns the device, between other work.
 
     Attributes:
-        engine: that draws.
-        backend: of the engine.
-        context: of the job, whose account is charged.
-        loop: that the engine's callers await on.
-        name: of the backend that draws.
-        caster: follows the beams of LiDARs there, too.
+        engine: the engine.
+        backend: its backend.
+        context: context of the job, whose account is charged.
+        loop: event loop of the engine's callers.
+        name: name of the backend.
+        caster: traces LiDAR rays on the engine, too.
     """
 
     engine: Engine
@@ -229,16 +229,16 @@ class EngineBackend:
 
     @property
     def draws_lenses(self) -> bool:
-        """As of the backend that draws."""
+        """As for the backend that renders."""
         return getattr(self.backend, "draws_lenses", False)
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
-        """Draw when interactive requests leave room in the queue. Raises JobCancelled."""
+        """Render when the queue has room besides interactive requests. Raises JobCancelled."""
         yielding = replace(request, between=self.engine.yield_to_urgent)
         return self.on_engine(self.backend.rasterize, yielding)
 
     def warm_up(self) -> None:
-        """The engine's is warm."""
+        """The engine's backend is already warm."""
 
     def on_engine(self, work: Callable[[T], R], argument: T) -> R:
         """The result of ``work`` on the engine's thread. Raises JobCancelled."""
@@ -253,7 +253,7 @@ class EngineBackend:
 
 @dataclass(frozen=True)
 class EngineCaster:
-    """Follows beams on the engine."""
+    """Traces rays on the engine."""
 
     backend: EngineBackend
     name: str = "engine"
@@ -264,7 +264,7 @@ class EngineCaster:
 
 
 def plan_of(request: DatasetRequest) -> ExportPlan:
-    """What a request asks for."""
+    """The export plan of a request."""
     return ExportPlan(
         formats=tuple(dict.fromkeys(request.formats)),
         cameras=tuple(request.cameras),
@@ -284,11 +284,11 @@ def plan_of(request: DatasetRequest) -> ExportPlan:
 
 
 def check_dataset(variants: Sequence[Variant], plan: ExportPlan, *, max_pixels: int) -> None:
-    """Refuse what cannot be exported before the job begins.
+    """Refuse invalid exports before the job begins.
 
     Raises:
-        DatasetError: formats, cameras, instants or splits that there are none of.
-        ServiceError: INVALID_REQUEST for more frames or pixels than a worker makes.
+        DatasetError: no such formats, cameras, times or splits.
+        ServiceError: INVALID_REQUEST for more frames or pixels than the worker's limit.
     """
     for name in plan.formats:
         writer_of(name)
@@ -318,8 +318,8 @@ async def make_dataset(
     backend: EngineBackend,
     quota: Quota,
 ) -> JobResult:
-    """Label a drive, write it in all formats, and pack it into one file; or only tell how much
-    there would be.
+    """Label a drive, write it in all formats, and pack it into one file; or only estimate its
+    size.
 
     Raises:
         JobCancelled: the job was cancelled.
@@ -344,7 +344,7 @@ def _export(
     context = backend.context
     context.folder.mkdir(parents=True, exist_ok=True)
     folder = context.folder / FOLDER
-    # Left half packed by a worker that died; the clips that it had finished are kept beside it.
+    # Partly packed by a worker that died; the clips that it finished are stored next to it.
     shutil.rmtree(folder, ignore_errors=True)
     frames = sum(len(clip.times_us) for clip in planned_shards(source.variants, plan))
     if frames > FEW_FRAMES:
@@ -365,7 +365,7 @@ def _export(
 
 
 class _Progress:
-    """Tells how far the job is, and ends it when it takes more disk than there is for it."""
+    """Reports the job's progress, and ends it if it exceeds the available disk space."""
 
     def __init__(self, context: JobContext, quota: Quota) -> None:
         self._context = context
@@ -384,7 +384,7 @@ class _Progress:
 
 
 def _packed(folder: Path, context: JobContext) -> JobResult:
-    """The files that the job leaves: the archive, the manifest and sheets to look at."""
+    """Result files of the job: the archive, the manifest and preview sheets."""
     manifest = json.loads((folder / MANIFEST).read_bytes())
     files = {ARCHIVE: "application/x-tar", MANIFEST: "application/json"}
     shutil.copyfile(folder / MANIFEST, context.folder / MANIFEST)

@@ -64,7 +64,7 @@ from .exports import VideoSource
 from .jobs import JobCancelled, JobContext, JobResult, Jobs, NewJob, Work, require_success
 
 NEARBY_DISTANCE = 25.0
-"""Objects this close to one that moves take part [m], up to ``MAX_NEARBY_OBJECTS`` in all."""
+"""Objects within this distance of a moving one take part [m], up to ``MAX_NEARBY_OBJECTS``."""
 
 MAX_NEARBY_OBJECTS = 12
 PLAYBACK = "playback.json"
@@ -72,12 +72,12 @@ PLAYBACK = "playback.json"
 
 @dataclass(frozen=True, eq=False)
 class RolloutPlan:
-    """A rollout that can begin.
+    """A rollout, ready to start.
 
     Attributes:
-        scene: with what is erased hidden, and inserted assets among its objects.
-        state: of the scenario; ``resolved_objects`` are its objects as ``scene`` has them.
-        options: of the physics.
+        scene: the scene with erased regions hidden and inserted assets added.
+        state: state of the scenario; ``resolved_objects`` are its objects as in ``scene``.
+        options: options of the physics.
     """
 
     scene: Scene
@@ -88,17 +88,17 @@ class RolloutPlan:
 
 @dataclass(frozen=True, eq=False)
 class ResolvedObjects:
-    """A scenario's objects, each with the id of the object in the scene that it shows."""
+    """Objects of a scenario, each with the id of its scene object."""
 
     visible: tuple[ObjectState, ...]
 
 
 def plan_rollout(scene: Scene, state: ScenarioState, request: SimulateRequest) -> RolloutPlan:
-    """What a request asks for.
+    """The rollout plan of a request.
 
     Raises:
         ServiceError: INVALID_REQUEST, UNKNOWN_OBJECT or TIME_OUT_OF_RANGE.
-        PhysicsError: a value that the physics cannot have.
+        PhysicsError: a value that the physics does not support.
     """
     start, end = _span(state, request)
     present = {o.object_id: o for o in state.visible if o.trajectory.covers(start)}
@@ -149,7 +149,7 @@ def _experiment(
     request: SimulateRequest,
     named: Sequence[str],
 ) -> SimulateOptions:
-    """An experiment; objects keep what ``set_physics`` says of them."""
+    """An experiment; objects keep their values from ``set_physics``."""
     setup = set_up(
         str(request.experiment),
         scene,
@@ -175,10 +175,10 @@ def _experiment(
 def _with_values(
     objects: Mapping[str, ObjectPhysics], values: Mapping[str, PhysicsValues]
 ) -> dict[str, ObjectPhysics]:
-    """What is known of objects with other values in place of those.
+    """Physics values of the objects, with some replaced.
 
     Raises:
-        ServiceError: UNKNOWN_OBJECT for values of one that takes no part.
+        ServiceError: UNKNOWN_OBJECT for values of an object that does not take part.
     """
     unknown = [name for name in values if name != "*" and name not in objects]
     if unknown:
@@ -199,7 +199,7 @@ def run_rollout(
     progress: Callable[[float], None],
     cancelled: Callable[[], bool],
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Simulate and keep the result in ``folder``; figures, and names of files by media type."""
+    """Simulate and store the result in ``folder``; returns figures, and files by media type."""
     result = simulate(
         plan.scene,
         plan.resolved_objects,
@@ -219,7 +219,7 @@ def run_rollout(
 
 
 def summary_of(result: SimulationResult) -> dict[str, Any]:
-    """What is said of a rollout in its job."""
+    """Summary of a rollout for its job."""
     return {
         "frames": result.frames,
         "start_us": result.start_us,
@@ -233,7 +233,7 @@ def summary_of(result: SimulationResult) -> dict[str, Any]:
 
 
 def describe(result: SimulationResult) -> dict[str, Any]:
-    """Everything but deformed shapes, for plots and maps: times, poses, contacts, energies."""
+    """Everything except deformed shapes, for plots and maps: times, poses, contacts, energies."""
     return summary_of(result) | {
         "times_us": [result.start_us + round(t * 1e6) for t in result.times_s.tolist()],
         "energy_names": list(ENERGIES),
@@ -254,7 +254,7 @@ def describe(result: SimulationResult) -> dict[str, Any]:
 
 
 class RolloutPlayback:
-    """A finished rollout as pictures; for one thread at a time."""
+    """Renders a finished rollout; not thread-safe."""
 
     def __init__(self, scene: Scene, state: ScenarioState, result: SimulationResult) -> None:
         self._scene = scene
@@ -267,11 +267,11 @@ class RolloutPlayback:
         self.span = (result.start_us, self._playback.time_us(result.frames - 1))
 
     def instances(self, t_us: int, *, aboard: bool = True) -> Sequence[Instance]:
-        """What is drawn at the kept frame nearest to ``t_us`` [us], with contact shadows.
+        """Instances at the stored frame nearest to ``t_us`` [us], with contact shadows.
 
         Args:
-            t_us: instant [us].
-            aboard: whether it is for cameras of the ego itself, which do not see its body.
+            t_us: time [us].
+            aboard: whether the cameras are on the ego, which hides its body.
         """
         since = (t_us - self._result.start_us) * 1e-6
         frame = int(np.abs(self._result.times_s - since).argmin())
@@ -299,7 +299,7 @@ class RolloutPlayback:
 
 
 def with_assets(scene: Scene, state: ScenarioState) -> tuple[Scene, PlacedObjects]:
-    """The scene with the scenario's assets as objects of it."""
+    """The scene with the scenario's assets as objects."""
     objects = dict(scene.objects)
     visible = []
     for subject in state.visible:
@@ -377,8 +377,7 @@ def _physics(subject: ObjectState, start: int) -> ObjectPhysics:
 
 
 def colliders_of(state: ScenarioState) -> list[Collider]:
-    """What does not yield: the scenario's own colliders, and the scene's ground unless one of them
-    is that."""
+    """Rigid colliders: the scenario's, and the scene's ground unless one of them is a ground."""
     colliders: list[Collider] = []
     grounds = [c for c in state.standing_colliders if isinstance(c.shape, GroundShape)]
     if not grounds:
@@ -401,7 +400,7 @@ def _collider(state: ScenarioState, given: AddCollider) -> Collider:
 def _solid(
     shape: BoxShape | CylinderShape | CapsuleShape | MeshShape,
 ) -> tuple[type[Solid], dict[str, Any]]:
-    """Which solid a shape is, with the members of its own."""
+    """The solid of a shape, with its members."""
     match shape:
         case BoxShape():
             return Box, {"size": shape.size}
@@ -429,11 +428,11 @@ def _rounded(values: Any) -> Any:
 # Jobs.
 
 MAX_CACHED_PLAYBACKS = 4
-"""Finished rollouts kept open; others are read from their files again."""
+"""Cached finished rollouts; others are read from their files."""
 
 
 class Simulations:
-    """Starts rollouts and shows finished ones. Belongs to the event loop."""
+    """Starts rollouts and shows finished ones, for use on the event loop."""
 
     def __init__(self, jobs: Jobs, scenarios: Scenarios, scene_cache: SceneCache) -> None:
         self._jobs = jobs
@@ -445,11 +444,11 @@ class Simulations:
     async def start(
         self, scenario_id: str, request: SimulateRequest, *, who: str, idempotent: IdempotentRequest
     ) -> JobInfo:
-        """Begin a rollout of the scenario as it is now.
+        """Start a rollout of the scenario's current revision.
 
         Raises:
-            ServiceError: as scenarios, scene cache and jobs do; INVALID_REQUEST, UNKNOWN_OBJECT or
-                TIME_OUT_OF_RANGE for what cannot be simulated.
+            ServiceError: as for scenarios, scene cache and jobs; INVALID_REQUEST, UNKNOWN_OBJECT or
+                TIME_OUT_OF_RANGE if it cannot be simulated.
         """
         revision = (await self._scenarios.view(scenario_id)).revision
         work = await self._work(scenario_id, revision, request)
@@ -459,7 +458,7 @@ class Simulations:
         return await self._jobs.start(new, work, idempotent=idempotent)
 
     async def rebuild(self, info: JobInfo) -> Work:
-        """The rollout of a job on record, of the scenario as it was then."""
+        """The rollout of a stored job, with the scenario at its revision."""
         fields = dict(info.request)
         scenario_id, revision = fields.pop("scenario"), fields.pop("revision")
         return await self._work(scenario_id, revision, SimulateRequest.model_validate(fields))
@@ -486,11 +485,11 @@ class Simulations:
         return work
 
     async def video_source(self, job_id: str) -> VideoSource:
-        """What a finished rollout shows.
+        """Video source of a finished rollout.
 
         Raises:
             ServiceError: UNKNOWN_JOB, JOB_NOT_DONE, JOB_FAILED; INVALID_REQUEST for another kind
-                of job; UNKNOWN_SCENARIO where that was deleted.
+                of job; UNKNOWN_SCENARIO if the scenario was deleted.
         """
         cached = self._playbacks.get(job_id)
         if cached is None:
@@ -502,7 +501,7 @@ class Simulations:
         scene, playback = cached
 
         def instances(t_us: int, *, aboard: bool = True) -> Sequence[Instance]:
-            # It keeps the last deformed clouds, which is not for two threads at once.
+            # It caches the last deformed clouds, which is not thread-safe.
             with self._drawing:
                 return playback.instances(t_us, aboard=aboard)
 
@@ -532,7 +531,7 @@ class Simulations:
 
 
 class Calibrations:
-    """Starts calibrations. Belongs to the event loop."""
+    """Starts calibrations, for use on the event loop."""
 
     def __init__(self, jobs: Jobs, scenarios: Scenarios, scene_cache: SceneCache) -> None:
         self._jobs = jobs
@@ -547,11 +546,11 @@ class Calibrations:
         who: str,
         idempotent: IdempotentRequest,
     ) -> JobInfo:
-        """Begin a calibration on the scenario as it is now.
+        """Start a calibration on the scenario's current revision.
 
         Raises:
-            ServiceError: as a simulation's; UNKNOWN_OBJECT for an object that takes no part.
-            PhysicsError: for observations that cannot be of the simulation.
+            ServiceError: as for a simulation; UNKNOWN_OBJECT for an object that does not take part.
+            PhysicsError: observations that do not fit the simulation.
         """
         view = await self._scenarios.view(scenario_id)
         scene = await self._scene_cache.get(view.row.scene)
@@ -602,7 +601,7 @@ def _run(
     progress: Callable[[float], None],
     cancelled: Callable[[], bool],
 ) -> ObjectCalibration:
-    # Slopes at the start, once more on the way, and at the end; steps; and coarser cells.
+    # Gradients at the start, once in between, and at the end; steps; and coarser cells.
     expected = 6 * len(request.parameters) + 2 * request.steps + 5
     try:
         return calibrate_object(

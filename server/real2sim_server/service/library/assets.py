@@ -1,4 +1,4 @@
-"""The asset library: things to insert, each a bundle that never changes."""
+"""The asset library: immutable bundles of objects to insert."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ USUAL_LENGTHS = {
     "motorcycle": 2.1,
     "cyclist": 1.8,
 }
-"""Usual length by category [m], for files that do not say what a unit is."""
+"""Typical length by category [m], for files without a unit."""
 
 log = structlog.get_logger(__name__)
 
@@ -62,10 +62,10 @@ class LibraryAsset:
 
     @property
     def nbytes(self) -> int:
-        """Memory of its Gaussians, in the light of every scene that shows it [bytes]."""
+        """Memory of its Gaussians, including relit copies for scenes [bytes]."""
         with self._lock:
             clouds = [self.asset.cloud, *self._lit.values()]
-        # Clouds in another light share all tensors but their colours.
+        # Relit clouds share all tensors except colours.
         tensors = [t for cloud in clouds for t in cloud.tensors().values()]
         return sum({t.data_ptr(): t.nbytes for t in tensors}.values())
 
@@ -76,7 +76,7 @@ class LibraryAsset:
 
     @property
     def category(self) -> str:
-        """Class of the thing."""
+        """Category of the asset."""
         return self.asset.category
 
     @property
@@ -91,7 +91,7 @@ class LibraryAsset:
 
     @property
     def figure(self) -> Figure | None:
-        """Of a person who walks; None for what is rigid."""
+        """Body model of a walking person; None for rigid assets."""
         return self.asset.figure
 
     @property
@@ -101,12 +101,12 @@ class LibraryAsset:
 
     @property
     def ambient(self) -> Colour | None:
-        """Mean colour of where it was cut out."""
+        """Mean colour of its original surroundings."""
         given = self.asset.provenance.get("ambient")
         return tuple(given) if given is not None else None
 
     def cloud_in(self, scene: Scene) -> GaussianCloud:
-        """Its Gaussians in the light of ``scene``, on its device."""
+        """Its Gaussians relit for ``scene``, on the scene's device."""
         found = self._lit.get(scene)
         if found is None:
             cloud = self.asset.cloud.to(scene.background.device)
@@ -117,14 +117,14 @@ class LibraryAsset:
 
 
 class AssetLibrary:
-    """The assets below a folder. Safe to use on any thread; reading and writing take time.
+    """The assets in a folder. Thread-safe; reading and writing are slow.
 
-    Those that were used last stay in memory as long as the budget has room. One that a scenario
-    shows stays alive with the scenario, and counts.
+    The most recently used assets stay in memory while the budget allows. An asset in use by a
+    scenario stays in memory with the scenario, and counts.
 
     Args:
-        folder: of asset bundles; it need not exist.
-        budget: of memory, shared with scenes; without it all assets stay in memory.
+        folder: folder of asset bundles; it need not exist.
+        budget: memory budget shared with scenes; without it all assets stay in memory.
     """
 
     def __init__(self, folder: Path, budget: MemoryBudget | None = None) -> None:
@@ -141,7 +141,7 @@ class AssetLibrary:
         self._loading = threading.Lock()
 
     def list(self) -> list[AssetInfo]:
-        """All assets by id; broken bundles are passed over, with a line in the log."""
+        """All assets by id; broken bundles are skipped and logged."""
         names = sorted(
             p.name.removesuffix(ASSET_SUFFIX) for p in self.folder.glob(f"*{ASSET_SUFFIX}")
         )
@@ -149,14 +149,14 @@ class AssetLibrary:
         return [_info(summary) for summary in found if summary is not None]
 
     def info(self, asset_id: str) -> AssetInfo:
-        """What the wire says about one. Raises ServiceError: UNKNOWN_ASSET."""
+        """The info of an asset. Raises ServiceError: UNKNOWN_ASSET."""
         summary = self._summary(asset_id)
         if summary is None:
             raise _unknown(asset_id)
         return _info(summary)
 
     def find(self, asset_id: str) -> LibraryAsset | None:
-        """The asset of that id, read from disk when it is not in memory.
+        """The asset of that id, read from disk if it is not in memory.
 
         Raises:
             ServiceError: OUT_OF_MEMORY.
@@ -179,12 +179,12 @@ class AssetLibrary:
 
     @property
     def held_bytes(self) -> int:
-        """Memory of the assets that are kept or in use, and of the one that is being read."""
+        """Memory of assets that are cached, in use, or being read [bytes]."""
         with self._lock:
             return self._reserved + sum(asset.nbytes for asset in self._alive.values())
 
     def idle(self) -> Sequence[IdleItem]:
-        """Assets that are kept. One that a scenario shows frees nothing when it is dropped."""
+        """Cached assets. Dropping one that a scenario uses frees no memory."""
         with self._lock:
             return [
                 IdleItem(used_at, self._strong[asset_id].nbytes, partial(self._drop, asset_id))
@@ -192,7 +192,7 @@ class AssetLibrary:
             ]
 
     def add(self, asset: Asset, *, claim: str | None = None) -> AssetInfo:
-        """Keep an asset; ``claim`` as in :mod:`.imports`.
+        """Store an asset; ``claim`` as in :mod:`.imports`.
 
         Raises:
             ServiceError: ALREADY_EXISTS: assets never change, because scenarios rely on them.
@@ -203,7 +203,7 @@ class AssetLibrary:
             return self.adopt(staging / "bundle", asset.asset_id, claim=claim)
 
     def adopt(self, folder: Path, asset_id: str, *, claim: str | None = None) -> AssetInfo:
-        """Take in a whole bundle of that id, which lies on the disk of the library.
+        """Move a complete bundle from the library's disk into the library.
 
         Raises:
             ServiceError: ALREADY_EXISTS.
@@ -215,11 +215,11 @@ class AssetLibrary:
         return self.info(asset_id)
 
     def made_by(self, claim: str | None, asset_id: str) -> AssetInfo | None:
-        """The asset, if that request has made it already."""
+        """The asset, if the same request has already created it."""
         return self.info(asset_id) if bears_claim(self.bundle(asset_id), claim) else None
 
     def check_free(self, asset_id: str) -> None:
-        """Raises ServiceError: ALREADY_EXISTS where the id is taken."""
+        """Raises ServiceError: ALREADY_EXISTS if the id is taken."""
         if self.bundle(asset_id).exists():
             raise ServiceError(
                 ErrorCode.ALREADY_EXISTS,
@@ -229,7 +229,7 @@ class AssetLibrary:
 
     @contextmanager
     def removing(self, asset_id: str) -> Iterator[None]:
-        """Hide the asset from lookups while the block runs; it stays on disk until :meth:`remove`.
+        """Hide the asset from lookups during the block; it stays on disk until :meth:`remove`.
 
         Raises:
             ServiceError: UNKNOWN_ASSET, also while it is being removed.
@@ -244,9 +244,9 @@ class AssetLibrary:
                 self._removing.discard(asset_id)
 
     def remove(self, asset_id: str) -> None:
-        """Delete a hidden asset; its id may be given again."""
+        """Delete a hidden asset; its id becomes available again."""
         with self._lock:
-            # Renamed first: a crash must not leave half a bundle under its name.
+            # Renamed first: a crash must not leave a partial bundle under its name.
             trash = self.folder / f".removed-{secrets.token_hex(6)}"
             self.bundle(asset_id).rename(trash)
             for known in (self._kept, self._strong, self._alive, self._summaries):
@@ -254,7 +254,7 @@ class AssetLibrary:
         shutil.rmtree(trash, ignore_errors=True)
 
     def bundle(self, asset_id: str) -> Path:
-        """Where the bundle of that id belongs."""
+        """Path of an asset's bundle."""
         return self.folder / f"{asset_id}{ASSET_SUFFIX}"
 
     # --- inside -----------------------------------------------------------------------------
@@ -307,12 +307,12 @@ class AssetLibrary:
         return loaded
 
     def _drop(self, asset_id: str) -> int:
-        """Stop keeping an asset; the bytes that come free, none while others use it."""
+        """Drop an asset from the cache; returns the freed bytes, 0 while others use it."""
         with self._lock:
             asset = self._strong.pop(asset_id, None)
             self._kept.pop(asset_id, None)
             nbytes = asset.nbytes if asset is not None else 0
-            # The last reference of this function: who else has one keeps it alive.
+            # The last reference in this function; other references keep the asset alive.
             asset = None
             return 0 if asset_id in self._alive else nbytes
 
@@ -340,7 +340,7 @@ def _info(summary: AssetSummary) -> AssetInfo:
 
 
 def extract_object(scene: Scene, object_id: str, *, asset_id: str, category: str | None) -> Asset:
-    """An object of a scene as an asset, with the light it was seen in.
+    """An object of a scene as an asset, with its original lighting.
 
     Raises:
         UnknownObjectError: ``scene`` has no such object.
@@ -374,20 +374,20 @@ def import_asset(
     quota: Quota,
     claim: str | None = None,
 ) -> AssetInfo:
-    """Add the asset in a splat file, upright, centred and at a real size.
+    """Import an asset from a splat file: upright, centred and at a real size.
 
     Args:
-        library: gets it.
-        source: the file, in a folder of its own on the library's disk, where the bundle is made.
-        upload: what was asked for.
-        asset_id: of the asset.
-        limits: of the process that reads the file.
-        quota: of the library.
-        claim: of the request, see :mod:`.imports`.
+        library: the target library.
+        source: the file, in a separate folder on the library's disk, where the bundle is created.
+        upload: the request.
+        asset_id: id of the asset.
+        limits: limits of the process that reads the file.
+        quota: quota of the library.
+        claim: claim of the request, see :mod:`.imports`.
 
     Raises:
-        ServiceError: IMPORT_FAILED with the reason, PAYLOAD_TOO_LARGE for what comes out of the
-            file, ALREADY_EXISTS, QUOTA_EXCEEDED.
+        ServiceError: IMPORT_FAILED with the reason, PAYLOAD_TOO_LARGE for the file's content,
+            ALREADY_EXISTS, QUOTA_EXCEEDED.
     """
     if (made := library.made_by(claim, asset_id)) is not None:
         return made
@@ -410,10 +410,10 @@ def import_asset(
 
 BACKDROP = (0.90, 0.91, 0.93)
 FOCAL = 1.6
-"""Of the width of the picture: a mild telephoto lens, which bends cars little."""
+"""Focal length as a fraction of the image width: a mild telephoto lens, with low distortion."""
 
 VIEW_FROM = (1.0, 0.75, 0.45)
-"""Front left, from above."""
+"""Direction of the camera: front left, from above."""
 
 
 def draw_thumbnail(asset: Asset, *, width: int, backend: Backend) -> NDArray[np.uint8]:

@@ -41,13 +41,13 @@ CLAIM_FILE = ".made_by"
 
 
 def put_claim(bundle: Path, claim: str | None) -> None:
-    """Mark a bundle that nobody sees yet; ``claim`` is None for requests without a key."""
+    """Mark a bundle before it becomes visible; ``claim`` is None for requests without a key."""
     if claim is not None:
         (bundle / CLAIM_FILE).write_text(claim, encoding="utf-8")
 
 
 def bears_claim(bundle: Path, claim: str | None) -> bool:
-    """Whether the bundle is there and was made by that request, whose answer was not stored."""
+    """Whether the bundle exists and comes from that request, whose reply was not stored."""
     try:
         return claim is not None and (bundle / CLAIM_FILE).read_text(encoding="utf-8") == claim
     except (OSError, ValueError):
@@ -55,7 +55,7 @@ def bears_claim(bundle: Path, claim: str | None) -> bool:
 
 
 def drop_claim(bundle: Path) -> None:
-    """Forget who made a bundle. Where that cannot be done the claim does no harm."""
+    """Remove the claim of a bundle. A failure is harmless."""
     with contextlib.suppress(OSError):
         (bundle / CLAIM_FILE).unlink(missing_ok=True)
 
@@ -68,13 +68,12 @@ def resolve_import(root: Path, given: str) -> Path:
     """The file or bundle at ``given`` below ``root``.
 
     Raises:
-        ServiceError: IMPORT_FAILED when it leads out of ``root`` (also by a link), or when there
-            is nothing.
+        ServiceError: IMPORT_FAILED if the path leaves ``root`` (also by a link) or does not exist.
     """
     top = root.resolve()
     try:
         target = (top / given).resolve(strict=True)
-        # A link inside a bundle could lead out of the folder just as well.
+        # A link inside a bundle could also leave the folder.
         inside = [target, *(p.resolve() for p in target.rglob("*"))]
     except (OSError, ValueError, RuntimeError):
         raise _import_failed(
@@ -94,19 +93,19 @@ def import_scene(
     quota: Quota,
     claim: str | None = None,
 ) -> None:
-    """Read ``source`` whole, check it, and make it bundle ``name`` below ``scenes``.
+    """Read and check ``source``, and create bundle ``name`` in ``scenes``.
 
     Args:
-        source: bundle or splat file, or the shipped street.
+        source: bundle or splat file, or the included street.
         scenes: the scene folder.
-        name: of the new scene.
-        limits: of the process that reads.
-        quota: of the scene folder.
-        claim: of the request; what it has made already stays as it is.
+        name: name of the new scene.
+        limits: limits of the process that reads.
+        quota: quota of the scene folder.
+        claim: claim of the request; an existing bundle with this claim is accepted.
 
     Raises:
-        ServiceError: IMPORT_FAILED when it cannot be read or written, PAYLOAD_TOO_LARGE for what
-            comes out of it, ALREADY_EXISTS when the name is taken, QUOTA_EXCEEDED.
+        ServiceError: IMPORT_FAILED if it cannot be read or written, PAYLOAD_TOO_LARGE for its
+            content, ALREADY_EXISTS if the name is taken, QUOTA_EXCEEDED.
     """
     folder = bundle_folder(scenes, name)
     if bears_claim(folder, claim):
@@ -127,10 +126,10 @@ def import_scene(
 
 @contextmanager
 def staging_folder(beside: Path) -> Iterator[Path]:
-    """A hidden folder on the disk of ``beside``, gone with the block.
+    """A hidden folder on the disk of ``beside``, removed after the block.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: it cannot be created.
     """
     beside.mkdir(parents=True, exist_ok=True)
     staging = beside / f"{STAGING_PREFIX}{secrets.token_hex(6)}"
@@ -143,15 +142,15 @@ def staging_folder(beside: Path) -> Iterator[Path]:
 
 @contextmanager
 def import_errors(source: Path, *, setting: str) -> Iterator[None]:
-    """Errors of the block as clients get them.
+    """Convert errors of the block for clients.
 
     Args:
-        source: what is imported; its place on this machine is left out of messages.
-        setting: that limits what comes out.
+        source: imported file; messages omit its path on this machine.
+        setting: setting that limits the content.
 
     Raises:
         ServiceError: IMPORT_FAILED or PAYLOAD_TOO_LARGE.
-        OSError: the worker's disk takes nothing, which is no fault of the file.
+        OSError: the worker's disk is full or fails, which is not the file's fault.
     """
     try:
         yield
@@ -174,10 +173,9 @@ def import_errors(source: Path, *, setting: str) -> Iterator[None]:
 
 
 def _raise_of_disk(error: StagingError) -> None:
-    """Raise the system's error where it says that there is no space, or no disk.
+    """Raise the system's error if the disk is full or missing.
 
-    The process that reads has a limit of its own for the size of files, which counts as the file's
-    fault.
+    The reading process has its own file size limit; exceeding it is the file's fault.
     """
     for number in (FULL_ERRNOS | REFUSED_ERRNOS) - {errno.EFBIG}:
         if str(error) == os.strerror(number):
@@ -198,10 +196,10 @@ def _check_name(folder: Path, name: str) -> None:
 
 
 def scene_name(source: Path, given: str | None) -> str:
-    """The name to import under.
+    """The name of the new scene.
 
     Raises:
-        ServiceError: INVALID_REQUEST when it cannot be part of a path.
+        ServiceError: INVALID_REQUEST if it cannot be part of a path.
     """
     if given is None:
         stem = source.name.split(".")[0]
@@ -229,14 +227,14 @@ def _import_failed(detail: str) -> ServiceError:
 T = TypeVar("T")
 
 MAX_IMPORTS = 8
-"""Imports that are received, wait or run; each may hold an upload on disk."""
+"""Imports being received, waiting or running; each may have an upload on disk."""
 
 
 class ImportQueue:
-    """One import after the other, on a thread that nothing else uses. Belongs to the event loop.
+    """Runs imports one at a time on a dedicated thread, for use on the event loop.
 
-    The reading is done by a process with limits, see :mod:`real2sim_server.scene.io.bundle`; one
-    at a time, so that these are the limits of all imports together.
+    A process with limits reads the file, see :mod:`real2sim_server.scene.io.bundle`. With one
+    import at a time these limits apply to all imports together.
     """
 
     def __init__(self) -> None:
@@ -244,7 +242,7 @@ class ImportQueue:
         self._taken = 0
 
     def close(self) -> None:
-        """Begin no further import."""
+        """Start no further imports."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     @contextmanager
@@ -267,5 +265,5 @@ class ImportQueue:
             self._taken -= 1
 
     async def run(self, work: Callable[[], T]) -> T:
-        """``work()`` once the imports before it are over."""
+        """``work()`` after all earlier imports."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)

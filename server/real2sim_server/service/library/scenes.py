@@ -33,12 +33,12 @@ from ..shared_objects import mark_used
 
 @dataclass(frozen=True)
 class IdleItem:
-    """Something in memory that nobody uses.
+    """An unused item in memory.
 
     Attributes:
-        used_at: when it was used last, by the monotonic clock.
-        nbytes: what it takes.
-        drop: forgets it; the bytes that come free, at once or within a moment.
+        used_at: time of the last use, monotonic clock [s].
+        nbytes: its size.
+        drop: drops it; returns the bytes that become free, immediately or shortly after.
     """
 
     used_at: float
@@ -47,18 +47,18 @@ class IdleItem:
 
 
 class MemoryHolder(Protocol):
-    """What loads things under the budget. Both are called on any thread."""
+    """A user of the memory budget. Both methods are called on any thread."""
 
     @property
     def held_bytes(self) -> int:
-        """Memory of all that is loaded or being loaded."""
+        """Memory of all loaded and loading items."""
 
     def idle(self) -> Sequence[IdleItem]:
-        """What could be forgotten."""
+        """Items that can be dropped."""
 
 
 class MemoryBudget:
-    """Bytes that all holders may take together. Safe to use on any thread.
+    """Memory budget of all holders. Thread-safe.
 
     Args:
         total_bytes: the budget.
@@ -70,21 +70,21 @@ class MemoryBudget:
         self._lock = threading.Lock()
 
     def add(self, holder: MemoryHolder) -> None:
-        """Count what ``holder`` loads."""
+        """Count the memory of ``holder``."""
         self._holders.append(holder)
 
     @property
     def free_bytes(self) -> int:
-        """What is left; negative where users keep more than the budget alive."""
+        """Free bytes; negative if items in use exceed the budget."""
         return self.total_bytes - sum(holder.held_bytes for holder in self._holders)
 
     def make_room(self, what: str, needed: int, *, reserve: Callable[[], None]) -> None:
-        """Forget idle things, longest unused first, until ``needed`` bytes fit.
+        """Drop idle items, least recently used first, until ``needed`` bytes fit.
 
         Args:
-            what: for messages, as ``scene 'street'``.
+            what: name for messages, such as ``scene 'street'``.
             needed: bytes.
-            reserve: makes its holder count them; called while no other call can take the room.
+            reserve: makes its holder count them; called before another call can use the space.
 
         Raises:
             ServiceError: OUT_OF_MEMORY.
@@ -128,15 +128,15 @@ def _out_of_memory(detail: str, *, hint: str, needed: int, free: int) -> Service
 
 @dataclass(frozen=True)
 class Quota:
-    """Limits of one folder. What is there already counts, whoever put it there.
+    """Limits of one folder. All content counts, regardless of its origin.
 
     Attributes:
-        folder: that is looked at; it need not exist.
-        what: its entries for messages, as ``assets``.
-        max_entries: of the folder; hidden ones do not count.
-        max_bytes: of everything below it.
-        setting: that the operator raises, as ``ASSETS_QUOTA``.
-        remedy: what makes room.
+        folder: the folder; it need not exist.
+        what: its kind of entries for messages, such as ``assets``.
+        max_entries: maximum number of entries; hidden ones do not count.
+        max_bytes: maximum size of all files below it.
+        setting: setting that the operator can raise, such as ``ASSETS_QUOTA``.
+        remedy: how to free space.
     """
 
     folder: Path
@@ -147,11 +147,11 @@ class Quota:
     remedy: str
 
     def check(self, *, added_bytes: int = 0, entries: int | None = None) -> None:
-        """Refuse one more entry where there is no room. Reads the folder, which takes time.
+        """Refuse another entry if a limit is reached. Reads the folder, which is slow.
 
         Args:
-            added_bytes: of the new entry, as far as they are known.
-            entries: that there are, where they are not counted by the folder.
+            added_bytes: size of the new entry, if known.
+            entries: number of entries, if not to be counted in the folder.
 
         Raises:
             ServiceError: QUOTA_EXCEEDED.
@@ -178,7 +178,7 @@ class Quota:
 
 
 def folder_usage(folder: Path) -> tuple[int, int]:
-    """Entries of a folder, and bytes of the files in them; hidden entries are being made."""
+    """Number of entries of a folder, and bytes of their files; hidden entries are incomplete."""
     entries = [entry for entry in _scan(folder) if not entry.name.startswith(".")]
     return len(entries), sum(map(_size, entries))
 
@@ -207,13 +207,13 @@ _IDENTIFIER = re.compile(ID_PATTERN)
 
 @dataclass(frozen=True)
 class Listing:
-    """One bundle folder.
+    """A bundle folder.
 
     Attributes:
-        name: of the scene in paths.
+        name: name of the scene in URLs.
         path: its folder.
-        summary: what it holds; None when it is broken.
-        reason: why it is broken; None when it is not.
+        summary: its content; None if it is broken.
+        reason: why it is broken, or None.
     """
 
     name: str
@@ -226,10 +226,10 @@ Fingerprint = tuple[tuple[str, int, int], ...]
 
 
 class SceneCatalog:
-    """Looks into the scene folder; what did not change since the last look is not read again.
+    """Lists the scene folder; only reads bundles that changed since the last call.
 
     Args:
-        folder: of bundles; it need not exist.
+        folder: folder of bundles; it need not exist.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -238,7 +238,7 @@ class SceneCatalog:
         self._lock = threading.Lock()
 
     def scan(self) -> dict[str, Listing]:
-        """All bundles by scene name, in the order of their names."""
+        """All bundles by scene name, sorted."""
         with self._lock:
             return self._scan()
 
@@ -258,20 +258,20 @@ class SceneCatalog:
         return dict(sorted(listings.items()))
 
     def mark_broken(self, listing: Listing, reason: str) -> None:
-        """Remember what only loading could find out, until the bundle changes."""
+        """Mark a bundle that failed to load, until it changes."""
         broken = Listing(listing.name, listing.path, None, reason)
         with self._lock:
             self._known[listing.path] = (_fingerprint(listing.path), broken)
 
     def public(self, error: Exception) -> str:
-        """The error's message without the place of the folder on this machine."""
+        """The error's message without the folder's path on this machine."""
         return str(error).replace(f"{self.folder}/", "")
 
     def _candidates(self) -> Iterator[Path]:
         if not self.folder.is_dir():
             return
         for path in sorted(self.folder.iterdir()):
-            # Hidden folders are bundles that are just being written.
+            # Hidden folders are bundles being written.
             if path.name.startswith(".") or not path.is_dir():
                 continue
             if path.suffix == BUNDLE_SUFFIX or (path / SCENE_DOCUMENT).exists():
@@ -297,13 +297,12 @@ class SceneCatalog:
 
 
 def bundle_folder(folder: Path, name: str) -> Path:
-    """Where a new bundle of that name belongs."""
+    """Path of a new bundle."""
     return folder / f"{name}{BUNDLE_SUFFIX}"
 
 
 def _fingerprint(path: Path) -> Fingerprint:
-    """Names, sizes and times of the files: any change of the bundle changes it. What is hidden is
-    no part of it."""
+    """Names, sizes and times of the files; changes with the bundle. Hidden files are excluded."""
     try:
         entries = sorted(p for p in path.iterdir() if not p.name.startswith("."))
         stats = [(p.name, p.stat()) for p in entries]
@@ -337,21 +336,20 @@ class _Resident:
 
 
 class SceneCache:
-    """Scenes of the scene folder, loaded when they are needed and evicted when memory is.
+    """Scenes of the scene folder, loaded on demand and evicted if memory is short.
 
-    One scene object serves all its users. A session pins its scene; unpinned scenes leave
-    memory in the order of their last use. Belongs to the event loop: its methods are not for
-    other threads.
+    All users share one scene object. A session pins its scene; unpinned scenes are evicted least
+    recently used first. All methods are for the event loop, except where noted.
 
     Args:
         catalog: the scene folder.
-        engine: puts loaded scenes onto the device.
-        budget: of memory, shared with others that load things.
-        device: where their tensors live.
-        on_load: called with the seconds each load took.
+        engine: uploads loaded scenes to the device.
+        budget: memory budget shared with other holders.
+        device: device of their tensors.
+        on_load: called with the duration of each load [s].
 
     Attributes:
-        fetch: brings a scene that is not in the folder from elsewhere; whether there was one.
+        fetch: fetches a missing scene from elsewhere; returns whether there was one.
     """
 
     def __init__(
@@ -373,15 +371,15 @@ class SceneCache:
         self._resident: dict[str, _Resident] = {}
         self._loading: dict[str, asyncio.Task[Scene]] = {}
         self._reserved: dict[str, int] = {}
-        # Reading and hashing bundles is disk work: on the engine it would hold up every session,
-        # on the loop everything. One thread, because disks and memory serve one best.
+        # Reading and hashing bundles is disk work; it would block sessions on the engine, and all
+        # requests on the event loop. One thread, because disks and memory serve one reader best.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         budget.add(self)
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="scenes")
 
     def close(self) -> None:
-        """Forget all scenes and end the disk thread."""
+        """Drop all scenes and end the disk thread."""
         self._disk.shutdown(cancel_futures=True)
         self._resident.clear()
 
@@ -389,10 +387,10 @@ class SceneCache:
         """``fn()`` on the thread that reads and writes bundles."""
         return await asyncio.get_running_loop().run_in_executor(self._disk, fn)
 
-    # --- looking ----------------------------------------------------------------------------
+    # --- queries ----------------------------------------------------------------------------
 
     async def refresh(self) -> dict[str, Listing]:
-        """Look into the scene folder; all scenes by name."""
+        """List the scene folder; all scenes by name."""
         self._listings = await asyncio.to_thread(self.catalog.scan)
         return self._listings
 
@@ -400,7 +398,7 @@ class SceneCache:
         """The bundle of that name.
 
         Raises:
-            ServiceError: UNKNOWN_SCENE, with the names there are.
+            ServiceError: UNKNOWN_SCENE, with the available names.
         """
         known = self._listings.get(name) or (await self.refresh()).get(name)
         if known is None and self.fetch is not None and await self.fetch(name):
@@ -417,9 +415,9 @@ class SceneCache:
         return known
 
     async def summary(self, name: str) -> SceneSummary:
-        """What the scene of that name holds: of the one in memory, else of the bundle on disk.
+        """Summary of a scene: of the one in memory, else of the bundle on disk.
 
-        A bundle that was replaced on disk counts from the next load on.
+        A bundle that was replaced on disk applies from the next load.
 
         Raises:
             ServiceError: UNKNOWN_SCENE or SCENE_BROKEN.
@@ -428,14 +426,14 @@ class SceneCache:
             return resident.summary
         listing = await self.listing(name)
         if listing.summary is None:
-            # It may have been mended since.
+            # It may have been repaired since.
             listing = (await self.refresh()).get(name, listing)
         if listing.summary is None:
             raise _broken(name, listing.reason)
         return listing.summary
 
     def state(self, name: str) -> SceneState:
-        """Where a listed scene is on its way into memory."""
+        """Loading state of a listed scene."""
         if name in self._resident:
             return SceneState.RESIDENT
         if name in self._loading:
@@ -463,11 +461,11 @@ class SceneCache:
 
     @property
     def held_bytes(self) -> int:
-        """Memory of all scenes that are resident or on their way."""
+        """Memory of all scenes that are resident or loading [bytes]."""
         return self.resident_bytes + sum(list(self._reserved.values()))
 
     def idle(self) -> list[IdleItem]:
-        """Scenes that no session pins. May be called on any thread, as what it returns."""
+        """Scenes that no session pins. Thread-safe, including the returned items."""
         return [
             IdleItem(r.used_at, nbytes, partial(self._drop, name, nbytes))
             for name, r in list(self._resident.items())
@@ -475,10 +473,10 @@ class SceneCache:
             for nbytes in (r.scene.nbytes + scene_levels_bytes(r.scene),)
         ]
 
-    # --- using ------------------------------------------------------------------------------
+    # --- use --------------------------------------------------------------------------------
 
     async def get(self, name: str) -> Scene:
-        """The scene, loaded if need be. A reference keeps it alive; it is not pinned.
+        """The scene, loaded if necessary. A reference keeps it alive; it is not pinned.
 
         Raises:
             ServiceError: UNKNOWN_SCENE, SCENE_BROKEN, or OUT_OF_MEMORY.
@@ -486,13 +484,13 @@ class SceneCache:
         return (await self._ensure(name)).scene
 
     async def pin(self, name: str) -> Scene:
-        """The scene, kept in memory until :meth:`unpin`. Raises like :meth:`get`."""
+        """The scene, held in memory until :meth:`unpin`. Raises like :meth:`get`."""
         resident = await self._ensure(name)
         resident.pins += 1
         return resident.scene
 
     def unpin(self, name: str) -> None:
-        """Give back one pin."""
+        """Release one pin."""
         resident = self._resident[name]
         if resident.pins <= 0:
             raise RuntimeError(f"scene {name!r} is not pinned")
@@ -501,7 +499,7 @@ class SceneCache:
 
     @asynccontextmanager
     async def pinned(self, name: str) -> AsyncIterator[Scene]:
-        """The scene, in memory for the length of the block. Raises like :meth:`get`."""
+        """The scene, in memory during the block. Raises like :meth:`get`."""
         scene = await self.pin(name)
         try:
             yield scene
@@ -509,7 +507,7 @@ class SceneCache:
             self.unpin(name)
 
     async def unload(self, name: str) -> None:
-        """Take the scene out of memory; nothing to do when it is not there.
+        """Remove the scene from memory; no effect if it is not there.
 
         Raises:
             ServiceError: UNKNOWN_SCENE, or SCENE_IN_USE while sessions pin it.
@@ -543,10 +541,10 @@ class SceneCache:
                     reserve=partial(self._reserved.__setitem__, name, summary.nbytes),
                 )
                 task = asyncio.create_task(self._load(name, summary), name=f"load {name}")
-                # Read the outcome even when all who waited have left.
+                # Retrieve the outcome even if all waiters have left.
                 task.add_done_callback(lambda t: t.cancelled() or t.exception())
                 self._loading[name] = task
-            # Others may wait for the same load; one who leaves must not end it.
+            # Others may wait for the same load; one that leaves must not cancel it.
             await asyncio.shield(task)
         resident.used_at = time.monotonic()
         return resident
@@ -577,7 +575,7 @@ class SceneCache:
         return scene
 
     def _drop(self, name: str, nbytes: int) -> int:
-        """Forget an idle scene to make room; other threads leave that to the loop."""
+        """Drop an idle scene; from other threads this runs on the event loop."""
         loop = self._loop
         if loop is None or loop.is_closed():
             return 0

@@ -1,1 +1,1 @@
-"""The engine that owns the device, and pictures drawn on it."""
+"""Rendering on the engine."""

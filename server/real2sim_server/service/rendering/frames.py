@@ -1,6 +1,6 @@
-"""Images and point clouds as bytes of the wire, and the optics of sensors.
+"""Images and point clouds as protocol bytes, and the optics of sensors.
 
-A frame is a msgpack map whose last member is ``data``; everything before it is its header.
+A frame is a msgpack map whose last member is ``data``; the members before it are its header.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from ...world.ranging import Cloud
 
 
 def camera_with(camera: Camera, optics: Optics) -> Camera:
-    """A camera of a rig with the optics of a sensor. Raises SceneError for optics that are none."""
+    """A camera of a rig with the optics of a sensor. Raises SceneError for invalid optics."""
     if optics == "pinhole":
         return camera
     if optics == "recorded":
@@ -44,17 +44,17 @@ def camera_with(camera: Camera, optics: Optics) -> Camera:
 
 
 def lens_of(spec: LensSpec) -> Lens | None:
-    """A lens of the wire. Raises SceneError for one that its model refuses."""
+    """The lens of a spec. Raises SceneError for parameters that its model refuses."""
     return lens_from(spec.model_dump())
 
 
 def needs_motion(sensors: Sequence[SensorSpec]) -> bool:
-    """Whether what moves matters to the images of sensors, and not only where it is."""
+    """Whether images of the sensors depend on velocities, and not only on poses."""
     return any(sensor.optics != "pinhole" or sensor.effects is not None for sensor in sensors)
 
 
 def frame_names(sensor: SensorSpec, camera: Camera | None, modality: str) -> dict[str, Any]:
-    """What a frame says of lens, shutter and effects; nothing where there are none."""
+    """Lens, shutter and effects of a frame; empty if there are none."""
     said: dict[str, Any] = {}
     if camera is not None and camera.lens is not None:
         said["lens"] = camera.lens.model
@@ -66,15 +66,15 @@ def frame_names(sensor: SensorSpec, camera: Camera | None, modality: str) -> dic
 
 
 class FollowingImage:
-    """An image that follows from a drawn one when somebody waits for it, on whatever thread.
+    """An image computed from a rendered one on demand, on any thread.
 
     Args:
-        drawn: [H, W] or [H, W, 3] uint8; whole once ``wait`` has returned.
-        wait: for the drawn image.
-        follow: the image that follows, of the same shape; called once, after ``wait``.
+        drawn: [H, W] or [H, W, 3] uint8; complete after ``wait``.
+        wait: waits for the rendered image.
+        follow: computes the image, of the same shape; called once, after ``wait``.
 
     Attributes:
-        pixels: like ``drawn``; whole once :meth:`ready` has returned.
+        pixels: like ``drawn``; complete after :meth:`ready`.
     """
 
     def __init__(
@@ -89,24 +89,24 @@ class FollowingImage:
         self._lock = threading.Lock()
 
     def ready(self) -> None:
-        """Return when the pixels are there; any number of times."""
+        """Wait until the pixels are complete; may be called repeatedly."""
         with self._lock:
             if self._follow is not None:
                 self._wait()
                 self.pixels[:] = self._follow()
-                self._follow = None  # and the drawn image with it
+                self._follow = None  # also releases the rendered image
 
 
 def blurred(
     view: RigView, blur: MotionBlurSpec, draw: Callable[[RigView], NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """The mean light of ``blur.samples`` images evenly within its exposure, whose middle is that of
-    ``view``.
+    """The mean light of ``blur.samples`` images at even times in the exposure, which is centred on
+    that of ``view``.
 
     Args:
-        view: of one camera, with the motion of its vehicle and of what it looks at.
-        blur: how long, and of how many.
-        draw: the colour image of such a view.
+        view: view of one camera, with the motion of its vehicle and of the visible objects.
+        blur: exposure time and number of samples.
+        draw: renders the colour image of such a view.
     """
     total: Light | None = None
     for k in range(blur.samples):
@@ -134,22 +134,22 @@ def _moved_on(instance: Instance, seconds: float) -> Instance:
 
 
 Part = bytes | memoryview
-"""Bytes of a message, sent as they lie in memory."""
+"""Bytes of a message, sent without copying."""
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedImage:
-    """One rendered image on its way into a frame.
+    """A rendered image, before encoding.
 
     Attributes:
-        sensor: that it was rendered for.
-        modality: name of a registered one.
-        t_us: instant [us].
+        sensor: its sensor.
+        modality: name of a registered modality.
+        t_us: time [us].
         T_world_sensor: [4, 4] float64, camera frame to world.
         K: [3, 3] float64 intrinsics [px].
-        pixels: of the dtype and shape of the modality.
-        ready: returns when they are there; asked before they are read.
-        camera: that it was drawn by.
+        pixels: dtype and shape depend on the modality.
+        ready: waits for the pixels; called before they are read.
+        camera: camera of the image.
     """
 
     sensor: SensorSpec
@@ -164,12 +164,12 @@ class RenderedImage:
 
 @dataclass(frozen=True, eq=False)
 class FrameHeader:
-    """A frame up to the bytes of its image.
+    """A frame without the bytes of its image.
 
     Attributes:
-        fields: of the wire's Frame, in its order, without ``data``.
-        members: those fields, encoded, without a map's header.
-        encoded: all of it, and the beginning of ``data``.
+        fields: members of the protocol's Frame, in order, without ``data``.
+        members: those fields, encoded, without a map header.
+        encoded: the encoded header and the beginning of ``data``.
     """
 
     fields: dict[str, Any]
@@ -182,7 +182,7 @@ class EncodedFrame:
     """One image, encoded.
 
     Attributes:
-        header: everything but its bytes.
+        header: everything except its bytes.
         data: its bytes.
     """
 
@@ -196,12 +196,12 @@ class EncodedFrame:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the decoded image."""
+        """Data type of the decoded image."""
         return tuple(self.header.fields["shape"])
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Of the wire's Frame, ``data`` as bytes among them."""
+        """Members of the protocol's Frame, including ``data`` as bytes."""
         return self.header.fields | {"data": bytes(self.data)}
 
 
@@ -228,7 +228,7 @@ def encode_frame(image: RenderedImage, *, jpeg: JpegEncoder = turbo_jpeg) -> Enc
 
 
 def placed_frame(frame: EncodedFrame, offset: int) -> EncodedFrame:
-    """The frame of an image that lies in shared memory, ``offset`` bytes from its beginning."""
+    """The frame of an image in shared memory, at ``offset`` bytes from its start."""
     fields, members = frame.header.fields, frame.header.members
     place = OFFSET + _UINT64 + offset.to_bytes(8, "big")
     encoded = map_header(len(fields) + 2) + members + place + DATA + _bin_header(0)
@@ -261,13 +261,13 @@ def _frame_header(fields: dict[str, Any], size: int) -> FrameHeader:
 
 
 def bytes_member(fields: Mapping[str, Any], data: Sequence[Part]) -> list[Part]:
-    """A msgpack map of ``fields`` and ``data``, the latter one after the other, in parts."""
+    """A msgpack map of ``fields`` and ``data`` (concatenated), in parts."""
     header = map_header(len(fields) + 1) + pack_pairs(fields) + DATA
     return [header + _bin_header(sum(len(part) for part in data)), *data]
 
 
 def _bin_header(length: int) -> bytes:
-    # Always of 32 bits, which msgpack's own packer writes for large values only.
+    # Always with a 32-bit length, which msgpack's packer only uses for large values.
     return b"\xc6" + length.to_bytes(4, "big")
 
 
@@ -279,11 +279,11 @@ _UINT64 = b"\xcf"
 # --- Point clouds --------------------------------------------------------------------------------
 
 DEFLATE_LEVEL = 1
-"""Higher ones take three times as long for a tenth less."""
+"""Higher levels take three times as long for 10 % less."""
 
 
 def cloud_parts(cloud: Cloud) -> list[Part]:
-    """The wire's PointCloud, in parts; raw columns are not copied."""
+    """The protocol's PointCloud, in parts; raw columns are not copied."""
     columns = {name: _little(column) for name, column in cloud.columns.items()}
     fields = {
         "sensor": cloud.sensor,
@@ -306,8 +306,8 @@ def cloud_parts(cloud: Cloud) -> list[Part]:
 
 
 def deflated(columns: Sequence[NDArray[Any]]) -> bytes:
-    """Columns by zlib, the first bytes of all numbers of each before the second ones: they hardly
-    differ from point to point."""
+    """Columns compressed by zlib, with the first bytes of all numbers before the second ones: these
+    hardly differ between points."""
     packer = zlib.compressobj(DEFLATE_LEVEL)
     parts = []
     for column in columns:

@@ -1,4 +1,4 @@
-"""From instances to encoded frames: rendered on the engine, encoded on other threads."""
+"""From instances to encoded frames: rendering on the engine, encoding on other threads."""
 
 from __future__ import annotations
 
@@ -55,24 +55,24 @@ R = TypeVar("R")
 
 MAX_ENCODERS = 8
 BULK_NICENESS = 10
-"""Of the thread that encodes large pictures; the engine's is less, see there."""
+"""Niceness of the thread that encodes large images; the engine has a higher priority."""
 
 VIEW_PIXELS = 2_000_000
-"""Requests of more pixels wait behind those that somebody looks at."""
+"""Requests with more pixels have a lower priority than interactive ones."""
 DEFAULT_OPTIONS = RasterOptions()
 
 
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
-    """All that is needed to render the sensors of one instant.
+    """Inputs for rendering the sensors at one time.
 
     Attributes:
-        scene: gives the sky; its clouds are those of ``instances``.
-        instances: what is rendered.
-        T_world_vehicle: [4, 4] float64, where the rig stands.
-        t_us: instant, noted in the frames [us].
+        scene: provides the sky; its clouds are those of ``instances``.
+        instances: the instances to render.
+        T_world_vehicle: [4, 4] float64, pose of the rig.
+        t_us: time, written to the frames [us].
         sensors: cameras, modalities, sizes and codecs.
-        rig: whose cameras these are; default: the scene's.
+        rig: rig of the cameras; default: the scene's.
         twist: [6] of the vehicle, see RigView; for rolling shutters and motion blur.
     """
 
@@ -94,24 +94,24 @@ class RenderedFrames:
 
 
 class Renderer:
-    """Answers render requests.
+    """Executes render requests.
 
-    Rendering runs on the engine. Encoding runs beside it, on half of the cores: simplejpeg,
+    Rendering runs on the engine. Encoding runs in parallel on half of the cores: simplejpeg,
     nvImageCodec and OpenCV release the GIL, so the engine renders the next request meanwhile and
-    the event loop stays free. A 1920x1280 jpeg takes 17 ms on the CPU, a png 170 ms; either way
+    the event loop stays free. A 1920x1280 jpeg takes 17 ms on the CPU, a png 170 ms; in both cases
     the loop's median lag is below 0.2 ms.
 
     Args:
         engine: runs the rendering.
-        backend: rasterizes.
-        metrics: gets durations by stage.
-        max_pixels: over all sensors and modalities of one request.
-        budget: of memory, which levels of detail count in.
+        backend: the rasterizer.
+        metrics: receives durations by stage.
+        max_pixels: limit over all sensors and modalities of one request.
+        budget: memory budget, which includes levels of detail.
 
     Attributes:
-        levels: of detail; small images wait for them before they go to the engine.
-        small_images: the kernels that draw them.
-        jpeg: what makes the bytes of jpegs, chosen by :meth:`warm_up`.
+        levels: levels of detail; small images wait for them before they are queued.
+        small_images: the kernels for small images.
+        jpeg: the jpeg encoder, chosen by :meth:`warm_up`.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Renderer:
         self.jpeg: JpegEncoder = turbo_jpeg
         self._engine = engine
         self._backend = backend
-        # To ask an object whether it has the members of a protocol takes 20 us, once a step.
+        # An isinstance check against a protocol takes 20 us, once a step.
         self._draws_together = cache(partial(draws_together, backend))
         self._uses_levels = cache(partial(uses_levels, backend))
         self._metrics = metrics
@@ -156,7 +156,7 @@ class Renderer:
         self._bulk_encoders.shutdown(cancel_futures=True)
 
     async def warm_up(self) -> None:
-        """Render and encode something in every form, so that no first frame waits for it."""
+        """Render and encode once in every form, so that no first frame is slow."""
         await self._engine.call(warm_up, self._backend, label="warm-up")
         self.jpeg, why = await asyncio.to_thread(jpeg_encoder_for, device_of(self._backend))
         log.info("jpeg", encoder=why)
@@ -195,8 +195,8 @@ class Renderer:
         cameras: Sequence[Camera],
         things: Callable[[], Sequence[Instance]],
     ) -> None:
-        """Wait until cameras can be drawn without holding up others: for levels of detail, see
-        there, and for kernels of lenses and of small images.
+        """Wait until cameras can be rendered without delaying others: for levels of detail, and for
+        kernels of lenses and small images.
 
         Raises:
             ServiceError: OUT_OF_MEMORY; INVALID_REQUEST where the backend draws no lenses.
@@ -228,7 +228,7 @@ class Renderer:
         try:
             return await asyncio.gather(*work)
         except Exception as error:
-            # Of images that were still on their way from the device.
+            # Images that were still being copied from the device.
             self._engine.note_error(error)
             raise
 
@@ -248,11 +248,11 @@ class Renderer:
         return images, (time.perf_counter() - started) * 1e3
 
     def draws_together(self, sensors: Sequence[SensorSpec], cameras: Sequence[Camera]) -> bool:
-        """Whether images of these sensors are drawn in one go with those of others like them.
+        """Whether images of these sensors can be rendered in one batch with similar ones.
 
         Args:
-            sensors: and their cameras, in the same order.
-            cameras: at the sizes that the sensors name.
+            sensors: the sensors.
+            cameras: their cameras in the same order, at the requested sizes.
         """
         modalities = frozenset(name for sensor in sensors for name in sensor.modalities)
         return self._draws_together(modalities) or all(
@@ -266,12 +266,12 @@ class Renderer:
         *,
         between: Callable[[], object] | None = None,
     ) -> list[list[RenderedImage]]:
-        """Images of all sensors of each request; those that one pass can draw are drawn in one
-        go. On the engine thread, which goes on while they are copied from the device.
+        """Images of all sensors of each request, batched where one pass can render them. On the
+        engine thread, which continues while they are copied from the device.
 
         Args:
-            requests: each with the cameras of its sensors, in their order.
-            between: called between pieces of the work.
+            requests: each with the cameras of its sensors, in order.
+            between: called between parts of the work.
 
         Raises:
             RenderError: of any of them.
@@ -345,24 +345,24 @@ class Renderer:
 
 
 def encoder_threads() -> int:
-    """Images that are encoded at a time: on half of the cores, two at least."""
+    """Images that are encoded in parallel: half of the cores, at least two."""
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
     return max(2, min(MAX_ENCODERS, cores // 2))
 
 
 def _priority(cameras: Sequence[Camera], stream: str) -> Priority:
-    """With what a request takes turns: nobody waits for the frames of a film."""
+    """Priority of a request: frames of a film have a lower one."""
     pixels = sum(camera.width * camera.height for camera in cameras)
     return Priority.BULK if stream == "export" or pixels > VIEW_PIXELS else Priority.VIEW
 
 
 Pass = tuple[RasterOptions, tuple[str, ...]]
-"""What is drawn in one go: by which options, and which modalities."""
+"""A batched pass: its options and modalities."""
 
 
 def _passes(requests: Sequence[RenderRequest]) -> dict[Pass, dict[int, list[int]]]:
-    """Indices of the sensors of each request, by the pass that draws them."""
+    """Indices of the sensors of each request, by rendering pass."""
     passes: dict[Pass, dict[int, list[int]]] = {}
     for r, request in enumerate(requests):
         for options, indices in _sensors_by_options(request.sensors).items():
@@ -391,7 +391,7 @@ def _with_ground(image: RenderedImage, scene: Scene, frame: Frame, camera: Camer
 
 
 def _modalities(sensors: Iterable[SensorSpec]) -> tuple[str, ...]:
-    """Everything that one of the sensors wants, each once, and what it is found by."""
+    """All modalities that the sensors require, without duplicates, and their inputs."""
     wanted = {name for sensor in sensors for name in sensor.modalities}
     if "semantic" in wanted:
         wanted.add("median_depth")
@@ -418,10 +418,10 @@ def _samples() -> Iterator[RenderedImage]:
 
 
 def check_known(scene: Scene, sensors: Iterable[SensorSpec]) -> None:
-    """Refuse images that need more than the scene holds.
+    """Refuse images that the scene's data cannot provide.
 
     Raises:
-        ServiceError: INVALID_REQUEST, uncertainty of a scene of which none is known.
+        ServiceError: INVALID_REQUEST, uncertainty of a scene that has none.
     """
     asked = any(UNCERTAINTY in sensor.modalities for sensor in sensors)
     if asked and not scene.has_uncertainties:
@@ -435,11 +435,10 @@ def check_known(scene: Scene, sensors: Iterable[SensorSpec]) -> None:
 def check_sensors(
     rig: CameraRig, sensors: Sequence[SensorSpec], *, max_pixels: int
 ) -> list[Camera]:
-    """The cameras of ``sensors`` at the sizes they name.
+    """The cameras of ``sensors`` at the requested sizes.
 
     Raises:
-        ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels, and for optics that
-            are none.
+        ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels or invalid optics.
     """
     cameras = []
     for sensor in sensors:
@@ -464,14 +463,14 @@ def check_sensors(
     return cameras
 
 
-# --- HTTP answers --------------------------------------------------------------------------------
+# --- HTTP replies --------------------------------------------------------------------------------
 
 CODEC_OF: dict[str, Codec] = {
     "image/jpeg": "jpeg",
     "image/png": "png",
     "application/msgpack": "raw",
 }
-"""Codec by media type; the order is that of preference."""
+"""Codec by media type, in order of preference."""
 
 FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
@@ -486,10 +485,10 @@ FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
 
 
 def choose_media_type(accept: str | None, modality: Modality) -> str:
-    """The media type that the client likes best (RFC 9110, section 12.5.1).
+    """The media type that the client prefers (RFC 9110, section 12.5.1).
 
     Raises:
-        ServiceError: NOT_ACCEPTABLE when there is none; depth and instance are never jpeg.
+        ServiceError: NOT_ACCEPTABLE if there is none; depth and instance are never jpeg.
     """
     codecs = modality_of(modality).codecs
     offered = [media_type for media_type, codec in CODEC_OF.items() if codec in codecs]
@@ -500,14 +499,14 @@ MSGPACK = "application/msgpack"
 
 
 def choose_frames_type(accept: str | None, modalities: Sequence[Modality]) -> str:
-    """The same for images of these modalities: msgpack, or, for one image, any of its forms."""
+    """The same for images of these modalities: msgpack, or for one image any of its formats."""
     if len(modalities) == 1:
         return choose_media_type(accept, modalities[0])
     return choose_among([MSGPACK], accept, of="more than one image")
 
 
 def frames_response(rendered: RenderedFrames, media_type: str, *, t_us: int) -> Response:
-    """The answer that carries all frames of one instant; one alone also as an image file."""
+    """The response with all frames of one time; a single frame also as an image file."""
     if media_type != MSGPACK:
         return frame_response(rendered, media_type)
     view = {"t_us": t_us, "frames": [frame.fields for frame in rendered.frames]}
@@ -519,10 +518,10 @@ def frames_response(rendered: RenderedFrames, media_type: str, *, t_us: int) -> 
 def frame_response(
     rendered: RenderedFrames, media_type: str, *, revision: int | None = None
 ) -> Response:
-    """The answer that carries the first frame.
+    """The response with the first frame.
 
-    msgpack holds the whole frame (pose, intrinsics, raw pixels) as on the drive socket; image
-    files carry the milliseconds by stage in ``Server-Timing`` as well.
+    msgpack contains the whole frame (pose, intrinsics, raw pixels) as on the drive socket. Image
+    files also have the milliseconds by stage in ``Server-Timing``.
     """
     frame = rendered.frames[0]
     content: bytes = bytes(frame.data)

@@ -1,1 +1,1 @@
-"""REST routes and sockets, one module a subject."""
+"""REST routes and sockets, one module per subject."""

@@ -1,4 +1,4 @@
-"""The asset library: upload, cut out, look."""
+"""The asset library: upload, cut out, query."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ router = APIRouter(prefix="/v1/assets", tags=["assets"], route_class=TokenRoute)
 async def add(
     worker: WorkerOf, request: Request, idempotency_key: IdempotencyKey = None
 ) -> Response:
-    """Add an asset: an object cut out of a scene or a person who walks (JSON), or an uploaded
+    """Add an asset: an object cut out of a scene or a walking person (JSON), or an uploaded
     splat file (form).
 
-    Assets stand upright with x forward, at a real size, and never change: an id that is taken
-    stays taken.
+    Assets are upright with x forward, at a real size. They never change, and an id cannot be
+    reused.
     """
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
     with worker.imports.place():
@@ -108,7 +108,7 @@ async def _added(
 
 @router.get("")
 async def list_assets(worker: WorkerOf) -> AssetList:
-    """The whole library."""
+    """All assets of the library."""
     return AssetList(assets=await asyncio.to_thread(worker.assets.list))
 
 
@@ -124,16 +124,16 @@ async def delete(
     asset_id: Identifier,
     dry_run: Annotated[bool, Query(description="check, change nothing")] = False,
 ) -> Response:
-    """Remove an asset that no scenario has in its history; its id may then be given again.
+    """Delete an asset that no scenario's history refers to; its id becomes available again.
 
-    Sessions that show it go on.
+    Sessions that show it continue.
     """
     await asyncio.to_thread(worker.assets.info, asset_id)
     await _check_unused(worker, asset_id)
     if dry_run:
         return Response(status_code=204)
     with worker.assets.removing(asset_id):
-        # Once more: an edit that was under way may have found it before.
+        # Again: an edit in progress may have found it before.
         await _check_unused(worker, asset_id)
         if worker.sharing is not None:
             await worker.sharing.forget("asset", asset_id)
@@ -154,13 +154,13 @@ async def delete(
 async def thumbnail(
     worker: WorkerOf, asset_id: Identifier, width: Annotated[int, Query(ge=32, le=1024)] = 256
 ) -> Response:
-    """A picture of the asset from its front left, three quarters as high as it is wide."""
+    """A picture of the asset from its front left, with an aspect ratio of 4:3."""
     asset = (await asyncio.to_thread(worker.assets.get, asset_id)).asset
     pixels = await worker.engine.call(
         draw_thumbnail, asset, width=width, backend=worker.backend, label="thumbnail"
     )
     encoded = await asyncio.to_thread(encode_image, pixels, "rgb", "png", quality=90)
-    # The same id is the same asset for ever.
+    # An id always refers to the same asset.
     headers = {"Cache-Control": "public, max-age=86400, immutable"}
     return Response(encoded.data, media_type="image/png", headers=headers)
 

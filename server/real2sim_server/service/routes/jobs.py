@@ -58,7 +58,7 @@ FILE_TYPES = (
     "application/xml",
     "application/vnd.apache.parquet",
 )
-"""Of what jobs leave."""
+"""Media types of result files."""
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=TokenRoute)
 
@@ -71,13 +71,13 @@ async def list_jobs(
     ] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> JobList:
-    """Jobs of this worker's store, newest first; also those of earlier runs."""
+    """Jobs in this worker's store, newest first, including those of earlier runs."""
     return JobList(jobs=await worker.jobs.list(subject=subject, limit=limit))
 
 
 @router.get("/{job_id}")
 async def describe(worker: WorkerOf, job_id: Identifier) -> JobInfo:
-    """One job: state, progress, and once it is over its result or error."""
+    """One job: state, progress, and at its end the result or error."""
     return await worker.jobs.get(job_id)
 
 
@@ -87,7 +87,7 @@ async def describe(worker: WorkerOf, job_id: Identifier) -> JobInfo:
     responses={204: {"description": "the job was over; it and its files are gone"}},
 )
 async def cancel(worker: WorkerOf, job_id: Identifier) -> Response:
-    """Cancel a job that is not over; remove one that is, with its files."""
+    """Cancel an unfinished job, or delete a finished one with its files."""
     info = await worker.jobs.cancel(job_id)
     return Response(status_code=204) if info is None else info_response(info)
 
@@ -116,11 +116,11 @@ async def events(
         ),
     ] = None,
 ) -> Response:
-    """Server-sent events until the job is over; comes back to where it was with Last-Event-ID."""
+    """Server-sent events until the job ends; `Last-Event-ID` resumes the stream."""
     after = int(last_event_id or 0)
     info = await worker.jobs.get(job_id)
     if info.over and info.event <= after:
-        return Response(status_code=204)  # tells browsers not to connect again
+        return Response(status_code=204)  # tells browsers not to reconnect
     return StreamingResponse(
         event_stream(_named(worker.jobs, job_id, after)),
         media_type="text/event-stream",
@@ -132,7 +132,7 @@ async def events(
 async def preview(
     worker: WorkerOf, job_id: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
-    """One frame of a finished simulation, or of a drive from where its vehicle was at ``t_us``."""
+    """One frame of a finished simulation, or of a drive from its vehicle's pose at ``t_us``."""
     media_type = query.media_type()
     video_source = await worker.video_source(job_id)
     t_us = video_source.span[0] if query.t_us is None else query.t_us
@@ -175,7 +175,7 @@ async def file(
         Query(description="answer 307 with an address at the object store, where there is one"),
     ] = False,
 ) -> Response:
-    """A file that a finished job left; `Range` asks for a part of it."""
+    """A result file of a finished job; supports `Range`."""
     if signed and worker.sharing is not None:
         seconds = worker.settings.objects_url_seconds
         url = await worker.sharing.signed_url("job", job_id, name, seconds=seconds)
@@ -204,11 +204,11 @@ async def create(
     idempotency_key: IdempotencyKey = None,
     who: ClientName = "",
 ) -> Response:
-    """Make a file that leaves the worker; the answer is a job.
+    """Start an export; the response is a job.
 
-    A **video** of a scene, a scenario as it is now, or a simulation, from a camera's way; once the
-    job has succeeded, `GET /v1/jobs/{id}/files/video.webm`. Or a labelled **data set** of a scene,
-    a scenario as it is now, a recorded episode or the running episode of a session, in public
+    Exports a **video** of a scene, the current scenario or a simulation, from a camera's path; once
+    the job has succeeded, `GET /v1/jobs/{id}/files/video.webm`. Or a labelled **data set** of a
+    scene, the current scenario, a recorded episode or the running episode of a session, in public
     formats: `GET /v1/jobs/{id}/files/dataset.tar`, `manifest.json` and `preview_0.jpg`.
     """
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
@@ -227,7 +227,7 @@ async def create(
 
 
 async def rebuild(worker: Worker, info: JobInfo) -> Work:
-    """The export of a job on record, of the scenario as it was then."""
+    """The export of a stored job, with the scenario at its revision."""
     fields = dict(info.request)
     revision = fields.pop("revision", None)
     return await _work(worker, EXPORT_BODY.validate_python(fields), revision, None)
@@ -245,7 +245,7 @@ async def _work(
 
 
 def _is_portable(body: ExportRequest | DatasetRequest) -> bool:
-    """Whether all that it shows is in the store, and the same for all workers."""
+    """Whether all its inputs are in the store, and the same for all workers."""
     if isinstance(body, DatasetRequest):
         return body.session is None and body.recording is None
     return body.simulation is None
@@ -339,7 +339,7 @@ async def _edited_source(
 
 
 def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """A scenario's history without its instants: the same edits give the same bytes."""
+    """A scenario's history without timestamps, so that equal edits give equal bytes."""
     if all(entry["kind"] == "edit" for entry in entries):
         return {"operations": [edit for entry in entries for edit in entry["operations"]]}
     kept = ("kind", "operations", "target")
@@ -348,7 +348,7 @@ def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 async def _session_source(worker: Worker, session_id: str, request: Request) -> DatasetSource:
     row = check_not_closed(await worker.sessions.row(session_id))
-    # Where the worker wants a token, the route has seen one: it opens every session.
+    # If the worker requires a token, the route has checked one: it opens every session.
     if not worker.accounts.wants_token and not opens_session(bearer_token(request), row):
         error = unauthorized("the data set of a session wants the session's token")
         error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
@@ -387,11 +387,12 @@ async def create_sweep(
     idempotency_key: IdempotencyKey = None,
     who: ClientName = "",
 ) -> Response:
-    """Drive points of a parameter space with planners, or search it for a planner's avoidable
-    failures (`method` of kind `search`); the answer is a job. Once it has succeeded,
-    `GET /v1/jobs/{id}/files/episodes.parquet` has a row an episode, and the `worst` of the result
-    left `EPISODE.r2e` and, of a scenario, `EPISODE.xosc`. A search leaves `failures.json`,
-    `failures.tar` with its page, and each failure as `failure_01.xosc` and `.r2e`."""
+    """Start a sweep: planners drive points of a parameter space; or, with `method` of kind
+    `search`, a search for avoidable failures of a planner. The response is a job. Once it has
+    succeeded, `GET /v1/jobs/{id}/files/episodes.parquet` has one row per episode. The `worst`
+    episodes of the result have `EPISODE.r2e` and, for a scenario, `EPISODE.xosc`. A search writes
+    `failures.json`, `failures.tar` with its page, and each failure as `failure_01.xosc` and
+    `.r2e`."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)

@@ -44,11 +44,11 @@ class FrameQuery:
     ] = None
 
     def media_type(self) -> str:
-        """Form of the answer. Raises ServiceError: NOT_ACCEPTABLE."""
+        """Format of the reply. Raises ServiceError: NOT_ACCEPTABLE."""
         return choose_media_type(self.accept, self.modality)
 
     def render_request(self, scene: Scene, state: ScenarioState, media_type: str) -> RenderRequest:
-        """What to draw, from where the recording vehicle was.
+        """Render request from the pose of the recording vehicle.
 
         Raises:
             TimeOutOfRangeError: ``t_us`` outside the recording.
@@ -64,7 +64,7 @@ class FrameQuery:
         media_type: str,
         T_world_vehicle: Float | None = None,
     ) -> RenderRequest:
-        """The same for instances that are there already, and another way of the vehicle."""
+        """Render request for given instances, and another path of the vehicle."""
         sensor = SensorSpec(
             camera=self.camera or scene.rig.names[0],
             modalities=[self.modality],
@@ -111,21 +111,20 @@ class SweepQuery:
     accept: Annotated[str | None, Header(description=f"{MSGPACK} or {POINTS}")] = None
 
     def media_type(self) -> str:
-        """Form of the answer. Raises ServiceError: NOT_ACCEPTABLE."""
+        """Format of the reply. Raises ServiceError: NOT_ACCEPTABLE."""
         return choose_among([MSGPACK, POINTS], self.accept, of="a sweep")
 
     def mounted(self) -> MountedLidar:
-        """The sensor. Raises WorldError: INVALID_REQUEST for one that the catalogue does not
-        have."""
+        """The sensor. Raises WorldError: INVALID_REQUEST if it is not in the catalogue."""
         return mounted_sensors([LidarSpec(lidar=self.lidar)], [], 1).lidars[0]
 
     def instant(self, state: ScenarioState) -> int:
-        """When the sweep ends [us]."""
+        """Time of the last ray [us]."""
         return state.clock[0] if self.t_us is None else self.t_us
 
 
 def sweep_response(cloud: Cloud, media_type: str, *, revision: int) -> Response:
-    """The cloud as msgpack, or its points alone."""
+    """The cloud as msgpack, or only its points."""
     if media_type == MSGPACK:
         content = b"".join(cloud_parts(cloud))
     else:
@@ -149,18 +148,18 @@ SweepQueryOf = Annotated[SweepQuery, Depends()]
 
 
 def free_view_request(scene: Scene, view: SceneView, media_type: str) -> RenderRequest:
-    """What to draw.
+    """Render request of a free view.
 
     Raises:
         EditError: UNKNOWN_OBJECT, for an object that the scene lacks.
-        ServiceError: INVALID_REQUEST, for a lens that does not reach what its image shows.
+        ServiceError: INVALID_REQUEST, for a lens that does not cover its image.
     """
     t_us = scene.start_us if view.t_us is None else view.t_us
     poses = {posed.object_id: posed.pose for posed in view.objects}
     return RenderRequest(
         scene=scene,
         instances=posed_instances(scene, t_us, poses, others=view.others),
-        # The cameras stand in the world, on a vehicle at its origin.
+        # The cameras are in the world frame, on a vehicle at its origin.
         T_world_vehicle=np.eye(4),
         t_us=t_us,
         sensors=[_sensor(camera, media_type) for camera in view.cameras],

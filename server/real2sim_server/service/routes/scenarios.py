@@ -1,4 +1,4 @@
-"""Scenarios: create, edit, undo, look; their storyboards and the gallery of corner cases."""
+"""Scenarios: create, edit, undo, query; their storyboards and the gallery of corner cases."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _ETAG = re.compile(r'"r(0|[1-9][0-9]{0,8})"')
 
 @dataclass(frozen=True)
 class Change:
-    """What a request that changes a scenario may carry."""
+    """Optional parts of a request that changes a scenario."""
 
     request: Request
     if_match: str | None
@@ -71,7 +71,7 @@ class Change:
 
     @property
     def expected(self) -> int | None:
-        """Revision that the change was made for. Raises ServiceError: INVALID_REQUEST."""
+        """Revision that the change is based on. Raises ServiceError: INVALID_REQUEST."""
         return expected_revision(self.if_match)
 
     def guard(self, worker: Worker) -> AbstractAsyncContextManager[IdempotentRequest]:
@@ -95,7 +95,7 @@ ChangeOf = Annotated[Change, Depends(_change_of)]
 async def create(
     worker: WorkerOf, body: ScenarioCreate, request: Request, idempotency_key: IdempotencyKey = None
 ) -> Response:
-    """A new scenario on a scene; it is stored and survives a restart."""
+    """Create a scenario on a scene; it is stored and survives a restart."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -116,9 +116,9 @@ async def import_(
     request: Request,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """A new scenario from a file that `GET .../export` gave, here or elsewhere.
+    """Create a scenario from a file of `GET .../export`, of this or another worker.
 
-    Its scene is found by hash. The whole history comes along, undo and redo included.
+    Its scene is identified by hash. The whole history is included, with undo and redo.
     """
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
@@ -129,21 +129,21 @@ async def import_(
 
 @router.get("/{scenario_id}", response_model=ScenarioInfo)
 async def describe(worker: WorkerOf, scenario_id: Identifier) -> Response:
-    """One scenario with all its objects as they are now."""
+    """One scenario with all its current objects."""
     view = await worker.scenarios.view(scenario_id)
     return await large_response(view.info, headers={"ETag": etag(view.revision)})
 
 
 @router.patch("/{scenario_id}", response_model=ScenarioInfo)
 async def rename(worker: WorkerOf, scenario_id: Identifier, body: ScenarioRename) -> Response:
-    """Give a scenario another name; its id and its history stay."""
+    """Rename a scenario; its id and its history do not change."""
     view = await worker.scenarios.rename(scenario_id, body.name)
     return await large_response(view.info, headers={"ETag": etag(view.revision)})
 
 
 @router.delete("/{scenario_id}", status_code=204, response_class=Response)
 async def delete(worker: WorkerOf, scenario_id: Identifier) -> Response:
-    """Remove a scenario and its history. Sessions that began from it go on."""
+    """Delete a scenario and its history. Sessions that started from it continue."""
     await worker.scenarios.delete(scenario_id)
     return Response(status_code=204)
 
@@ -155,7 +155,7 @@ async def edit(
     body: OperationBatch,
     change: ChangeOf,
 ) -> Response:
-    """Apply a batch of operations, all or none; 412 with the missed entries when it is stale."""
+    """Apply a batch of operations, all or none; 412 with the missed entries if it is stale."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -174,7 +174,7 @@ async def edit(
 async def history(
     worker: WorkerOf, scenario_id: Identifier, after: Annotated[int, Query(ge=0)] = 0
 ) -> History:
-    """Revisions behind ``after``, oldest first."""
+    """Revisions after ``after``, oldest first."""
     return await worker.scenarios.history(scenario_id, after=after)
 
 
@@ -184,7 +184,7 @@ async def undo(
     scenario_id: Identifier,
     change: ChangeOf,
 ) -> Response:
-    """Take back the last batch that is in effect."""
+    """Undo the last batch that is in effect."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -200,7 +200,7 @@ async def redo(
     scenario_id: Identifier,
     change: ChangeOf,
 ) -> Response:
-    """Bring back the last batch that was undone."""
+    """Redo the last batch that was undone."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -218,7 +218,7 @@ async def fork(
     body: ScenarioFork | None = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """A new scenario with the same history, up to a revision; the two go separate ways."""
+    """Create an independent scenario with the same history, up to a revision."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -237,10 +237,11 @@ async def simulate(  # noqa: PLR0917, one parameter for each part of the request
     idempotency_key: IdempotencyKey = None,
     who: ClientName = "",
 ) -> Response:
-    """Let physics move the scenario as it is now; the answer is a job.
+    """Start a physics rollout of the current scenario; the response is a job.
 
-    Once it has succeeded, its result has contacts and figures, its file `playback.json` poses and
-    energies of every frame; `GET /v1/jobs/{id}/preview` shows it, `POST /v1/exports` films it.
+    Once it has succeeded, its result has contacts and figures, and its file `playback.json` has
+    poses and energies of every frame. `GET /v1/jobs/{id}/preview` shows it, `POST /v1/exports`
+    exports a video.
     """
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
@@ -260,11 +261,11 @@ async def calibrate(  # noqa: PLR0917, one parameter for each part of the reques
     idempotency_key: IdempotencyKey = None,
     who: ClientName = "",
 ) -> Response:
-    """Find values of an object with which a simulation shows what was seen of it; a job.
+    """Fit physics parameters of an object to observations of it; the response is a job.
 
-    Its result has `factors` on what was given, `uncertainty` of each (what observations leave open
-    and what cells do, together), `values` where a factor makes one, and in `untold` the parameters
-    that these observations say nothing about.
+    Its result has `factors` on the initial values, the `uncertainty` of each (of observations and
+    cell size together), `values` where a factor applies to a known value, and in `untold` the
+    parameters that these observations do not determine.
     """
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
@@ -275,7 +276,7 @@ async def calibrate(  # noqa: PLR0917, one parameter for each part of the reques
 
 @router.get("/{scenario_id}/export", response_model=ScenarioDocument)
 async def export(worker: WorkerOf, scenario_id: Identifier) -> Response:
-    """The scenario with its whole history as one JSON file that names its scene by hash."""
+    """The scenario with its whole history as one JSON file that refers to its scene by hash."""
     document = await worker.scenarios.export(scenario_id)
     name = f"{scenario_id}.scenario.json"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
@@ -286,7 +287,7 @@ async def export(worker: WorkerOf, scenario_id: Identifier) -> Response:
 async def preview(
     worker: WorkerOf, scenario_id: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
-    """One frame of the scenario as it is now, from where the recording vehicle was at ``t_us``."""
+    """One frame of the current scenario, from the recording vehicle's pose at ``t_us``."""
     media_type = query.media_type()
     view = await worker.scenarios.view(scenario_id)
     scene = await worker.scene_cache.get(view.row.scene)
@@ -311,8 +312,8 @@ async def points(
     t_us: Annotated[Microseconds | None, Query(description="default: its start")] = None,
     part: Annotated[Part, Query(description="of the scene")] = "all",
 ) -> Response:
-    """The centres of the Gaussians of the scenario as it is now at an instant: a point cloud with
-    colour, normal, semantic class and instance. Faint ones are left out."""
+    """The centres of the Gaussians of the current scenario at a time: a point cloud with colour,
+    normal, semantic class and instance. Faint Gaussians are omitted."""
     view = await worker.scenarios.view(scenario_id)
     scene = await worker.scene_cache.get(view.row.scene)
     first, last = view.state.clock
@@ -334,8 +335,8 @@ async def points(
 async def sweep(
     worker: WorkerOf, scenario_id: Identifier, query: SweepQueryOf, request: Request
 ) -> Response:
-    """What a LiDAR of the catalogue measures in the scenario as it is now, on the recording
-    vehicle; its last ray is fired at ``t_us``."""
+    """Simulate a sweep of a LiDAR of the catalogue in the current scenario, on the recording
+    vehicle; ``t_us`` is the time of its last ray."""
     media_type = query.media_type()
     mounted = await asyncio.to_thread(query.mounted)
     view = await worker.scenarios.view(scenario_id)
@@ -350,10 +351,10 @@ async def sweep(
 
 
 def expected_revision(if_match: str | None) -> int | None:
-    """Revision that ``If-Match`` names; None where any will do.
+    """Revision in ``If-Match``; None if any is accepted.
 
     Raises:
-        ServiceError: INVALID_REQUEST for anything but ``"r<number>"`` or ``*``.
+        ServiceError: INVALID_REQUEST for values other than ``"r<number>"`` or ``*``.
     """
     if if_match is None or if_match.strip() == "*":
         return None
@@ -377,7 +378,7 @@ T = TypeVar("T")
 
 @storyboards_router.get("/gallery")
 async def gallery() -> Gallery:
-    """Ready corner cases; `POST /v1/scenarios/{id}/corner-case` takes one over."""
+    """Predefined corner cases; apply one with `POST /v1/scenarios/{id}/corner-case`."""
     return Gallery(
         cases=[
             CornerCaseInfo(
@@ -403,8 +404,8 @@ async def gallery() -> Gallery:
     },
 )
 async def picture(case: Identifier) -> Response:
-    """A corner case from above: who comes from where, and where an ego that goes straight on at
-    10 m/s (blue) meets them."""
+    """A corner case from above: the paths of the road users, and where they meet an ego that
+    drives straight on at 10 m/s (blue)."""
     if case not in GALLERY:
         raise ServiceError(
             ErrorCode.NOT_FOUND,
@@ -420,7 +421,7 @@ async def picture(case: Identifier) -> Response:
 async def apply_corner_case(
     worker: WorkerOf, scenario_id: Identifier, body: CornerCaseChoice, change: ChangeOf
 ) -> Response:
-    """Let a corner case of the gallery be what happens in the scenario; an edit as others are."""
+    """Apply a corner case of the gallery to the scenario; an edit, which can be undone."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -433,7 +434,7 @@ async def apply_corner_case(
     "/scenarios/{scenario_id}/storyboard", name="describe", response_model=Storyboard | None
 )
 async def describe_storyboard(worker: WorkerOf, scenario_id: Identifier) -> Response:
-    """What happens in sessions of the scenario; null where nothing is written."""
+    """Storyboard of the scenario's sessions; null if there is none."""
     view = await worker.scenarios.view(scenario_id)
     board = view.state.storyboard
     content = "null" if board is None else await asyncio.to_thread(board.model_dump_json)
@@ -445,8 +446,8 @@ async def describe_storyboard(worker: WorkerOf, scenario_id: Identifier) -> Resp
 async def replace(
     worker: WorkerOf, scenario_id: Identifier, body: Storyboard, change: ChangeOf
 ) -> Response:
-    """Say what happens in sessions of the scenario, unless a reset brings a storyboard of its own;
-    an edit as others are, to be undone."""
+    """Set the storyboard of the scenario's sessions, unless a reset sets its own; an edit, which
+    can be undone."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -456,7 +457,7 @@ async def replace(
 
 @storyboards_router.delete("/scenarios/{scenario_id}/storyboard", response_model=OperationResult)
 async def remove(worker: WorkerOf, scenario_id: Identifier, change: ChangeOf) -> Response:
-    """Let nothing happen in sessions of the scenario; an edit as others are."""
+    """Remove the storyboard of the scenario; an edit, which can be undone."""
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -475,7 +476,7 @@ async def remove(worker: WorkerOf, scenario_id: Identifier, change: ChangeOf) ->
     },
 )
 async def export_xosc(worker: WorkerOf, scenario_id: Identifier) -> Response:
-    """What happens in the scenario as an OpenSCENARIO file."""
+    """The scenario's storyboard as an OpenSCENARIO file."""
     view = await worker.scenarios.view(scenario_id)
     board = view.state.storyboard
     if board is None:
@@ -506,10 +507,10 @@ async def import_xosc(  # noqa: PLR0917, one parameter for each part of the requ
         str | None, Query(max_length=200, description="entity that is the ego; default: Ego")
     ] = None,
 ) -> Response:
-    """Say what happens in the scenario by an OpenSCENARIO 1.0 to 1.3 file without catalogs.
+    """Set the storyboard from an OpenSCENARIO 1.0 to 1.3 file without catalogs.
 
-    Its roads are laid along the recorded drive, so that the ego begins where it was recorded. What
-    is not supported is refused by its name and line.
+    Its roads are aligned with the recorded drive, so the ego starts where it was recorded.
+    Unsupported elements are refused with their name and line.
     """
     async with change.guard(worker) as idempotent:
         if idempotent.replay:
@@ -546,7 +547,7 @@ async def _set(
 
 
 async def _read(made: Callable[[], T]) -> T:
-    """What a file or the gallery gives, on another thread. Raises ServiceError."""
+    """Read a file or the gallery on another thread. Raises ServiceError."""
     try:
         return await asyncio.to_thread(made)
     except ScenarioError as error:

@@ -63,7 +63,7 @@ router = APIRouter(prefix="/v1", tags=["scenes"], route_class=TokenRoute)
 
 @router.get("/scenes", response_model=SceneList)
 async def list_scenes(worker: WorkerOf) -> Response:
-    """Every scene below the worker's scene folder, resident or not, broken ones with the reason."""
+    """All scenes in the worker's scene folder, resident or not; broken ones have a reason."""
     scene_cache = worker.scene_cache
     listed = [
         (item, scene_cache.state(name)) for name, item in (await scene_cache.refresh()).items()
@@ -84,9 +84,9 @@ async def describe(worker: WorkerOf, scene: Identifier) -> Response:
 
 @router.get("/scenes/{scene}/lanes", response_model=SceneLanes)
 async def lanes(worker: WorkerOf, scene: Identifier, roads: bool = True) -> Response:
-    """The lanes of a scene: centre lines, neighbours, stop lines, signals; 404 where it has none.
+    """The lanes of a scene: centre lines, neighbours, stop lines, signals; 404 if it has none.
 
-    `roads=false` leaves out reference lines of roads.
+    `roads=false` omits the reference lines of roads.
     """
     summary = await worker.scene_cache.summary(scene)
     graph = await asyncio.to_thread(lambda: summary.lanes)
@@ -115,8 +115,8 @@ async def load(
 ) -> Response:
     """Load a scene into memory.
 
-    200 when it is there, at once or within two seconds; else 202 and the job that loads it. 507
-    when the memory budget does not allow it.
+    Returns 200 if it is loaded within two seconds, else 202 and the job that loads it. Returns 507
+    if the memory budget does not allow it.
     """
     state = worker.scene_cache.state(scene)
     if state is SceneState.RESIDENT:
@@ -144,7 +144,7 @@ async def load(
 
 @router.delete("/scenes/{scene}/residency", response_model=SceneInfo)
 async def unload(worker: WorkerOf, scene: Identifier) -> Response:
-    """Take a scene out of memory; 409 while sessions use it."""
+    """Unload a scene from memory; 409 while sessions use it."""
     await worker.scene_cache.unload(scene)
     return await scene_response(worker, scene)
 
@@ -153,7 +153,7 @@ async def unload(worker: WorkerOf, scene: Identifier) -> Response:
 async def render(
     worker: WorkerOf, scene: Identifier, query: FrameQueryOf, request: Request
 ) -> Response:
-    """One frame of the unedited scene, from where the recording vehicle was at ``t_us``."""
+    """One frame of the unedited scene, from the recording vehicle's pose at ``t_us``."""
     media_type = query.media_type()
     resident = await worker.scene_cache.get(scene)
     render_request = await asyncio.to_thread(
@@ -175,9 +175,9 @@ async def view(
     request: Request,
     accept: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """One instant of the scene from cameras anywhere, with objects where the request has them.
+    """Render one instant of the scene from any cameras, with objects at the requested poses.
 
-    Nothing is kept of it: for other programs that drive and want pictures.
+    Nothing is stored. For external simulators that need images.
     """
     modalities = [name for camera in body.cameras for name in camera.modalities]
     media_type = choose_frames_type(accept, modalities)
@@ -188,7 +188,7 @@ async def view(
 
 
 def _wait_seconds(prefer: str | None) -> float:
-    """Seconds that a client wants to wait for the end of a job."""
+    """Seconds that a client is willing to wait for the end of a job."""
     preference = (prefer or "").lower()
     if "respond-async" in preference:
         return 0.0
@@ -213,7 +213,7 @@ async def scene_response(
 # --- Imports -------------------------------------------------------------------------------------
 
 UPLOAD_PATHS = ("/v1/scenes",)
-"""Where forms may be larger than other requests."""
+"""Paths whose forms may be larger than other requests."""
 
 _BODY = {
     "requestBody": {
@@ -242,7 +242,7 @@ _BODY = {
 async def import_(
     worker: WorkerOf, request: Request, idempotency_key: IdempotencyKey = None
 ) -> Response:
-    """Add a scene: a bundle or ply below the import folder (JSON), the demo street
+    """Add a scene: a bundle or ply in the import folder (JSON), the demo street
     (`{"demo": true}`), or an uploaded ply."""
     kind = request.headers.get("Content-Type", "").split(";")[0].strip().lower()
     with worker.imports.place():
@@ -325,7 +325,7 @@ def _import(worker: Worker, source: Path, name: str, claim: str | None) -> None:
 
 
 def stored_upload(file: UploadFile, staging: Path) -> Path:
-    """The upload as a file in ``staging``: readers map files, and tell some formats by suffix."""
+    """The upload as a file in ``staging``: readers map files, and some formats need the suffix."""
     given = Path(file.filename or "upload.ply").name.lower()
     ending = next((suffix for suffix in suffixes() if given.endswith(suffix)), ".ply")
     stored = staging / f"upload{ending}"
@@ -395,8 +395,8 @@ async def splats(
     content_hash: KnownHash = None,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """Gaussians of the background (world frame) or of one object (its box's frame), those that
-    cover most first, as an spz file; axes are kept: z is up."""
+    """Gaussians of the background (world frame) or of one object (its box's frame) as an spz file,
+    sorted by decreasing coverage; z is up."""
     resident = await worker.scene_cache.get(scene)
     headers = _caching(resident, content_hash, f"splats {object_id} {first} {count}")
     subject = None if object_id is None else resident.object(object_id)
@@ -450,7 +450,7 @@ async def sky(
 
 
 def _caching(scene: Scene, content_hash: str | None, what: str) -> dict[str, str]:
-    """Headers that say for how long an answer holds. Raises ServiceError: NOT_FOUND."""
+    """Cache headers of a response. Raises ServiceError: NOT_FOUND."""
     if content_hash is not None and content_hash != scene.content_hash:
         raise ServiceError(
             ErrorCode.NOT_FOUND,
@@ -490,9 +490,9 @@ async def object_splats(
     object_id: Annotated[Identifier, Query(description="of which, in the frame of its box")],
     t_us: Annotated[Microseconds | None, Query(description="default: its start")] = None,
 ) -> Response:
-    """The Gaussians of one object of a scenario as it is now, those that cover most first: of an
-    asset, of a person as far in walking as at ``t_us``, as large as edits have made it. An spz file
-    in the frame of its box; axes are kept: z is up."""
+    """The current Gaussians of one object of a scenario, sorted by decreasing coverage: of an
+    asset, or of a person in the pose at ``t_us``, at its edited size. An spz file in the frame of
+    its box; z is up."""
     view = await worker.scenarios.view(scenario_id)
     scene = await worker.scene_cache.get(view.row.scene)
     subject = next((o for o in view.state.visible if o.object_id == object_id), None)

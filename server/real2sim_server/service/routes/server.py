@@ -1,4 +1,4 @@
-"""The server itself: what it is, its health and metrics, the reference of calls, the studio."""
+"""The server: its status, health and metrics, the API reference, the studio."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ async def describe(worker: WorkerOf) -> ServerInfo:
 
 @router.get("/fleet")
 async def fleet(worker: WorkerOf) -> Fleet:
-    """The workers that share this one's store, with what each last told of itself."""
+    """The workers that share this one's store, with the last status each reported."""
     members = [
         FleetMember.model_validate({**row.document, "worker_id": row.worker_id, "alive": row.alive})
         for row in await worker.leases.workers()
@@ -60,7 +60,7 @@ async def fleet(worker: WorkerOf) -> Fleet:
 
 
 def limits_of(settings: Settings) -> Limits:
-    """The limits that ``settings`` and the protocol set."""
+    """The limits set by ``settings`` and the protocol."""
     return Limits(
         max_sessions=settings.max_sessions,
         max_request_bytes=settings.max_request_bytes,
@@ -82,7 +82,7 @@ docs_router = APIRouter(include_in_schema=False)
 
 @docs_router.get("/docs")
 async def docs(request: Request) -> HTMLResponse:
-    """Every call with its parameters, answers and an example."""
+    """Every call with its parameters, replies and an example."""
     page = reference_page(published(request.app))
     return HTMLResponse(page, headers={"Content-Security-Policy": POLICY})
 
@@ -97,7 +97,7 @@ health_router = APIRouter(tags=["health"])
     responses={503: {"model": dict[str, str], "description": "dead or stalled, and why"}},
 )
 async def live(worker: WorkerOf, response: Response) -> dict[str, str]:
-    """200 while the engine thread shows signs of life; at 503 only a restart helps."""
+    """200 while the engine thread responds; on 503 the worker needs a restart."""
     engine = worker.engine
     if not engine.alive:
         response.status_code = 503
@@ -111,7 +111,7 @@ async def live(worker: WorkerOf, response: Response) -> dict[str, str]:
 
 @health_router.get("/readyz", responses={503: {"model": Readiness, "description": "not ready"}})
 async def ready(worker: WorkerOf, response: Response) -> Readiness:
-    """200 when new work is welcome; otherwise 503 with the reasons."""
+    """200 if the worker accepts new work; else 503 with the reasons."""
     readiness = worker.readiness()
     if not readiness.ready:
         response.status_code = 503
@@ -141,10 +141,10 @@ IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
 
 
 def policy_of(page: str) -> str:
-    """Nothing from elsewhere: the studio works offline, and what is no part of it cannot run.
+    """Content security policy: no external content, because the studio works offline.
 
-    The map of the page's vendored modules is allowed by its hash. The renderer of Gaussians sorts
-    in WebAssembly that it carries as ``data:``, on a worker that it makes of a ``blob:``.
+    The import map of the page's vendored modules is allowed by its hash. The Gaussian renderer
+    sorts in WebAssembly loaded from ``data:``, in a web worker created from a ``blob:``.
     """
     maps = IMPORT_MAP.findall(page)
     hashes = (base64.b64encode(hashlib.sha256(m.encode()).digest()).decode() for m in maps)
@@ -164,7 +164,7 @@ ui_router = APIRouter(include_in_schema=False)
 @ui_router.get("/")
 @ui_router.get("/ui")
 async def entry() -> Response:
-    """To the studio; relative links need the slash."""
+    """Redirect to the studio; relative links need the slash."""
     return RedirectResponse("/ui/")
 
 
@@ -179,7 +179,7 @@ async def file(name: str) -> Response:
             hint="open /ui/",
         )
     headers = {
-        # What is vendored has its version in its path.
+        # Vendored files have their version in their path.
         "Cache-Control": "public, max-age=31536000, immutable"
         if name.startswith("vendor/")
         else "no-cache",
@@ -188,7 +188,7 @@ async def file(name: str) -> Response:
     return Response(path.read_bytes(), media_type=MEDIA_TYPES[path.suffix], headers=headers)
 
 
-# Listed once: a path of a request is looked up, never joined to a folder.
+# Listed once: request paths are looked up, never joined to a folder.
 STUDIO = {
     p.relative_to(FOLDER).as_posix(): p
     for p in sorted(FOLDER.rglob("*"))

@@ -1,4 +1,4 @@
-"""Sessions by plain requests: the same world as the drive socket, for scripts."""
+"""Sessions over REST: the same world as the drive socket, for scripts."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ EXACTLY_ONE = "that the session runs on; give exactly one of `scene` and `scenar
 
 
 class SessionRoute(TokenRoute):
-    """A route of a session, for whoever has its token or the worker's."""
+    """A route of a session, accessible with its token or the worker's."""
 
     async def check(self, request: Request) -> None:
         """Raises ServiceError: UNAUTHORIZED, UNKNOWN_SESSION or SESSION_CLOSED."""
@@ -91,7 +91,7 @@ async def _check_session_token(request: Request, session_id: str) -> None:
         return
     row = None
     if given is not None or not accounts.wants_token:
-        # The row is enough: no session is rebuilt for those who may not use it.
+        # The row is sufficient: no session is rebuilt for unauthorised requests.
         row = check_not_closed(await worker.sessions.row(session_id))
     if row is None or not opens_session(given, row):
         worker.metrics.auth_failures.labels("http").inc()
@@ -109,7 +109,7 @@ async def _session_of(
     session_id: str,
     _credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Session:
-    """The session, whose token was checked by its route.
+    """The session; its route has checked the token.
 
     Raises:
         ServiceError: UNKNOWN_SESSION or SESSION_CLOSED.
@@ -131,9 +131,9 @@ async def create(  # noqa: PLR0917, one parameter for each part of the request
     scenario: Annotated[Identifier | None, Query(description=EXACTLY_ONE)] = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """A new session on a scene or a scenario, exactly one of them; with a body its first episode
-    begins at once. The answer holds the session's token, which its other calls and its drive
-    socket want, and which is told only here."""
+    """Create a session on a scene or a scenario, exactly one of them; a body starts the first
+    episode immediately. The response has the session's token, which its other calls and its drive
+    socket require. The token is only returned here."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -149,7 +149,7 @@ async def create(  # noqa: PLR0917, one parameter for each part of the request
 
 @router.get("", dependencies=[Depends(require_token)])
 async def list_sessions(worker: WorkerOf, request: Request) -> SessionList:
-    """All open sessions; their tokens are not told."""
+    """All open sessions, without their tokens."""
     ws_base = _ws_base(request)
     return SessionList(sessions=[session_info(s, ws_base=ws_base) for s in worker.sessions])
 
@@ -175,7 +175,8 @@ async def reset(
     body: ResetSpec | None = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Begin an episode anew, from what the session was made of; refused beside a controller."""
+    """Start a new episode from the session's scene or scenario; refused while a controller is
+    connected."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -196,7 +197,8 @@ async def step(
     body: StepRequest,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Move the clock; ends early with the episode. Refused beside a controller."""
+    """Advance the clock; stops at the end of the episode. Refused while a controller is
+    connected."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -223,9 +225,9 @@ async def edit(
     body: SessionEdit,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Edit the running world before its next step: put road users there (`spawn`) and take them
-    away (`delete`), move objects. A controller may be driving meanwhile; the next observation has
-    the event `edited`."""
+    """Edit the running world before its next step: add road users (`spawn`), remove them (`delete`)
+    or move objects. Also possible while a controller drives; its next observation has the event
+    `edited`."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -252,15 +254,15 @@ async def state(
     ] = None,
     wait_s: Annotated[float, Query(ge=0, le=30, description="for so long at most")] = 10.0,
 ) -> Response:
-    """Where everything is now, with the newest plan; with `after` it waits for what comes next,
-    beside any controller."""
+    """Current poses of all objects, and the newest plan; `after` waits for the next step. Also
+    available while a controller is connected."""
     if after is not None:
         await _left(session, after, wait_s)
     return await large_response(lambda: shown_state(session))
 
 
 async def _left(session: Session, step: int, seconds: float) -> None:
-    """Wait until the clock has left a step, the episode is over, or so long."""
+    """Wait until the clock has passed a step, the episode ends, or the timeout."""
     give_up = time.monotonic() + seconds
     while time.monotonic() < give_up:
         session.check_open()
@@ -274,8 +276,9 @@ async def _left(session: Session, step: int, seconds: float) -> None:
 async def clock(
     worker: WorkerOf, session: SessionOf, request: Request, body: SessionClock
 ) -> SessionInfo:
-    """Hold the clock beside a controller, let it go for some steps or for good, at a pace or as
-    fast as it can, or end the episode. Actions of the controller wait meanwhile."""
+    """Hold the clock of a connected controller, run it for some steps or freely, at a given pace or
+    as fast as possible, or end the episode. The controller's actions wait while the clock is
+    held."""
     match body.state:
         case "running":
             session.hold.release(pace=body.pace)
@@ -295,10 +298,12 @@ async def drive(  # noqa: PLR0917, one parameter for each part of the request
     idempotency_key: IdempotencyKey = None,
     who: ClientName = "",
 ) -> Response:
-    """Let a planner drive the session, from a reset to its end, and keep a recording; the answer is
-    a job. Once it has succeeded: `GET /v1/jobs/{id}/files/playback.json` (poses, scores, plans and
-    events of every instant), `recording.r2e`, and `GET /v1/jobs/{id}/preview`. The session stays,
-    to be forked from any of its steps."""
+    """Let a planner drive the session, from a reset to the end, and store a recording.
+
+    The response is a job. Once it has succeeded: `GET /v1/jobs/{id}/files/playback.json` (poses,
+    scores, plans and events of every step), `recording.r2e`, and `GET /v1/jobs/{id}/preview`. The
+    session stays open and can be forked from any of its steps.
+    """
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -320,7 +325,7 @@ async def fork(
     ] = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """A new session that goes on from the present instant of this one, or from an earlier one."""
+    """Create a session that continues from the current or an earlier step of this one."""
     async with worker.idempotency.guard(request, idempotency_key) as idempotent:
         if idempotent.replay:
             return worker.replayed(idempotent.replay)
@@ -343,7 +348,7 @@ async def recording(
     session: SessionOf,
     frames: Annotated[bool, Query(description="draw and keep the images too")] = False,
 ) -> Response:
-    """The running episode as a file, to be replayed and scored again: `real2sim replay`."""
+    """The current episode as a file, for replay and scoring: `real2sim replay`."""
     made = await recording_of(worker.sessions, session, frames=frames)
     name = f"{session.session_id}.r2e"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
@@ -369,13 +374,13 @@ async def render(
     body: SessionRender,
     accept: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """Images, sweeps and scans of the current instant; never moves time."""
+    """Images, sweeps and scans of the current step; time does not advance."""
     pipeline, world = worker.sessions.pipeline, session.running_world()
     return await view_response(pipeline, world, body, accept)
 
 
 def _state_reply(session: Session, idempotent: IdempotentRequest) -> MakeReply:
-    """What is stored under a request's key once the world has moved."""
+    """The reply to store under a request's key after the world has moved."""
 
     def reply(world: World, events: Sequence[Event]) -> StoredReply | None:
         if idempotent.key is None:
@@ -386,7 +391,7 @@ def _state_reply(session: Session, idempotent: IdempotentRequest) -> MakeReply:
 
 
 def _own_url(request: Request) -> str:
-    """How a process on this machine reaches the worker, whatever way the request has come."""
+    """Address of the worker for processes on this machine, independent of the request's route."""
     host, port = request.scope.get("server") or ("127.0.0.1", 8600)
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
@@ -401,8 +406,8 @@ MSGPACK = "application/msgpack"
 async def view_response(
     pipeline: StepPipeline, world: World, asked: SessionRender, accept: str | None
 ) -> Response:
-    """All frames and clouds as msgpack; a single image also as a file, if ``accept`` likes that
-    best.
+    """All frames and clouds as msgpack; a single image also as a file, if ``accept`` prefers
+    that.
 
     In msgpack each frame has the codec its sensor names.
 

@@ -1,4 +1,4 @@
-"""The drive socket and the view socket. A handshake that fails is answered over HTTP."""
+"""The drive socket and the view socket. Failed handshakes are answered over HTTP."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ log = structlog.get_logger(__name__)
 
 @router.websocket("/{session_id}/drive")
 async def drive(socket: WebSocket, worker: WorkerOf, session_id: str) -> None:
-    """Drive a session in lock step, or look on; see docs of the drive socket."""
+    """Drive a session in lockstep, or observe it; see the drive socket's documentation."""
     try:
         protocol = common_protocol(socket)
         account = account_of_handshake(socket, worker)
@@ -94,7 +94,7 @@ async def _serve_drive(
         resume_token=worker.sessions.resume_token(row),
     )
     try:
-        # Who has the session's token alone drives for whoever made it.
+        # A client with only the session's token drives on behalf of its owner.
         account = account or account_of_token(worker, hello.token)
         account = account or worker.accounts.of_owner(row.owner)
         act_for(socket, account)
@@ -128,7 +128,7 @@ def _steps(session: Session) -> int:
 
 
 def common_protocol(socket: WebSocket) -> str:
-    """The subprotocol that both sides speak. Raises ServiceError: UNSUPPORTED_PROTOCOL."""
+    """The common subprotocol. Raises ServiceError: UNSUPPORTED_PROTOCOL."""
     offered = list(socket.scope.get("subprotocols", []))
     for protocol in SUPPORTED_SUBPROTOCOLS:
         if protocol in offered:
@@ -137,10 +137,10 @@ def common_protocol(socket: WebSocket) -> str:
 
 
 def account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
-    """Whose token of the worker the handshake has; hello may carry one instead.
+    """The account of the worker's token in the handshake; hello may have one instead.
 
     Raises:
-        ServiceError: UNAUTHORIZED for a wrong one.
+        ServiceError: UNAUTHORIZED for a wrong token.
     """
     given = bearer_token(socket)
     if given is None or not worker.accounts.wants_token:
@@ -153,13 +153,13 @@ def account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
 
 
 def account_of_token(worker: Worker, token: str | None) -> Account | None:
-    """Whose token of the worker it is; None where the worker has none."""
+    """The account of a worker's token; None for other tokens."""
     return worker.accounts.of_token(token) if worker.accounts.wants_token else None
 
 
 @contextlib.contextmanager
 def ended_when_revoked(connection: Connection, account: Account) -> Iterator[None]:
-    """The connection ends when the token of its account is no more."""
+    """End the connection when the token of its account is removed."""
     revoked = partial(_end, connection, account)
     account.on_revoked.add(revoked)
     try:
@@ -169,7 +169,7 @@ def ended_when_revoked(connection: Connection, account: Account) -> Iterator[Non
 
 
 def _end(connection: Connection, account: Account) -> None:
-    """Leave a client whose token is no more; not awaited, for it may be slow to read."""
+    """Disconnect a client whose token was removed; not awaited, because it may read slowly."""
     ending = asyncio.ensure_future(connection.end(service_error(RevokedError(account.name))))
     _ending.add(ending)
     ending.add_done_callback(_ending.discard)
@@ -184,23 +184,23 @@ _ending: set[asyncio.Future[None]] = set()
 # answered; older ones are dropped.
 
 REVISION_CHECK_S = 1.0
-"""How often an idle view checks the revision of its scenario."""
+"""Interval at which an idle view checks its scenario's revision [s]."""
 PICK_WIDTH = 640
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class ViewRequest(Model):
-    """A question of the browser.
+    """A request of the browser.
 
     Attributes:
-        seq: comes back with the answer.
-        T_world_camera: 16 values, row by row: a free camera with the intrinsics of ``camera``;
-            None for the recorded place.
-        operations: applied to this picture alone: the preview of an edit in the making.
+        seq: returned with the answer.
+        T_world_camera: 16 values, row-major: a free camera with the intrinsics of ``camera``;
+            None for the recorded pose.
+        operations: applied to this picture only: preview of an unfinished edit.
         job: finished simulation to show instead of the scenario.
-        shows: what the picture is of; ``uncertainty`` comes in colours, see uncertainty_picture.
-        pick: (across, down) in shares of the picture: ask for the object there instead.
+        shows: modality of the picture; ``uncertainty`` is coloured, see uncertainty_picture.
+        pick: (across, down) in fractions of the picture: query the object there instead.
     """
 
     seq: int = 0
@@ -220,8 +220,8 @@ VIEW_REQUEST: TypeAdapter[ViewRequest] = TypeAdapter(ViewRequest)
 class ViewConnection:
     """One browser's view of one scenario.
 
-    The reader keeps one picture and one pick that wait; a newer one takes the place of the older,
-    so a slow drawing never leaves a queue behind it.
+    The reader buffers one picture and one pick request; a newer one replaces the older, so slow
+    rendering never builds up a queue.
     """
 
     def __init__(self, socket: WebSocket, worker: Worker, scenario_id: str) -> None:
@@ -234,11 +234,11 @@ class ViewConnection:
         self._revoked = asyncio.Event()
 
     def end(self) -> None:
-        """Leave the browser: its token is no more."""
+        """Disconnect the browser: its token was removed."""
         self._revoked.set()
 
     async def serve(self) -> None:
-        """Answer until the browser leaves. Raises RevokedError: it has to."""
+        """Answer until the browser leaves. Raises RevokedError if its token is removed."""
         reader = asyncio.create_task(self._read())
         answerer = asyncio.create_task(self._answer_requests())
         tasks = {reader, answerer, asyncio.create_task(self._until_revoked())}
@@ -247,7 +247,7 @@ class ViewConnection:
         finally:
             for task in tasks:
                 task.cancel()
-            # Not gather(): cancelled itself, it would pass on the cancellation of its tasks.
+            # Not gather(): if cancelled itself, it would pass the cancellation to its tasks.
             await asyncio.wait(tasks)
         for task in tasks:
             error = None if task.cancelled() else task.exception()
@@ -365,12 +365,12 @@ class ViewConnection:
 
 
 def instance_at(ids: NDArray[np.uint16], place: tuple[float, float], *, reach: int = 3) -> int:
-    """Id under a pointer; near the rim of an object the object, not the background.
+    """Id of the object under a pointer; near its edge the object, not the background.
 
     Args:
         ids: [H, W] instance image.
-        place: (across, down) in shares of the picture.
-        reach: how far beside the pointer an object may be [px].
+        place: (across, down) in fractions of the picture.
+        reach: maximum distance of an object from the pointer [px].
     """
     height, width = ids.shape
     column = min(int(place[0] * width), width - 1)
@@ -424,14 +424,14 @@ def _render_request(
 HANDSHAKE_TIMEOUT_S = 10.0
 CLOSED_BAD_MESSAGE, CLOSED_UNAUTHORIZED, CLOSED_NOT_FOUND = 4400, 4401, 4404
 CLOSED_TIMEOUT, CLOSED_OVER_LIMIT, CLOSED_FAILED = 4408, 4429, 4500
-"""Codes with which the socket is closed."""
+"""Close codes of the socket."""
 CLOSED_BY = {
     ErrorCode.UNKNOWN_SCENARIO: CLOSED_NOT_FOUND,
     ErrorCode.UNAUTHORIZED: CLOSED_UNAUTHORIZED,
     ErrorCode.TOO_MANY_REQUESTS: CLOSED_OVER_LIMIT,
 }
 
-# Not json.loads(): it follows nesting until the stack ends, and lets lone surrogates pass.
+# Not json.loads(): deep nesting overflows its stack, and it accepts lone surrogates.
 _HELLO: TypeAdapter[dict[str, object]] = TypeAdapter(dict[str, object])
 
 
@@ -439,10 +439,10 @@ view_router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"])
 
 
 class NoHelloError(Exception):
-    """A first message that lets nobody in.
+    """An invalid first message.
 
     Args:
-        code: with which the socket is closed.
+        code: close code of the socket.
         reason: sent with it.
     """
 
@@ -453,7 +453,7 @@ class NoHelloError(Exception):
 
 @view_router.websocket("/{scenario_id}/view")
 async def view(socket: WebSocket, worker: WorkerOf, scenario_id: str) -> None:
-    """Frames and picks of a scenario for one browser; the latest question wins."""
+    """Frames and picks of a scenario for one browser; newer requests replace older ones."""
     await socket.accept()
     try:
         with worker.metrics.open_socket("view"):
@@ -488,11 +488,11 @@ async def _serve_view(
 
 
 async def _check_hello(socket: WebSocket, worker: Worker) -> Account:
-    """Read `{"type": "hello", "token": ...}`; whose token it is.
+    """Read `{"type": "hello", "token": ...}`; returns the token's account.
 
     Raises:
-        NoHelloError: the token is not right.
-        OverLimitError: its holder has had their requests.
+        NoHelloError: the token is wrong.
+        OverLimitError: the account's request limit is reached.
     """
     try:
         async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):

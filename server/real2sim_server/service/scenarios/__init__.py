@@ -1,1 +1,1 @@
-"""Scenarios of a worker: edited one at a time, on record before they take effect."""
+"""Scenarios of a worker: edits are serialized, and stored before they take effect."""

@@ -47,7 +47,7 @@ from ..storage.store import ScenarioRow, SnapshotRow, Store, StoreError
 
 @dataclass(frozen=True, eq=False)
 class ScenarioView:
-    """A scenario at one revision: for answers, previews and new sessions. Never changes."""
+    """An immutable scenario at one revision: for replies, previews and new sessions."""
 
     row: ScenarioRow
     summary: SceneSummary
@@ -57,7 +57,7 @@ class ScenarioView:
     can_redo: bool
 
     def info(self, *, tracks: bool = True) -> ScenarioInfo:
-        """What the wire says about it; takes milliseconds where there are many trajectories."""
+        """The info for clients; takes milliseconds with many trajectories."""
         return ScenarioInfo(
             **scenario_head(self.row, self.revision),
             can_undo=self.can_undo,
@@ -72,19 +72,19 @@ class ScenarioView:
 
 
 def created_headers(info: ScenarioInfo) -> dict[str, str]:
-    """Headers of the answer to a creation."""
+    """Headers of the reply to a creation."""
     return {"Location": f"/v1/scenarios/{info.scenario_id}", "ETag": info.etag}
 
 
 def tag(result: OperationResult) -> dict[str, str]:
-    """Headers of the answer to a change."""
+    """Headers of the reply to a change."""
     return {"ETag": result.etag}
 
 
 class StoredOperations(Sequence[Operation]):
-    """Operations as the store has them, made into models when one is looked at.
+    """Stored operations, parsed on access.
 
-    They were checked when they were written; of a long log most are never looked at again.
+    They were validated when written; most entries of a long log are never accessed again.
     """
 
     def __init__(self, stored: Sequence[Mapping[str, Any]]) -> None:
@@ -106,7 +106,7 @@ class StoredOperations(Sequence[Operation]):
 
 
 def stored_entry(stored: Mapping[str, Any]) -> LogEntry:
-    """One revision as the store has it."""
+    """One stored revision."""
     return LogEntry(
         revision=stored["revision"],
         kind=stored["kind"],
@@ -123,7 +123,7 @@ def replayed(
     log: Sequence[HistoryEntry],
     assets: AssetLookup | None,
 ) -> Scenario:
-    """The scenario that a log leads to. Raises EditError where it does not fit its scene."""
+    """The scenario of a log. Raises EditError if the log does not fit its scene."""
     return Scenario.replay(
         ScenarioState.of(summary, assets=assets),
         [
@@ -136,7 +136,7 @@ def replayed(
 
 
 def history_entry(entry: LogEntry) -> HistoryEntry:
-    """One revision as the wire has it."""
+    """One revision as a protocol model."""
     return HistoryEntry(
         revision=entry.revision,
         kind=entry.kind,
@@ -148,7 +148,7 @@ def history_entry(entry: LogEntry) -> HistoryEntry:
 
 
 def asset_hashes(entries: Iterable[LogEntry], assets: AssetLookup | None) -> dict[str, str]:
-    """Content hash of every asset that a log names, by id."""
+    """Content hash of every asset in a log, by id."""
     named = {
         operation.asset_id
         for entry in entries
@@ -162,7 +162,7 @@ def asset_hashes(entries: Iterable[LogEntry], assets: AssetLookup | None) -> dic
 def operation_result(
     planned: PlannedEntry, *, revision: int, dry_run: bool = False
 ) -> OperationResult:
-    """The answer to a change."""
+    """The reply to a change."""
     return OperationResult(
         revision=revision,
         etag=etag(revision),
@@ -174,7 +174,7 @@ def operation_result(
 
 
 def stale_revision(scenario: Scenario, expected: int) -> ServiceError:
-    """The refusal of a change made for another revision, with what was missed."""
+    """The refusal of a change for another revision, with the missed entries."""
     entries = scenario.entries[max(0, expected) :]
     missed = [history_entry(e).model_dump(mode="json") for e in entries]
     return ServiceError(
@@ -187,7 +187,7 @@ def stale_revision(scenario: Scenario, expected: int) -> ServiceError:
 
 
 def changed_elsewhere(scenario_id: str) -> ServiceError:
-    """The refusal of a change that another worker was faster than."""
+    """The refusal of a change after another worker's faster one."""
     return ServiceError(
         ErrorCode.STALE_REVISION,
         f"another worker has changed scenario {scenario_id!r}",
@@ -196,7 +196,7 @@ def changed_elsewhere(scenario_id: str) -> ServiceError:
 
 
 def listed_info(row: ScenarioRow, kinds: Sequence[str]) -> ScenarioInfo:
-    """What a list says of a scenario, from the kinds of its log entries."""
+    """Info of a scenario in a list, from the kinds of its log entries."""
     done = undone = 0
     for kind in kinds:
         match kind:
@@ -210,7 +210,7 @@ def listed_info(row: ScenarioRow, kinds: Sequence[str]) -> ScenarioInfo:
 
 
 def scenario_head(row: ScenarioRow, revision: int) -> dict[str, Any]:
-    """The fields that every answer about a scenario has."""
+    """The fields of every reply about a scenario."""
     return {
         "scenario_id": row.scenario_id,
         "name": row.name,
@@ -223,17 +223,17 @@ def scenario_head(row: ScenarioRow, revision: int) -> dict[str, Any]:
 
 
 def iso_time(instant_us: int) -> str:
-    """An instant as the wire has it: UTC, ISO 8601."""
+    """A time as in replies: UTC, ISO 8601."""
     return datetime.fromtimestamp(instant_us / 1e6, UTC).isoformat(timespec="milliseconds")
 
 
 # --- Snapshots -----------------------------------------------------------------------------------
 
-# A long log then replays only its end.
+# With a snapshot, only the end of a long log is replayed.
 
 INTERVAL = 128
-"""Revisions between snapshots: each takes a few milliseconds off the back of one edit in so many,
-and opening applies fewer than this many edits."""
+"""Revisions between snapshots. A snapshot adds a few milliseconds after one edit in this many, and
+opening a scenario applies fewer than this many edits."""
 
 FORMAT = 1
 
@@ -241,10 +241,9 @@ log = structlog.get_logger(__name__)
 
 
 class Snapshots:
-    """Snapshots of all scenarios of a worker. Belongs to the event loop.
+    """Snapshots of all scenarios of a worker, for use on the event loop.
 
-    They are a convenience: written after the answer, never waited for, and passed over when
-    anything is odd about them.
+    They are optional: written after the reply, never waited for, and ignored if invalid.
     """
 
     def __init__(self, store: Store) -> None:
@@ -256,7 +255,8 @@ class Snapshots:
     async def load(
         self, row: ScenarioRow, summary: SceneSummary, assets: AssetLookup | None
     ) -> Scenario:
-        """A scenario from its log, which is what counts, and from a snapshot where there is one."""
+        """Load a scenario from its log, which is authoritative, and from a snapshot if there is
+        one."""
         stored = await self._store.scenario_entries(row.scenario_id)
         initial = await asyncio.to_thread(ScenarioState.of, summary, assets=assets)
         known = await self._read(row.scenario_id, initial, revisions=len(stored))
@@ -272,7 +272,7 @@ class Snapshots:
         return scenario
 
     def save_if_due(self, scenario_id: str, revision: int, state: ScenarioState) -> None:
-        """Save ``state`` in the background when the last snapshot is old."""
+        """Save ``state`` in the background if the last snapshot is old."""
         if revision - self._revisions.get(scenario_id, 0) < INTERVAL:
             return
         self._revisions[scenario_id] = revision
@@ -291,7 +291,7 @@ class Snapshots:
     async def _read(
         self, scenario_id: str, initial: ScenarioState, *, revisions: int
     ) -> tuple[int, ScenarioState] | None:
-        """A revision and the state after it; None where there is none of use."""
+        """A revision and its state; None without a usable snapshot."""
         row = await self._store.snapshot(scenario_id) if revisions >= INTERVAL else None
         if row is None or row.made_by != self._made_by or row.revision > revisions:
             return None
@@ -309,25 +309,25 @@ class Snapshots:
             row = SnapshotRow(scenario_id, revision, self._made_by, packed)
             await self._store.save_snapshot(row)
         except (StoreError, SQLAlchemyError, RuntimeError) as error:
-            # Deleted meanwhile, or the worker is stopping: the log is all that counts.
+            # Deleted meanwhile, or the worker is stopping; the log is sufficient.
             log.info("snapshot not kept", scenario_id=scenario_id, reason=str(error))
 
 
 # --- Recorded scenes -----------------------------------------------------------------------------
 
-# A scene as it was recorded serves as a scenario that nobody can change.
+# A recorded scene is available as a read-only scenario.
 
 PREFIX = "recorded."
-"""Before the content hash of a scene: the id of its recording. No other id begins like that."""
+"""Id prefix of recordings, before the content hash of the scene. No other id has it."""
 
 
 def recorded_hash(scenario_id: str) -> str | None:
-    """Content hash of the scene whose recording has this id; None of scenarios that were made."""
+    """Content hash of the scene whose recording has this id; None for other scenarios."""
     return scenario_id.removeprefix(PREFIX) if scenario_id.startswith(PREFIX) else None
 
 
 def recorded_row(scene: str, summary: SceneSummary) -> ScenarioRow:
-    """What the store would have of it, were it stored."""
+    """The row of a recorded scenario, which is not stored."""
     return ScenarioRow(
         scenario_id=f"{PREFIX}{summary.content_hash}",
         name="",
@@ -338,7 +338,7 @@ def recorded_row(scene: str, summary: SceneSummary) -> ScenarioRow:
 
 
 def check_made(scenario_id: str) -> None:
-    """Raises ServiceError: INVALID_OPERATION for a recording, which nobody can change."""
+    """Raises ServiceError: INVALID_OPERATION for a recording, which is read-only."""
     if recorded_hash(scenario_id) is not None:
         raise ServiceError(
             ErrorCode.INVALID_OPERATION,
@@ -356,9 +356,9 @@ class CachedScenario:
     """A scenario in memory.
 
     Attributes:
-        row: replaced where its name has changed.
-        scenario: replaced, under the lock, by a longer one when others have added to its log.
-        lock: one edit at a time; readers need none, for states are immutable.
+        row: replaced when its name changes.
+        scenario: replaced, under the lock, when others have extended its log.
+        lock: serializes edits; readers need none, because states are immutable.
     """
 
     row: ScenarioRow
@@ -368,7 +368,7 @@ class CachedScenario:
 
 
 class ScenarioCache:
-    """The most recently used scenarios. Belongs to the event loop."""
+    """The most recently used scenarios, for use on the event loop."""
 
     def __init__(
         self,
@@ -385,21 +385,21 @@ class ScenarioCache:
         self._opening: dict[str, asyncio.Lock] = {}
 
     def evict(self, scenario_id: str) -> None:
-        """Forget it; the next request reads it from the store."""
+        """Drop it from the cache; the next request reads it from the store."""
         self._cached.pop(scenario_id, None)
 
     async def wait_for_changes(self) -> None:
-        """Wait for the changes that are under way."""
+        """Wait for the changes in progress."""
         for cached in list(self._cached.values()):
             async with cached.lock:
                 pass
 
     @asynccontextmanager
     async def locked(self, scenario_id: str) -> AsyncIterator[CachedScenario]:
-        """The scenario while nobody else changes it.
+        """The scenario, locked against other changes.
 
         Raises:
-            ServiceError: as :meth:`get`, or INVALID_OPERATION for what was recorded.
+            ServiceError: as :meth:`get`, or INVALID_OPERATION for a recording.
         """
         check_made(scenario_id)
         while True:
@@ -411,11 +411,10 @@ class ScenarioCache:
                     return
 
     async def get(self, scenario_id: str) -> CachedScenario:
-        """The scenario with all that is in its log, by whichever worker; a scene as it was
-        recorded has none.
+        """The scenario with all entries of its log, by any worker; a recorded scene has no log.
 
         Raises:
-            ServiceError: UNKNOWN_SCENARIO, or SCENE_BROKEN where its scene has changed.
+            ServiceError: UNKNOWN_SCENARIO, or SCENE_BROKEN if its scene has changed.
         """
         if (wanted := recorded_hash(scenario_id)) is not None:
             return await self._recorded(scenario_id, wanted)
@@ -433,7 +432,7 @@ class ScenarioCache:
         return cached
 
     async def _recorded(self, scenario_id: str, wanted: str) -> CachedScenario:
-        """A scene as it was recorded; only memory has it."""
+        """A recorded scene, which is not stored."""
         cached = self._cached.get(scenario_id)
         if cached is not None:
             there = await self._scene_cache.summary(cached.row.scene)
@@ -452,9 +451,10 @@ class ScenarioCache:
         raise _unknown(scenario_id)
 
     async def _is_current(self, scenario_id: str, cached: CachedScenario) -> bool:
-        """Whether a scenario in memory is, by now, what the log says; evicts it where it is not.
+        """Whether a cached scenario matches the log; evicts it if not.
 
-        The log is asked each time, because other workers on the same store may have written to it.
+        The log is checked each time, because other workers with the same store may have written to
+        it.
         """
         known = cached.scenario.revision
         newest = await self._store.newest_of_scenario(scenario_id)
@@ -465,11 +465,11 @@ class ScenarioCache:
         if name != cached.row.name:
             cached.row = replace(cached.row, name=name)
         if stored < known:
-            # The store has been put back to an earlier day.
+            # The store was restored from an earlier backup.
             self.evict(scenario_id)
             return False
         if stored > cached.scenario.revision:
-            # What a change of our own has written takes effect before its lock is free.
+            # Our own changes take effect before their lock is released.
             async with cached.lock:
                 await self._catch_up(scenario_id, cached)
         if self._cached.get(scenario_id) is not cached:
@@ -478,7 +478,7 @@ class ScenarioCache:
         return True
 
     async def _catch_up(self, scenario_id: str, cached: CachedScenario) -> None:
-        """Apply what others have added to the log; the scenario's lock is held."""
+        """Apply entries that others have added to the log; the scenario's lock is held."""
         scenario = cached.scenario
         missed = await self._store.scenario_entries(scenario_id, after=scenario.revision)
         if missed:

@@ -1,4 +1,4 @@
-"""Scenarios of a worker: edited under a lock each, on record before they take effect."""
+"""Scenarios of a worker: one lock per scenario, edits stored before they take effect."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ from .scenario_cache import (
 __all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
 
 MAX_RACES = 8
-"""Tries of one change against changes of other workers to the same scenario."""
+"""Attempts of one change if other workers change the same scenario."""
 
 
 class Scenarios:
-    """All scenarios of a worker. Belongs to the event loop."""
+    """All scenarios of a worker, for use on the event loop."""
 
     def __init__(
         self,
@@ -117,10 +117,10 @@ class Scenarios:
     async def import_(
         self, document: ScenarioDocument, *, idempotent: IdempotentRequest
     ) -> ScenarioInfo:
-        """A new scenario from a file, on the scene of its hash.
+        """Create a scenario from a file, on the scene with its hash.
 
         Raises:
-            ServiceError: UNKNOWN_SCENE or UNKNOWN_ASSET where what it names is not here;
+            ServiceError: UNKNOWN_SCENE or UNKNOWN_ASSET if the file refers to missing ones;
                 INVALID_OPERATION for a log that does not fit its scene.
         """
         summary = await self._summary_of(document)
@@ -139,8 +139,8 @@ class Scenarios:
         )
 
     async def rename(self, scenario_id: str, name: str) -> ScenarioView:
-        """Give a scenario another name. Raises ServiceError: UNKNOWN_SCENARIO, or
-        INVALID_OPERATION for what was recorded."""
+        """Rename a scenario. Raises ServiceError: UNKNOWN_SCENARIO, or INVALID_OPERATION for a
+        recording."""
         check_made(scenario_id)
         await self._store.rename_scenario(scenario_id, name)
         return await self.view(scenario_id)
@@ -159,17 +159,17 @@ class Scenarios:
     # --- reading ----------------------------------------------------------------------------
 
     async def list(self) -> list[ScenarioInfo]:
-        """All scenarios, oldest first, without their objects; those of missing scenes too."""
+        """All scenarios, oldest first, without their objects; including those of missing scenes."""
         kinds = await self._store.scenario_kinds()
         rows = await self._store.scenarios()
         return [listed_info(row, kinds.get(row.scenario_id, [])) for row in rows]
 
     async def view(self, scenario_id: str) -> ScenarioView:
-        """The scenario as it is now. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
+        """The current scenario. Raises ServiceError: UNKNOWN_SCENARIO or SCENE_BROKEN."""
         return _view(await self._scenarios_cache.get(scenario_id))
 
     async def state_at(self, scenario_id: str, revision: int) -> ScenarioState:
-        """What the scenario was at a revision. Raises ServiceError: UNKNOWN_SCENARIO."""
+        """The scenario at a revision. Raises ServiceError: UNKNOWN_SCENARIO."""
         cached = await self._scenarios_cache.get(scenario_id)
         if revision == cached.scenario.revision:
             return cached.scenario.state
@@ -178,7 +178,7 @@ class Scenarios:
         return earlier.state
 
     async def history(self, scenario_id: str, *, after: int = 0) -> History:
-        """Revisions behind ``after``, oldest first."""
+        """Revisions after ``after``, oldest first."""
         scenario = (await self._scenarios_cache.get(scenario_id)).scenario
         return History(
             revision=scenario.revision,
@@ -188,13 +188,13 @@ class Scenarios:
         )
 
     async def using_asset(self, asset_id: str) -> Sequence[str]:
-        """Ids of the scenarios whose history names an asset, edits that are under way included."""
+        """Ids of the scenarios whose history refers to an asset, including edits in progress."""
         await self._scenarios_cache.wait_for_changes()
         return await self._store.scenarios_naming(asset_id)
 
     @property
     def assets(self) -> AssetLookup | None:
-        """Where scenarios find what they insert."""
+        """Lookup of inserted assets."""
         return self._assets
 
     # --- editing ----------------------------------------------------------------------------
@@ -212,12 +212,12 @@ class Scenarios:
         """Apply operations, all or none.
 
         Args:
-            scenario_id: of the scenario.
+            scenario_id: the scenario.
             operations: in order.
-            expected: revision they were made for; None for any.
-            dry_run: check and answer, change nothing.
-            idempotent: what the answer is stored under.
-            who: goes on record.
+            expected: revision they are based on; None for any.
+            dry_run: validate and reply without changes.
+            idempotent: stores the reply.
+            who: name for the history.
 
         Raises:
             ServiceError: UNKNOWN_SCENARIO; STALE_REVISION, with the missed entries as member
@@ -243,7 +243,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
-        """Take back the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
+        """Undo the last edit in effect. Raises as :meth:`edit`, or NOTHING_TO_UNDO."""
         result = await self._change(
             scenario_id, lambda s: s.plan_undo(who=who), expected, idempotent=idempotent
         )
@@ -258,7 +258,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
         who: str = "",
     ) -> OperationResult:
-        """Bring back the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
+        """Redo the last undone edit. Raises as :meth:`edit`, or NOTHING_TO_REDO."""
         result = await self._change(
             scenario_id, lambda s: s.plan_redo(who=who), expected, idempotent=idempotent
         )
@@ -314,7 +314,7 @@ class Scenarios:
         idempotent: IdempotentRequest,
     ) -> OperationResult:
         for _ in range(MAX_RACES):
-            # Another worker may be faster; then the change is planned anew behind its entry.
+            # If another worker is faster, the change is planned again on top of its entry.
             with contextlib.suppress(ConflictError):
                 return await self._change_once(
                     scenario_id, plan, expected, dry_run=dry_run, idempotent=idempotent
@@ -352,7 +352,7 @@ class Scenarios:
             except (EditError, ConflictError):
                 raise
             except Exception:
-                # Only the store knows whether the entry is in the log.
+                # Only the store can tell whether the entry is in the log.
                 self._scenarios_cache.evict(scenario_id)
                 raise
             if not dry_run:

@@ -1,4 +1,4 @@
-"""Closed-loop sessions: the same world by plain requests and by the drive socket."""
+"""Closed-loop sessions: the same world over REST and the drive socket."""
 
 from .registry import SessionLimits, Sessions
 from .session import Session

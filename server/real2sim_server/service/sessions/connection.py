@@ -1,6 +1,7 @@
-"""One drive socket once its client is known: messages in lock step or as an observer.
+"""A drive socket after its hello: messages in lockstep, or as an observer.
 
-The first two phases of a step are here, ``_receive`` and ``_check``; see `pipeline` for the others.
+It contains the first two phases of a step, ``_receive`` and ``_check``; see `pipeline` for the
+others.
 """
 
 from __future__ import annotations
@@ -61,17 +62,17 @@ Send = Callable[[EncodedMessage], Awaitable[None]]
 
 
 class DeadlineTimer:
-    """Waits for the action that is due, on behalf of one connected controller.
+    """Waits for the due action of one connected controller.
 
-    The clock of a deadline runs from the moment the observation has been sent until the action
-    has arrived; neither computing nor a lost connection counts. Nothing here holds up another
-    session: what a fallback computes waits in the same queue as any step.
+    The time of a deadline runs from sending the observation to receiving the action; neither
+    computing nor a lost connection counts. Other sessions are not delayed: a fallback step waits in
+    the same queue as any step.
 
     Args:
-        session: whose controller is connected.
-        stepper: makes the fallback's step.
-        send: sends an observation that no action has led to.
-        missed: counts deadlines that have passed.
+        session: session of the controller.
+        stepper: computes the fallback step.
+        send: sends the observation of a fallback step.
+        missed: counts missed deadlines.
     """
 
     def __init__(self, session: Session, stepper: Stepper, send: Send, *, missed: Counter) -> None:
@@ -101,7 +102,7 @@ class DeadlineTimer:
 
     @property
     def waiting(self) -> bool:
-        """Whether an action is being waited for."""
+        """Whether an action is due."""
         return self._waiting is not None and not self._waiting.done()
 
     @property
@@ -113,14 +114,14 @@ class DeadlineTimer:
         try:
             while (until := self._next(step)) is not None:
                 await clock.sleep_until(until)
-                # The fallback itself must not be broken off half way by an action that arrives.
+                # An arriving action must not cancel a fallback step in progress.
                 await asyncio.shield(asyncio.ensure_future(self._expire(step)))
                 step = self._session.lockstep.step or 0
         except Exception:
             log.exception("fallback failed", session_id=self._session.session_id)
 
     def _next(self, step: int) -> float | None:
-        """Monotonic time of the next deadline; None where there is none."""
+        """Monotonic time of the next deadline, or None."""
         session = self._session
         if session.world is None or session.world.over or session.lockstep.step != step:
             return None
@@ -168,10 +169,10 @@ class Connection:
     """An accepted drive socket of a session.
 
     Args:
-        socket: whose hello was right.
-        session: that it belongs to.
+        socket: socket with a valid hello.
+        session: its session.
         sessions: the session's registry.
-        ws_base: how clients reach this worker, for example ``ws://127.0.0.1:8600``.
+        ws_base: address of this worker for clients, for example ``ws://127.0.0.1:8600``.
     """
 
     def __init__(
@@ -188,7 +189,7 @@ class Connection:
         )
 
     async def serve(self, hello: Hello) -> None:
-        """Serve until one of both leaves. A client that vanishes is no error."""
+        """Serve until either side leaves. A vanished client is not an error."""
         session = self._session
         try:
             session.check_open()
@@ -216,7 +217,7 @@ class Connection:
     # --- welcome ----------------------------------------------------------------------------
 
     async def _welcome(self, hello: Hello) -> None:
-        """Warm up, with progress messages meanwhile, and send what there is."""
+        """Warm up, with progress messages, and send the current state."""
         warming = self._sessions.warm_up(self._session)
         try:
             await with_progress(
@@ -241,7 +242,7 @@ class Connection:
             raise FatalError(controller_taken(session.session_id), message_id=hello.id)
         session.controller, session.tell_controller = self, self._send
         if isinstance(old, Connection):
-            # Its client has come back by another way; the old one may never notice.
+            # Its client has reconnected; the old connection may never notice.
             await old.yield_control()
         try:
             yield
@@ -251,17 +252,17 @@ class Connection:
                 session.controller = session.tell_controller = None
 
     async def end(self, error: ServiceError) -> None:
-        """Tell the client why, and leave it."""
+        """Send the client the reason, and disconnect."""
         await self._close_with_error(error)
 
     async def yield_control(self) -> None:
-        """Leave the session to the connection that has resumed it."""
+        """Leave the session to the connection that resumed it."""
         self._session.close_callbacks.discard(self._close_with_error)
         self._deadline_timer.cancel()
         await self._close_with_error(controller_taken(self._session.session_id))
 
     async def _resend_missed_observation(self, hello: Hello) -> None:
-        """Send a controller that comes back the present observation, unless it has it."""
+        """Send a reconnected controller the current observation, unless it has it."""
         session = self._session
         async with session.lock:
             newest, step = session.newest, session.lockstep.step
@@ -284,7 +285,7 @@ class Connection:
                 await forwarding
 
     async def _forward(self, queue: ObserverQueue) -> None:
-        # The receiving side notices a client that has left.
+        # The receiver notices when the client leaves.
         with contextlib.suppress(WebSocketDisconnect):
             while True:
                 await self._send(await queue.take())
@@ -350,7 +351,7 @@ class Connection:
                 assert_never(message)
 
     async def _act(self, action: Action, content: bytes) -> EncodedMessage:
-        """Check an action, and let it pass the rest of the step pipeline."""
+        """Check an action, and run it through the rest of the step pipeline."""
         session, waited_us = self._session, self._deadline_timer.waited_us
         arrived, slot = time.perf_counter(), self._slot(action.slot)
         if action.step == session.lockstep.step:
@@ -372,7 +373,8 @@ class Connection:
             return answer
 
     async def _until_let(self, action: Action) -> None:
-        """Wait for the clock; a client whose clock is held is told, so that it does not give up."""
+        """Wait for the clock; sends progress messages while it is held, so that clients do not time
+        out."""
         session = self._session
         while (wait_s := session.hold.wait_s) > 0 and session.lockstep.is_due(action.step):
             session.check_open()
@@ -383,16 +385,16 @@ class Connection:
             await session.hold.wait(min(wait_s, PROGRESS_S))
 
     def _check(self, action: Action, content: bytes) -> EncodedMessage | None:
-        """Whether this action is due; the answer to it where it was given before.
+        """Whether this action is due; returns its answer if it was given before.
 
         Raises:
-            ServiceError: the session is over, or the action is out of step.
+            ServiceError: the session has ended, or the action is for another step.
         """
         self._session.check_open()
         return self._session.lockstep.cached_answer(action.step, content)
 
     async def _change(self, message: Attach | Agent | Snapshot | Restore | Fork) -> EncodedMessage:
-        """Changes other than steps and edits; the session's lock is held."""
+        """Changes other than steps and edits; the caller holds the session's lock."""
         session, stepper = self._session, self._sessions.stepper
         match message:
             case Attach():
@@ -431,7 +433,7 @@ class Connection:
         return pack_message("edited", fields)
 
     async def _finish(self, role: str) -> EncodedMessage:
-        """The result; a controller that says bye ends the session."""
+        """The result; a bye of the controller ends the session."""
         session = self._session
         scores = await self._sessions.scores(session)
         if role == "controller":
@@ -443,10 +445,10 @@ class Connection:
     # --- shared memory ------------------------------------------------------------------------
 
     def _settle_offer(self, message: ClientMessage) -> None:
-        """The first message after the welcome says whether the client has opened the memory.
+        """Read from the first message after the welcome whether the client has opened the memory.
 
         Raises:
-            ServiceError: INVALID_REQUEST, it says so without having done it.
+            ServiceError: INVALID_REQUEST, it claims so without the secret.
         """
         assert self._segment is not None
         try:
@@ -481,12 +483,12 @@ class Connection:
         return received
 
     async def _send(self, message: EncodedMessage, message_id: int = 0) -> None:
-        # The end of the session is sent from elsewhere.
+        # Another task sends the end of the session.
         async with self._sending:
             await send(self._socket, message, message_id)
 
     async def _close_with_error(self, error: ServiceError, *, message_id: int = 0) -> None:
-        """Send the error and close; a client that does not read is left alone."""
+        """Send the error and close; does not wait for a client that does not read."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT_S), self._sending:
                 step = self._session.lockstep.step
@@ -497,7 +499,7 @@ class Connection:
 
 
 def _check_role(message: ClientMessage, role: str) -> None:
-    """Raises ServiceError: NOT_CONTROLLER for a message that such clients may not send."""
+    """Raises ServiceError: NOT_CONTROLLER for a message that observers may not send."""
     allowed = ALLOWED_MESSAGES[role]
     if isinstance(message, allowed):
         return

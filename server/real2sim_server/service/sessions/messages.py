@@ -1,4 +1,4 @@
-"""What clients send, read strictly: hello, which opens a connection, and all that follows it."""
+"""Strict parsing of clients' messages: hello, which opens a connection, and all later ones."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ReceivedMessage:
     """One message of a client.
 
     Attributes:
-        message: as its model.
+        message: the parsed message.
         content: canonical bytes of an action's plan; empty for other messages.
     """
 
@@ -58,12 +58,12 @@ class ReceivedAction(ReceivedMessage):
 
 
 class BadMessageError(Exception):
-    """A message that is refused before anybody looks at what it wants.
+    """An invalid message.
 
     Attributes:
         error: sent to the client.
-        message_id: of the message, as far as it could be read.
-        fatal: whether there is no sense in going on.
+        message_id: id of the message, if readable.
+        fatal: whether the connection must end.
     """
 
     def __init__(self, error: ServiceError, *, message_id: int = 0, fatal: bool = False) -> None:
@@ -74,10 +74,10 @@ class BadMessageError(Exception):
 
 
 def read_message(data: bytes) -> ReceivedMessage:
-    """The message in ``data``.
+    """Parse the message in ``data``.
 
     Raises:
-        BadMessageError: not a message; one of another protocol version is fatal.
+        BadMessageError: invalid; fatal if it has another protocol version.
     """
     if (action := action_in(data)) is not None:
         return action
@@ -87,9 +87,8 @@ def read_message(data: bytes) -> ReceivedMessage:
 
 
 def action_in(data: bytes) -> ReceivedAction | None:
-    """An action, by far the commonest of messages; None for anything else and for whatever has to
-    be refused. Nobody looks at each of its values twice: its model leaves no place for any that
-    the wire does not carry."""
+    """Parse an action, the most frequent message; None for other or invalid messages. Values are
+    validated once: the model only has types that the protocol carries."""
     try:
         fields = unpack(data)
         if fields["type"] == "action" and type(fields["v"]) is int:
@@ -97,20 +96,20 @@ def action_in(data: bytes) -> ReceivedAction | None:
             if isinstance(message, Action):
                 return ReceivedAction(message, plan_payload(message.plan))
     except Exception:
-        # Found out once more, where it is said what is wrong.
+        # The general parser repeats the error, with an explanation.
         return None
     return None
 
 
 def _read(data: bytes) -> ClientMessage:
-    """The message in ``data``. Raises as :func:`read_message` does."""
+    """Parse the message in ``data``. Raises as :func:`read_message` does."""
     try:
         fields = decode(data, max_bytes=MAX_CLIENT_MESSAGE_BYTES)
     except CodecError as error:
         raise BadMessageError(bad_message(str(error))) from error
     message_id = _id_of(fields)
     version = fields.get("v", PROTOCOL_VERSION)
-    # An array would be compared value by value.
+    # An array would be compared element by element.
     if type(version) is not int or version != PROTOCOL_VERSION:
         detail = (
             f"the message has protocol version {version!r}; this worker speaks {PROTOCOL_VERSION}. "
@@ -134,7 +133,7 @@ def bad_message(detail: str) -> ServiceError:
 
 
 def unsupported_protocol(offered: list[str]) -> ServiceError:
-    """UNSUPPORTED_PROTOCOL, naming what both sides speak."""
+    """UNSUPPORTED_PROTOCOL, with the versions of both sides."""
     return ServiceError(ErrorCode.UNSUPPORTED_PROTOCOL, protocol_mismatch(offered))
 
 
@@ -144,7 +143,7 @@ def _id_of(fields: dict[str, Any]) -> int:
 
 
 def validation_summary(error: ValidationError) -> str:
-    """What is wrong and where: ``action/plan/poses/0/1: input should be a finite number``."""
+    """The error and its location: ``action/plan/poses/0/1: input should be a finite number``."""
     found = error.errors(include_url=False, include_context=False)
     texts = []
     for problem in found[:MAX_PROBLEMS]:
@@ -162,7 +161,7 @@ HANDSHAKE_TIMEOUT_S = 10.0
 PROGRESS_S = 1.0
 CLOSE_TIMEOUT_S = 2.0
 SMALL_BYTES = 16_384
-"""Messages up to this size are read on the event loop: that takes less than handing them over."""
+"""Messages up to this size are parsed on the event loop, which is faster than another thread."""
 POLICY_VIOLATION = 1008
 
 
@@ -183,17 +182,17 @@ async def receive_hello(
     opens_worker: Callable[[str | None], bool],
     resume_token: str,
 ) -> Hello:
-    """The hello of a client that may use the session of a row.
+    """Receive the hello of a client that may use a session.
 
     Args:
         socket: accepted with our subprotocol.
-        row: of the session.
-        authorised: whether the handshake carried the worker's token.
+        row: row of the session.
+        authorised: whether the handshake had the worker's token.
         opens_worker: whether a token is one of the worker's, which open every session.
-        resume_token: of the session's controller.
+        resume_token: token of the session's controller.
 
     Raises:
-        FatalError: anything else came, or nothing in time, or without a token.
+        FatalError: another message, a timeout, or a missing token.
         WebSocketDisconnect: the client has left.
     """
     try:
@@ -218,7 +217,7 @@ async def receive_hello(
 
 
 def is_resuming(hello: Hello, resume_token: str) -> bool:
-    """Whether this is the session's controller who comes back."""
+    """Whether this is the session's controller, reconnecting."""
     resume = hello.resume
     return resume is not None and secrets_equal(resume.token, resume_token)
 
@@ -228,7 +227,7 @@ async def receive(socket: WebSocket) -> ReceivedMessage:
 
     Raises:
         WebSocketDisconnect: the client has left.
-        BadMessageError: what came is no message.
+        BadMessageError: an invalid message.
     """
     event = await socket.receive()
     if event["type"] == "websocket.disconnect":
@@ -251,9 +250,9 @@ async def send(socket: WebSocket, message: EncodedMessage, message_id: int = 0) 
 async def with_progress(
     socket: WebSocket, work: Coroutine[Any, Any, T], hello: Envelope, *, phase: str
 ) -> T:
-    """The result of ``work``; the client is told of a ``phase`` meanwhile."""
+    """The result of ``work``; meanwhile the client receives progress of a ``phase``."""
     task = asyncio.create_task(work)
-    # Read the outcome even when the client has left meanwhile.
+    # Retrieve the outcome even if the client has left.
     task.add_done_callback(lambda done: done.cancelled() or done.exception())
     while not (await asyncio.wait({task}, timeout=PROGRESS_S))[0]:
         fields = {"phase": phase, "eta_s": None}
@@ -264,7 +263,7 @@ async def with_progress(
 async def close_with_error(
     socket: WebSocket, error: ServiceError, *, message_id: int = 0, step: int | None = None
 ) -> None:
-    """Send the error and close; a client that does not read is left alone."""
+    """Send the error and close; does not wait for a client that does not read."""
     with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
         async with asyncio.timeout(CLOSE_TIMEOUT_S):
             message = error_message(error, fatal=True, step=step)
@@ -275,7 +274,7 @@ async def close_with_error(
 def error_message(
     error: ServiceError, *, fatal: bool = False, step: int | None = None
 ) -> EncodedMessage:
-    """An error as a message; ``step``: the one that is due."""
+    """An error as a message; ``step`` is the due one."""
     fields = {
         "code": error.code.value,
         "detail": error.detail,

@@ -1,23 +1,23 @@
-"""The step pipeline: a change of a session's world becomes an observation of it.
+"""The step pipeline: from a change of a session's world to its observation.
 
 ============  ==============  ====================================================================
-phase         runs on         what happens
+phase         runs on         purpose
 ============  ==============  ====================================================================
-``receive``   event loop      a message is read and validated (`connection`)
-``check``     event loop      role, session, lock step: is this action due (`connection`)
-``advance``   worlds, engine  a fork of the world moves, as far as images show it
-``render``    engine          deformations, then images and clouds of the sensors that are due
-``evaluate``  worlds, beside  metrics and events; the log entry is written; the observation is
-              the rendering   packed but for its images
-``encode``    encoders        images are encoded, raw ones copied into shared memory; the parts
-                              become one message
-``send``      event loop      the message is written to the socket (`connection`)
+``receive``   event loop      read and validate a message (`connection`)
+``check``     event loop      check role, session and step of the action (`connection`)
+``advance``   worlds, engine  advance a fork of the world, except for parts that images do not show
+``render``    engine          deformations, then images and clouds of the due sensors
+``evaluate``  worlds, during  metrics and events; write the log entry; pack the observation without
+              rendering       its images
+``encode``    encoders        encode images, copy raw ones into shared memory; join the parts into
+                              one message
+``send``      event loop      write the message to the socket (`connection`)
 ============  ==============  ====================================================================
 
-A world without sensors moves on a thread of its own: it needs no device, and its planner does not
-wait while other sessions are rendered. Steps that wait for a thread together pass the phases
-together: their log entries are one transaction, and where the backend can, their images are drawn
-in one go, each with the bits that it would have alone. No step waits for one that is not there yet.
+A world without sensors advances on a separate thread: it needs no device, and its planner does not
+wait while other sessions are rendered. Steps that wait for a thread at the same time are processed
+as a batch: their log entries are one transaction, and if the backend supports it, their images are
+rendered in one pass, bit-identical to separate rendering. No step waits for later ones.
 """
 
 from __future__ import annotations
@@ -51,24 +51,24 @@ T = TypeVar("T")
 
 WARM_UP_WIDTH = 320
 MAX_TOGETHER = 16
-"""Steps without sensors made in one go: the first waits for the last, some milliseconds."""
+"""Maximum batch of steps without sensors: the first waits a few milliseconds for the last."""
 MAX_TOGETHER_DRAWN = 8
-"""The same of steps with images."""
+"""The same for steps with images."""
 MAX_PIXELS_TOGETHER = 16_000_000
-"""Of their images."""
+"""The same for their images."""
 MAX_WAITING = 1024
-"""Steps that may wait for the thread of worlds."""
+"""Maximum number of steps waiting for the thread of worlds."""
 
 
 @dataclass(frozen=True, eq=False)
 class LogWrite:
-    """Entries of a session's log on their way to the store.
+    """Entries of a session's log to be stored.
 
     Attributes:
-        store: takes them.
-        claim: on the session.
-        entries: of its log.
-        instead: whether they replace what may be on record from there on.
+        store: the store.
+        claim: the claim on the session.
+        entries: the entries.
+        instead: whether they replace stored entries from there on.
     """
 
     store: Store
@@ -79,15 +79,15 @@ class LogWrite:
 
 @dataclass(frozen=True, eq=False)
 class EncodedObservation:
-    """An instant as a message.
+    """An observation as a message.
 
     Attributes:
-        world: at that instant; it is not committed by being shown.
-        frames: the images of the message.
-        message: for all who get it, whole.
-        timing_ms: by stage.
-        placed: for the client that is answered, where its images lie in shared memory.
-        clouds: of the message.
+        world: the observed world; not yet committed.
+        frames: images of the message.
+        message: complete message for all recipients.
+        timing_ms: durations by stage.
+        placed: message for the answered client, if its images are in shared memory.
+        clouds: point clouds of the message.
     """
 
     world: World
@@ -99,29 +99,29 @@ class EncodedObservation:
 
     @property
     def answer(self) -> EncodedMessage:
-        """For the client that is answered."""
+        """The message for the answered client."""
         return self.placed or self.message
 
 
 @dataclass(eq=False)
 class Step:
-    """A change of a session's world on its way to an observation.
+    """A change of a session's world, until its observation.
 
     Attributes:
-        change: makes the new world, complete as far as images show it, and leaves the present one
-            alone; runs off the event loop.
-        cameras: of the world's sensors, by name, at the sizes they name.
-        clouds: whether those of its LiDARs and radars are made.
-        log: is written once the new world is evaluated; None where it is in the log already.
-        slot: that raw images of the answer may be written to.
-        drawn_with: the scene with whose other steps this one may be drawn; None for none.
-        timer: of the stages.
-        world: the new one, once it has moved.
-        sensors, ranging: that are due in it.
-        images, measured: of these, in their order.
-        members: of the message, without images, clouds and timing.
+        change: creates the new world, complete except for parts that images do not show, without
+            modifying the current one; runs off the event loop.
+        cameras: cameras of the world's sensors by name, at the requested sizes.
+        clouds: whether to compute clouds of its LiDARs and radars.
+        log: written once the new world is evaluated; None if it is already in the log.
+        slot: shared memory slot for raw images.
+        drawn_with: scene whose steps can be rendered in the same batch; None for no batching.
+        timer: timer of the stages.
+        world: the new world, after advancing.
+        sensors, ranging: due sensors.
+        images, measured: their results, in order.
+        members: members of the message, without images, clouds and timing.
         recorded: whether ``log`` is written.
-        error: why the step has failed.
+        error: reason for a failure.
     """
 
     change: Callable[[], World]
@@ -142,13 +142,13 @@ class Step:
 
     @property
     def moved(self) -> World:
-        """The new world of a step that has advanced."""
+        """The new world of an advanced step."""
         assert self.world is not None
         return self.world
 
     @contextlib.contextmanager
     def catching(self) -> Iterator[None]:
-        """A phase whose failure is this step's alone."""
+        """Assign an error of the block to this step only."""
         try:
             yield
         except Exception as error:
@@ -156,20 +156,20 @@ class Step:
 
 
 class KernelsMissingError(Exception):
-    """An image has to wait for kernels of deformation; nothing has happened."""
+    """An image has to wait for deformation kernels; the request had no effect."""
 
 
 class StepPipeline:
-    """Makes observations of changed worlds, and views of present ones.
+    """Computes observations of changed worlds, and views of current ones.
 
     Args:
-        engine: runs what is rendered.
+        engine: runs the rendering.
         renderer: renders and encodes.
-        metrics: gets durations by stage.
-        deformation: kernels that images after impacts need.
-        max_pixels: over all images of one instant.
-        max_rays: over all LiDARs and radars of one instant.
-        caster: name of the backend that casts their rays, see :func:`.cast`.
+        metrics: receives durations by stage.
+        deformation: kernels for images after impacts.
+        max_pixels: limit over all images of one step.
+        max_rays: limit over all LiDARs and radars of one step.
+        caster: name of the ray casting backend, see :func:`.cast`.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class StepPipeline:
         self._evaluators = ThreadPoolExecutor(1, thread_name_prefix="evaluate")
 
     def start(self) -> None:
-        """Begin to move worlds."""
+        """Start the threads."""
         self._worlds.start()
 
     def close(self) -> None:
@@ -201,7 +201,7 @@ class StepPipeline:
         self._worlds.stop(drain=False)
         self._evaluators.shutdown(cancel_futures=True)
 
-    # --- what a session waits for before it begins ----------------------------------------------
+    # --- preparation before an episode begins ---------------------------------------------------
 
     def cameras(self, scene: Scene, sensors: Sequence[SensorSpec]) -> dict[str, Camera]:
         """Cameras of ``sensors`` by name. Raises ServiceError: UNKNOWN_CAMERA, INVALID_REQUEST."""
@@ -211,10 +211,11 @@ class StepPipeline:
     async def ranging_ready(
         self, ranging: RangingSensors, sensors: Sequence[SensorSpec], cameras: Mapping[str, Camera]
     ) -> None:
-        """Wait until clouds of an episode can be made.
+        """Wait until clouds of an episode can be computed.
 
         Raises:
-            ServiceError: INVALID_REQUEST for too many rays, or bytes beside those of raw images.
+            ServiceError: INVALID_REQUEST for too many rays, or for bytes that exceed the message
+                size together with raw images.
         """
         size = raw_image_bytes(sensors, [cameras[sensor.camera] for sensor in sensors])
         await self._clouds.ready(ranging, image_bytes=size)
@@ -226,7 +227,7 @@ class StepPipeline:
         sensors: Sequence[SensorSpec],
         cameras: Mapping[str, Camera],
     ) -> None:
-        """Wait until small images of a scenario have what they are drawn from, off the engine.
+        """Prepare the levels of detail for small images of a scenario, off the engine.
 
         Raises:
             ServiceError: OUT_OF_MEMORY.
@@ -235,7 +236,7 @@ class StepPipeline:
         await self._renderer.ready(sensors, sizes, lambda: things_at_start(scene, state))
 
     async def edit_ready(self, world: World, cameras: Mapping[str, Camera]) -> None:
-        """The same for a world that has just been edited, by what it shows now and later."""
+        """As :meth:`levels_ready` for an edited world, for its current and later objects."""
         sensors = world.spec.sensors
 
         def shown() -> list[Instance]:
@@ -246,7 +247,8 @@ class StepPipeline:
         await self._renderer.ready(sensors, [cameras[s.camera] for s in sensors], shown)
 
     def drawn_with(self, world: World, cameras: Mapping[str, Camera]) -> Scene | None:
-        """With the sessions of which scene the next step of a world may be drawn; None for none.
+        """The scene whose sessions may share a rendering batch with the world's next step; None for
+        none.
 
         No session waits for the deformations of another.
         """
@@ -264,13 +266,14 @@ class StepPipeline:
     # --- a change of the world ------------------------------------------------------------------
 
     async def run(self, step: Step) -> EncodedObservation:
-        """Advance, render, evaluate and encode; the observation of the new world.
+        """Advance, render, evaluate and encode; returns the observation of the new world.
 
-        Evaluation has ended when this returns or raises. Where it raises, nothing has happened but
+        Evaluation has ended when this returns or raises. If it raises, nothing has changed, except
+        that the change may be stored.
         that the change may be on record.
 
         Raises:
-            QueueFullError: too much waits for the thread.
+            QueueFullError: the thread's queue is full.
         """
         try:
             await self._compute_on_thread(step)
@@ -293,8 +296,8 @@ class StepPipeline:
         )
 
     def compute(self, steps: Sequence[Step]) -> list[Exception | None]:
-        """Advance, render and evaluate steps in one go; why each has failed, None where it has not.
-        Where one fails, the others go on."""
+        """Advance, render and evaluate a batch of steps; returns the error of each, or None.
+        Failures do not affect the other steps."""
         for step in steps:
             step.timer.stage("queue")
         self.advance(steps)
@@ -312,7 +315,8 @@ class StepPipeline:
         return [step.error for step in steps]
 
     def advance(self, steps: Sequence[Step]) -> None:
-        """Move the worlds, as far as images show them, and find the sensors that are due."""
+        """Advance the worlds, except for parts that images do not show, and find the due
+        sensors."""
         for step in steps:
             with step.catching():
                 world = step.world = step.world or step.change()
@@ -323,7 +327,7 @@ class StepPipeline:
             step.timer.stage("world")
 
     def render(self, steps: Sequence[Step]) -> None:
-        """Draw the images and make the clouds of worlds, their objects deformed first."""
+        """Render the images and clouds of worlds, after deforming their objects."""
         for step in steps:
             with step.catching():
                 _deform(step.moved, step.timer)
@@ -331,7 +335,7 @@ class StepPipeline:
         try:
             self._draw(drawn)
         except Exception:
-            # Each then finds out for itself: the trouble of one is not that of the others.
+            # Then render them one by one, so that one failure does not affect the others.
             for step in drawn:
                 with step.catching():
                     self._draw([step])
@@ -343,7 +347,7 @@ class StepPipeline:
                 step.timer.stage("cast")
 
     def evaluate(self, steps: Sequence[Step]) -> None:
-        """Complete the worlds by what images do not show, write the log, and describe them."""
+        """Complete the worlds, write the log, and prepare the messages."""
         moved = [step for step in steps if step.world is not None and step.error is None]
         for step in moved:
             with step.catching():
@@ -355,7 +359,7 @@ class StepPipeline:
                 step.members = pack_members(step.moved.observe().obs_fields())
 
     async def encode(self, step: Step, kind: str) -> EncodedObservation:
-        """The observation encoded; counted once the answer is on its way."""
+        """The encoded observation; counted when the reply is sent."""
         if step.images or step.measured:
             frames = await self._renderer.encode(step.images)
             pack = partial(_packed, step, kind)
@@ -366,19 +370,19 @@ class StepPipeline:
         return observation
 
     def _draw(self, steps: Sequence[Step]) -> None:
-        """Draw the images of steps in one go, or none where one of them fails."""
+        """Render the images of a batch of steps; none of them if one fails."""
         requests = [(_request(s.moved, s.sensors), _cameras(s)) for s in steps]
         for step, images in zip(steps, self._renderer.render_together(requests), strict=True):
             step.images = _estimated(step.moved, images)
 
     def _require_kernels(self, world: World) -> None:
-        """Raises KernelsMissingError where images of a world would compile on the engine, which
-        belongs to all sessions."""
+        """Raises KernelsMissingError if images of a world would compile kernels on the engine,
+        which all sessions share."""
         shapes = world.deformation
         if shapes is not None and shapes.has_impacts and not self._deformation.ready:
             raise KernelsMissingError
 
-    # --- a view of a world that stays as it is --------------------------------------------------
+    # --- views of an unchanged world ------------------------------------------------------------
 
     async def view(
         self,
@@ -388,17 +392,17 @@ class StepPipeline:
         ranging: RangingSensors = NO_SENSORS,
         slot: FrameSlot | None = None,
     ) -> EncodedObservation:
-        """Images and clouds of a committed instant, from the vehicle; time does not move.
+        """Images and clouds of a committed step, from the vehicle; time does not advance.
 
         Args:
-            world: at that instant.
-            sensors: what it is seen by.
-            ranging: LiDARs and radars that look, too; all of them are due.
-            slot: that raw images of the answer may be written to.
+            world: the world at that step.
+            sensors: the cameras.
+            ranging: LiDARs and radars, all of them due.
+            slot: shared memory slot for raw images.
 
         Raises:
             ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels.
-            QueueFullError: too much waits for the engine.
+            QueueFullError: the engine's queue is full.
         """
         cameras = cameras_of(world.scene, sensors, max_pixels=self._max_pixels)
         things = partial(things_at_start, world.scene, world.state)
@@ -443,16 +447,16 @@ class StepPipeline:
         Raises:
             ServiceError: INVALID_REQUEST for too many rays.
             TimeOutOfRangeError: ``t_us`` is outside the recording.
-            QueueFullError: too much waits for the engine.
+            QueueFullError: the engine's queue is full.
         """
         await self._clouds.ready(RangingSensors((mounted,)))
         cast = partial(self._clouds.recorded, scene, state, mounted, t_us)
         return await self._engine.call(cast, label="sweep")
 
     async def first_render(self, scene: Scene, state: ScenarioState) -> None:
-        """Render a scene from its first camera, to have everything compiled and in memory.
+        """Render a scene once from its first camera, to compile kernels and fill memory.
 
-        The picture is the worker's own and small: the limit of pixels is for those asked for.
+        The image is small and exempt from the pixel limit.
         """
         camera = scene.rig[scene.rig.names[0]].resized(WARM_UP_WIDTH)
         request = RenderRequest(
@@ -472,8 +476,8 @@ class StepPipeline:
 
 
 def record(steps: Sequence[Step]) -> None:
-    """Write the log entries of steps, in one transaction where that can be; the trouble of one is
-    not that of the others. Off the event loop."""
+    """Write the log entries of steps, if possible in one transaction; one failure does not affect
+    the others. Off the event loop."""
     logs = [(step, step.log) for step in steps if step.log is not None]
     if len(logs) > 1 and not any(log.instead for _, log in logs):
         with contextlib.suppress(Exception):
@@ -489,7 +493,7 @@ def record(steps: Sequence[Step]) -> None:
 
 
 def _packed(step: Step, kind: str, frames: Sequence[EncodedFrame]) -> EncodedObservation:
-    """The message of a step, and the one whose images lie in shared memory."""
+    """The messages of a step, with images included and with images in shared memory."""
     assert step.members is not None
     placed_frames = step.slot.place(frames) if step.slot is not None else None
     step.timer.stage("encode")
@@ -506,7 +510,7 @@ def _packed(step: Step, kind: str, frames: Sequence[EncodedFrame]) -> EncodedObs
 
 
 def _deform(world: World, timer: PhaseTimer) -> None:
-    """Find the shapes that images of a world show."""
+    """Compute the deformed shapes in a world's images."""
     if world.deformation is not None:
         world.deformation.solve(world.t_us)
         timer.stage("physics")
@@ -529,7 +533,7 @@ def _cameras(step: Step) -> list[Camera]:
 
 
 def _estimated(world: World, images: Sequence[RenderedImage]) -> Sequence[RenderedImage]:
-    """Images show where the ego is; their poses are those of its own estimate."""
+    """Images from the true ego pose, labelled with poses of the ego's estimate."""
     if world.T_world_estimate is world.T_world_body:
         return images
     believed = []

@@ -1,4 +1,4 @@
-"""A session's episode as a file."""
+"""Recordings of sessions' episodes."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ MAX_FRAMES_BYTES = 512 * 1024 * 1024
 
 
 async def recording_of(sessions: Sessions, session: Session, *, frames: bool) -> bytes:
-    """The recording of the running episode: replayed from the session's log.
+    """The recording of the current episode, replayed from the session's log.
 
     Args:
-        sessions: has the log.
-        session: whose episode.
-        frames: whether its sensors are rendered again; raw images are stored as png.
+        sessions: registry with the log.
+        session: the session.
+        frames: whether to render its sensors again; raw images are stored as png.
 
     Raises:
         ServiceError: NOT_RESET, or PAYLOAD_TOO_LARGE for more than 512 MiB of images.
@@ -42,7 +42,7 @@ async def recording_of(sessions: Sessions, session: Session, *, frames: bool) ->
 
 
 async def episode_of(sessions: Sessions, session: Session) -> Recording:
-    """The running episode so far, without images.
+    """The current episode so far, without images.
 
     Raises:
         ServiceError: NOT_RESET.
@@ -105,7 +105,7 @@ async def _frames(
 
 
 async def _drawn(pipeline: StepPipeline, world: World) -> EncodedObservation | None:
-    """What the sensors that are due show; None where none is."""
+    """The observation of the due sensors; None if none is due."""
     sensors = [
         s.model_copy(update={"codec": "png"}) if s.codec == "raw" else s
         for s in world.due_sensors()

@@ -40,24 +40,24 @@ from .session import EpisodeStart, Session, session_info
 from .shared_memory import Segments
 from .step import Stepper
 
-# Recovery: sessions that an earlier run of the worker left open are rebuilt from their logs.
+# Recovery: rebuilds sessions of an earlier run of the worker from their logs.
 
 
 def entries_of(rows: Iterable[SessionEntry]) -> list[Entry]:
-    """Entries of a stored log, for the world to live through again."""
+    """Entries of a stored log, to replay in a world."""
     return [Entry(row.kind, row.step or 0, row.payload) for row in rows]
 
 
 async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> None:
-    """Make a new session what it was when its last entry took effect.
+    """Rebuild a session to its state after its last entry.
 
-    Everything is replayed without rendering but the last step, whose answer its client may never
-    have got: it is rendered, so that the same action sent again gets it.
+    All entries are replayed without rendering, except the last step. Its client may not have
+    received the observation, so it is rendered for a repeated action.
 
     Args:
-        session: at its beginning, its scene pinned.
+        session: at its start, with its scene pinned.
         store: has its log.
-        pipeline: moves worlds and draws.
+        pipeline: advances and renders worlds.
     """
     start = session.start
     rows = await store.session_entries(session.session_id)
@@ -88,7 +88,7 @@ async def rebuild(session: Session, *, store: Store, pipeline: StepPipeline) -> 
 async def _cameras_ready(
     pipeline: StepPipeline, session: Session, world: World
 ) -> dict[str, Camera]:
-    """Cameras of an episode, once all that its observations would wait for is there."""
+    """Cameras of an episode, once everything that its observations would wait for is ready."""
     start, sensors = session.start, world.spec.sensors
     cameras = pipeline.cameras(start.scene, sensors)
     await pipeline.ranging_ready(world.ranging, sensors, cameras)
@@ -97,10 +97,10 @@ async def _cameras_ready(
 
 
 async def state_at(scenarios: Scenarios, scenario_id: str, revision: int) -> ScenarioState:
-    """Objects of a scenario as they were at a revision.
+    """Objects of a scenario at a revision.
 
     Raises:
-        ServiceError: UNKNOWN_SCENARIO where it was deleted.
+        ServiceError: UNKNOWN_SCENARIO if it was deleted.
     """
     view = await scenarios.view(scenario_id)
     if view.revision == revision:
@@ -123,7 +123,7 @@ async def state_at(scenarios: Scenarios, scenario_id: str, revision: int) -> Sce
 
 
 def check_scene(row: SessionRow, scene_hash: str) -> None:
-    """Raises ServiceError: SCENE_BROKEN when the scene is not the one the session ran on."""
+    """Raises ServiceError: SCENE_BROKEN if the scene differs from the session's."""
     if row.scene_hash != scene_hash:
         raise ServiceError(
             ErrorCode.SCENE_BROKEN,
@@ -144,8 +144,8 @@ def _world(replayer: Replayer) -> World:
 
 
 def _content(entry: Entry) -> bytes:
-    """What an action is compared by: its plan alone, as this version writes it. The version that
-    wrote the entry may not have known all of its members."""
+    """The bytes that identify an action: only its plan, encoded by this version. The version that
+    wrote the entry may have had fewer members."""
     fields = decode(entry.payload)["plan"]
     return plan_payload(None if fields is None else PLAN.validate_python(fields))
 
@@ -161,13 +161,13 @@ log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class SessionLimits:
-    """What the sessions of a worker may take.
+    """Limits of a worker's sessions.
 
     Attributes:
         worker_id: first part of session ids.
-        max_sessions: open at one time.
-        idle_seconds: without use and without connection, after which a session leaves the memory;
-            a later request rebuilds it from its log.
+        max_sessions: maximum number of open sessions.
+        idle_seconds: time without use and without connection after which a session leaves the
+            memory; a later request rebuilds it from its log.
     """
 
     worker_id: str
@@ -176,22 +176,22 @@ class SessionLimits:
 
 
 class Sessions:
-    """All open sessions of a worker. Belongs to the event loop.
+    """All open sessions of a worker, for use on the event loop.
 
     Args:
-        limits: how many, and for how long.
-        pipeline: draws what sessions look like.
-        kernels: what episodes wait for before they begin.
-        store: where they and their logs are written before they take effect.
-        scene_cache: keeps their scenes in memory.
-        scenarios: what they may begin from.
-        metrics: gets their number.
-        segments: in which controllers on this machine get their images.
-        leases: by which workers on one store tell which of them has which session.
-        accounts: of those who make them, each with a limit of its own.
+        limits: number and lifetime.
+        pipeline: renders sessions.
+        kernels: kernels that episodes wait for.
+        store: stores sessions and their logs before they take effect.
+        scene_cache: holds their scenes in memory.
+        scenarios: scenarios to start from.
+        metrics: receives their number.
+        segments: shared memory for controllers on this machine.
+        leases: sessions of each worker with the same store.
+        accounts: accounts of the owners, with their limits.
 
     Attributes:
-        resume_key: what tokens of controllers that come back are made with.
+        resume_key: key of the controllers' resume tokens.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class Sessions:
         self._in_creation: Counter[str] = Counter()
         self._rebuilding: dict[str, asyncio.Task[Session]] = {}
         self._closing: set[asyncio.Future[None]] = set()
-        # Objects of a bare scene are the same for all sessions on it.
+        # All sessions on a bare scene share its objects.
         self._bare_states: WeakKeyDictionary[Scene, ScenarioState] = WeakKeyDictionary()
         self._warm: WeakSet[Scene] = WeakSet()
         metrics.watch(metrics.sessions, lambda: len(self._open))
@@ -241,12 +241,12 @@ class Sessions:
         return len(self._open) + self._in_creation.total() >= self._limits.max_sessions
 
     def owned(self) -> Counter[str]:
-        """How many there are by the name of their owner's token, those in creation included."""
+        """Number of sessions by name of the owner's token, including those in creation."""
         return self._in_creation + Counter(s.row.owner for s in self._open.values())
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[Sessions]:
-        """Idle sessions are evicted for the length of the block; open ones end with it."""
+        """Evict idle sessions during the block; open ones end with it."""
         self.pipeline.start()
         evicting = asyncio.create_task(self._evict_idle(), name="idle-sessions")
         try:
@@ -269,18 +269,18 @@ class Sessions:
         idempotent: IdempotentRequest,
         ws_base: str,
     ) -> SessionInfo:
-        """A new session on a scene or a scenario.
+        """Create a session on a scene or a scenario.
 
         Args:
             scene, scenario: exactly one of them.
-            spec: of the episode that begins at once; None waits for a reset.
-            idempotent: what the answer is stored under.
-            ws_base: how clients reach this worker, for example ``ws://127.0.0.1:8600``.
+            spec: starts an episode immediately; None waits for a reset.
+            idempotent: stores the reply.
+            ws_base: address of this worker for clients, for example ``ws://127.0.0.1:8600``.
 
         Raises:
-            ServiceError: OVER_CAPACITY or DRAINING; INVALID_REQUEST; as scene cache and scenarios
-                do.
-            WorldError: the episode cannot run as asked.
+            ServiceError: OVER_CAPACITY or DRAINING; INVALID_REQUEST; or as for scene cache and
+                scenarios.
+            WorldError: the episode cannot run with these options.
         """
         if (scene is None) == (scenario is None):
             raise ServiceError(
@@ -309,12 +309,12 @@ class Sessions:
         return info
 
     async def find(self, session_id: str) -> Session:
-        """The open session of that id; one that an earlier run left open, or a worker that is no
-        more, is rebuilt first.
+        """The open session of that id; sessions of an earlier run or of a dead worker are rebuilt
+        first.
 
         Raises:
-            ServiceError: SESSION_CLOSED when it is over, UNKNOWN_SESSION, SESSION_ELSEWHERE while
-                another worker has it, or what is in the way of rebuilding it.
+            ServiceError: SESSION_CLOSED if it has ended, UNKNOWN_SESSION, SESSION_ELSEWHERE while
+                another worker has it, or an error of the rebuild.
         """
         if (session := self._open.get(session_id)) is not None:
             if session.log_unsure:
@@ -324,14 +324,14 @@ class Sessions:
         return await self._rebuilt(check_not_closed(await self.row(session_id)))
 
     async def row(self, session_id: str) -> SessionRow:
-        """The row of a session, open or closed, whoever has it, without rebuilding it.
+        """The row of a session, open or closed, of any worker, without rebuilding it.
 
         Raises:
             ServiceError: UNKNOWN_SESSION.
         """
         if (session := self._open.get(session_id)) is not None:
             return session.row
-        # What no id of ours looks like need not be asked of a database, which may choke on it.
+        # Ids of another format are not queried; the database may reject some of them.
         row = await self._store.session(session_id) if _ID.fullmatch(session_id) else None
         if row is None:
             hint = "GET /v1/sessions lists them"
@@ -346,19 +346,19 @@ class Sessions:
         idempotent: IdempotentRequest,
         step: int | None = None,
     ) -> SessionInfo:
-        """A new session that goes on from an instant of another, held by its lock.
+        """Create a session that continues from a step of another, whose lock is held.
 
-        Its log begins with a copy of the other's, so that it can be rebuilt on its own.
+        Its log begins with a copy of the other's, so that it can be rebuilt independently.
 
         Args:
-            session: the other one.
-            ws_base: how clients reach this worker.
-            idempotent: what the answer is stored under.
-            step: of that instant, in the running episode; None for the present one.
+            session: the other session.
+            ws_base: address of this worker for clients.
+            idempotent: stores the reply.
+            step: step of the current episode; None for the newest.
 
         Raises:
-            ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET; INVALID_REQUEST for a step that the
-                episode has not had.
+            ServiceError: OVER_CAPACITY, DRAINING or NOT_RESET; INVALID_REQUEST for a step outside
+                the episode.
         """
         world = session.running_world()
         with self._reserved_slot(owner_name()):
@@ -394,10 +394,10 @@ class Sessions:
     async def _back_at(
         self, session: Session, rows: list[SessionEntry], step: int
     ) -> tuple[World, list[SessionEntry]]:
-        """The instant of a step, and the log up to it.
+        """The world at a step, and the log up to it.
 
         Raises:
-            ServiceError: INVALID_REQUEST, the episode has not had it.
+            ServiceError: INVALID_REQUEST, the episode does not have the step.
         """
         episode = last_episode(entries_of(rows))
 
@@ -420,31 +420,30 @@ class Sessions:
         return world, rows[: len(rows) - len(episode) + count]
 
     async def end_episode(self, session: Session) -> None:
-        """End the running episode where it is; the controller is told. A second time changes
-        nothing."""
+        """End the current episode at its newest step, and notify the controller. Idempotent."""
         async with session.lock:
             session.check_open()
             if session.running_world().over:
                 return
             message = await self.stepper.stop(session, "stopped")
-            # An action that waits for the clock is refused behind this, once the lock is let go.
+            # An action that waits for the clock is refused after this, when the lock is released.
             if session.tell_controller is not None:
                 with contextlib.suppress(Exception):
                     await session.tell_controller(message)
         session.hold.release()
 
     async def entries(self, session: Session) -> list[Entry]:
-        """Everything that has happened to a session, oldest first."""
-        # A step on its way is in the log already; it may be withdrawn again.
+        """All entries of a session's log, oldest first."""
+        # A step in progress is already in the log; it may be withdrawn again.
         end = session.next_seq
         rows = await self._store.session_entries(session.session_id)
         return entries_of(row for row in rows if row.seq < end)
 
     async def scores(self, session: Session) -> list[Score]:
-        """Final scores of the running episode; empty before the first reset.
+        """Final scores of the current episode; empty before the first reset.
 
-        After a collision the same episode is run once more without reactions of the ego, for the
-        impact speed that NeuroNCAP compares with.
+        After a collision, the episode is simulated again without reactions of the ego, for the
+        impact speed that NeuroNCAP uses as reference.
         """
         world = session.world
         if world is None:
@@ -461,7 +460,7 @@ class Sessions:
         return await self.pipeline.on_world_thread(score)
 
     async def close(self, session: Session, *, reason: str) -> None:
-        """End a session once its step under way is done; a second time changes nothing."""
+        """End a session after its step in progress; idempotent."""
         if self._open.pop(session.session_id, None) is None:
             return
         session.closed = _closed(session.session_id, reason)
@@ -469,7 +468,7 @@ class Sessions:
             try:
                 await self._store.close_session(session.row.claim, reason=reason)
             except BaseException:
-                # It is not over as long as the store does not say so.
+                # It has not ended until the store says so.
                 session.closed = None
                 self._open[session.session_id] = session
                 raise
@@ -478,8 +477,8 @@ class Sessions:
         log.info("session closed", session_id=session.session_id, reason=reason)
 
     def let_go(self, session: Session) -> None:
-        """Leave a session that another worker has taken over, or may; its connections are told to
-        come back to that one. A second time changes nothing."""
+        """Drop a session that another worker has taken over, or may take over; its connections are
+        redirected. Idempotent."""
         if self._open.get(session.session_id) is not session:
             return
         del self._open[session.session_id]
@@ -489,13 +488,13 @@ class Sessions:
         log.warning("session left to another worker", session_id=session.session_id)
 
     def hand_over(self) -> None:
-        """Leave all sessions to other workers, and take none back; what is on record is whole."""
+        """Hand over all sessions to other workers, and accept none back; the logs are complete."""
         self.draining = self._handed_over = True
         for session in list(self):
             self.let_go(session)
 
     async def let_go_of_lost(self) -> None:
-        """Leave all sessions that were taken over: this worker was thought dead."""
+        """Drop all sessions that were taken over: other workers considered this one dead."""
         epochs = await self._leases.epochs(list(self._open))
         for session in self:
             if epochs.get(session.session_id) != session.row.epoch:
@@ -505,7 +504,7 @@ class Sessions:
         """Free the memory of a session without connections; :meth:`find` rebuilds it."""
         if self._open.pop(session.session_id, None) is None:
             return
-        # A request that has just found it must not move a world that is being rebuilt.
+        # A concurrent request must not advance a world that is being rebuilt.
         session.closed = ServiceError(
             ErrorCode.QUEUE_FULL,
             f"session {session.session_id!r} has just left the memory because it was idle",
@@ -515,14 +514,14 @@ class Sessions:
         log.info("session evicted", session_id=session.session_id)
 
     async def warm_up(self, session: Session) -> None:
-        """Draw the session's scene once, so that no observation waits for a first render."""
+        """Render the session's scene once, so that no observation waits for a first render."""
         scene = session.start.scene
         if scene not in self._warm:
             await self.pipeline.first_render(scene, session.start.state)
             self._warm.add(scene)
 
     def resume_token(self, row: SessionRow) -> str:
-        """Lets a controller come back; the same in every run, and not in the store."""
+        """Token to reconnect a controller; the same in every run, and not in the store."""
         return hmac.new(self.resume_key, row.session_id.encode(), "sha256").hexdigest()
 
     # --- inside -----------------------------------------------------------------------------
@@ -533,8 +532,8 @@ class Sessions:
 
         Raises:
             ServiceError: DRAINING or OVER_CAPACITY.
-            OverLimitError: its owner has as many as they may.
-            RevokedError: its owner's token is no more.
+            OverLimitError: the owner's session limit is reached.
+            RevokedError: the owner's token has been removed.
         """
         if self.draining:
             raise ServiceError(ErrorCode.DRAINING, "the worker is stopping")
@@ -589,7 +588,7 @@ class Sessions:
         return session
 
     def _tell(self, session: Session, error: ServiceError) -> None:
-        """End a session's connections; not awaited, for clients may be slow to read."""
+        """End a session's connections; not awaited, because clients may read slowly."""
         for close in session.close_callbacks:
             closing = asyncio.ensure_future(close(error))
             self._closing.add(closing)
@@ -601,7 +600,7 @@ class Sessions:
     async def _start(
         self, scene: str | None, scenario: str | None, token: str
     ) -> tuple[SessionRow, EpisodeStart]:
-        """What the new session is and begins from; its scene is pinned."""
+        """Id and start of the new session; its scene is pinned."""
         view = await self._scenarios.view(scenario) if scenario is not None else None
         name = view.row.scene if view is not None else str(scene)
         pinned = await self._scene_cache.pin(name)
@@ -643,12 +642,12 @@ class Sessions:
 
 
 def created_headers(info: SessionInfo) -> dict[str, str]:
-    """Headers of the answer to a creation."""
+    """Headers of the reply to a creation."""
     return {"Location": f"/v1/sessions/{info.session_id}"}
 
 
 def check_not_closed(row: SessionRow) -> SessionRow:
-    """The row. Raises ServiceError: SESSION_CLOSED when its session is over."""
+    """The row. Raises ServiceError: SESSION_CLOSED if its session has ended."""
     if row.closed_us is not None:
         raise _closed(row.session_id, row.reason or "closed")
     return row

@@ -1,4 +1,4 @@
-"""Sensors of sessions: how much one message may carry, and when clouds can be made."""
+"""Sensors of sessions: message size limits, and preparation of clouds."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from ..rendering.background import BackgroundCompile
 from ..rendering.renderer import check_known, check_sensors
 
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
-"""Of raw images in one message; the rest of it fits in what is left of a reader's limit."""
+"""Limit of raw images in one message; the remainder is for its other members."""
 
 
 def cameras_of(scene: Scene, sensors: Sequence[SensorSpec], *, max_pixels: int) -> list[Camera]:
-    """Cameras of sensors, in their order, at the sizes that these name.
+    """The cameras of sensors in order, at the requested sizes.
 
     Raises:
         ServiceError: UNKNOWN_CAMERA, or INVALID_REQUEST for too many pixels or bytes, and for
@@ -50,7 +50,7 @@ def cameras_of(scene: Scene, sensors: Sequence[SensorSpec], *, max_pixels: int) 
 
 
 def check_message_bytes(size: int) -> None:
-    """Raises ServiceError: INVALID_REQUEST for raw images and clouds that no one message holds."""
+    """Raises ServiceError: INVALID_REQUEST if raw images and clouds exceed one message."""
     if size > MAX_IMAGE_BYTES:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST,
@@ -61,7 +61,7 @@ def check_message_bytes(size: int) -> None:
 
 
 def raw_image_bytes(sensors: Sequence[SensorSpec], cameras: Iterable[Camera]) -> int:
-    """Of the raw images of one instant; ``cameras``: of the sensors, in their order."""
+    """Size of the raw images of one step [bytes]; ``cameras``: those of the sensors, in order."""
     return sum(
         modality_of(modality).raw_bytes(camera.width, camera.height)
         for camera, sensor in zip(cameras, sensors, strict=True)
@@ -71,14 +71,14 @@ def raw_image_bytes(sensors: Sequence[SensorSpec], cameras: Iterable[Camera]) ->
 
 
 POINT_BYTES = 40
-"""Of a point with all its columns, or a detection of a radar; with room."""
+"""Upper bound for a point with all its columns, or a radar detection [bytes]."""
 
 
 async def mounted_beside(
     lidars: Sequence[LidarSpec], radars: Sequence[RadarSpec], dt_us: int
 ) -> RangingSensors:
-    """As :func:`.mounted_sensors`, and their rays prepared, beside event loop and engine. Raises
-    WorldError: INVALID_REQUEST."""
+    """As :func:`.mounted_sensors`, and prepares their rays, off the event loop and the engine.
+    Raises WorldError: INVALID_REQUEST."""
     if not lidars and not radars:
         return NO_SENSORS
 
@@ -94,7 +94,7 @@ async def mounted_beside(
 
 
 async def looking(world: World, asked: SessionRender | Render) -> RangingSensors:
-    """LiDARs and radars of a look aside. Raises WorldError: INVALID_REQUEST."""
+    """LiDARs and radars of a render request. Raises WorldError: INVALID_REQUEST."""
     return await mounted_beside(asked.lidars, asked.radars, world.spec.dt_us)
 
 
@@ -103,8 +103,8 @@ class WorldClouds:
 
     Args:
         engine: loads the kernels.
-        max_rays: over all LiDARs and radars of one observation.
-        caster: name of the backend that casts, see :func:`.cast`.
+        max_rays: limit over all LiDARs and radars of one observation.
+        caster: name of the ray casting backend, see :func:`.cast`.
     """
 
     def __init__(self, engine: Engine, *, max_rays: int, caster: str = "auto") -> None:
@@ -119,11 +119,11 @@ class WorldClouds:
         )
 
     async def ready(self, sensors: RangingSensors, *, image_bytes: int = 0) -> None:
-        """Return once clouds of these sensors can be made without holding up others.
+        """Wait until clouds of these sensors can be computed without delaying others.
 
         Args:
-            sensors: of an episode, or of a look aside.
-            image_bytes: of raw images in the same message.
+            sensors: sensors of an episode, or of a render request.
+            image_bytes: size of raw images in the same message.
 
         Raises:
             ServiceError: INVALID_REQUEST for too many rays or bytes.
@@ -141,7 +141,7 @@ class WorldClouds:
         await self._kernels.ready()
 
     def of(self, world: World, due: Sequence[Mounted]) -> list[Cloud]:
-        """Clouds of the sensors that are due, in their order."""
+        """Clouds of the due sensors, in order."""
         return clouds_of(world, due, self._chosen()) if due else []
 
     def recorded(

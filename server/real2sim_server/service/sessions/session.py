@@ -1,4 +1,4 @@
-"""One closed-loop session: its lock step, its clock, its edits, its viewers and its REST models."""
+"""One closed-loop session: its lockstep, clock, edits, observers and REST models."""
 
 from __future__ import annotations
 
@@ -48,14 +48,13 @@ A = TypeVar("A")
 
 
 class LockStep(Generic[A]):
-    """Which action is due, and the answer to the last one.
+    """The due action, and the answer to the last one.
 
-    Ask :meth:`cached_answer` before the world moves and call :meth:`advance` once it has moved; an
-    action that is refused in between leaves everything as it was. Actions are compared by their
-    canonical bytes.
+    Call :meth:`cached_answer` before the world advances and :meth:`advance` afterwards. An action
+    that is refused in between changes nothing. Actions are compared by their canonical bytes.
 
     Attributes:
-        step: of the newest observation; None before the first reset.
+        step: step of the newest observation; None before the first reset.
         over: whether the episode has ended.
     """
 
@@ -65,11 +64,11 @@ class LockStep(Generic[A]):
         self._last: tuple[bytes, A] | None = None
 
     def reset(self, step: int = 0, *, over: bool = False) -> None:
-        """An episode begins at step 0, or is returned to at another."""
+        """Start an episode at step 0, or return to a snapshot at another step."""
         self.step, self.over, self._last = step, over, None
 
     def end(self) -> None:
-        """The episode ends without a step; the last answer can still be had again."""
+        """End the episode without a step; the last answer can still be repeated."""
         self.over = True
 
     def restore_answer(self, content: bytes, answer: A) -> None:
@@ -77,14 +76,14 @@ class LockStep(Generic[A]):
         self._last = (content, answer)
 
     def cached_answer(self, step: int, content: bytes) -> A | None:
-        """The answer already given to this action; None when it is the one that is due.
+        """The answer already given to this action; None if it is the due action.
 
         Args:
-            step: of the observation that the action answers.
-            content: canonical bytes of what the action asks for.
+            step: step of the observation that the action answers.
+            content: canonical bytes of the action.
 
         Raises:
-            ServiceError: NOT_RESET; STEP_CONFLICT for another action where one was taken;
+            ServiceError: NOT_RESET; STEP_CONFLICT if the step had another action;
                 STALE_STEP for older steps; EPISODE_OVER; BAD_STEP for newer steps.
         """
         if self.step is None:
@@ -113,16 +112,16 @@ class LockStep(Generic[A]):
         return None
 
     def is_due(self, step: int) -> bool:
-        """Whether an action for ``step`` is the one that the clock waits for."""
+        """Whether an action for ``step`` is due."""
         return step == self.step and not self.over
 
     def advance(self, content: bytes, answer: A, *, over: bool) -> None:
-        """The due action was taken; ``answer`` is kept until the next one."""
+        """The due action was taken; stores ``answer`` until the next one."""
         self._move(1, over=over)
         self._last = (content, answer)
 
     def skip(self, steps: int, *, over: bool) -> None:
-        """The clock was moved by other means; no answer is kept."""
+        """The clock was advanced without an action; no answer is stored."""
         self._move(steps, over=over)
         self._last = None
 
@@ -153,8 +152,8 @@ def _repeated(step: int, content: bytes, taken: bytes, answer: A) -> A:
 
 
 class ClockHold:
-    """Lets actions pass, all of them or so many, at once or at a pace; the others wait. Belongs to
-    the event loop."""
+    """Gates actions: passes all, or a number of them, immediately or at a pace; others wait. For
+    use on the event loop."""
 
     def __init__(self) -> None:
         self._steps: int | None = None
@@ -164,33 +163,33 @@ class ClockHold:
 
     @property
     def held(self) -> bool:
-        """Whether the next action has to wait until somebody lets it go."""
+        """Whether the next action has to wait for a release."""
         return self._steps == 0
 
     @property
     def free(self) -> bool:
-        """Whether actions need not ask before they move the clock."""
+        """Whether actions pass without waiting."""
         return self._steps is None and self._pace is None
 
     @property
     def wait_s(self) -> float:
-        """How long the next action has to wait from now [s]."""
+        """Remaining time until the next action may pass [s]."""
         if self.held:
             return math.inf
         return 0.0 if self._pace is None else max(0.0, self._next_s - clock.monotonic())
 
     def release(self, *, pace: float | None = None) -> None:
-        """All actions pass; with a pace, so many simulated seconds take a second."""
+        """Let all actions pass; ``pace`` is in simulated seconds per second."""
         self._steps, self._pace = None, pace
         self._changed.set()
 
     def hold(self, *, after: int = 0) -> None:
-        """So many more actions pass; then they wait."""
+        """Let ``after`` more actions pass, then hold."""
         self._steps = after
         self._changed.set()
 
     def take_step(self, dt_us: int) -> None:
-        """An action passes, for a step so long."""
+        """Count a passing action with the given step duration."""
         if self._steps:
             self._steps -= 1
         if self._pace is not None:
@@ -198,7 +197,7 @@ class ClockHold:
             self._next_s = max(self._next_s, now) + dt_us * 1e-6 / self._pace
 
     async def wait(self, seconds: float) -> None:
-        """Wait for a change, so long at most."""
+        """Wait for a change, with a timeout."""
         self._changed.clear()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
@@ -206,14 +205,14 @@ class ClockHold:
 
 
 KEPT = 4
-"""Observations that wait for a slow observer; older ones are dropped."""
+"""Maximum queue length for a slow observer; older observations are dropped."""
 
 
 class ObserverQueue:
-    """A few observations on their way to one observer. Putting one in never waits.
+    """A short queue of observations for one observer. Adding one never waits.
 
     Attributes:
-        dropped: observations that the observer was too slow for.
+        dropped: number of observations dropped for a slow observer.
     """
 
     def __init__(self) -> None:
@@ -222,14 +221,14 @@ class ObserverQueue:
         self._filled = asyncio.Event()
 
     def put(self, message: EncodedMessage) -> None:
-        """Add the newest observation; the oldest makes room."""
+        """Add the newest observation; a full queue drops the oldest."""
         if len(self._waiting) == KEPT:
             self.dropped += 1
         self._waiting.append(message)
         self._filled.set()
 
     async def take(self) -> EncodedMessage:
-        """The oldest that waits."""
+        """The oldest queued observation."""
         await self._filled.wait()
         message = self._waiting.popleft()
         if not self._waiting:
@@ -238,19 +237,19 @@ class ObserverQueue:
 
 
 CloseWithError = Callable[[ServiceError], Awaitable[None]]
-"""Tells a connection that its session is over, and ends it."""
+"""Ends a connection with the reason that its session has ended."""
 
 
 TellController = Callable[[EncodedMessage], Awaitable[None]]
 
 
 class NewestPlan(NamedTuple):
-    """What a controller wants.
+    """The newest plan of a controller.
 
     Attributes:
-        plan: as it was sent.
-        motion: of the observation that it answers.
-        took_us: from the observation to the action [us].
+        plan: as sent.
+        motion: motion in the observation that it answers.
+        took_us: time from the observation to the action [us].
     """
 
     plan: Plan
@@ -260,12 +259,12 @@ class NewestPlan(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EpisodeStart:
-    """What a session begins from, at its creation and at every reset.
+    """Start of a session, at its creation and at every reset.
 
     Attributes:
         scene: pinned in memory, shared with other sessions.
-        summary: of its bundle.
-        state: objects of the scenario as it was then, or of the bare scene.
+        summary: summary of its bundle.
+        state: objects of the scenario at that time, or of the bare scene.
     """
 
     scene: Scene
@@ -275,32 +274,32 @@ class EpisodeStart:
 
 @dataclass(eq=False)
 class Session:
-    """A light view onto a scene. Belongs to the event loop; its worlds are computed elsewhere.
+    """A session on a scene, for use on the event loop; its worlds are computed elsewhere.
 
     Attributes:
-        row: as it is in the store.
+        row: its row in the store.
         start: scene and objects at step 0.
-        resume_token: lets a controller come back; the same in every run of the worker.
+        resume_token: token to reconnect a controller; the same in every run of the worker.
         lock: held during any change of the session.
-        world: the committed instant; never changed in place, so readers need no lock.
-        cameras: of the episode's sensors at the sizes they name, by name.
-        lockstep: which action is due.
-        events: since the last answer to a REST step.
-        next_seq: of the session's log.
-        log_unsure: whether there may be something in the log from ``next_seq`` on that never took
-            effect: the store did not say how it ended.
-        unsure_replies: keys of answers that may be stored likewise.
-        snapshots: instants to return to, by name.
-        newest: observation of the present instant, where it has been shown.
+        world: the committed world; never modified in place, so readers need no lock.
+        cameras: cameras of the episode's sensors at the requested sizes, by name.
+        lockstep: the due action.
+        events: events since the last answer to a REST step.
+        next_seq: next entry of the session's log.
+        log_unsure: whether the log may have entries from ``next_seq`` that never took effect,
+            because the store did not report the outcome.
+        unsure_replies: keys of replies that may be stored likewise.
+        snapshots: saved states by name.
+        newest: observation of the current step, if it has been computed.
         late: whether the planner has missed the deadline of the due action, and the clock waits.
         expires_at: monotonic time at which the episode is cut off [s]; None for never.
-        controller: the connection that drives, if there is one.
-        tell_controller: sends it an observation that no action has led to.
-        hold: whether the clock may move.
-        newest_plan: that the controller has sent.
-        observers: queues of the connections that look on.
+        controller: the connection that drives, if any.
+        tell_controller: sends it an observation without an action.
+        hold: gates the clock.
+        newest_plan: newest plan of the controller.
+        observers: queues of the observers' connections.
         close_callbacks: one for each open connection.
-        closed: why the session is over; None while it is not.
+        closed: why the session has ended; None while it is open.
     """
 
     row: SessionRow
@@ -329,27 +328,27 @@ class Session:
 
     @property
     def session_id(self) -> str:
-        """Names its worker: ``<worker>.<random>``."""
+        """Session id, which starts with its worker: ``<worker>.<random>``."""
         return self.row.session_id
 
     @property
     def connected(self) -> bool:
-        """Whether anybody is connected by socket."""
+        """Whether any socket is connected."""
         return bool(self.close_callbacks)
 
     def touch(self) -> None:
-        """Somebody uses the session."""
+        """Record a use of the session."""
         self.used_at = clock.monotonic()
 
     def running_world(self) -> World:
-        """The committed instant. Raises ServiceError: NOT_RESET before the first reset."""
+        """The committed world. Raises ServiceError: NOT_RESET before the first reset."""
         if self.world is None:
             raise not_reset()
         return self.world
 
     @property
     def spec(self) -> ResetSpec:
-        """Of the running episode; the defaults before the first one."""
+        """Spec of the current episode; the defaults before the first one."""
         return self.world.spec if self.world else ResetSpec()
 
     def begin(self, world: World, cameras: dict[str, Camera]) -> None:
@@ -362,16 +361,16 @@ class Session:
 
     @property
     def expired(self) -> bool:
-        """Whether the episode has used up its wall-clock time."""
+        """Whether the episode has exceeded its wall-clock time."""
         return self.expires_at is not None and clock.monotonic() >= self.expires_at
 
     def take_events(self) -> list[Event]:
-        """Events since this was called last."""
+        """Events since the last call."""
         taken, self.events = self.events, []
         return taken
 
     def check_open(self) -> None:
-        """Raises ServiceError: SESSION_CLOSED once the session is over."""
+        """Raises ServiceError: SESSION_CLOSED if the session has ended."""
         if self.closed is not None:
             raise self.closed
 
@@ -381,14 +380,14 @@ class Session:
             raise controller_taken(self.session_id)
 
     def publish(self, message: EncodedMessage) -> None:
-        """The newest observation, for all observers; never waits."""
+        """Send the newest observation to all observers; never waits."""
         self.newest = message
         for queue in self.observers:
             queue.put(message)
 
 
 def opens_session(token: str | None, row: SessionRow) -> bool:
-    """Whether a token is that of the session of a row."""
+    """Whether a token is the session token of a row."""
     return token is not None and secrets_equal(token_hash(token), row.token_hash)
 
 
@@ -405,7 +404,7 @@ def controller_taken(session_id: str) -> ServiceError:
 
 
 def session_info(session: Session, *, ws_base: str, token: str = "") -> SessionInfo:
-    """A session; only its creator gets the token."""
+    """A session; only the reply to its creation has the token."""
     world, row = session.world, session.row
     created = datetime.fromtimestamp(row.created_us / 1e6, UTC)
     return SessionInfo(
@@ -425,7 +424,7 @@ def session_info(session: Session, *, ws_base: str, token: str = "") -> SessionI
 
 
 def session_state(session_id: str, world: World, events: Iterable[Event]) -> SessionState:
-    """Where everything is at an instant, and what happened before it."""
+    """Poses of all objects at a step, and the events before it."""
     seen = world.observe()
     return SessionState.model_validate(
         {
@@ -447,7 +446,7 @@ def session_state(session_id: str, world: World, events: Iterable[Event]) -> Ses
 
 
 def shown_state(session: Session) -> SessionState:
-    """As :func:`session_state`, for those who look on: with the newest plan."""
+    """As :func:`session_state`, with the newest plan, for observers."""
     state = session_state(session.session_id, session.running_world(), tuple(session.events))
     newest = session.newest_plan
     plan = plan_in_world(newest.plan, newest.motion) if newest is not None else None
@@ -463,7 +462,7 @@ def shown_state(session: Session) -> SessionState:
 
 
 def session_edited(session_id: str, world: World, outcome: EditOutcome) -> SessionEdited:
-    """What an edit of a running world led to."""
+    """The result of an edit in a running session."""
     return SessionEdited(
         session_id=session_id,
         step=world.steps,
@@ -474,7 +473,7 @@ def session_edited(session_id: str, world: World, outcome: EditOutcome) -> Sessi
 
 
 def welcome_fields(session: Session, role: str) -> dict[str, Any]:
-    """Of the wire's Welcome, without envelope."""
+    """Members of the protocol's Welcome, without envelope."""
     start, world = session.start, session.world
     objects = (world.state if world else start.state).visible
     infos = edited_objects(objects, start.summary, tracks=False)
@@ -505,7 +504,8 @@ def welcome_fields(session: Session, role: str) -> dict[str, Any]:
 
 
 def result_fields(world: World | None, scores: Sequence[Score]) -> dict[str, Any]:
-    """Of the wire's Result, without envelope; ``world``: the last instant, if an episode began."""
+    """Members of the protocol's Result, without envelope; ``world``: the last one, if there is
+    one."""
     return {
         "steps": world.steps if world else 0,
         "t_us": world.t_us if world else None,

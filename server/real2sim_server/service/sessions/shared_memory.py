@@ -1,14 +1,13 @@
-"""Images for a controller on the same machine: a file in memory that both have mapped.
+"""Images for a controller on the same machine, in a file that both processes map.
 
-The worker makes one for each controller and names it in the welcome. A client that can open it
-sends back the secret at its beginning: proof that both see the same memory, which no address gives
-where there are containers and tunnels. From then on nobody needs the name and it goes, so that the
-memory is free once worker and client have let go of it, however each of them ends; a name is left
-behind only by a worker that is killed before its client has answered, and the next one sweeps it.
+The worker creates a file for each controller and names it in the welcome. A client that can open it
+returns the secret at its start. This proves that both see the same memory; with containers and
+tunnels an address would not. The name is then removed, so that the memory is free once worker and
+client have released it, however they end. A name only remains if a worker is killed before its
+client has answered; the next worker removes it.
 
-With each message the client says which slot the images of its answer may be written to, and the
-worker writes nowhere else and at no other time. So an image stays as it is for as long as its
-client keeps the slot to itself, and no further message has to say so.
+Each message names the slot for the images of its answer, and the worker writes to no other slot and
+at no other time. An image therefore stays unchanged as long as its client does not reuse the slot.
 """
 
 from __future__ import annotations
@@ -41,29 +40,29 @@ from ..library.scenes import IdleItem, MemoryBudget
 from ..rendering.frames import EncodedFrame, placed_frame
 
 SLOTS = 4
-"""The observation under way, the newest, and two before it that a planner may hold."""
+"""The observation in progress, the newest, and two earlier ones that a planner may hold."""
 PREFIX = "real2sim-"
 NAME_BYTES = 16
 READ_ONLY = 0o400
-"""Of our user alone, who may not write through the name: no client cuts it short by mistake."""
+"""Read-only for our user, so that no client truncates the file by mistake."""
 
 log = structlog.get_logger(__name__)
 
 
 class Segment:
-    """The shared memory of one controller. Its images are placed on any thread, one answer at a
-    time; all else happens on the event loop.
+    """The shared memory of one controller. Images are placed on any thread, one answer at a time;
+    all other methods are for the event loop.
 
     Args:
-        path: of a file that does not exist yet.
-        slot_bytes: of each slot; nothing is taken of the machine's memory before images need it.
-        budget: in which that counts.
+        path: path of the new file.
+        slot_bytes: size of each slot; memory is only allocated when images need it.
+        budget: memory budget that counts it.
 
     Attributes:
         attached: whether the client has proved that it has opened the memory.
 
     Raises:
-        OSError: there is no such memory here.
+        OSError: shared memory is not available here.
     """
 
     def __init__(self, path: Path, slot_bytes: int, budget: MemoryBudget) -> None:
@@ -83,7 +82,7 @@ class Segment:
             size = SHM_HEADER_BYTES + SLOTS * slot_bytes
             os.ftruncate(self._file, size)
             os.posix_fallocate(self._file, 0, SHM_HEADER_BYTES)
-            # Unmapped with the last array on it, which another thread may be using.
+            # Unmapped with the last array that uses it, possibly on another thread.
             self._memory = np.frombuffer(mmap.mmap(self._file, size), np.uint8)
         except BaseException:
             self.close()
@@ -93,7 +92,7 @@ class Segment:
 
     @property
     def offer(self) -> dict[str, Any]:
-        """Of the wire's SharedMemory."""
+        """The protocol's SharedMemory."""
         return {"name": self._path.name, "slots": SLOTS, "slot_bytes": self._slot_bytes}
 
     @property
@@ -103,11 +102,11 @@ class Segment:
 
     @property
     def taken_bytes(self) -> int:
-        """What is taken of the machine's memory."""
+        """Allocated memory [bytes]."""
         return sum(self._taken)
 
     def attach(self, secret: bytes) -> None:
-        """The client has opened the memory. Raises ServiceError: INVALID_REQUEST, it has not."""
+        """The client has opened the memory. Raises ServiceError: INVALID_REQUEST, wrong secret."""
         if not secrets_equal(secret.hex(), self._secret.hex()):
             raise ServiceError(
                 ErrorCode.INVALID_REQUEST,
@@ -118,7 +117,7 @@ class Segment:
         self._remove_name()
 
     def slot(self, number: int | None) -> FrameSlot | None:
-        """The slot of a message; None where it names none, or the client has not attached.
+        """The slot of a message; None if it names none, or the client has not attached.
 
         Raises:
             ServiceError: INVALID_REQUEST, there is no such slot.
@@ -133,9 +132,9 @@ class Segment:
         return FrameSlot(self, number)
 
     def place(self, number: int, frames: Sequence[EncodedFrame]) -> list[EncodedFrame] | None:
-        """Copy raw images into a slot; the frames that say where they lie.
+        """Copy raw images into a slot; returns frames with their offsets.
 
-        None where they do not fit, or the machine or the budget has no such memory left.
+        None if they do not fit, or if the machine or the budget has no memory left.
         """
         memory, begin = self._memory, SHM_HEADER_BYTES + number * self._slot_bytes
         offsets, end = [], begin
@@ -152,7 +151,7 @@ class Segment:
         ]
 
     def close(self) -> None:
-        """Let go of the memory, and of its name where that is still there."""
+        """Release the memory, and remove its name if it still exists."""
         with self._lock:
             if self._file is None:
                 return
@@ -163,9 +162,9 @@ class Segment:
             self._memory = np.empty(0, np.uint8)
 
     def _take(self, number: int, size: int) -> bool:
-        """Whether the first ``size`` bytes of a slot are there to be written to.
+        """Whether the first ``size`` bytes of a slot can be allocated.
 
-        Pages of a file that the system cannot provide would end the process when written to.
+        Writing to pages that the system cannot provide would kill the process.
         """
         if size <= self._taken[number]:
             return True
@@ -185,7 +184,7 @@ class Segment:
         return True
 
     def _reserve(self, number: int, size: int) -> None:
-        """Count memory of a slot. Raises ServiceError: OUT_OF_MEMORY."""
+        """Reserve memory for a slot. Raises ServiceError: OUT_OF_MEMORY."""
         taken = self._taken
         self._budget.make_room(
             "shared memory of images",
@@ -199,18 +198,18 @@ class Segment:
 
 
 def _placed(frame: EncodedFrame, memory: NDArray[np.uint8], offset: int) -> EncodedFrame:
-    """The frame of a raw image that is copied there; NumPy lets other threads run meanwhile."""
+    """The frame of a raw image that is copied there; NumPy releases the GIL meanwhile."""
     pixels = np.frombuffer(frame.data, np.uint8)
     np.copyto(memory[offset : offset + len(pixels)], pixels)
     return placed_frame(frame, offset)
 
 
 class FrameSlot(NamedTuple):
-    """Where the images of one answer may be written.
+    """Slot for the images of one answer.
 
     Attributes:
-        segment: of the connection.
-        number: of the slot.
+        segment: shared memory of the connection.
+        number: number of the slot.
     """
 
     segment: Segment
@@ -222,11 +221,11 @@ class FrameSlot(NamedTuple):
 
 
 class Segments:
-    """The shared memory of a worker's controllers, under its budget of memory.
+    """Shared memory of a worker's controllers, within the memory budget.
 
     Args:
-        budget: in which it counts.
-        segment_bytes: of one controller; 0 offers none.
+        budget: memory budget that counts it.
+        segment_bytes: size for one controller; 0 disables shared memory.
     """
 
     def __init__(self, budget: MemoryBudget, segment_bytes: int) -> None:
@@ -237,15 +236,15 @@ class Segments:
 
     @property
     def held_bytes(self) -> int:
-        """Memory that images have taken."""
+        """Memory allocated for images [bytes]."""
         return sum(segment.taken_bytes for segment in self._segments)
 
     def idle(self) -> Sequence[IdleItem]:
-        """Nothing: clients may be looking at all of it."""
+        """Nothing: clients may be using all of it."""
         return ()
 
     def create(self) -> Segment | None:
-        """Memory for a controller; None where there is none to be had."""
+        """Memory for a controller; None if not available."""
         if not self._slot_bytes or not hasattr(os, "posix_fallocate"):
             return None
         path = Path(SHM_FOLDER, PREFIX + secrets.token_hex(NAME_BYTES))
@@ -259,13 +258,13 @@ class Segments:
 
 
 def sweep_segments() -> list[Path]:
-    """Remove the names that killed workers of this user have left behind; returns them."""
+    """Remove the names of this user's killed workers; returns them."""
     found = Path(SHM_FOLDER).glob(PREFIX + "[0-9a-f]" * 2 * NAME_BYTES)
     return [path for path in found if _removed_if_left(path)]
 
 
 def _removed_if_left(path: Path) -> bool:
-    """Remove a name unless it belongs to a process that lives; whether it is removed."""
+    """Remove a name unless its process is alive; returns whether it was removed."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
@@ -283,7 +282,7 @@ def _removed_if_left(path: Path) -> bool:
 
 
 def _lock(file: int) -> None:
-    """Own a file until it is closed; the kernel ends that with the process. Raises OSError."""
+    """Lock a file until it is closed; the lock ends with the process. Raises OSError."""
     import fcntl
 
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,8 +1,8 @@
-"""A session's step from one committed instant to the next, and to the bytes that show it.
+"""A session's step from one committed world to the next, and to its encoded observation.
 
-A change is made on a fork of the world and passes the step pipeline (`pipeline`), which writes it
-to the session's log first. It takes effect once its observation is encoded and packed. If anything
-fails before that, the session stays unchanged and the log entry is withdrawn.
+A change is made on a fork of the world and runs through the step pipeline (`pipeline`), which first
+writes it to the session's log. It takes effect once its observation is encoded and packed. If
+anything fails before that, the session stays unchanged and the log entry is withdrawn.
 """
 
 from __future__ import annotations
@@ -43,25 +43,25 @@ LogRecord = tuple[str, int, bytes]
 """Kind, step and payload of an entry of a session's log."""
 
 MakeReply = Callable[[World, Sequence[Event]], StoredReply | None]
-"""Makes what is stored under a request's key of the world it led to and the events on the way."""
+"""Creates the reply to store under a request's key, from the new world and the events."""
 
 MakeEditReply = Callable[[World, EditOutcome], StoredReply | None]
-"""The same of an edited world and what the edit led to."""
+"""The same for an edit, from the edited world and its outcome."""
 
 MAX_SNAPSHOTS = 32
 
 STEPS_AT_ONCE = 20
-"""Steps of a REST request that are computed in one go; other sessions get their turn between."""
+"""Steps of a REST request computed in one batch; other sessions run in between."""
 
 
 class Stepper:
-    """Moves the worlds of sessions; the caller holds the session's lock.
+    """Advances the worlds of sessions; the caller holds the session's lock.
 
     Args:
-        pipeline: makes observations of changed worlds.
-        kernels: what episodes wait for before they begin.
-        store: takes the logs of the sessions.
-        on_fenced: told of a session that turns out to be another worker's.
+        pipeline: computes observations of changed worlds.
+        kernels: kernels that episodes wait for.
+        store: stores the logs of the sessions.
+        on_fenced: called with a session that belongs to another worker.
     """
 
     def __init__(
@@ -80,10 +80,11 @@ class Stepper:
     async def reset(
         self, session: Session, spec: ResetSpec, *, slot: FrameSlot | None = None
     ) -> EncodedMessage:
-        """Begin an episode; its first observation, raw images in a slot where one is given.
+        """Start an episode; returns its first observation, with raw images in the slot if given.
 
         Raises:
-            WorldError, ServiceError: the episode cannot run as asked; the running one goes on.
+            WorldError, ServiceError: the episode cannot run with these options; the current one
+                continues.
         """
         cameras = await self._announced(session, spec)
         record = ("reset", 0, reset_payload(spec))
@@ -95,9 +96,9 @@ class Stepper:
         return observation.answer
 
     async def restart(self, session: Session, spec: ResetSpec, *, reply: MakeReply) -> None:
-        """Begin an episode without rendering its first observation. Raises like reset().
+        """Start an episode without rendering its first observation. Raises like reset().
 
-        ``reply`` makes the answer that is stored with it.
+        ``reply`` creates the reply that is stored with it.
         """
         cameras = await self._announced(session, spec)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
@@ -106,13 +107,13 @@ class Stepper:
         session.begin(world, cameras)
 
     async def begin(self, session: Session, spec: ResetSpec) -> None:
-        """Like restart(), for a session that is not in the store yet; see beginning_entries()."""
+        """Like restart(), for a session that is not yet stored; see beginning_entries()."""
         cameras = await self._announced(session, spec)
         world = await self._pipeline.on_world_thread(_beginning(session, spec))
         session.begin(world, cameras)
 
     async def _announced(self, session: Session, spec: ResetSpec) -> dict[str, Camera]:
-        """Cameras of an episode, once all that it would wait for on the way is there."""
+        """Cameras of an episode, once everything that its steps would wait for is ready."""
         start = session.start
         cameras = self._pipeline.cameras(start.scene, spec.sensors)
         ranging = await mounted_beside(spec.lidars, spec.radars, spec.dt_us)
@@ -122,7 +123,7 @@ class Stepper:
         return cameras
 
     def beginning_entries(self, session: Session) -> list[SessionEntry]:
-        """The log of a session that is not in the store yet: its first episode, if it has one."""
+        """Log of a session that is not yet stored: its first episode, if any."""
         if session.world is None:
             return []
         return _entries(session, [("reset", 0, reset_payload(session.spec))])
@@ -136,18 +137,18 @@ class Stepper:
         waited_us: int = 0,
         slot: FrameSlot | None = None,
     ) -> EncodedMessage:
-        """Take the action that is due; the next observation.
+        """Take the due action; returns the next observation.
 
         Args:
-            session: its lock step wants this action now.
-            plan: what the ego does.
+            session: its lockstep expects this action.
+            plan: plan of the ego.
             payload: canonical bytes of the plan.
             waited_us: wall-clock time from the observation to this action.
-            slot: that raw images of the observation may be written to.
+            slot: shared memory slot for raw images.
 
         Raises:
             WorldError: the plan is refused.
-            QueueFullError: too much waits for the engine; the same action may be sent again.
+            QueueFullError: the engine's queue is full; the same action may be sent again.
         """
         now = session.running_world()
         if plan is not None:
@@ -158,14 +159,14 @@ class Stepper:
             entry = action_payload(plan, latency_us=latency_us, missed=session.late)
         change = partial(_moved, now, plan, latency_us, session.late)
         observation = await self._move(session, change, entry, slot=slot)
-        # Given once more, its images come with it: the slot may hold others by then.
+        # A repeated answer includes its images: the slot may have others by then.
         session.lockstep.advance(payload, observation.message, over=observation.world.over)
         return observation.answer
 
     async def step_without_action(self, session: Session) -> EncodedMessage:
-        """Go on without the action that is due, by the episode's fallback; the observation.
+        """Advance without the due action, by the episode's fallback; returns the observation.
 
-        That action is stale from here on.
+        The action is stale afterwards.
         """
         change = partial(_moved, session.running_world(), None, 0, True)
         entry = action_payload(None, missed=True)
@@ -174,7 +175,7 @@ class Stepper:
         return observation.message
 
     async def stop(self, session: Session, reason: str) -> EncodedMessage:
-        """End the episode where it is; the present observation with the reason."""
+        """End the episode at its newest step; returns its observation with the reason."""
         now = session.running_world()
         record = ("stop", now.steps, stop_payload(reason))
         step = Step(partial(_stopped, now, reason), session.cameras, clouds=bool(now.ranging))
@@ -192,7 +193,7 @@ class Stepper:
         *,
         slot: FrameSlot | None = None,
     ) -> EncodedObservation:
-        """The clock moves by one step."""
+        """Advance the clock by one step."""
         now = session.running_world()
         step = Step(
             change,
@@ -207,12 +208,13 @@ class Stepper:
         return observation
 
     async def step(self, session: Session, n: int, plan: Plan | None, *, reply: MakeReply) -> None:
-        """Move the clock ``n`` times under one plan, or to the end; nothing is drawn.
+        """Advance the clock ``n`` times under one plan, or to the end, without rendering.
 
-        All of it takes effect, or nothing; ``reply`` makes the answer that is stored with it.
+        The steps take effect together or not at all; ``reply`` creates the reply that is stored
+        with them.
 
         Raises:
-            WorldError: the plan is refused, or the episode is over already.
+            WorldError: the plan is refused, or the episode has already ended.
         """
         now = session.running_world()
         given, world, events = plan, now, list(session.events)
@@ -237,7 +239,7 @@ class Stepper:
         base_rev: int | None,
         reply: MakeEditReply | None = None,
     ) -> EditOutcome:
-        """Edit the world before its next step; ``reply`` makes the answer that is stored with it.
+        """Edit the world before its next step; ``reply`` creates the reply that is stored with it.
 
         Raises:
             EditError, ServiceError: nothing has changed.
@@ -256,7 +258,7 @@ class Stepper:
         return outcome
 
     async def set_agent_plan(self, session: Session, message: Agent) -> None:
-        """Give an externally driven object a plan. Raises WorldError."""
+        """Set the plan of an externally driven object. Raises WorldError."""
         now = session.running_world()
 
         def steered() -> World:
@@ -270,7 +272,7 @@ class Stepper:
         session.world = world
 
     async def snapshot(self, session: Session, name: str) -> World:
-        """Keep the present instant under a name. Raises ServiceError: INVALID_REQUEST."""
+        """Save the current state under a name. Raises ServiceError: INVALID_REQUEST."""
         now = session.running_world()
         if name not in session.snapshots and len(session.snapshots) >= MAX_SNAPSHOTS:
             raise ServiceError(
@@ -283,7 +285,7 @@ class Stepper:
         return now
 
     async def restore(self, session: Session, name: str) -> EncodedMessage:
-        """Go back to a snapshot; its observation.
+        """Return to a snapshot; returns its observation.
 
         Raises:
             ServiceError: NOT_FOUND.
@@ -306,7 +308,7 @@ class Stepper:
         return observation.message
 
     async def _observe(self, session: Session, step: Step, entry: LogRecord) -> EncodedObservation:
-        """The observation of a change, which is on record then."""
+        """The observation of a change, after the change is stored."""
         entries = _entries(session, [entry])
         step.log = LogWrite(self._store, session.row.claim, entries, session.log_unsure)
         try:
@@ -325,7 +327,7 @@ class Stepper:
         return observation
 
     async def _withdraw(self, session: Session) -> None:
-        """Take back what has been recorded ahead; by the next entry where the store is not well."""
+        """Withdraw entries that were stored ahead; with the next entry if the store fails."""
         try:
             await self._store.withdraw(session.row.claim, from_seq=session.next_seq)
         except StoreTroubleError:
@@ -334,7 +336,7 @@ class Stepper:
             self._on_fenced(session)
 
     async def settle(self, session: Session) -> None:
-        """Take back what may be on record of changes that never took effect, answers included."""
+        """Withdraw entries and replies that may be stored but never took effect."""
         if session.log_unsure:
             keys, seq = session.unsure_replies, session.next_seq
             await self._store.withdraw(session.row.claim, from_seq=seq, replies=keys)

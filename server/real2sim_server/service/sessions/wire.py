@@ -1,4 +1,4 @@
-"""Server messages as bytes, with images that are never copied on the way."""
+"""Server messages as bytes; images are never copied."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class PhaseTimer:
     _since: float = field(default_factory=time.perf_counter)
 
     def stage(self, name: str) -> None:
-        """What happened since the last stage was ``name``."""
+        """End the stage ``name``, which began at the last stage."""
         now = time.perf_counter()
         self.timing_ms[name] = (now - self._since) * 1e3
         self._since = now
@@ -36,11 +36,11 @@ class PhaseTimer:
 @made_quickly
 @dataclass(frozen=True, eq=False)
 class EncodedMembers:
-    """Members of a message, encoded.
+    """Encoded members of a message.
 
     Attributes:
-        count: how many.
-        encoded: their names and values, without a map's header.
+        count: number of members.
+        encoded: their names and values, without a map header.
     """
 
     count: int
@@ -50,18 +50,18 @@ class EncodedMembers:
 @made_quickly
 @dataclass(frozen=True, eq=False)
 class EncodedMessage:
-    """An encoded message that lacks only its id, so that one encoding serves all who get it.
+    """An encoded message without its id, so that one encoding serves all recipients.
 
     Attributes:
-        head: bytes up to the id.
-        rest: everything behind it; views of images among them.
+        head: bytes before the id.
+        rest: bytes after it, including views of images.
     """
 
     head: bytes
     rest: tuple[Part, ...]
 
     def parts(self, message_id: int = 0) -> list[Part]:
-        """The whole message, to be sent one part after the other."""
+        """The whole message, in parts to be sent in order."""
         return [self.head + _packed(message_id), *self.rest]
 
     def joined(self, message_id: int = 0) -> bytes:
@@ -88,10 +88,10 @@ def pack_with_frames(
     *,
     clouds: Sequence[Sequence[Part]] = (),
 ) -> EncodedMessage:
-    """A message with the members ``frames``, ``timing`` and, where there are any, ``clouds`` (maps,
-    each in parts) besides ``members``.
+    """A message of ``members``, ``frames``, ``timing`` and, if any, ``clouds`` (maps, each in
+    parts).
 
-    What it takes to send the parts is not in ``timing``, for that comes later.
+    ``timing`` does not include sending.
     """
     parts: list[Part] = [members.encoded + FRAMES + array_header(len(frames))]
     for frame in frames:

@@ -1,1 +1,1 @@
-"""Durable memory of a worker: tables, rows, migrations of state."""
+"""Persistent storage of a worker: tables, rows, schema migrations."""

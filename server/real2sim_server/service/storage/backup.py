@@ -1,7 +1,7 @@
-"""Copies of a worker's store: taken while it works, and put back where none works.
+"""Backups of a worker's store: made while it runs, restored while no worker runs.
 
-A backup is one tar file: what it is (`backup.json`), the database, and the bundles of the assets
-that scenarios may name. Scenes and results of jobs are files like others, and not in it.
+A backup is one tar file: metadata (`backup.json`), the database, and the bundles of the assets
+that scenarios may refer to. It does not include scenes and job results, which are plain files.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ DATABASE = "store.db"
 ASSETS = "assets"
 FORMAT = 1
 RESTORING = ".restore-"
-"""First part of the name of what is unpacked for a while in a state folder."""
+"""Name prefix of temporary folders in a state folder."""
 
 
 class BackupError(StoreError):
-    """A backup cannot be made or put back; the message says why and what to do."""
+    """A backup cannot be made or restored; the message states the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class BackupInfo:
-    """What a backup is.
+    """Metadata of a backup.
 
     Attributes:
-        format: of the file.
+        format: format of the file.
         created_at: UTC, ISO 8601.
         made_by: version of this program.
-        schema: version of the database's.
-        sha256: of the database.
-        assets: bundles in it.
+        schema: schema version of the database.
+        sha256: hash of the database.
+        assets: its bundles.
     """
 
     format: int
@@ -60,12 +60,12 @@ class BackupInfo:
 
 
 def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
-    """Copy a store, also while a worker writes to it: the copy is what it was at one instant.
+    """Copy a store to a file, also while a worker writes to it: the copy is a consistent snapshot.
 
     Args:
         database: SQLite file.
         assets: folder of asset bundles; it need not exist.
-        out: tar file to make; must not exist.
+        out: new tar file; must not exist.
 
     Raises:
         BackupError: there is no such database, or the copy is damaged.
@@ -76,7 +76,7 @@ def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
     with tempfile.TemporaryDirectory(prefix=".backup-", dir=out.parent) as folder:
         copy = Path(folder) / DATABASE
         _copy_database(database, copy)
-        # After the database: an asset that it names is there already, and never changes.
+        # After the database: its assets already exist, and never change.
         bundles = [path for path in sorted(assets.glob("[!.]*")) if path.is_dir()]
         info = BackupInfo(
             format=FORMAT,
@@ -95,28 +95,28 @@ def make_backup(database: Path, assets: Path, out: Path) -> BackupInfo:
         packed.chmod(0o600)
         with packed.open("rb") as file:
             os.fsync(file.fileno())
-        # Never over a file that has come meanwhile.
+        # Never overwrites a file created meanwhile.
         os.link(packed, out)
     return info
 
 
 def restore_backup(file: Path, data: Path, *, database: Path, assets: Path, replace: bool) -> Path:
-    """Put a backup back; the store that was there is moved aside.
+    """Restore a backup; an existing store is moved aside.
 
     Args:
         file: made by :func:`make_backup`.
-        data: state folder, which no worker may own.
-        database: SQLite file to make.
-        assets: folder that gets the bundles it lacks.
-        replace: whether there may be a store already.
+        data: state folder, not in use by a worker.
+        database: SQLite file to create.
+        assets: folder that receives missing bundles.
+        replace: whether an existing store may be replaced.
 
     Returns:
-        The store that was there, where it lies now; ``database`` itself if there was none.
+        The new path of the old store; ``database`` if there was none.
 
     Raises:
-        BackupError: it is no backup, damaged, or too new; or there is a store already.
-        StateFolderError: a worker is on the state folder.
-        OSError: something cannot be written.
+        BackupError: it is not a backup, damaged, or too new; or there is already a store.
+        StateFolderError: a worker uses the state folder.
+        OSError: a file cannot be written.
     """
     if not file.is_file():
         raise BackupError(f"there is no file {str(file)!r}")
@@ -145,7 +145,7 @@ def _copy_database(source: Path, target: Path) -> None:
         contextlib.closing(sqlite3.connect(target)) as writing,
     ):
         try:
-            # In one piece, so that it ends also while a worker writes; it keeps no writer waiting.
+            # In one step, so that it finishes even while a worker writes; writers need not wait.
             reading.backup(writing, pages=-1)
             writing.execute("PRAGMA journal_mode=DELETE")
         except sqlite3.Error as error:
@@ -153,7 +153,7 @@ def _copy_database(source: Path, target: Path) -> None:
 
 
 def _checked_schema(database: Path) -> int:
-    """The schema version of a copy. Raises BackupError: it is damaged."""
+    """Schema version of a copy. Raises BackupError: it is damaged."""
     with contextlib.closing(sqlite3.connect(database)) as connection:
         try:
             (state,) = connection.execute("PRAGMA quick_check(1)").fetchone()
@@ -169,7 +169,7 @@ def _checked_schema(database: Path) -> int:
 
 @contextlib.contextmanager
 def _unpacked(file: Path, beside: Path) -> Iterator[Path]:
-    """The contents of a backup, checked, in a folder that goes with the block."""
+    """The verified contents of a backup, in a folder that is removed after the block."""
     with tempfile.TemporaryDirectory(prefix=RESTORING, dir=beside) as name:
         folder = Path(name)
         try:
@@ -198,7 +198,7 @@ def _belongs(member: tarfile.TarInfo) -> bool:
 
 
 def _move_aside(database: Path) -> Path:
-    """Move a store out of the way, with what its journal holds."""
+    """Move a store aside, including its journal."""
     with (
         contextlib.closing(sqlite3.connect(database)) as connection,
         contextlib.suppress(sqlite3.Error),
@@ -214,7 +214,7 @@ def _move_aside(database: Path) -> Path:
 
 
 def _add_missing(bundles: Path, assets: Path) -> None:
-    """Assets never change, so that those of an id that is there are the same."""
+    """Copy missing assets. Assets never change, so existing ids have the same content."""
     if not bundles.is_dir():
         return
     assets.mkdir(parents=True, exist_ok=True)

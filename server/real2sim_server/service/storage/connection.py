@@ -21,7 +21,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.pool import StaticPool
 
-# Errors, by what to do about them.
+# Errors, by remedy.
 
 FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 REFUSED_ERRNOS = frozenset(
@@ -36,28 +36,28 @@ REFUSED_ERRNOS = frozenset(
         errno.ENOTCONN,
     }
 )
-"""Of a disk that is read-only, broken or gone, and of folders that belong to others."""
+"""Errors of read-only, broken or missing disks, and of folders of other users."""
 LITTLE_SPACE = 1 << 20
-"""Free bytes below which a failed write is put down to a full disk."""
+"""With fewer free bytes, a failed write is attributed to a full disk."""
 
 
 class StoreError(RuntimeError):
-    """The store cannot be used; the message says why and what to do."""
+    """The store is unusable; the message states the reason and the remedy."""
 
 
 class ConflictError(StoreError):
-    """A row that must be new exists already: another writer was first."""
+    """A row already exists: another writer was first."""
 
 
 class FencedError(StoreError):
-    """The session belongs to another worker by now: nothing was written."""
+    """Another worker has taken over the session: nothing was written."""
 
 
 class StoreTroubleError(StoreError):
-    """The store cannot do it just now, and whether it was done is open; send it again later.
+    """The store currently fails, and the outcome is unknown; try again later.
 
     Args:
-        reason: in the words of the driver, for the log and not for clients.
+        reason: text of the driver, for logs only.
     """
 
     told = "the worker's store is in trouble"
@@ -68,35 +68,35 @@ class StoreTroubleError(StoreError):
 
 
 class StoreUnavailableError(StoreTroubleError):
-    """The database is gone, frozen or locked."""
+    """The database is unreachable, frozen or locked."""
 
     told = "the worker's store does not answer"
 
 
 class StoreBusyError(StoreUnavailableError):
-    """One statement was given up; the database is well."""
+    """One statement was cancelled; the database is healthy."""
 
     told = "the worker's store was too busy for this"
 
 
 class StoreReadOnlyError(StoreTroubleError):
-    """The database is there and takes nothing; reading goes on."""
+    """The database is read-only; reads still succeed."""
 
     told = "the worker's store cannot be written to"
 
 
 class StoreFullError(StoreTroubleError):
-    """There is no space left where the database is."""
+    """No space left on the database's disk."""
 
     told = "the worker has no space left to store anything"
 
 
 def sorted_error(error: Exception, *, folder: Path | None) -> StoreError | None:
-    """The error of a driver as one of ours; None where it is a bug.
+    """Convert an error of a driver; None if it is a bug.
 
     Args:
-        error: of SQLAlchemy, of a driver, or of the system.
-        folder: of a database that is a file.
+        error: from SQLAlchemy, a driver, or the system.
+        folder: folder of a database file.
     """
     if isinstance(error, StoreError):
         return error
@@ -114,12 +114,12 @@ def sorted_error(error: Exception, *, folder: Path | None) -> StoreError | None:
 
 
 def is_full(error: OSError) -> bool:
-    """Whether it is for want of space that a file was not written."""
+    """Whether the error is caused by lack of disk space."""
     return error.errno in FULL_ERRNOS
 
 
 def is_refused(error: OSError) -> bool:
-    """Whether the disk takes nothing at present, or gives nothing."""
+    """Whether the disk currently refuses writes or reads."""
     return error.errno in REFUSED_ERRNOS
 
 
@@ -168,14 +168,14 @@ def _has_little_space(folder: Path) -> bool:
 
 _KINDS_OF_STATES: tuple[tuple[tuple[str, ...], type[StoreTroubleError]], ...] = (
     (("53100",), StoreFullError),
-    # Of a server that follows another one, for example.
+    # A read-only standby server, for example.
     (("25006",), StoreReadOnlyError),
-    # Deadlocks and the like, locks and statements that took too long.
+    # Deadlocks and similar conflicts, and timeouts of locks and statements.
     (("40", "55P03", "57014"), StoreBusyError),
-    # Connection, transaction state, resources, state of the server, operator, system.
+    # Connection, transaction state, resources, server state, operator, system.
     (("08", "25", "53", "55", "57", "58"), StoreUnavailableError),
 )
-"""Beginnings of states of a server's errors; the first that fits counts."""
+"""Prefixes of a server's SQLSTATE; the first match applies."""
 
 
 def _of_server(error: SQLAlchemyError, cause: BaseException) -> StoreError | None:
@@ -183,7 +183,7 @@ def _of_server(error: SQLAlchemyError, cause: BaseException) -> StoreError | Non
         kinds = (kind for states, kind in _KINDS_OF_STATES if state.startswith(states))
         found = next(kinds, None)
         return found(_why(cause)) if found is not None else None
-    # Without a state the server has not spoken: it is not there, or the way to it is broken.
+    # Without a state the error is not from the server: it is down or unreachable.
     broken = ("OperationalError", "InterfaceError", "TimeoutError", "PendingRollbackError")
     if type(error).__name__ in broken or getattr(error, "connection_invalidated", False):
         return StoreUnavailableError(_why(cause))
@@ -191,7 +191,7 @@ def _of_server(error: SQLAlchemyError, cause: BaseException) -> StoreError | Non
 
 
 def _sqlstate(error: BaseException) -> str:
-    """Of a server's error, in whatever words of the driver; empty where there is none."""
+    """SQLSTATE of a server's error, from any driver; empty if there is none."""
     first = error.args[0] if error.args else None
     if isinstance(first, dict):
         return str(first.get("C", ""))
@@ -206,29 +206,29 @@ def _why(error: BaseException) -> str:
 
 
 DRIVER_TIMEOUTS = {"pg8000": "timeout", "psycopg": "connect_timeout", "psycopg2": "connect_timeout"}
-"""Argument of a PostgreSQL driver that limits its waiting [s]. Only pg8000 limits reading too, so
-that a server that is frozen is noticed."""
+"""Timeout argument of each PostgreSQL driver [s]. Only pg8000 also limits reads, so that a frozen
+server is detected."""
 
 RETRY_S = 0.01
-"""Between two attempts to change the journal of an SQLite database [s]."""
+"""Interval of attempts to switch the journal of an SQLite database [s]."""
 
 SERVER_SHARE = 0.8
-"""Of the time that a statement may take, before the server itself gives it up."""
+"""Fraction of the statement timeout after which the server cancels a statement."""
 
 
 def connect(url: str, *, timeout_s: float) -> sa.Engine:
-    """An engine for ``url``; SQLite's folder is made, its journal is a write-ahead one.
+    """An engine for ``url``; for SQLite, creates the folder and uses a write-ahead journal.
 
     Args:
         url: SQLAlchemy URL.
-        timeout_s: of one statement, of a lock, and of an answer of the server [s].
+        timeout_s: timeout of a statement, a lock, and a server's answer [s].
     """
     parsed = make_url(url)
     if parsed.get_backend_name() != "sqlite":
         return _server_engine(parsed, timeout_s)
     file = file_of(url)
     if file is None:
-        # Such a database belongs to its connection, whichever thread uses it.
+        # An in-memory database belongs to its connection, which all threads share.
         other_threads = {"check_same_thread": False}
         engine = sa.create_engine(parsed, poolclass=StaticPool, connect_args=other_threads)
     else:
@@ -240,10 +240,10 @@ def connect(url: str, *, timeout_s: float) -> sa.Engine:
     def set_up(connection: Any, _record: object) -> None:
         cursor = connection.cursor()
         if not cursor.execute("PRAGMA page_count").fetchone()[0]:
-            # Freed pages can be given back in pieces, if this is said before there is any.
+            # Incremental vacuum must be enabled before the first table is created.
             cursor.execute("PRAGMA auto_vacuum=INCREMENTAL")
         keep_write_ahead_journal(cursor, timeout_s)
-        # What is needed to take back one of several rows has no need of a file.
+        # The rollback data of a statement needs no file.
         for pragma in ("synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
             cursor.execute(f"PRAGMA {pragma}")
         cursor.execute(f"PRAGMA busy_timeout={round(timeout_s * 1000)}")
@@ -253,13 +253,13 @@ def connect(url: str, *, timeout_s: float) -> sa.Engine:
 
 
 def keep_write_ahead_journal(cursor: sqlite3.Cursor, timeout_s: float) -> None:
-    """Let a database keep a write-ahead journal.
+    """Switch a database to a write-ahead journal.
 
-    Of several connections that change the journal of one file at once, SQLite refuses all but one
-    without letting them wait; so they try again here.
+    If several connections switch the journal of one file at the same time, SQLite refuses all but
+    one without waiting, so this function retries.
 
     Raises:
-        sqlite3.OperationalError: the file stays locked for ``timeout_s``, or cannot be used.
+        sqlite3.OperationalError: the file stays locked for ``timeout_s``, or is unusable.
     """
     last = time.monotonic() + timeout_s
     while True:
@@ -274,7 +274,7 @@ def keep_write_ahead_journal(cursor: sqlite3.Cursor, timeout_s: float) -> None:
 
 def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:
     limit = DRIVER_TIMEOUTS.get(url.get_driver_name())
-    # The others take whole seconds.
+    # The other drivers require whole seconds.
     seconds = timeout_s if limit == "timeout" else max(1, round(timeout_s))
     arguments = {limit: seconds} if limit else {}
     engine = sa.create_engine(
@@ -296,11 +296,11 @@ def _server_engine(url: sa.URL, timeout_s: float) -> sa.Engine:
 
 
 def native_connection(url: sa.URL, timeout_s: float) -> tuple[Any, socket.socket]:
-    """A connection of pg8000's own kind, outside of all pools, and its socket; each statement is
-    committed by itself.
+    """A native pg8000 connection outside of all pools, and its socket; each statement is
+    committed separately.
 
     Raises:
-        pg8000.exceptions.Error: there is no server, or it refuses.
+        pg8000.exceptions.Error: the server is unreachable, or refuses.
     """
     from pg8000 import native
 
@@ -328,8 +328,8 @@ def native_connection(url: sa.URL, timeout_s: float) -> tuple[Any, socket.socket
 def _connect_by_own_socket(
     dialect: Any, _record: object, arguments: list[Any], parameters: dict[str, Any]
 ) -> Any:
-    """A connection of pg8000, whose socket is closed at once where none comes of it: pg8000 leaves
-    it open where a server takes connections and answers nothing."""
+    """A pg8000 connection; closes its socket if connecting fails. pg8000 leaves it open if a server
+    accepts connections but does not answer."""
     if {"sock", "unix_sock", "source_address"} & parameters.keys():
         return None  # by the driver itself
     address = parameters.get("host", "localhost"), parameters.get("port", 5432)
@@ -341,7 +341,7 @@ def _connect_by_own_socket(
         ) from error
     try:
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        # What `connect` of the driver does, which takes no socket.
+        # Replaces the driver's `connect`, which accepts no socket.
         return dialect.loaded_dbapi.Connection(*arguments, **parameters, sock=connected)
     except BaseException:
         connected.close()
@@ -349,7 +349,7 @@ def _connect_by_own_socket(
 
 
 def file_of(url: str) -> Path | None:
-    """The file of an SQLite database; None for others and for those in memory."""
+    """The file of an SQLite database; None for other and in-memory databases."""
     parsed = make_url(url)
     if parsed.get_backend_name() != "sqlite" or not parsed.database:
         return None
@@ -357,7 +357,7 @@ def file_of(url: str) -> Path | None:
 
 
 def make_private(file: Path) -> None:
-    """Make sure that nobody but its owner can read a database file; made where it is missing.
+    """Make a database file readable only by its owner; creates it if missing.
 
     SQLite gives its journals the permissions of the file. An existing file is not opened:
     closing it would release all locks of this process on it (fcntl(2)), and another process could
@@ -384,23 +384,23 @@ LOCK_FILE = "worker.lock"
 
 
 class StateFolderError(OSError):
-    """The state folder cannot be used; the message says why and what to do."""
+    """The state folder is unusable; the message states the reason and the remedy."""
 
 
 def check_state_folder(folder: Path) -> None:
-    """Refuse a state folder that cannot be used now. Raises StateFolderError."""
+    """Check that the state folder is usable. Raises StateFolderError."""
     with owned_folder(folder):
         pass
 
 
 @contextlib.contextmanager
 def owned_folder(folder: Path) -> Iterator[None]:
-    """Own the state folder for the length of the block; made where it is missing.
+    """Own the state folder during the block; creates it if missing.
 
-    The lock is the kernel's, so that it ends with the process however that ends; the file stays.
+    The kernel releases the lock when the process ends for any reason; the file stays.
 
     Raises:
-        StateFolderError: another process owns it, named by its PID; or it cannot be written to.
+        StateFolderError: another process owns it (with its PID); or it is not writable.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -416,12 +416,12 @@ def owned_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def owned_name(database: Path, worker_id: str) -> Iterator[None]:
-    """Be the only worker of that name on a database file, for the length of the block.
+    """Ensure during the block that only this worker uses a name on a database file.
 
-    Workers with state folders and names of their own may share one database.
+    Workers with separate state folders and names may share one database.
 
     Raises:
-        StateFolderError: another process has the name, named by its PID.
+        StateFolderError: another process has the name (with its PID).
     """
     path = database.with_name(f"{database.name}.{worker_id}.lock")
     try:
@@ -491,13 +491,13 @@ def _unusable(folder: Path, error: OSError) -> StateFolderError:
 # --- Ownership of a name on a server -------------------------------------------------------------
 
 NAME_SPACE = 0x5232_5302
-"""Of PostgreSQL's advisory locks: names of workers."""
+"""Class of PostgreSQL's advisory locks for worker names."""
 
 
 class NameOnServer:
-    """Being the only worker of a name on a PostgreSQL database.
+    """Ensures that only one worker uses a name on a PostgreSQL database.
 
-    The lock belongs to a connection of its own, and ends with it.
+    The lock belongs to a dedicated connection, and ends with it.
     """
 
     def __init__(self, engine: sa.Engine, worker_id: str) -> None:
@@ -506,7 +506,7 @@ class NameOnServer:
         self._connection: sa.Connection | None = None
 
     def hold(self) -> None:
-        """Take the name, or make sure that it is still ours.
+        """Take the name, or check that it is still ours.
 
         Raises:
             StoreError: another worker has it.
@@ -518,12 +518,12 @@ class NameOnServer:
         try:
             self._connection.exec_driver_sql("SELECT 1")
         except Exception:
-            # Drivers let errors of sockets through as they are; the connection is spoilt by any.
+            # Drivers do not convert socket errors; any of them breaks the connection.
             self.drop()
             raise
 
     def drop(self) -> None:
-        """Give the name back."""
+        """Release the name."""
         connection, self._connection = self._connection, None
         if connection is not None:
             with contextlib.suppress(sa.exc.SQLAlchemyError, OSError):
@@ -562,18 +562,17 @@ class NameOnServer:
 
 # --- Prepared statements -------------------------------------------------------------------------
 
-# One message to PostgreSQL and one back for each statement, which is a transaction of its own.
-# SQLAlchemy begins and ends a transaction around each and parses it anew, which takes several times
-# the processor time.
+# Each statement is one round trip to PostgreSQL and its own transaction. SQLAlchemy begins and ends
+# a transaction around each and parses it again, which takes several times the processor time.
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A statement for such a connection.
+    """A statement for :class:`PreparedStatements`.
 
     Attributes:
-        text: with ``:name`` for values; it returns a row for each that it changes.
-        values: by name.
+        text: with ``:name`` for values; returns a row for each changed one.
+        values: values by name.
     """
 
     text: str
@@ -581,11 +580,11 @@ class Prepared:
 
 
 class PreparedStatements:
-    """Statements that are prepared once for each connection. For one thread at a time.
+    """Statements that are prepared once per connection. Not thread-safe.
 
     Args:
-        url: of the database, with the driver pg8000.
-        timeout_s: of a statement, a lock, an answer [s].
+        url: URL of the database, with the driver pg8000.
+        timeout_s: timeout of a statement, a lock, an answer [s].
     """
 
     def __init__(self, url: sa.URL, *, timeout_s: float) -> None:
@@ -596,10 +595,10 @@ class PreparedStatements:
         self._known: dict[str, Any] = {}
 
     def execute(self, prepared: Prepared) -> int:
-        """Rows that the statement has changed; it is committed.
+        """Execute and commit the statement; returns the number of changed rows.
 
         Raises:
-            sqlalchemy.exc.SQLAlchemyError: of the server, or there is none.
+            sqlalchemy.exc.SQLAlchemyError: from the server, or it is unreachable.
         """
         if self._is_broken():
             self.close()
@@ -611,7 +610,7 @@ class PreparedStatements:
             raise
 
     def close(self) -> None:
-        """Disconnect; the next statement connects again."""
+        """Disconnect; the next statement reconnects."""
         connection, self._connection = self._connection, None
         self._known.clear()
         if connection is not None:
@@ -629,11 +628,12 @@ class PreparedStatements:
         return known
 
     def _is_broken(self) -> bool:
-        """Whether the server has said something unasked: that it closes, in all likelihood."""
+        """Whether the server has sent unexpected data, most likely that it closes the
+        connection."""
         return self._socket is not None and bool(select.select([self._socket], [], [], 0)[0])
 
     def _sort(self, error: Exception, text: str) -> None:
-        """Raise errors of the driver as SQLAlchemy does; a connection that may be spoilt goes."""
+        """Raise errors of the driver as SQLAlchemy does; closes a connection that may be broken."""
         from pg8000.exceptions import DatabaseError, InterfaceError
 
         state = str(error.args[0].get("C", "")) if _is_of_server(error) else ""

@@ -1,6 +1,6 @@
-"""The database of a store: statements on a thread of its own, what reaches the disk, and trouble.
+"""The database of a store: statements on a dedicated thread, durability, and failures.
 
-It knows no tables but the one that shows whether it is well; what is asked is the store's.
+It only knows the table of its probe; ``store`` defines all others and their queries.
 """
 
 from __future__ import annotations
@@ -44,35 +44,35 @@ T = TypeVar("T")
 
 TIMEOUT_S = 5.0
 PATIENCE = 3.0
-"""Timeouts that a caller waits for its turn and its answer."""
+"""Timeouts that a caller waits, for its turn and its answer."""
 PROBE_S = 1.0
-"""Between questions whether a store in trouble is well again."""
+"""Interval of probes of a failing store [s]."""
 CHECK_S = 5.0
-"""Between questions whether a store is still well."""
+"""Interval of probes of a healthy store [s]."""
 SCHEMA_TIMEOUT_S = 3600.0
-"""Of a migration: it may have to rewrite everything."""
+"""Timeout of a migration, which may rewrite all tables [s]."""
 
 Durability = Literal["all", "edits", "process"]
-"""What is on the disk before it is acknowledged: all, all but steps of sessions, or nothing; what
-is not is safe when the process dies, and the last of it lost when the machine does."""
+"""What is on disk before it is acknowledged: everything, everything except session steps, or
+nothing. Other writes survive a crash of the process, but the last ones not a crash of the
+machine."""
 
 OnCall = Callable[[str, float, bool], None]
-"""Told of a call: ``read`` or ``write``, its seconds, and whether it went well."""
+"""Called after a call: ``read`` or ``write``, its seconds, and whether it succeeded."""
 
 log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Write:
-    """A statement that writes. Rows beside it, not in it, so that it is compiled only once.
+    """A statement that writes, with its rows separate, so that it is compiled only once.
 
     Attributes:
-        statement: as text it goes to the driver as it is, with tuples as rows.
-        rows: that it is made with, once for each.
-        prepared: the same for a connection that prepares it, where it may be alone in its
-            transaction.
-        fenced: how many rows it must change; fewer mean that their sessions were taken over, and
-            nothing of the transaction is kept. None where it may be any number.
+        statement: text is passed to the driver unchanged, with tuples as rows.
+        rows: parameter rows; the statement is executed once for each.
+        prepared: the same as a prepared statement, for use if it is alone in its transaction.
+        fenced: number of rows that it must change. If it changes fewer, their sessions were taken
+            over, and the transaction is rolled back. None for any number.
     """
 
     statement: sa.Executable | str
@@ -81,36 +81,36 @@ class Write:
     prepared: Prepared | None = None
 
     def made_by(self, connection: sa.Connection) -> sa.CursorResult[Any]:
-        """What comes of it."""
+        """Execute the statement and return its result."""
         if isinstance(self.statement, str):
             return connection.exec_driver_sql(self.statement, cast("Any", self.rows))
         return connection.execute(self.statement, cast("Any", self.rows))
 
     def checked(self, changed: int) -> int:
-        """The rows that it changed. Raises FencedError."""
+        """Number of changed rows. Raises FencedError."""
         if self.fenced is not None and changed != self.fenced:
             raise FencedError("another worker has taken the session over")
         return changed
 
 
 class Database:
-    """SQLAlchemy Core on one thread of its own, so that the event loop never waits for a disk.
+    """SQLAlchemy Core on a dedicated thread, so that the event loop never waits for a disk.
 
-    A database in trouble is noticed within ``timeout_s``. From then on calls are refused at once,
-    until a probe of :meth:`watch` finds it well again.
+    A failing database is detected within ``timeout_s``. From then on calls are refused immediately,
+    until a probe of :meth:`watch` succeeds.
 
-    One thread is enough: an append takes 0.1 to 0.2 ms in SQLite's write-ahead mode, which has
-    one writer at a time anyway, and the order of appends is the order of the calls. Code that
-    computes on another thread may write from there, by :meth:`execute`: to be woken by a thread
-    and to wake another one takes longer than an append.
+    One thread is sufficient: an append takes 0.1 to 0.2 ms in SQLite's write-ahead mode, which only
+    supports one writer at a time, and appends keep the order of the calls. Code on other computing
+    threads may write directly with :meth:`execute`: a switch to another thread and back takes
+    longer than an append.
 
     Args:
         url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
-        worker_id: name to hold as long as the database is open; None for a guest.
-        timeout_s: of a statement, a lock, an answer [s].
-        durability: what reaches the disk before it is acknowledged.
-        migration: whether a store of an older schema is brought up to date.
-        on_call: told of each read and write, on the thread that did it.
+        worker_id: name to hold while the database is open; None for a guest.
+        timeout_s: timeout of a statement, a lock, an answer [s].
+        durability: what is on disk before it is acknowledged.
+        migration: whether to migrate a store of an older schema.
+        on_call: called after each read and write, on its thread.
     """
 
     def __init__(
@@ -142,36 +142,36 @@ class Database:
         self._prepared: PreparedStatements | None = None
 
     async def open(self, first: Write) -> None:
-        """Connect, create what is missing, and execute the first statement.
+        """Connect, create missing tables, and execute the first statement.
 
         Raises:
-            StoreError: the database cannot be opened, or is of a newer version.
-            StateFolderError: another worker of that name is on it.
+            StoreError: the database cannot be opened, or has a newer version.
+            StateFolderError: another worker of that name uses it.
         """
         await self._run(partial(self._open, first))
 
     async def close(self) -> None:
-        """Finish what was begun and disconnect."""
+        """Finish pending calls and disconnect."""
         await self._run(self._close)
         self._executor.shutdown()
 
     @property
     def trouble(self) -> StoreTroubleError | None:
-        """What is wrong with the database; None while it is well."""
+        """Failure of the database; None while it is healthy."""
         return self._trouble
 
     @property
     def is_server(self) -> bool:
-        """Whether it is a server, which has a clock of its own and many writers."""
+        """Whether it is a server, with its own clock and many writers."""
         return self._connected().dialect.name == "postgresql"
 
     @property
     def is_file(self) -> bool:
-        """Whether it is a file of SQLite's."""
+        """Whether it is an SQLite file."""
         return self._file is not None
 
     async def watch(self) -> None:
-        """Look after the database for ever: notice trouble, and its end."""
+        """Monitor the database until cancelled: detect failures and recoveries."""
         while True:
             await asyncio.sleep(PROBE_S if self._trouble else CHECK_S)
             try:
@@ -179,7 +179,7 @@ class Database:
             except StoreError:
                 continue
             except Exception:
-                # Whatever it was: without this watch the store would never be well again.
+                # Any error: without this loop the store would never recover.
                 log.exception("looking after the store failed")
 
     # --- statements -------------------------------------------------------------------------
@@ -199,17 +199,17 @@ class Database:
         return await self.on_thread(read)
 
     async def write(self, *changes: Write) -> list[int]:
-        """Rows changed by each statement, in one transaction; the answer is a promise.
+        """Rows changed by each statement, in one transaction, durable on return.
 
         Raises:
-            ConflictError: a row that must be new exists.
+            ConflictError: a row already exists.
             FencedError: a session was taken over.
         """
         self._refuse_while_down()
         return await self.on_thread(partial(self.execute, changes))
 
     async def write_returning(self, statement: sa.UpdateBase) -> list[dict[str, Any]]:
-        """Rows that a statement returns which writes, in a transaction of its own."""
+        """Rows returned by a writing statement, in its own transaction."""
 
         def write() -> list[dict[str, Any]]:
             self._refuse_while_down()
@@ -230,13 +230,13 @@ class Database:
         """Like :meth:`write`, on the calling thread; never on the event loop.
 
         Args:
-            changes: all of them, or none.
-            promised: whether somebody relies on them beyond a session: then they are on the disk
+            changes: executed in one transaction.
+            promised: whether they matter beyond a session: then they are on disk
                 before this returns, unless ``durability`` is ``process``.
         """
         self._refuse_while_down()
         durable = self._durability == "all" or (promised and self._durability == "edits")
-        # SQLite lets those who find it locked sleep and try again; they had better queue here.
+        # SQLite makes clients of a locked file sleep and retry; queueing here is faster.
         if not self._write_lock.acquire(timeout=self._timeout_s):
             raise self._noted(StoreUnavailableError("the write before this one has not ended"))
         try:
@@ -251,23 +251,23 @@ class Database:
         return counts
 
     async def on_thread(self, fn: Callable[[], T]) -> T:
-        """``fn()`` on the thread of the database, awaited as long as any answer.
+        """``fn()`` on the thread of the database, with the usual timeout.
 
         Raises:
-            StoreUnavailableError: it was not done in that time.
+            StoreUnavailableError: it did not finish in time.
         """
         return await self._run(fn, patience_s=PATIENCE * self._timeout_s)
 
     # --- size -------------------------------------------------------------------------------
 
     async def used_bytes(self) -> int | None:
-        """What a database of SQLite takes, without what it could give back; None for a server."""
+        """Size of an SQLite database without free pages; None for a server."""
         if self._connected().dialect.name != "sqlite":
             return None
         return await self.on_thread(self._pages_bytes)
 
     async def give_back(self, pages: int) -> bool:
-        """Give free pages of a database file back to the disk; whether there are more."""
+        """Return free pages of a database file to the disk; returns whether there are more."""
         if self._file is None:
             return False
         return await self.on_thread(partial(self._shrink, pages))
@@ -285,7 +285,8 @@ class Database:
             with self._write_lock, self._connected().connect() as connection:
                 cursor = _driver_of(connection).cursor()
                 (before,) = cursor.execute("PRAGMA freelist_count").fetchone()
-                # A step a page; the driver makes but one of what has no columns, save in scripts.
+                # One step per page; except in scripts, the driver executes only one for statements
+                # without columns.
                 cursor.executescript(f"PRAGMA incremental_vacuum({pages})")
                 (after,) = cursor.execute("PRAGMA freelist_count").fetchone()
                 more = 0 < after < before
@@ -299,10 +300,10 @@ class Database:
     # --- inside -----------------------------------------------------------------------------
 
     async def _run(self, fn: Callable[[], T], *, patience_s: float | None = None) -> T:
-        """``fn()`` on the database's thread; done also when the caller is cancelled or has left.
+        """Run ``fn()`` on the database's thread; it completes even if the caller is cancelled.
 
         Raises:
-            StoreUnavailableError: it was not done within ``patience_s``.
+            StoreUnavailableError: it did not finish within ``patience_s``.
         """
         work = asyncio.get_running_loop().run_in_executor(self._executor, fn)
         work.add_done_callback(_looked_at)
@@ -331,12 +332,12 @@ class Database:
             return [c.checked(c.made_by(connection).rowcount) for c in changes]
 
     def _executed_by_driver(self, change: Write, *, durable: bool) -> int:
-        """The same of one statement as text, for a file: SQLAlchemy would take longer to hand it
-        on than SQLite to append what a step leaves."""
+        """The same for one statement as text, on a file: SQLAlchemy's overhead would exceed
+        SQLite's time for appending a step."""
         statement, rows = cast("str", change.statement), change.rows or [()]
         with self._kept_writer(durable=durable) as writer:
             connection = _driver_of(writer)
-            # The driver begins a transaction by itself; it is rolled back where one row fails.
+            # The driver begins a transaction automatically; it is rolled back if a row fails.
             with connection:
                 if len(rows) == 1:
                     cursor = connection.execute(statement, cast("Any", rows[0]))
@@ -346,7 +347,7 @@ class Database:
 
     @contextlib.contextmanager
     def _transaction(self, *, durable: bool) -> Iterator[sa.Connection]:
-        """A transaction of its own, committed at the end; the caller holds the write lock."""
+        """A separate transaction, committed at the end; the caller holds the write lock."""
         if self._file is None:
             with self._connected().begin() as connection:
                 yield connection
@@ -356,10 +357,10 @@ class Database:
 
     @contextlib.contextmanager
     def _kept_writer(self, *, durable: bool) -> Iterator[sa.Connection]:
-        """The connection that writes to a file, kept unless it fails; the caller holds the write
+        """The connection that writes to a file, reused unless it fails; the caller holds the write
         lock."""
         if self._writer is None:
-            # Fetching a connection from the pool and giving it back takes as long as an append.
+            # Taking a connection from the pool and returning it takes as long as an append.
             self._writer, self._writer_is_durable = self._connected().connect(), False
         if durable != self._writer_is_durable:
             self._set_durable(self._writer, durable=durable)
@@ -373,8 +374,8 @@ class Database:
             raise
 
     def _found_full(self, error: Exception) -> bool:
-        """Whether there was no space. What was written is taken back then and the connection is
-        good; were it the last one and closed, readers might not get their files any more."""
+        """Whether the disk was full. The write is then rolled back and the connection is kept. If
+        the last connection closed, readers might not be able to create their files."""
         return isinstance(sorted_error(error, folder=self._folder), StoreFullError)
 
     @property
@@ -382,13 +383,13 @@ class Database:
         return self._file.parent if self._file else None
 
     def _set_durable(self, writer: sa.Connection, *, durable: bool) -> None:
-        # NORMAL loses no committed transaction when the process dies, only when the machine does.
+        # NORMAL only loses committed transactions if the machine crashes.
         pragma = f"PRAGMA synchronous={'FULL' if durable else 'NORMAL'}"
         _driver_of(writer).execute(pragma).close()
         self._writer_is_durable = durable
 
     def _drop_writer(self) -> None:
-        """A connection that has failed may be in any state; the next write gets another one."""
+        """Close a failed connection, which may be in any state; the next write opens a new one."""
         writer, self._writer = self._writer, None
         if writer is not None:
             with contextlib.suppress(sa.exc.SQLAlchemyError):
@@ -400,7 +401,7 @@ class Database:
             raise StoreError("the store is not open")
         return self._engine
 
-    # --- trouble ----------------------------------------------------------------------------
+    # --- failures ---------------------------------------------------------------------------
 
     def _refuse_while_down(self) -> None:
         trouble = self._trouble
@@ -408,7 +409,7 @@ class Database:
             raise type(trouble)(trouble.reason)
 
     def _reraise(self, error: Exception) -> NoReturn:
-        """Raise the error as callers get it; trouble is noted."""
+        """Raise the converted error, and record failures."""
         found = sorted_error(error, folder=self._folder)
         if isinstance(found, StoreTroubleError):
             self._noted(found)
@@ -431,12 +432,13 @@ class Database:
         log.warning("store well again", after_s=seconds)
 
     def _probe(self) -> None:
-        """Do what shows whether the database is well: read, and after trouble write."""
+        """Check the database: read, and write after a failure."""
         version = t.alembic_version.c.version_num
         try:
             if self._name_on_server is not None:
                 self._name_on_server.hold()
-            # On a full disk connections stay good, and new ones might not get their journal.
+            # On a full disk existing connections still work, but new ones might not get their
+            # journal.
             full = isinstance(self._trouble, StoreFullError)
             if self._trouble is not None and self._file is not None and not full:
                 self._reconnect()
@@ -451,8 +453,8 @@ class Database:
         self._recovered()
 
     def _reconnect(self) -> None:
-        """Leave all connections to a file: those that were made while it could not be written to
-        stay read-only for good, and SQLite makes later ones so as long as one of them is open."""
+        """Close all connections to a file. Connections opened while it was read-only stay
+        read-only, and so do later ones while one of them is open."""
         with self._write_lock:
             self._drop_writer()
             self._connected().dispose()
@@ -482,7 +484,7 @@ class Database:
         """Create or migrate the schema, with a long timeout."""
         engine = self._connected()
         with engine.connect():
-            pass  # Whether anybody is there is found out in the usual time.
+            pass  # The connection is checked with the usual timeout.
         if self._file is None and engine.dialect.name == "sqlite":
             prepare_schema(engine, policy=self._migration)
             return
@@ -513,13 +515,13 @@ class Database:
 
 
 def _driver_of(connection: sa.Connection) -> sqlite3.Connection:
-    """SQLite's own connection, for what is no statement of SQLAlchemy's."""
+    """SQLite's native connection, for calls that are not SQLAlchemy statements."""
     found = connection.connection.dbapi_connection
     assert found is not None
     return cast("sqlite3.Connection", found)
 
 
 def _looked_at(work: asyncio.Future[Any]) -> None:
-    """Nobody may be left to be told how it ended."""
+    """Retrieve the outcome of abandoned work, so that asyncio does not log it as unhandled."""
     if not work.cancelled():
         work.exception()

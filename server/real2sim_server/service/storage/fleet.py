@@ -1,8 +1,8 @@
-"""Leases of workers on sessions, and notices between workers.
+"""Leases of workers on sessions, and notifications between workers.
 
-A worker renews its lease every few seconds; others may take over the sessions of one whose lease
-has run out. All compare times by one clock: that of the database server, or of the machine that
-holds the file.
+A worker renews its lease every few seconds. If a lease expires, other workers may take over its
+sessions. All times are from one clock: that of the database server, or of the machine with the
+database file.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class WorkerRow:
 
     Attributes:
         worker_id: its name.
-        alive: whether its lease still runs.
-        document: what it last said about itself.
+        alive: whether its lease is valid.
+        document: its last reported status.
     """
 
     worker_id: str
@@ -45,15 +45,15 @@ class WorkerRow:
 
 
 class Leases:
-    """Promises of a worker, and what comes of those that others do not keep.
+    """The lease of a worker, and takeovers of expired ones.
 
     Args:
-        store: open while this is used.
-        worker_id: whose promises these are.
-        seconds: for which each holds.
+        store: open during use.
+        worker_id: id of this worker.
+        seconds: duration of a lease.
 
     Attributes:
-        worker_id: whose promises these are.
+        worker_id: id of this worker.
     """
 
     def __init__(self, store: Store, worker_id: str, *, seconds: float) -> None:
@@ -62,20 +62,20 @@ class Leases:
         self._seconds = seconds
 
     async def renew(self, document: Mapping[str, Any]) -> None:
-        """Promise to be alive for so long from now on.
+        """Renew the lease from now.
 
         Args:
-            document: what the fleet is told about the worker, JSON values.
+            document: status of the worker for the fleet, JSON values.
         """
         await self._promise(self._seconds, document)
 
     async def give_up(self, document: Mapping[str, Any]) -> None:
-        """Take the promise back: others may have the sessions at once."""
+        """End the lease: other workers may take over the sessions immediately."""
         await self._promise(0.0, document)
 
     async def take_over(self, session_id: str) -> SessionRow | None:
-        """Claim an open session that is this worker's, or whose worker has not kept its promise;
-        None where there is none, or another one has it."""
+        """Claim an open session of this worker or of one with an expired lease; None if there is
+        none, or another worker has it."""
         s = t.sessions.c
         is_free = (s.worker_id == self.worker_id) | ~is_alive(s.worker_id, self._store)
         claimed = sa.update(t.sessions).where((s.session_id == session_id) & s.closed_us.is_(None))
@@ -85,14 +85,14 @@ class Leases:
         return row if count and row is not None and row.worker_id == self.worker_id else None
 
     async def epochs(self, session_ids: Collection[str]) -> dict[str, int]:
-        """Epochs of those of the sessions that this worker has, by their ids."""
+        """Epochs of this worker's sessions among ``session_ids``, by id."""
         s = t.sessions.c
         mine = (s.worker_id == self.worker_id) & s.session_id.in_(session_ids)
         rows = await self._store.read(sa.select(s.session_id, s.epoch).where(mine))
         return {row["session_id"]: row["epoch"] for row in rows}
 
     async def workers(self) -> list[WorkerRow]:
-        """All workers that ever shared the store, by name."""
+        """All workers that have ever shared the store, by name."""
         w = t.workers.c
         alive = (w.lease_until_us > clock_of(self._store)).label("alive")
         query = sa.select(w.worker_id, alive, w.document).order_by(w.worker_id)
@@ -110,7 +110,7 @@ class Leases:
         first = Write(sa.insert(t.workers).values(worker_id=self.worker_id, **values))
 
         def promise() -> None:
-            # It is no use after the machine has gone down: nothing has to reach the disk.
+            # A lease is useless after a crash of the machine, so it need not be durable.
             (count,) = self._store.database.execute([renewed], promised=False)
             if not count:
                 self._store.database.execute([first], promised=False)
@@ -119,13 +119,13 @@ class Leases:
 
 
 def is_alive(worker_id: sa.ColumnElement[str], store: Store) -> sa.ColumnElement[bool]:
-    """Whether the worker that a column names keeps its promise, as a condition."""
+    """SQL condition: whether the worker named by a column has a valid lease."""
     w = t.workers.c
     return sa.exists().where((w.worker_id == worker_id) & (w.lease_until_us > clock_of(store)))
 
 
 def clock_of(store: Store) -> sa.ColumnElement[int]:
-    """Wall clock that all compare times by [us], as an expression."""
+    """SQL expression: the common wall clock [us]."""
     if store.database.is_server:
         seconds = sa.func.extract("epoch", sa.func.clock_timestamp())
         return sa.cast(seconds * 1_000_000, sa.BigInteger)
@@ -134,25 +134,25 @@ def clock_of(store: Store) -> sa.ColumnElement[int]:
 
 # --- Notices -------------------------------------------------------------------------------------
 
-# PostgreSQL's LISTEN and NOTIFY tell other workers of a change at once. Notices may be lost and
-# SQLite has none, so that waiting is always bounded.
+# PostgreSQL's LISTEN and NOTIFY notify other workers of a change immediately. Notifications may be
+# lost and SQLite has none, so every wait has a timeout.
 
 Topic = Literal["jobs", "bundles"]
-"""What has changed."""
+"""Kind of change."""
 
 CHANNEL = "real2sim"
 BEAT_S = 1.0
-"""Between questions whether the server is still there, and for word that the driver has kept."""
+"""Interval of server health checks, which also receive notifications buffered by the driver [s]."""
 RETRY_S = 1.0
-"""Between attempts to connect."""
+"""Interval of connection attempts [s]."""
 PAUSE_S = 0.05
-"""From word to the look that it causes, in which more may come."""
+"""Delay from a notification to the resulting query, to collect further ones [s]."""
 
 log = structlog.get_logger(__name__)
 
 
 def notice(topic: Topic, *, on_server: bool) -> list[Write]:
-    """What lets other workers know, once the transaction that it is part of is committed."""
+    """Statements that notify other workers when their transaction is committed."""
     if not on_server:
         return []
     return [Write(sa.text("SELECT pg_notify(:channel, :topic)").bindparams(**_of(topic)))]
@@ -163,11 +163,11 @@ def _of(topic: str) -> dict[str, str]:
 
 
 class Notices:
-    """Hears what other workers say. Belongs to the event loop; it listens on a thread of its own.
+    """Receives notifications of other workers on a separate thread. For use on the event loop.
 
     Args:
-        url: of the store.
-        timeout_s: of an answer of its server [s].
+        url: URL of the store.
+        timeout_s: timeout of the server's answers [s].
     """
 
     def __init__(self, url: str, *, timeout_s: float) -> None:
@@ -179,14 +179,14 @@ class Notices:
 
     @property
     def can_hear(self) -> bool:
-        """Whether the store has word to give."""
+        """Whether the database supports notifications."""
         return self._url.get_backend_name() == "postgresql" and (
             self._url.get_driver_name() == "pg8000"
         )
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Listens for the length of the block, where there is something to hear."""
+        """Listen during the block, if the database supports it."""
         if not self.can_hear:
             yield
             return
@@ -200,7 +200,8 @@ class Notices:
             await asyncio.to_thread(thread.join)
 
     def listener(self, topic: Topic) -> Callable[[float], Awaitable[None]]:
-        """A function that waits for word about ``topic`` since its last call, or some seconds."""
+        """A function that waits, with a timeout, for a notification about ``topic`` since its last
+        call."""
         seen = self._counts[topic]
 
         async def wait(seconds: float) -> None:
@@ -226,7 +227,7 @@ class Notices:
             try:
                 self._listen_once(loop)
             except Exception as error:
-                # The store tells of its trouble itself; meanwhile others look now and then.
+                # The store logs its own failures; meanwhile waiters poll.
                 log.debug("not listening", reason=str(error))
             self._stop.wait(RETRY_S)
 
@@ -234,7 +235,7 @@ class Notices:
         connection, socket = native_connection(self._url, self._timeout_s)
         try:
             connection.run(f"LISTEN {CHANNEL}")
-            # What was said before may have been missed.
+            # Earlier notifications may have been missed.
             heard = Counter({"jobs": 1, "bundles": 1})
             while not self._stop.is_set():
                 if heard:

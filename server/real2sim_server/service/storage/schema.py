@@ -1,9 +1,9 @@
 """The tables of a store, their rows, and the Alembic revisions that upgrade an older store.
 
-Types are portable between SQLite and PostgreSQL. A new store gets the current tables at once. To
+Types are portable between SQLite and PostgreSQL. A new store gets the current tables directly. To
 change a table, raise ``SCHEMA_VERSION`` and add a revision with that number to
-``revisions/versions``; it turns a store of the previous version into a new one. Released revisions
-never change.
+``revisions/versions``, which migrates a store of the previous version. Released revisions never
+change.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ if TYPE_CHECKING:
 # Tables.
 
 SCHEMA_VERSION = 1
-"""Raise it with every change of a table, together with a new file in ``revisions/versions``."""
+"""Increase it with every table change, together with a new file in ``revisions/versions``."""
 
 metadata = MetaData()
 
 alembic_version = Table("alembic_version", MetaData(), Column("version_num", String(32)))
-"""Alembic's own table, which holds the schema version in one row."""
+"""Alembic's own table, with the schema version in one row."""
 
 scenarios = Table(
     "scenarios",
@@ -57,7 +57,7 @@ scenarios = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 
-# Append-only. The primary key is what keeps two writers from making the same revision.
+# Append-only. The primary key prevents two writers from adding the same revision.
 scenario_log = Table(
     "scenario_log",
     metadata,
@@ -73,8 +73,8 @@ scenario_log = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 
-# What a log has led to at one revision, so that opening need not replay all of it. Made from the
-# log and nothing else: losing a row costs time, never an edit.
+# State of a scenario at one revision, so that opening need not replay the whole log. Derived from
+# the log: losing a row costs time, but no edits.
 scenario_snapshots = Table(
     "scenario_snapshots",
     metadata,
@@ -103,7 +103,7 @@ sessions = Table(
     Column("closed_us", BigInteger, nullable=True),
     Column("reason", Text, nullable=True),
     Column("owner", String(80), nullable=False, server_default="default"),
-    # Raised whenever a worker takes the session over; who wrote under an earlier one may no more.
+    # Increases whenever a worker takes over the session; writes with an earlier epoch are refused.
     Column("epoch", Integer, nullable=False, server_default="0"),
 )
 Index("ix_sessions_open", sessions.c.worker_id, sessions.c.closed_us)
@@ -125,7 +125,7 @@ session_log = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 
-# Workers that share the store, and until when each has promised to be alive.
+# Workers that share the store, and the end of each lease.
 workers = Table(
     "workers",
     metadata,
@@ -144,11 +144,11 @@ jobs = Table(
     Column("state", String(16), nullable=False),
     Column("document", Text, nullable=False),
     Column("created_us", BigInteger, nullable=False),
-    # Raised whenever a worker takes the job over, as of a session.
+    # Increases whenever a worker takes over the job, as for a session.
     Column("epoch", Integer, nullable=False, server_default="0"),
-    # Times that a worker died at it.
+    # Number of workers that died while running it.
     Column("deaths", Integer, nullable=False, server_default="0"),
-    # Whether any worker can begin it anew from its document, and whether somebody has cancelled it.
+    # Whether any worker can rebuild it from its document, and whether a client has cancelled it.
     Column("portable", Integer, nullable=False, server_default="0"),
     Column("cancelled", Integer, nullable=False, server_default="0"),
 )
@@ -167,7 +167,7 @@ idempotent_replies = Table(
 )
 Index("ix_idempotent_replies_created", idempotent_replies.c.created_us)
 
-# Scenes, assets and files of jobs that lie in a store of objects: of which ones they are made.
+# Scenes, assets and job files in an object store, with their objects.
 shared_bundles = Table(
     "shared_bundles",
     metadata,
@@ -179,7 +179,7 @@ shared_bundles = Table(
     Column("created_us", BigInteger, nullable=False),
 )
 
-# Requests that changed something, and those that were refused for their token or role.
+# Requests that changed something, or were refused for their token or role.
 audit = Table(
     "audit",
     metadata,
@@ -217,12 +217,12 @@ class ScenarioRow:
 
 @dataclass(frozen=True)
 class SnapshotRow:
-    """What the log of a scenario has led to.
+    """Snapshot of a scenario's state.
 
     Attributes:
-        revision: after which.
-        made_by: the program that made it; another one may read the same log otherwise.
-        state: as :func:`real2sim_server.edit.pack_state` has it.
+        revision: the revision.
+        made_by: program version that created it; another may interpret the log differently.
+        state: encoded by :func:`real2sim_server.edit.pack_state`.
     """
 
     scenario_id: str
@@ -235,9 +235,8 @@ class Claim(NamedTuple):
     """A worker's right to write the log of a session.
 
     Attributes:
-        session_id: of the session.
-        epoch: raised whenever a worker takes the session over; of several claims the one with the
-            highest counts.
+        session_id: the session.
+        epoch: increases whenever a worker takes over the session; only the highest is valid.
     """
 
     session_id: str
@@ -249,12 +248,12 @@ class SessionRow:
     """A session as created.
 
     Attributes:
-        worker_id: who has it now.
-        scenario_id, scenario_revision: what it began from; None for the bare scene.
-        token_hash: of the token that opens it, as :func:`~..tokens.token_hash` makes it.
+        worker_id: worker that currently has it.
+        scenario_id, scenario_revision: its start; None for the bare scene.
+        token_hash: hash of its token, from :func:`~..tokens.token_hash`.
         closed_us, reason: None while it is open.
-        owner: name of the token that it was made with.
-        epoch: how often it was taken over.
+        owner: name of the token that created it.
+        epoch: number of takeovers.
     """
 
     session_id: str
@@ -300,7 +299,7 @@ class StoredReply:
     """An answer stored for a request that may be repeated with the same Idempotency-Key.
 
     Attributes:
-        key: the header's value together with the call it was sent to.
+        fingerprint: SHA-256 of the request; a different one with the same key is refused.
         fingerprint: SHA-256 of the request; another one under the same key is refused.
     """
 
@@ -338,7 +337,7 @@ class SchemaStatus:
 
 
 def schema_status(engine: sa.Engine) -> SchemaStatus:
-    """Look at a store's schema; nothing changes.
+    """Check a store's schema without changes.
 
     Raises:
         StoreError: this program can neither use nor migrate it.

@@ -1,4 +1,4 @@
-"""Durable memory of a worker: scenarios, sessions, and stored answers."""
+"""Persistent scenarios, sessions and replies of a worker."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from .schema import Claim, Policy, ScenarioRow, SessionEntry, SessionRow, Snapsh
 
 # --- Session logs --------------------------------------------------------------------------------
 
-# A worker that slept for longer than its lease may wake up in the middle of a step, after another
-# one has taken over the session. So each write states the epoch of its claim, and the statement
-# compares it with the session's within the database.
+# A worker that was suspended for longer than its lease may resume in the middle of a step, after
+# another one has taken over the session. Each write therefore has the epoch of its claim, and the
+# statement compares it with the session's in the database.
 
 ClaimedEntries = tuple[Claim, Sequence[SessionEntry]]
-"""What a session's log gets, and by which right."""
+"""Entries for a session's log, and the claim on the session."""
 
 MAX_ROWS = 32
-"""Entries that one statement appends; more of them take turns."""
+"""Maximum number of entries per statement."""
 
 COLUMNS = "session_id, seq, kind, step, payload, created_us"
 TYPES = ("VARCHAR(80)", "INTEGER", "VARCHAR(16)", "INTEGER", "BYTEA", "BIGINT", "INTEGER")
-"""Of the columns and the epoch, in PostgreSQL."""
+"""PostgreSQL types of the columns and the epoch."""
 
 
 def appended(logs: Sequence[ClaimedEntries], *, on_server: bool) -> list[Write]:
-    """What appends entries to the logs of sessions.
+    """Statements that append entries to the logs of sessions.
 
     Args:
-        logs: of one session or of several.
+        logs: one or more logs.
         on_server: whether the database is PostgreSQL.
     """
     values = [
@@ -55,11 +55,11 @@ def appended(logs: Sequence[ClaimedEntries], *, on_server: bool) -> list[Write]:
 
 
 def withdrawn(claim: Claim, from_seq: int) -> list[Write]:
-    """What removes the end of a session's log."""
+    """Statements that remove the end of a session's log."""
     s, log = t.sessions.c, t.session_log.c
     mine = (s.session_id == claim.session_id) & (s.epoch == claim.epoch)
     end = (log.session_id == claim.session_id) & (log.seq >= from_seq)
-    # Changes nothing; holds the row, so that nobody takes the session over meanwhile.
+    # Changes nothing, but locks the row, so that the session cannot be taken over meanwhile.
     held = sa.update(t.sessions).where(mine).values(epoch=claim.epoch)
     return [Write(held, fenced=1), Write(sa.delete(t.session_log).where(end))]
 
@@ -68,9 +68,9 @@ def withdrawn(claim: Claim, from_seq: int) -> list[Write]:
 def _append(rows: int) -> str:
     """The statement that appends entries, for SQLite.
 
-    Every step of a session makes one: to have the statement put together by SQLAlchemy takes as
-    long as the append. Of many in one go the driver gives the interpreter up but once, not for
-    every row, and other threads keep it longer than a row takes.
+    Every step of a session executes it, and assembling it in SQLAlchemy takes as long as the
+    append. With many rows in one statement the driver releases the GIL only once; releasing it per
+    row lets other threads hold it for longer than a row takes.
     """
     values = ", ".join(["(?, ?, ?, ?, ?, ?, ?)"] * rows)
     given = ", ".join(f"v.column{k}" for k in range(1, 7))
@@ -83,7 +83,7 @@ def _append(rows: int) -> str:
 def _appended_on_server(values: Sequence[tuple[object, ...]]) -> Write:
     given = {f"v{k}": value for k, value in enumerate(chain.from_iterable(values))}
     text = _append_on_server(len(values))
-    # Of one session all rows are written or none: the statement needs no transaction around it.
+    # Either all rows of a session are written or none: the statement needs no transaction.
     alone = len({row[0] for row in values}) == 1
     prepared = Prepared(f"{text.text} RETURNING 1", given) if alone else None
     return Write(text.bindparams(**given), fenced=len(values), prepared=prepared)
@@ -91,8 +91,8 @@ def _appended_on_server(values: Sequence[tuple[object, ...]]) -> Write:
 
 @cache
 def _append_on_server(rows: int) -> sa.TextClause:
-    """The same for PostgreSQL. ``FOR SHARE`` waits for whoever is just taking a session over, and
-    looks at its epoch again."""
+    """The same for PostgreSQL. ``FOR SHARE`` waits for a concurrent takeover of the session, and
+    then checks its epoch again."""
     width = len(TYPES)
     values = ", ".join(
         "(" + ", ".join(f"CAST(:v{row * width + k} AS {TYPES[k]})" for k in range(width)) + ")"
@@ -122,24 +122,24 @@ __all__ = [
 ]
 
 ROW_BYTES = 120
-"""About what a row of a log takes beside its payload, with its index."""
+"""Approximate size of a log row without its payload, including its index [bytes]."""
 
 REPLY_LIFETIME_US = 24 * 3600 * 1_000_000
 
 
 class Store:
-    """What is asked of the database, and what is written to it.
+    """Queries and writes of the database.
 
-    Computing threads may write by :meth:`record` and :meth:`record_revision`, see
+    Computing threads may write with :meth:`record` and :meth:`record_revision`, see
     :class:`.database.Database`.
 
     Args:
         url: SQLAlchemy URL; ``sqlite:///path`` or, with its driver installed, ``postgresql://``.
-        worker_id: name to hold as long as the store is open; None for a guest.
-        timeout_s: of a statement, a lock, an answer [s].
-        durability: what reaches the disk before it is acknowledged.
-        migration: whether a store of an older schema is brought up to date.
-        on_call: told of each read and write, on the thread that did it.
+        worker_id: name to hold while the store is open; None for a guest.
+        timeout_s: timeout of a statement, a lock, an answer [s].
+        durability: what is on disk before it is acknowledged.
+        migration: whether to migrate a store of an older schema.
+        on_call: called after each read and write, on its thread.
     """
 
     def __init__(
@@ -163,25 +163,25 @@ class Store:
         )
 
     async def open(self) -> None:
-        """Connect and create what is missing.
+        """Connect and create missing tables.
 
         Raises:
-            StoreError: the database cannot be opened, or is of a newer version.
-            StateFolderError: another worker of that name is on it.
+            StoreError: the database cannot be opened, or has a newer version.
+            StateFolderError: another worker of that name uses it.
         """
         await self.database.open(Write(_delete_old_replies()))
 
     async def close(self) -> None:
-        """Finish what was begun and disconnect."""
+        """Finish pending calls and disconnect."""
         await self.database.close()
 
     @property
     def trouble(self) -> StoreTroubleError | None:
-        """What is wrong with the database; None while it is well."""
+        """Failure of the database; None while it is healthy."""
         return self.database.trouble
 
     async def watch(self) -> None:
-        """Look after the database for ever: notice trouble, and its end."""
+        """Monitor the database until cancelled: detect failures and recoveries."""
         await self.database.watch()
 
     # --- scenarios --------------------------------------------------------------------------
@@ -193,8 +193,8 @@ class Store:
         entries: Sequence[Mapping[str, Any]] = (),
         reply: StoredReply | None = None,
     ) -> None:
-        """Add a scenario with a log that it may have, and in the same transaction the answer to
-        the request for it; ``entries`` hold their revisions."""
+        """Add a scenario with an optional log and, in the same transaction, the reply to its
+        request; ``entries`` include their revisions."""
         rows = [_log_row(row.scenario_id, e["revision"], e, row.created_us) for e in entries]
         log = [_insert_rows(t.scenario_log, *rows)] if rows else []
         await self.database.write(
@@ -213,7 +213,7 @@ class Store:
         return [ScenarioRow(**row) for row in await self.database.read(query)]
 
     async def delete_scenario(self, scenario_id: str) -> bool:
-        """Remove a scenario and its log; whether there was one."""
+        """Delete a scenario and its log; returns whether it existed."""
         of_scenario = t.scenario_log.c.scenario_id == scenario_id
         counts = await self.database.write(
             Write(sa.delete(t.scenario_log).where(of_scenario)),
@@ -231,15 +231,15 @@ class Store:
         created_us: int,
         reply: StoredReply | None = None,
     ) -> None:
-        """Append one revision, and in the same transaction the answer to the request for it; on the
+        """Append one revision and, in the same transaction, the reply to its request; on the
         calling thread, never on the event loop.
 
         Args:
-            scenario_id: of the scenario.
-            revision: next of its log.
-            entry: JSON values; ``kind`` among them.
+            scenario_id: the scenario.
+            revision: next revision of its log.
+            entry: JSON values, including ``kind``.
             created_us: wall clock [us].
-            reply: stored for a repeated request.
+            reply: stored for repeated requests.
 
         Raises:
             ConflictError: the revision exists, or the scenario does not.
@@ -249,14 +249,13 @@ class Store:
         self.database.execute(changes)
 
     async def rename_scenario(self, scenario_id: str, name: str) -> bool:
-        """Give a scenario another name; whether there was one."""
+        """Rename a scenario; returns whether it exists."""
         of_scenario = t.scenarios.c.scenario_id == scenario_id
         changes = sa.update(t.scenarios).where(of_scenario).values(name=name)
         return (await self.database.write(Write(changes)))[-1] > 0
 
     async def newest_of_scenario(self, scenario_id: str) -> tuple[int, str] | None:
-        """Revisions that a scenario has, 0 for none, and its name; None where there is no such
-        scenario."""
+        """Number of revisions of a scenario, and its name; None if there is no such scenario."""
         log, row = t.scenario_log, t.scenarios
         newest = sa.select(sa.func.max(log.c.revision)).where(log.c.scenario_id == scenario_id)
         query = sa.select(newest.scalar_subquery().label("newest"), row.c.name)
@@ -266,7 +265,7 @@ class Store:
         return (rows[0]["newest"] or 0, rows[0]["name"]) if rows else None
 
     async def scenario_entries(self, scenario_id: str, *, after: int = 0) -> list[dict[str, Any]]:
-        """The log of a scenario behind revision ``after``, oldest first."""
+        """The log of a scenario after revision ``after``, oldest first."""
         log = t.scenario_log
         query = sa.select(log.c.entry).where(log.c.scenario_id == scenario_id)
         query = query.where(log.c.revision > after)
@@ -274,7 +273,7 @@ class Store:
         return [json.loads(row["entry"]) for row in rows]
 
     async def save_snapshot(self, row: SnapshotRow) -> None:
-        """Keep it in place of an older one of its scenario.
+        """Store a snapshot, replacing an older one of its scenario.
 
         Raises:
             ConflictError: the scenario was deleted.
@@ -318,8 +317,8 @@ class Store:
         entries: Sequence[SessionEntry] = (),
         reply: StoredReply | None = None,
     ) -> None:
-        """Add a session with a log that it may have, and in the same transaction the answer to the
-        request for it."""
+        """Add a session with an optional log and, in the same transaction, the reply to its
+        request."""
         rows = [{"session_id": row.session_id} | vars(entry) for entry in entries]
         entry_writes = [_insert_rows(t.session_log, *rows)] if rows else []
         await self.database.write(
@@ -342,8 +341,8 @@ class Store:
         return [SessionRow(**row) for row in rows]
 
     async def close_session(self, claim: Claim, *, reason: str) -> None:
-        """Note that a session is over; a second time changes nothing, nor does it once another
-        worker has the session."""
+        """Mark a session as ended; idempotent, and without effect if another worker has the
+        session."""
         s = t.sessions.c
         still_open = (s.session_id == claim.session_id) & s.closed_us.is_(None)
         mine = still_open & (s.epoch == claim.epoch)
@@ -358,13 +357,13 @@ class Store:
         instead: bool = False,
         reply: StoredReply | None = None,
     ) -> None:
-        """Append to a session's log, and the answer to the request for it, all or nothing.
+        """Append entries to a session's log, and the reply to their request, atomically.
 
         Args:
-            claim: on the session.
-            entries: with their places in its log.
-            instead: of anything that is there already from the first of those places on.
-            reply: stored for a repeated request.
+            claim: claim on the session.
+            entries: entries with their positions in the log.
+            instead: whether to replace existing entries from the first position.
+            reply: stored for repeated requests.
 
         Raises:
             ConflictError: a ``seq`` is taken.
@@ -388,14 +387,14 @@ class Store:
         changes = [*self._append([(claim, entries)]), *_reply_writes(reply)]
         if instead:
             changes = [*withdrawn(claim, entries[0].seq), *changes]
-        # A stored answer is a promise beyond the session.
+        # A stored reply must be durable beyond the session.
         self.database.execute(changes, promised=reply is not None)
 
     def record_together(self, logs: Sequence[ClaimedEntries]) -> None:
-        """Entries of several sessions by :meth:`record` in one transaction: all, or none of them.
+        """Store entries of several sessions in one transaction, as :meth:`record` does.
 
         Args:
-            logs: claims on sessions, and what their logs get.
+            logs: claims on sessions, and their entries.
         """
         if any(entries for _, entries in logs):
             self.database.execute(self._append(logs), promised=False)
@@ -404,7 +403,7 @@ class Store:
         return appended(logs, on_server=self.database.is_server)
 
     async def withdraw(self, claim: Claim, *, from_seq: int, replies: Sequence[str] = ()) -> None:
-        """Remove the end of a session's log, and answers by their keys: what was recorded ahead and
+        """Remove the end of a session's log and replies by their keys, which were stored ahead but
         never took effect.
 
         Raises:
@@ -415,16 +414,16 @@ class Store:
         await self.database.write(*withdrawn(claim, from_seq), *forgotten)
 
     async def session_entries(self, session_id: str, *, after: int = -1) -> list[SessionEntry]:
-        """The log of a session behind ``after``, oldest first."""
+        """The log of a session after ``after``, oldest first."""
         log = t.session_log
         query = sa.select(log.c.seq, log.c.kind, log.c.step, log.c.payload, log.c.created_us)
         query = query.where((log.c.session_id == session_id) & (log.c.seq > after))
         return [SessionEntry(**row) for row in await self.database.read(query.order_by(log.c.seq))]
 
-    # --- answers ----------------------------------------------------------------------------
+    # --- replies ----------------------------------------------------------------------------
 
     async def reply(self, key: str) -> StoredReply | None:
-        """The answer kept under ``key``, for 24 hours."""
+        """The reply stored under ``key``, for 24 hours."""
         table = t.idempotent_replies
         fresh = table.c.created_us > now_us() - REPLY_LIFETIME_US
         rows = await self.database.read(sa.select(table).where((table.c.key == key) & fresh))
@@ -435,13 +434,13 @@ class Store:
         return StoredReply(key, row["fingerprint"], row["status"], headers, row["body"])
 
     async def forget_old_replies(self) -> None:
-        """Remove the answers that are kept no longer."""
+        """Delete expired replies."""
         await self.database.write(Write(_delete_old_replies()))
 
     # --- size -------------------------------------------------------------------------------
 
     async def size_bytes(self) -> int:
-        """What the store takes, without what it could give back; of a server about its logs."""
+        """Size of the store without free pages; for a server, approximate size of its logs."""
         used = await self.database.used_bytes()
         if used is not None:
             return used
@@ -452,7 +451,7 @@ class Store:
         return int(row["bytes"]) + ROW_BYTES * int(row["rows"])
 
     async def give_back(self, pages: int) -> bool:
-        """Give free pages of a database file back to the disk; whether there are more."""
+        """Return free pages of a database file to the disk; returns whether there are more."""
         return await self.database.give_back(pages)
 
     # --- other tables -------------------------------------------------------------------
@@ -462,10 +461,11 @@ class Store:
         return await self.database.read(query)
 
     async def write(self, *changes: Write, reply: StoredReply | None = None) -> list[int]:
-        """Rows changed by each statement, in one transaction, also with the answer to a request.
+        """Rows changed by each statement, in one transaction, optionally with the reply to a
+        request.
 
         Raises:
-            ConflictError: a row that must be new exists.
+            ConflictError: a row already exists.
         """
         return await self.database.write(*changes, *_reply_writes(reply))
 
@@ -497,7 +497,7 @@ def _insert_rows(table: sa.Table, *rows: Mapping[str, Any]) -> Write:
 
 @cache
 def _insert(table: sa.Table) -> sa.Insert:
-    """One statement for all rows of a table: to recognise a new one as known takes longer."""
+    """One statement for all rows of a table, because caching new statements is slower."""
     return sa.insert(table)
 
 

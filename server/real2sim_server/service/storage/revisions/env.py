@@ -1,4 +1,4 @@
-"""Alembic's environment: runs the revisions of this folder on the connection it is given.
+"""Alembic's environment: runs the revisions of this folder on a given connection.
 
 A worker and ``real2sim store migrate`` pass the connection that holds the lock of the schema, see
 :mod:`..schema`. To write a revision, set ``REAL2SIM_STORE_URL`` and run ``alembic revision``.
