@@ -21,10 +21,10 @@ EPSILON = 1e-15
 
 
 class SelectiveAdam:
-    """Adam (Kingma and Ba 2015) over named tensors whose first axis are rows.
+    """Adam (Kingma and Ba 2015) over named tensors with one row per Gaussian.
 
-    Rows that were not seen keep value and moments, so that a Gaussian does not drift while it is
-    out of view; the bias of young moments is corrected by the number of steps of all.
+    Unseen rows keep their value and moments, so a Gaussian does not drift while it is out of view.
+    The bias correction uses the global step count.
 
     Args:
         parameters: by name, float32, updated in place.
@@ -42,12 +42,12 @@ class SelectiveAdam:
         rates: Mapping[str, float | Tensor],
         seen: Mapping[str, Tensor],
     ) -> None:
-        """One step along the gradients held by ``parameters``.
+        """One step along the gradients of ``parameters``.
 
         Args:
-            parameters: those without a gradient are left alone.
-            rates: learning rate by name, one number or one for each column of a row.
-            seen: [rows] bool by name; all rows where a name is missing.
+            parameters: those without a gradient do not change.
+            rates: learning rate by name, one number or one per column.
+            seen: [rows] bool by name; all rows if a name is missing.
         """
         self.steps += 1
         for name, parameter in parameters.items():
@@ -88,7 +88,8 @@ class SelectiveAdam:
         )
 
     def gather(self, name: str, source: Tensor, fresh: Tensor) -> None:
-        """Follow a change of rows: new row i was row ``source[i]``; ``fresh`` rows start anew.
+        """Follow a change of rows: new row i was row ``source[i]``; ``fresh`` rows get zero
+        moments.
 
         Args:
             source: [M] int64.
@@ -105,13 +106,13 @@ class SelectiveAdam:
             moments[name][slice(None) if rows is None else rows] = 0
 
     def state(self) -> dict[str, Tensor]:
-        """Moments by ``first.<name>`` and ``second.<name>``; the tensors themselves."""
+        """Moments as ``first.<name>`` and ``second.<name>``, without copies."""
         return {f"first.{k}": v for k, v in self.first.items()} | {
             f"second.{k}": v for k, v in self.second.items()
         }
 
     def restore(self, state: Mapping[str, Tensor], steps: int) -> None:
-        """Take over what :meth:`state` gave after ``steps`` steps; what it lacks begins."""
+        """Restore the result of :meth:`state` after ``steps`` steps; missing moments are 0."""
         self.steps = steps
         self.first = {k: state.get(f"first.{k}", held) for k, held in self.first.items()}
         self.second = {k: state.get(f"second.{k}", held) for k, held in self.second.items()}
@@ -134,10 +135,10 @@ def _update_plain(views: list[Tensor], seen: Tensor, columns: Tensor, correction
 # by owner.
 
 SPLIT_SHRINK = 1.6
-"""By which the halves of a split Gaussian are smaller (Kerbl et al. 2023)."""
+"""Factor by which the halves of a split Gaussian are smaller (Kerbl et al. 2023)."""
 RESET_OPACITY = 0.01
 MAX_COPIES = 51
-"""More copies of one Gaussian are shared out as if there were so many."""
+"""Cap on the number of copies of one Gaussian when opacity is divided among them."""
 
 
 def step_generator(seed: int, iteration: int) -> np.random.Generator:
@@ -155,12 +156,12 @@ def refine(
     prune: Tensor,
     rng: np.random.Generator,
 ) -> Gaussians:
-    """Duplicate, split and prune at once (Kerbl et al. 2023); every tensor is gathered once.
+    """Duplicate, split and prune in one pass (Kerbl et al. 2023); every tensor is gathered once.
 
     Args:
-        duplicate: [N] bool, get a copy with moments of zero.
-        split: [N] bool, become two smaller ones, placed at random within the one.
-        prune: [N] bool, removed; none of them is in the others.
+        duplicate: [N] bool, get a copy with zero moments.
+        split: [N] bool, are replaced by two smaller ones at random positions within the original.
+        prune: [N] bool, are removed; disjoint from the other masks.
         rng: places the halves.
     """
     kept = (~prune & ~split).nonzero()[:, 0]
@@ -186,7 +187,7 @@ def _scatter(gaussians: Gaussians, halves: Tensor, rng: np.random.Generator) -> 
 
 @torch.no_grad()
 def prune(gaussians: Gaussians, optimizer: SelectiveAdam, mask: Tensor) -> Gaussians:
-    """Without the Gaussians of ``mask`` [N] bool."""
+    """Remove the Gaussians of ``mask`` [N] bool."""
     kept = (~mask).nonzero()[:, 0]
     return select_rows(gaussians, optimizer, kept, torch.zeros_like(kept, dtype=torch.bool))
 
@@ -201,15 +202,15 @@ def relocate(
     min_opacity: float,
     rng: np.random.Generator,
 ) -> Gaussians:
-    """Replace dead Gaussians by copies of live ones, drawn by opacity (Kheradmand et al. 2024).
+    """Replace dead Gaussians by copies of live ones, sampled by opacity (Kheradmand et al. 2024).
 
-    Copies look together like the one they were made from.
+    The copies of a Gaussian together look like the original.
 
     Args:
         dead: [N] bool.
-        count: of Gaussians afterwards; never fewer than live ones.
+        count: number of Gaussians afterwards; at least the number of live ones.
         min_opacity: of copies.
-        rng: draws which ones are copied.
+        rng: samples the Gaussians to copy.
     """
     live = (~dead).nonzero()[:, 0]
     if len(live) == 0:
@@ -230,7 +231,7 @@ def relocate(
 
 
 def sample_by_weight(weights: Tensor, count: int, rng: np.random.Generator) -> Tensor:
-    """``count`` indices [count] int64 drawn with probability proportional to ``weights`` [N]."""
+    """``count`` indices [count] int64, sampled with probability proportional to ``weights`` [N]."""
     sums = np.cumsum(weights.double().cpu().numpy())
     chosen = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
     return torch.from_numpy(np.minimum(chosen, len(sums) - 1)).to(weights.device)
@@ -265,14 +266,14 @@ def inject_noise(
     min_opacity: float,
     rng: np.random.Generator,
 ) -> None:
-    """Move the means by noise along each Gaussian's own shape, in place.
+    """Add noise along each Gaussian's shape to the means, in place.
 
     Kheradmand et al. 2024, eq. 8: the more transparent a Gaussian, the more it moves.
 
     Args:
         rate: learning rate of the means [m].
-        strength: of the noise, relative to that.
-        min_opacity: about which the noise ceases.
+        strength: of the noise, relative to the rate.
+        min_opacity: opacity around which the noise fades out.
     """
     drawn = rng.standard_normal((len(gaussians), 3), dtype=np.float32)
     noise = torch.from_numpy(drawn).to(gaussians.means.device)
@@ -286,7 +287,7 @@ def inject_noise(
 
 @torch.no_grad()
 def reset_opacity(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
-    """Lower all opacities to RESET_OPACITY in place, so that only what is needed comes back."""
+    """Lower all opacities to RESET_OPACITY in place, so that only the Gaussians in use recover."""
     limit = float(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     gaussians.logits.clamp_(max=limit)
     optimizer.reset_moments("logits")
@@ -324,7 +325,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 # the render and :meth:`Strategy.step_post_backward` after the optimiser's step.
 
 BOX_MARGIN = 1.15
-"""Objects' Gaussians may stick out of their boxes by this factor: mirrors, antennas, bad boxes."""
+"""Gaussians of objects may exceed their boxes by this factor: mirrors, antennas, inexact boxes."""
 
 
 @dataclass(frozen=True)
