@@ -21,7 +21,7 @@ WIDEST = 1280
 FEATURES = 4000
 """Features of an image at most, the strongest."""
 BASELINES = (0.5, 1.5, 4.0)
-"""Baselines at which two images of a camera are matched [m]."""
+"""Each image is matched with the next one, and with the first one beyond each baseline [m]."""
 MIN_STEP = 0.2
 """Images of a camera closer to each other than this tell nothing new [m]."""
 MIN_DEPTH, MAX_DEPTH = 1.0, 400.0

@@ -46,8 +46,7 @@ COMPARED = 1500
 MAX_SCALE = 1.35
 """A body that would have to be stretched or pressed more than this is another kind of vehicle."""
 GRAZING = 0.35
-"""Below this cosine between ray and normal a camera barely sees a surface: 20 degrees from edge on.
-"""
+"""A camera barely sees a surface below this cosine between ray and normal (20 degrees)."""
 PAINT_REACH = 0.2
 """Points farther from a body give no evidence of its parts [m]."""
 
