@@ -330,12 +330,12 @@ BOX_MARGIN = 1.15
 
 @dataclass(frozen=True)
 class VisibilityLimits:
-    """Which Gaussians count as hidden: see :mod:`.visibility`.
+    """Limits of hidden Gaussians, see :mod:`.visibility`.
 
     Attributes:
-        fraction: visible fraction up to which all are.
-        occluded_fraction: visible fraction up to which those are that lie deep behind a surface.
-        occluded_depth: how deep that is [m].
+        fraction: all Gaussians up to this visible fraction are hidden.
+        occluded_fraction: visible fraction up to which Gaussians deep behind a surface are hidden.
+        occluded_depth: minimum depth behind the surface [m].
     """
 
     fraction: float = 0.005
@@ -345,31 +345,31 @@ class VisibilityLimits:
 
 @dataclass(frozen=True)
 class DensifyOptions:
-    """When and how Gaussians are added and removed.
+    """Schedule and limits for adding and removing Gaussians.
 
     Attributes:
         method: name of a strategy, see STRATEGIES.
-        start, stop: fraction of all iterations between which it happens.
-        every: iterations from one round to the next.
-        max_gaussians: never more than so many.
+        start, stop: range of the rounds, as fractions of all iterations.
+        every: iterations between rounds.
+        max_gaussians: maximum number.
         background_gradient: absgrad on the image above which background grows.
         object_gradient: plain gradient above which objects grow.
         split_scale: Gaussians larger than this are split, smaller ones duplicated [m].
-        min_opacity: below it Gaussians are removed, or moved by ``mcmc``.
+        min_opacity: Gaussians below it are removed, or moved by ``mcmc``.
         max_scale: larger ones near the drive are removed [m].
         reset_every: iterations between resets of opacity; 0 for never.
         noise: of ``mcmc``: factor on the learning rate of means.
-        growth: of ``mcmc``: fraction by which the number grows in a round.
+        growth: of ``mcmc``: relative growth of the number per round.
         hidden_rounds: fractions of all iterations at which hidden Gaussians are pruned.
-        prior_round: fraction of all iterations at which they are pruned once more, and priors of
-            stage 0 take their places; what stands before these closes up in the rest.
-        background_limits: of what counts as hidden in the background.
-        object_limits: likewise in objects.
-        last_background_limits: when priors take their places, besides, of what is no higher than
-            the objects: what lies metres behind all that images show of it was learnt through gaps
-            in them, and shows when one is deleted.
-        last_object_limits: likewise in objects; what a window shows of an object's inside is
-            hardly ever learnt well, and is better drawn as the window's colour.
+        prior_round: fraction of all iterations at which they are pruned again and replaced by
+            priors of stage 0; the surfaces in front close up in the remaining iterations.
+        background_limits: of hidden Gaussians in the background.
+        object_limits: of hidden Gaussians in objects.
+        last_background_limits: additional limits in the prior round, for background no higher than
+            the objects: Gaussians metres behind the visible surfaces were learnt through gaps in
+            them, and become visible when an object is deleted.
+        last_object_limits: the same in objects: an interior seen through a window is rarely learnt
+            well, and looks better in the window's colour.
     """
 
     method: str = "gradient"
@@ -401,11 +401,11 @@ class DensifyOptions:
 
 @dataclass(frozen=True, eq=False)
 class ScreenSums:
-    """What was visible on images since the last round.
+    """Visibility on images since the last round.
 
     Attributes:
         gradients: [N, 2] float32 sums, see ScreenStatistics.
-        views: [N] float32, in how many images each Gaussian was drawn.
+        views: [N] float32, number of images that each Gaussian was rendered in.
     """
 
     gradients: Tensor
@@ -417,7 +417,7 @@ class ScreenSums:
         return cls(torch.zeros(count, 2, device=device), torch.zeros(count, device=device))
 
     def add(self, rows: list[slice], screen: ScreenStatistics) -> None:
-        """Add one image; ``rows`` are those of each drawn instance."""
+        """Add one image; ``rows`` are those of each rendered instance."""
         for part, radii, gradients in zip(rows, screen.radii, screen.gradients, strict=True):
             self.gradients[part] += gradients
             self.views[part] += (radii > 0).any(0)
@@ -425,12 +425,12 @@ class ScreenSums:
 
 @dataclass(frozen=True, eq=False)
 class TrainingStep:
-    """A step that was taken.
+    """A finished step.
 
     Attributes:
         iteration: counted from 0.
-        rows: of the Gaussians of each drawn instance.
-        screen: where these were on the image, with gradients.
+        rows: of the Gaussians of each rendered instance.
+        screen: their positions on the image, with gradients.
         means_rate: learning rate of the means in this step [m].
     """
 
@@ -441,14 +441,14 @@ class TrainingStep:
 
 
 class Strategy:
-    """Leaves the set of Gaussians as it is; others add and remove.
+    """Base strategy: does not change the set of Gaussians; subclasses add and remove.
 
     Attributes:
-        state: what was visible since the last round; a part of checkpoints.
+        state: visibility since the last round; a part of checkpoints.
 
     Args:
-        options: see there.
-        half_sizes: [I, 3] half the sizes of the objects' boxes [m], where the Gaussians are.
+        options: see :class:`DensifyOptions`.
+        half_sizes: [I, 3] half the sizes of the objects' boxes [m], on the Gaussians' device.
         seed: of all noise, together with the iteration.
         iterations: of the whole training.
     """
@@ -468,10 +468,10 @@ class Strategy:
         self.state = ScreenSums.zeros(count, self._half_sizes.device)
 
     def step_pre_backward(self, output: RenderOutput) -> None:
-        """After the image of a step is drawn, before the loss is differentiated.
+        """Called after the image of a step is rendered, before the backward pass.
 
         Raises:
-            ReconstructError: the renderer keeps no screen statistics.
+            ReconstructError: the renderer has no screen statistics.
         """
         if output.screen is None:
             raise ReconstructError("this renderer does not count what it draws; choose another")
@@ -479,12 +479,14 @@ class Strategy:
     def step_post_backward(
         self, gaussians: Gaussians, optimizer: SelectiveAdam, step: TrainingStep
     ) -> Gaussians:
-        """The Gaussians after the optimiser's step; the moments in ``optimizer`` follow."""
+        """The Gaussians after the optimiser's step; the moments in ``optimizer`` are updated to
+        match.
+        """
         self.state.add(step.rows, step.screen)
         return gaussians
 
     def step_end(self, gaussians: Gaussians, optimizer: SelectiveAdam, iteration: int) -> None:
-        """Last in a step, in place, after hidden Gaussians were pruned; nothing by default."""
+        """Last call in a step, in place, after hidden Gaussians were pruned; nothing by default."""
 
     def _is_due(self, iteration: int) -> bool:
         """Whether a round of adding and removing follows the step ``iteration``."""
