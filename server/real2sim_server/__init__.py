@@ -2,9 +2,10 @@
 
 import os
 
-# Threads of a kernel wait for each other by spinning. GNU OpenMP lets them spin for milliseconds:
-# as soon as anything else wants a core, they keep it from the very thread that they wait for, and
-# kernels take ten times as long. A tenth of a millisecond bridges the gap between two kernels; who
-# waits longer sleeps. It is read when the library is loaded, so nothing may be imported before.
+# Threads of a kernel wait for each other by spinning. GNU OpenMP spins for milliseconds, so a
+# waiting thread keeps its core from the thread that it waits for, and kernels take ten times as
+# long when other programs need the cores. A tenth of a millisecond bridges the gap between two
+# kernels; after that, threads sleep. The variable is read when the library is loaded, so it must be
+# set before any other import.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "6000")

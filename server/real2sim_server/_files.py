@@ -58,14 +58,14 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def sweep_leftovers(folder: Path, *, unused_s: float, prefix: str | None = None) -> list[Path]:
-    """Remove what killed programs have left unfinished in a folder; what was removed.
+    """Remove unfinished files of killed programs from a folder; returns the removed paths.
 
-    A folder that was moved aside, and whose place is empty, goes back there.
+    A folder that was moved aside is moved back if its original path is free.
 
     Args:
-        folder: of which the entries are looked at; it need not exist.
-        unused_s: seconds for which nobody may have written to what is removed.
-        prefix: of the hidden names to remove instead of those that this module makes.
+        folder: to scan; it need not exist.
+        unused_s: only entries without writes for this many seconds are removed.
+        prefix: of hidden names to remove, instead of the names made by this module.
     """
     removed = []
     for path in sorted(folder.glob(".*")):
@@ -87,7 +87,7 @@ def sweep_leftovers(folder: Path, *, unused_s: float, prefix: str | None = None)
 
 
 def _last_written(path: Path) -> float:
-    """Of a file, or of anything in a folder [s since 1970]."""
+    """Last modification of a file, or of anything in a folder [s since 1970]."""
     below = path.rglob("*") if path.is_dir() else ()
     times: list[float] = [entry.lstat().st_mtime for entry in (path, *below)]
     return max(times)
@@ -113,7 +113,7 @@ def _move(folder: Path, target: Path) -> None:
     except OSError as error:
         if error.errno != errno.EXDEV:
             raise
-        # In a container: what a layer of its image holds is copied and removed, but not renamed.
+        # In a container, folders of an image layer can be copied and removed, but not renamed.
         shutil.copytree(folder, target, symlinks=True)
         shutil.rmtree(folder)
 
@@ -128,18 +128,18 @@ def _flush_folder(folder: Path) -> None:
 
 
 def _sibling(path: Path, purpose: str) -> Path:
-    """A hidden name beside ``path``: on the same file system, so that renaming is atomic."""
+    """A hidden name next to ``path``: on the same file system, so that renaming is atomic."""
     return path.parent / f".{path.name}.{purpose}-{secrets.token_hex(6)}"
 
 
 def unpack_tar(tar: tarfile.TarFile, folder: Path, *, members: Iterable[tarfile.TarInfo]) -> None:
-    """Write files and folders of an archive below ``folder``; others may not write them.
+    """Write files and folders of an archive below ``folder``; other users cannot write them.
 
-    As ``extractall(filter="data")``, which Python has from 3.11.4 on.
+    Like ``extractall(filter="data")``, which Python has from 3.11.4 on.
 
     Raises:
-        tarfile.ExtractError: a link or a device, or a name that leads out of ``folder``.
-        OSError: nothing can be written there.
+        tarfile.ExtractError: a link, a device, or a name outside ``folder``.
+        OSError: the folder cannot be written.
     """
     for member in members:
         path = PurePosixPath(member.name)

@@ -1,4 +1,4 @@
-"""Arrays of ``.npy`` files and entries of zip archives, whose headers may promise anything."""
+"""Arrays of ``.npy`` files and entries of zip archives, with untrusted headers."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _HEADERS = {
 def read_npy(data: bytes) -> NDArray[Any]:
     """The array of a ``.npy`` file of plain values.
 
-    Shape and type are compared with the bytes there are before anything is allocated.
+    Shape and type are checked against the number of bytes before anything is allocated.
 
     Raises:
-        ValueError: no such file, values that are objects, or another number of bytes than it says.
+        ValueError: not such a file, object values, or a wrong number of bytes.
     """
     stream = io.BytesIO(data)
     shape, fortran, dtype = _read_header(stream, len(data))

@@ -1,11 +1,11 @@
-"""How kernels are compiled and kept on disk: the one place of the server that says so.
+"""Compilation and disk cache of kernels for the whole server.
 
-Two decorators, bare or with options of ``numba.njit``, which are handed through:
+Two decorators, bare or with options of ``numba.njit``, which are passed through:
 
 ``@kernel``
-    What Python calls. Kept on disk, so that only the first run compiles it.
+    For functions called from Python. Cached on disk, so that only the first run compiles it.
 ``@func``
-    What only kernels and other funcs call. Compiled with them and kept as part of them.
+    For functions called only by kernels and other funcs. Compiled and cached with them.
 
     from .._numba import PARALLEL_LOOPS, func, kernel
 
@@ -16,25 +16,26 @@ Two decorators, bare or with options of ``numba.njit``, which are handed through
     @kernel(nogil=True, parallel=PARALLEL_LOOPS)
     def norms(points): ...
 
-Both divide as NumPy does (``error_model="numpy"``) unless told otherwise. A family of kernels that
-shares options binds them once: ``entry = functools.partial(kernel, nogil=True, fastmath=True)``.
-Without ``nogil`` a kernel keeps the interpreter's lock: right for those that take microseconds,
-since whoever gives the lock up may wait milliseconds to get it back.
+Both divide like NumPy (``error_model="numpy"``) by default. A family of kernels with the same
+options binds them once: ``entry = functools.partial(kernel, nogil=True, fastmath=True)``. Without
+``nogil`` a kernel holds the interpreter's lock. This is right for kernels that take microseconds,
+because reacquiring the lock can take milliseconds.
 
-A kernel on disk cannot be stale. Numba's own key of what it keeps is the file that defines the
-function and that function's bytecode. It misses whatever a kernel takes from elsewhere: constants,
-functions that it calls, code generators of intrinsics, the order of a tuple's fields, options of
-the compiler. :func:`fingerprint` covers all of these: it walks from the function over every global
-name and closure cell it can reach, as they are at the first call. It reads no source file, so
-importing costs nothing, and comments or docstrings elsewhere compile nothing anew.
+A cached kernel cannot be stale. Numba's own cache key covers the file that defines the function and
+that function's bytecode. It misses dependencies: constants, called functions, code generators of
+intrinsics, the order of a tuple's fields, compiler options. :func:`fingerprint` covers all of
+these: it walks from the function over every reachable global name and closure cell, with their
+values at the first call. It reads no source file, so importing costs nothing, and changes to
+comments or docstrings elsewhere compile nothing.
 
-Processes that need the same kernel at once compile it once: the first holds a lock on a file beside
-what is kept, and the others load what it leaves. Who holds it may compile other kernels on the way,
-those that the first calls, so nobody ever waits in a circle; who waited for two minutes compiles.
+Processes that need the same kernel at the same time compile it once: the first holds a lock on a
+file next to the cache entry, and the others load its result. The holder may compile other kernels
+that the first one calls, so there is no deadlock; a process that has waited for two minutes
+compiles itself.
 
-Out of sight of the fingerprint stays what Numba finds by type or by registration and not by name:
-bodies given to ``numba.extending.overload`` and options given to ``register_jitable`` (its
-functions are seen).
+The fingerprint does not cover functions that Numba finds by type or registration instead of by
+name: bodies passed to ``numba.extending.overload`` and options passed to ``register_jitable`` (its
+functions are covered).
 """
 
 from __future__ import annotations
@@ -73,12 +74,12 @@ from . import console
 
 @dataclass
 class Made:
-    """The kernels that this process has made ready; those that they call count as part of them.
+    """Kernels that this process has made ready, including those that they call.
 
     Attributes:
-        done: from disk or by compiling.
-        expected: that warm-ups have said to come; 0 where none has.
-        compiled: of all, those that were compiled or are being compiled.
+        done: loaded from disk or compiled.
+        expected: announced by warm-ups; 0 without an announcement.
+        compiled: kernels that were or are being compiled.
     """
 
     done: int = 0
@@ -86,14 +87,14 @@ class Made:
     compiled: int = 0
 
     def expect(self, count: int) -> None:
-        """Say that a warm-up makes so many kernels ready."""
+        """Announce that a warm-up makes ``count`` kernels ready."""
         self.expected += count
 
     def __str__(self) -> str:
         return f"{self.done} of {self.expected}" if self.done <= self.expected else f"{self.done}"
 
     def tell(self) -> None:
-        """Tell who wants to know of compiling, see :mod:`.console`; on the thread that compiles."""
+        """Notify listeners of compiling, see :mod:`.console`; on the thread that compiles."""
         if self.compiled and console.LISTENERS:
             console.LISTENERS[-1](f"{COMPILING}: {self}")
 
@@ -102,27 +103,28 @@ made = Made()
 COMPILING = "compiling kernels, on the first run only"
 
 MAX_WAIT_S = 120.0
-"""For another process that compiles the same kernel; the longest take half a minute."""
+"""Maximum wait for another process that compiles the same kernel; the longest take half a minute.
+"""
 
 LOW_PRIORITY = 10
-"""Niceness from which on a thread holds nobody up: on a busy machine it compiles for minutes."""
+"""Niceness from which a thread must not block others: on a busy machine it compiles for minutes."""
 
 PARALLEL_LOOPS = ParallelOptions(
     {"comprehension": False, "reduction": False, "numpy": False, "setitem": False}
 )
-"""For ``parallel=``: threads share the loops over ``prange`` and nothing else.
+"""Value for ``parallel=``: only loops over ``prange`` are parallel.
 
-With ``parallel=True`` every statement on an array becomes a parallel loop too, each compiled on its
-own; for the small arrays between loops that costs seconds of compiling and gains nothing.
+With ``parallel=True`` every statement on an array also becomes a parallel loop and is compiled
+separately. For the small arrays between loops, that costs seconds of compilation and gains nothing.
 """
 
 
 def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
-    """Compile what Python calls; machine code is kept on disk, see the module.
+    """Compile a function for calls from Python; machine code is cached on disk, see the module.
 
     Args:
         function: to compile; absent when the decorator is used with options.
-        **options: of ``numba.njit``; ``error_model`` is "numpy" unless given.
+        **options: of ``numba.njit``; ``error_model`` defaults to "numpy".
 
     Returns:
         A Numba dispatcher, or the decorator that makes one.
@@ -138,9 +140,9 @@ def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any
 
 
 def func(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
-    """Compile what only kernels and other funcs call; kept on disk as part of the kernels.
+    """Compile a function for calls from kernels and other funcs; cached as part of the kernels.
 
-    Args and result as of :func:`kernel`.
+    Arguments and result as for :func:`kernel`.
     """
     if function is None:
         return functools.partial(func, **options)
@@ -148,29 +150,29 @@ def func(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
 
 
 def fingerprint(compiled: Any) -> str:
-    """64 hexadecimal digits that change with anything a kernel is made of.
+    """64 hexadecimal digits that change with every dependency of a kernel.
 
     Args:
-        compiled: what :func:`kernel` or :func:`func` returned.
+        compiled: result of :func:`kernel` or :func:`func`.
     """
     reach = _Reach()
     reach.reference(compiled)
     digest = hashlib.sha256()
-    for part in reach.parts:  # grows on the way
+    for part in reach.parts:  # grows during the loop
         digest.update(reach.describe(part).encode())
     return digest.hexdigest()
 
 
 def is_on_disk(compiled: Any) -> bool:
-    """Whether an earlier run left machine code of a kernel, as its sources are now."""
+    """Whether the machine code of a kernel with its current sources is on disk."""
     cache = getattr(compiled, "_cache", None)
     return not isinstance(cache, _KernelCache) or cache.holds_any()
 
 
 class _ReadOnlyCacheLocator(UserProvidedCacheLocator):
-    """A folder of NUMBA_CACHE_DIR that cannot be written, as in an image whose root is read-only.
+    """A read-only folder of NUMBA_CACHE_DIR, as in an image with a read-only root.
 
-    Numba would pass it over, with all that it holds, and compile everything at each start.
+    Numba would ignore the folder and its contents, and compile everything at each start.
     """
 
     @classmethod
@@ -226,7 +228,7 @@ class _KernelCache(FunctionCache):
         return load_or_compile
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What is kept for a signature; None if this process is to compile it."""
+        """Cached code for a signature; None if this process must compile it."""
         kept = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         if kept is None and self._until_kept is not None:
             self._until_kept.enter_context(_locked(f"{self._cache_file._index_path}.lock"))
@@ -240,12 +242,12 @@ class _KernelCache(FunctionCache):
         return sig, codegen.magic_tuple(), self._fingerprint, tuple(_tuple_fields(sig))
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep machine code; where it cannot be written, the next start compiles it again."""
+        """Save machine code; if the folder is not writable, the next start compiles it again."""
         with contextlib.suppress(OSError):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
     def holds_any(self) -> bool:
-        """Whether anything is kept under the present fingerprint, for whatever signature."""
+        """Whether there is code for the current fingerprint, for any signature."""
         kept = self._cache_file._load_index()
         return any(self._fingerprint in key for key in kept)
 
@@ -255,22 +257,24 @@ class _KernelCache(FunctionCache):
 
 
 class _Index(IndexDataCacheFile):
-    """What is kept of one function, by key."""
+    """Cached entries of one function, by key."""
 
     def _load_index(self) -> dict[Any, str]:
         try:
             kept: dict[Any, str] = super()._load_index()  # type: ignore[no-untyped-call]
         except (AttributeError, ImportError):
-            # Keys are pickled with the classes of their named tuples, which may have other names
-            # since: then nothing that is kept can be used.
+            # Keys are pickled with the classes of their named tuples. If those were renamed, no
+            # entry can be used.
             return {}
         return kept
 
 
 @contextlib.contextmanager
 def _locked(path: str) -> Iterator[None]:
-    """No other process is in such a block with the same path; without effect where files cannot be
-    locked, and after ``MAX_WAIT_S``. Belongs to who has the compiler's lock."""
+    """Hold an exclusive lock on ``path`` against other processes.
+
+    No effect if files cannot be locked, and after ``MAX_WAIT_S``. Requires the compiler's lock.
+    """
     if path in _LOCKED:
         yield
         return
@@ -307,7 +311,7 @@ def _tuple_fields(signature: Any) -> Iterator[tuple[str, ...]]:
 
 
 class _Reach:
-    """All functions and classes that a kernel reaches, numbered in the order they are met.
+    """All functions and classes that a kernel reaches, numbered in the order of discovery.
 
     Attributes:
         parts: dispatchers, intrinsics, functions and classes; :meth:`describe` adds to them.
@@ -318,7 +322,7 @@ class _Reach:
         self._numbers: dict[int, int] = {}
 
     def reference(self, part: Any) -> str:
-        """Short text that stands for a part."""
+        """Short text that identifies a part."""
         number = self._numbers.setdefault(id(part), len(self.parts))
         if number == len(self.parts):
             self.parts.append(part)
@@ -346,7 +350,7 @@ class _Reach:
         return f"function {code} {self._value(cells)} {self._value(defaults)} {outside}"
 
     def _code(self, code: CodeType, doc: str | None, names: set[str]) -> str:
-        """Text of a function's code; adds what it may look up outside to ``names``."""
+        """Text of a function's code; adds the outside names it may look up to ``names``."""
         names.update(code.co_names)
         constants = [
             self._code(constant, None, names)
@@ -369,7 +373,7 @@ class _Reach:
         return f"class {[self._value(base) for base in kind.__bases__]} {members}"
 
     def _value(self, value: Any) -> str:
-        """Text of a value, which is the same in each process."""
+        """Text of a value, identical in every process."""
         if isinstance(value, (Dispatcher, _Intrinsic)):
             return self.reference(value)
         if isinstance(value, (FunctionType, type)):
@@ -423,13 +427,13 @@ def _lookup(
 
 
 def _of_library(module: str | None) -> bool:
-    """Whether what stands in a module changes with Python, NumPy or Numba alone."""
+    """Whether a module changes only with Python, NumPy or Numba."""
     root = (module or "builtins").partition(".")[0]
     return root in _LIBRARIES or (root in sys.stdlib_module_names and root != "__main__")
 
 
 _COMPILING: list[_KernelCache] = []
-"""The kernel that is being made ready, and those that it calls; belongs to the compiler's lock."""
+"""The kernel that is being made ready, and those that it calls; guarded by the compiler's lock."""
 
 _LOCKED: set[str] = set()
 _LIBRARIES = frozenset({"llvmlite", "numba", "numpy"})

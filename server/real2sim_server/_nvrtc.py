@@ -1,6 +1,6 @@
-"""How CUDA kernels are compiled by NVRTC and kept on disk, in one place.
+"""Compilation of CUDA kernels by NVRTC, with a disk cache.
 
-Needs cuda-core and NVRTC, which come as wheels, and neither a driver nor a GPU.
+Requires cuda-core and NVRTC, available as wheels, but neither a driver nor a GPU.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from ._files import atomic_file
 
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
-"""Those that kernels are compiled for in the tests; others are compiled when they are met."""
+"""Architectures that the tests compile kernels for; others are compiled on first use."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,13 +25,13 @@ class KernelSource:
     """Kernels that are compiled together.
 
     Attributes:
-        name: under which NVRTC speaks of the source.
-        kept_as: how the name of its cubins begins.
+        name: name of the source for NVRTC.
+        kept_as: prefix of the cubins' file names.
         text: the source.
-        folder: what it includes.
-        fma: products are added without rounding in between.
-        diag_suppress: number of a warning that is none here.
-        error: what is raised, with NVRTC's words, where it does not compile.
+        folder: include folder.
+        fma: whether products are added without intermediate rounding.
+        diag_suppress: number of a warning to suppress.
+        error: exception to raise, with NVRTC's message, if compilation fails.
     """
 
     name: str
@@ -48,15 +48,15 @@ class KernelSource:
         return path.read_bytes() if path.is_file() else self.compiled(architecture)[0]
 
     def compiled(self, architecture: str) -> tuple[bytes, str]:
-        """Cubin, which is kept on the disk, and what ptxas says about it."""
+        """The cubin, cached on disk, and the output of ptxas."""
         code, log = self._compile(architecture)
-        # Without a place to keep it, it is compiled at every start: seconds.
+        # Without a cache folder, every start compiles for a few seconds.
         with suppress(OSError), atomic_file(self.path(architecture)) as file:
             file.write(code)
         return code, log
 
     def path(self, architecture: str) -> Path:
-        """Where the cubin is kept: by all of its source, options, architecture and NVRTC."""
+        """Path of the cubin, keyed by source, options, architecture and NVRTC version."""
         options = f"{architecture} {nvrtc_version()} {self.fma} {self.diag_suppress}"
         digest = hashlib.sha256(options.encode() + self.text.encode())
         for path in sorted(self.folder.iterdir()):
@@ -90,7 +90,7 @@ class KernelSource:
 
 @functools.cache
 def nvrtc_version() -> str:
-    """Of the NVRTC that compiles here. Raises whatever keeps it from being loaded."""
+    """Version of the installed NVRTC. Raises the error that prevents loading it."""
     from cuda.bindings import nvrtc
 
     _, major, minor = nvrtc.nvrtcVersion()
@@ -98,7 +98,7 @@ def nvrtc_version() -> str:
 
 
 def kernels_folder() -> Path:
-    """Where kernels are kept: ``$TORCH_EXTENSIONS_DIR``, or below the user's cache folder."""
+    """Folder of the kernel cache: ``$TORCH_EXTENSIONS_DIR``, or below the user's cache folder."""
     given = os.environ.get("TORCH_EXTENSIONS_DIR")
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return Path(given) if given else cache / "real2sim"

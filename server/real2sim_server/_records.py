@@ -1,4 +1,4 @@
-"""Frozen dataclasses that every step makes several of, made in less than half the time."""
+"""A fast ``__init__`` for frozen dataclasses on hot paths."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ R = TypeVar("R")
 
 
 def made_quickly(record: type[R]) -> type[R]:
-    """A frozen dataclass with an ``__init__`` that stores its members past the guard of frozen
-    ones, which is asked for each otherwise; above ``@dataclass``.
+    """Class decorator above ``@dataclass`` for frozen dataclasses: a faster ``__init__``.
+
+    It stores the members without the check of frozen classes for each of them.
 
     Raises:
-        TypeError: for what such a class cannot have here: members of keywords only, without a place
-            in ``__init__``, or work after it.
+        TypeError: for unsupported features: keyword-only members, members without an ``__init__``
+            argument, or a ``__post_init__``.
     """
     members = fields(record)  # type: ignore[arg-type]
     if hasattr(record, "__post_init__") or any(m.kw_only or not m.init for m in members):
@@ -39,7 +40,7 @@ def _parameter(member: Field[Any]) -> str:
 
 
 def _value(member: Field[Any]) -> str:
-    """What is stored: a factory that is the argument still has been given none."""
+    """Stored value; a default factory as the argument means that no value was passed."""
     if member.default_factory is MISSING:
         return member.name
     return f"_{member.name}() if {member.name} is _{member.name} else {member.name}"

@@ -23,18 +23,18 @@ from rich.table import Table
 SERVER_MODULES = ("torch", "numba", "fastapi", "uvicorn", "cv2", "sqlalchemy", "safetensors")
 
 LINE_EVERY_S = 10.0
-"""Of a :class:`StatusLine` that is no line of a terminal."""
+"""Interval of the lines of a :class:`StatusLine` without a terminal."""
 
 console = Console()
 errors = Console(stderr=True)
 
 
 class CommandError(Exception):
-    """A command cannot go on; the message says what was given, what is allowed, what to do."""
+    """A command cannot continue; the message gives the value, the allowed ones, and a fix."""
 
 
 def run_command(command: Callable[..., None], **arguments: Any) -> None:
-    """Run a command; turn the errors a person can mend into one sentence and exit code 1."""
+    """Run a command; report user errors as one sentence with exit code 1."""
     require_server_extra()
     try:
         with telling_of_compiling():
@@ -60,7 +60,7 @@ def is_expected(error: Exception) -> bool:
 
 
 def require_server_extra() -> None:
-    """Leave with a sentence when the base install meets a command of the worker."""
+    """Exit with a message if the base install runs a command of the worker."""
     missing = [name for name in SERVER_MODULES if importlib.util.find_spec(name) is None]
     if missing:
         errors.print(
@@ -72,10 +72,10 @@ def require_server_extra() -> None:
 
 
 class StatusLine:
-    """One line about what takes long: written over on a terminal, elsewhere a line now and then.
+    """A status line for long operations: updated in place on a terminal, else printed now and then.
 
     Args:
-        tell: writes a line where standard error is no terminal.
+        tell: writes a line if standard error is not a terminal.
     """
 
     def __init__(self, tell: Callable[[str], object] | None = None) -> None:
@@ -85,9 +85,9 @@ class StatusLine:
 
     def show(self, text: str) -> None:
         """Say how far it is."""
-        # Where a progress bar is shown, it takes whole lines and puts them above itself.
+        # A progress bar takes whole lines and prints them above itself.
         if sys.stderr.isatty() and not isinstance(sys.stderr, FileProxy):
-            # What others write goes over it, from the start of the line.
+            # Other output overwrites it, from the start of the line.
             print(text.ljust(self._width), end="\r", file=sys.stderr, flush=True)
             self._width = len(text)
         elif time.monotonic() >= self._next:
@@ -102,7 +102,7 @@ class StatusLine:
 
 
 LISTENERS: list[Callable[[str], object]] = []
-"""The last of them is told how far it is while kernels are compiled."""
+"""The last listener gets the progress of kernel compilation."""
 
 
 @contextmanager
@@ -146,8 +146,11 @@ def staged_progress() -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def told_progress(*, follow: bool) -> Iterator[Callable[..., None]]:
-    """As :func:`staged_progress`, or for a program that follows: a line of JSON on standard output
-    for each report; the process ends when its standard input does, as when who follows has died."""
+    """Progress bars as :func:`staged_progress`, or JSON lines for a program that follows.
+
+    With ``follow``, each report is one line of JSON on standard output, and the process ends when
+    its standard input is closed, for example because the following program has died.
+    """
     if not follow:
         with staged_progress() as report:
             yield report
@@ -167,7 +170,7 @@ def _end_with_input() -> None:
 
 
 def print_figures(title: str, figures: Mapping[str, Any]) -> None:
-    """A two-column table of figures; those within mappings get rows of their own."""
+    """A two-column table of figures; nested mappings get separate rows."""
     table = Table(title=title, show_header=False, title_justify="left")
     for name, figure in _flat(figures):
         text = f"{figure:.4g}" if isinstance(figure, float) else str(figure)
@@ -184,7 +187,7 @@ def _flat(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
-    """Write figures to ``path``, whole or not at all; nothing where it is None.
+    """Write figures to ``path`` atomically; nothing if it is None.
 
     Numbers and arrays may be NumPy's.
     """

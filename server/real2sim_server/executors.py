@@ -1,7 +1,7 @@
 """Executors of many independent tasks: this process, processes, or a Ray cluster.
 
-A task gives the same result wherever it runs, and runs again if its worker dies. Data sets make
-their clips this way, and sweeps drive their episodes.
+A task gives the same result on any worker, and runs again if its worker dies. Data sets build their
+clips with executors, and sweeps drive their episodes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 EXECUTORS = ("processes", "ray")
 
 MAX_TRIES = 3
-"""Times a task is started; one whose worker dies runs again on another."""
+"""Maximum number of starts of a task; if its worker dies, it runs again on another."""
 
 
 class ExecutorError(RuntimeError):
@@ -25,7 +25,7 @@ class ExecutorError(RuntimeError):
 
 
 class Worker(Protocol):
-    """Does tasks, one at a time, and keeps in memory what they share."""
+    """Runs tasks, one at a time, and holds their shared data in memory."""
 
     def make(self, task: Any) -> Any:
         """The result of a task; both can be pickled."""
@@ -33,8 +33,9 @@ class Worker(Protocol):
 
 
 Recipe = Callable[[int], Worker]
-"""Makes a worker that computes with so many threads; it can be pickled, and finds its files on
-every machine."""
+"""Makes a worker that uses the given number of threads; it can be pickled, and finds its files on
+every machine.
+"""
 
 OnResult = Callable[[str, Any], None]
 """Told the name of a task that is done, and its result, in the caller's process."""
@@ -44,15 +45,15 @@ class Executor(Protocol):
     """Does tasks."""
 
     def run(self, recipe: Recipe, tasks: Mapping[str, Any], on_result: OnResult) -> None:
-        """Do all tasks, in any order.
+        """Run all tasks, in any order.
 
         Args:
             recipe: of the workers.
             tasks: by name.
-            on_result: called once for each, as soon as it is done. What it raises ends the run.
+            on_result: called once per task when it is done. An exception from it ends the run.
 
         Raises:
-            ExecutorError: a task's workers die again and again.
+            ExecutorError: a task's workers die repeatedly.
         """
         ...
 
@@ -70,7 +71,7 @@ class InProcess:
 
 
 def threads_of(workers: int) -> int:
-    """What each of so many workers on this machine computes with."""
+    """Number of threads for each of ``workers`` workers on this machine."""
     return max(1, (os.cpu_count() or 1) // max(workers, 1))
 
 
@@ -78,10 +79,10 @@ _worker: Worker | None = None
 
 
 class Processes:
-    """Processes of this machine, each a worker; all start anew if one dies.
+    """Processes of this machine, each a worker; all restart if one dies.
 
     Args:
-        workers: processes; they share the cores.
+        workers: number of processes; they share the cores.
     """
 
     def __init__(self, workers: int) -> None:
@@ -93,7 +94,8 @@ class Processes:
         while left:
             before = len(left)
             self._done(recipe, left, on_result)
-            # Which task a process died of is not known; some must have been done in between.
+            # The task that killed a process is unknown; between failures, some tasks must have
+            # finished.
             fruitless = fruitless + 1 if len(left) == before else 0
             if fruitless >= MAX_TRIES:
                 raise ExecutorError(
@@ -102,7 +104,7 @@ class Processes:
                 )
 
     def _done(self, recipe: Recipe, left: dict[str, Any], on_result: OnResult) -> None:
-        """Take from ``left`` what is done, until all is or a process has died."""
+        """Remove finished tasks from ``left``, until all are done or a process has died."""
         workers = min(self._workers, len(left))
         with ProcessPoolExecutor(
             workers,
@@ -144,14 +146,14 @@ def _make(task: Any) -> Any:
 
 
 class RayCluster:
-    """Workers that are actors of a Ray cluster, on this machine or on many.
+    """Workers that are actors of a Ray cluster, on one or many machines.
 
-    If a worker or its machine dies, Ray starts it anew and the task it was at runs again. Results
-    come back by value, so that the machines need no disk in common.
+    If a worker or its machine dies, Ray restarts it and its current task runs again. Results are
+    returned by value, so the machines need no shared disk.
 
     Args:
-        workers: how many.
-        address: of an existing cluster, ``auto`` for that of the environment; None starts one on
+        workers: number of workers.
+        address: of an existing cluster, ``auto`` for the one of the environment; None starts one on
             this machine, which ends with the run.
 
     Raises:
@@ -240,7 +242,7 @@ class HostedWorker:
         self._worker = recipe(threads)
 
     def is_ready(self) -> bool:
-        """Whether it has been made: an answer at all says so."""
+        """Whether the worker was created: any answer means yes."""
         return True
 
     def make(self, task: Any) -> Any:
@@ -249,13 +251,13 @@ class HostedWorker:
 
 
 def executor_of(name: str, *, workers: int, address: str | None = None) -> Executor:
-    """The executor of that name.
+    """The executor with that name.
 
     Args:
-        name: of EXECUTORS; ``processes`` with one worker does all in this process.
+        name: from EXECUTORS; ``processes`` with one worker runs everything in this process.
         workers: at least 1.
-        address: of an existing Ray cluster, ``auto`` for that of the environment; None for one on
-            this machine.
+        address: of an existing Ray cluster, ``auto`` for the one of the environment; None for one
+            on this machine.
 
     Raises:
         ExecutorError: an unknown name, no worker, or Ray is not installed.

@@ -55,8 +55,10 @@ RGB = RasterOptions(depth=False, instance=False, detail="auto")
 
 
 def fitted(camera: Camera, width: int, height: int) -> Camera:
-    """A camera of another size that sees the middle of what ``camera`` sees: scaled until one side
-    fits, and cut at the other, so that pixels stay square."""
+    """A camera of another size with the centre of the view of ``camera``.
+
+    The image is scaled until one side fits and cropped at the other, so that pixels stay square.
+    """
     scale = max(width / camera.width, height / camera.height)
     K = camera.K.copy()
     K[:2] *= scale
@@ -72,16 +74,16 @@ def batch_images(
     *,
     backend: str | Backend = "auto",
 ) -> NDArray[np.uint8]:
-    """What cameras of one size see in some worlds, [len(worlds), C, H, W, 3] uint8.
+    """Images of cameras of one size in some worlds, [len(worlds), C, H, W, 3] uint8.
 
     Args:
         batch: the worlds.
-        cameras: C of them.
-        worlds: which of the worlds.
-        backend: draws.
+        cameras: C cameras.
+        worlds: indices of the worlds.
+        backend: renderer.
 
     Raises:
-        RenderError: for cameras that are no pinholes; batches draw none with lenses.
+        RenderError: cameras that are not pinholes; batches do not support lenses.
     """
     for camera in cameras:
         if not camera.is_pinhole:
@@ -113,7 +115,9 @@ def batch_images(
 Arrays = dict[str, NDArray[Any]]
 
 ACCELERATION, BRAKING, STEERING = 4.0, 8.0, 0.6
-"""What actions of 1, -1 and, sideways, 1 stand for [m/s^2], [rad]; as in ``real2sim.DriveEnv``."""
+"""Values of actions of 1, -1 and, for steering, 1: [m/s^2], [m/s^2], [rad]; as in
+``real2sim.DriveEnv``.
+"""
 FAULT, OFF_ROAD = 10.0, 0.1
 """What a contact that the ego is to blame for costs [m], and a step once it was off the road."""
 FAR = 1e4
@@ -192,12 +196,13 @@ class VectorDriveEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Arrays, dict[str, Any]]:
-        """Begin all episodes, or those of ``options["reset_mask"]`` [N] bool.
+        """Start new episodes in all worlds, or in those of ``options["reset_mask"]`` [N] bool.
 
         Args:
-            seed: of the first world, the others count on from there; or one for each. They draw
-                where episodes begin.
-            options: ``reset_mask`` alone.
+            seed: of the first world, incremented for the others; or one per world. It determines
+                the
+                start times of the episodes.
+            options: only ``reset_mask``.
 
         Raises:
             ValueError: a seed or a mask of another length, or other options.
@@ -214,7 +219,7 @@ class VectorDriveEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
     def step(  # type: ignore[override]
         self, actions: ArrayLike
     ) -> tuple[Arrays, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Drive one clock step in every world.
+        """Drive one time step in every world.
 
         Args:
             actions: [N, 2] in [-1, 1]: acceleration (1 is 4 m/s^2, -1 brakes by 8 m/s^2) and
@@ -243,7 +248,7 @@ class VectorDriveEnv(VectorEnv[Arrays, NDArray[np.float32], Arrays]):
         """Nothing is held open."""
 
     def _same_step(self, seen: Arrays, info: dict[str, Any]) -> tuple[Arrays, dict[str, Any]]:
-        """The first observations of new episodes; the last ones go to ``final_obs``."""
+        """The first observations of new episodes; the last ones are in ``final_obs``."""
         ended = self._ended.copy()
         final: NDArray[Any] = np.full(self.num_envs, None, dtype=object)
         for w in np.flatnonzero(ended).tolist():

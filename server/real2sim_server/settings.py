@@ -23,76 +23,77 @@ def _default_data_dir() -> Path:
 
 
 class Settings(BaseSettings):
-    """Everything about a worker that differs from one installation to the next.
+    """Configuration of a worker.
 
     Attributes:
-        host, port: where to listen; an address beyond loopback needs ``token``.
-        token: bearer token that every request but ``/livez`` and ``/readyz`` must carry.
-        token_file: file that holds the token, as an orchestrator mounts it.
-        tokens_file: named tokens with limits, which `real2sim token` makes; read again whenever it
+        host, port: listening address; an address beyond loopback requires ``token``.
+        token: bearer token required by every request except ``/livez`` and ``/readyz``.
+        token_file: file with the token, as mounted by an orchestrator.
+        tokens_file: named tokens with limits, created by `real2sim token`; reloaded when it
             changes.
         worker_id: first part of session ids, so that a proxy can find the worker again.
-        data_dir: what the worker writes; the next five lie below it by default.
+        data_dir: root of the worker's files; default parent of the next five.
         scenes_dir: folder of scene bundles.
-        demo: add the demo street to the scene folder at the start, unless a scene of its name,
-            ``demo_street``, is there.
+        demo: add the demo street to the scene folder at startup, unless a scene named
+            ``demo_street`` exists.
         import_root: the only folder that ``POST /v1/scenes`` may read from.
         assets_dir: folder of asset bundles.
-        jobs_dir: folder of the files that jobs leave.
+        jobs_dir: folder of the output files of jobs.
         store_url: SQLAlchemy URL of scenarios and sessions.
-        agent_port: where the worker tells HAProxy's agent-check how much it takes; none by default.
-        agent_weight: of the worker there, in per cent.
-        hot_scene_sessions: sessions in a scene, over all workers on a store, from which on two of
-            them have it in memory; 0 for never.
-        objects_url: store of objects by which workers share scenes, assets and files of jobs:
+        agent_port: port for HAProxy's agent-check; none by default.
+        agent_weight: weight of the worker there, in per cent.
+        hot_scene_sessions: number of sessions in a scene, over all workers on a store, from which
+            two workers keep it in memory; 0 for never.
+        objects_url: object store through which workers share scenes, assets and files of jobs:
             ``file:///folder`` or ``s3://bucket/prefix?endpoint=...``; none by default.
-        objects_cache_bytes: disk for what came out of it.
-        objects_url_seconds: for which a signed address of a file is good.
-        lease_seconds: for which a worker promises others on its store to be alive, again and again;
-            once it does not, they may take its sessions over.
-        store_timeout_seconds: after which a database that does not answer is in trouble.
-        durability: what is on the disk before it is acknowledged: ``all``; ``edits``, which is all
-            but the steps of sessions; or ``process``, nothing. The rest is safe when the process
-            is killed, and its last seconds are lost when the machine loses power. SQLite only.
-        store_migration: whether a worker brings a store of an older schema up to date (``auto``),
-            or refuses it with the command to run (``refuse``).
+        objects_cache_bytes: disk cache of the object store.
+        objects_url_seconds: validity of a signed address of a file.
+        lease_seconds: duration of the lease that a worker renews on its store; when it expires,
+            other workers may take over its sessions.
+        store_timeout_seconds: time after which an unresponsive database counts as unavailable.
+        durability: data on disk before it is acknowledged: ``all``; ``edits``, everything except
+            the steps of sessions; or ``process``, nothing. The rest survives a killed process, but
+            its last seconds are lost in a power failure. SQLite only.
+        store_migration: whether a worker upgrades a store with an older schema (``auto``), or
+            refuses it with the command to run (``refuse``).
         store_max_bytes: size above which the oldest ended sessions are removed.
-        session_retention_days: after which ended sessions are removed, and unused ones ended.
-        job_retention_days: after which ended jobs are removed, with their files.
-        backend: what draws: ``auto`` chooses by the hardware at hand; ``nvrtc`` are the kernels of
-            our own for a GPU, which serve and do not train.
+        session_retention_days: age at which ended sessions are removed, and unused ones ended.
+        job_retention_days: age at which ended jobs are removed, with their files.
+        backend: renderer: ``auto`` selects by hardware; ``nvrtc`` are the built-in kernels for a
+            GPU, for serving only, not for training.
         threads: of numba and torch; 0 for one per core.
-        scene_memory_bytes: budget of resident scenes and assets together, and of shared memory.
-        shared_memory_bytes: of each controller on this machine, in four slots, for raw images;
-            taken as images need it, and counted in the budget. 0 sends all over the socket.
-        max_sessions: open sessions; more are refused at creation.
-        session_idle_seconds: unused sessions without connections leave the memory after this time;
-            they are rebuilt from their logs on demand.
-        queue_length: jobs that may wait for the engine; more are refused.
+        scene_memory_bytes: budget of resident scenes, assets and shared memory together.
+        shared_memory_bytes: per controller on this machine, in four slots, for raw images;
+            allocated on demand, and counted in the budget. 0 sends everything over the socket.
+        max_sessions: open sessions; further ones are rejected at creation.
+        session_idle_seconds: time after which unused sessions without connections leave the
+            memory; they are rebuilt from their logs on demand.
+        queue_length: jobs that may wait for the engine; further ones are rejected.
         max_request_bytes, max_upload_bytes: body of a request, and of an uploaded splat file.
-        max_scene_bytes, max_asset_bytes: what an imported scene or asset may take in memory,
-            however small its file is.
-        import_memory_bytes, import_seconds: of the process that reads an import.
-        assets_quota, assets_quota_bytes: assets of the library, and their disk.
-        scenes_quota, scenes_quota_bytes: scenes of the scene folder, and their disk; more cannot be
-            imported.
-        jobs_quota, jobs_quota_bytes: jobs on record, and the disk of their files; no job begins
-            beyond.
+        max_scene_bytes, max_asset_bytes: memory limit of an imported scene or asset, independent
+            of the size of its file.
+        import_memory_bytes, import_seconds: limits of the process that reads an import.
+        assets_quota, assets_quota_bytes: assets of the library, and their disk space.
+        scenes_quota, scenes_quota_bytes: scenes of the scene folder, and their disk space; imports
+            beyond are rejected.
+        jobs_quota, jobs_quota_bytes: recorded jobs, and the disk space of their files; no job
+            starts beyond.
         max_pixels_per_step: pixels over all cameras of one observation or render.
         max_rays_per_step: rays over all LiDARs and radars of one observation or render.
         stall_seconds: `/livez` fails when one job takes longer than this.
-        drain_seconds: how long a worker that is to stop goes on serving, not ready, so that proxies
-            send new work elsewhere; SIGINT, or a second signal, ends it at once.
-        graceful_seconds: time that open requests get at shutdown.
-        max_connections: open connections; fewer where the limit of descriptors is lower. Where all
-            are taken, those make room that are silent for longest while it is their turn to send.
-        head_seconds: time for the headers of a request.
-        body_seconds: time for its body, beside the time that it takes at 10 kB/s.
-        write_seconds: time for a client to read what it was sent, beside the time at that rate.
-        keep_alive_seconds: how long a connection stays open between requests.
+        drain_seconds: time for which a stopping worker continues to serve, not ready, so that
+            proxies send new work elsewhere; SIGINT, or a second signal, ends it immediately.
+        graceful_seconds: time limit of open requests at shutdown.
+        max_connections: open connections; fewer if the limit of descriptors is lower. At the
+            limit, the connections that have been silent longest while expected to send are closed.
+        head_seconds: time limit for the headers of a request.
+        body_seconds: time limit for its body, plus the transfer time at 10 kB/s.
+        write_seconds: time limit for a client to read its reply, plus the transfer time at that
+            rate.
+        keep_alive_seconds: time that a connection stays open between requests.
         metrics: whether `/metrics` is served.
-        traces_url: collector of OpenTelemetry that gets spans, ``http://host:4318/v1/traces``; none
-            by default.
+        traces_url: OpenTelemetry collector for spans, ``http://host:4318/v1/traces``; none by
+            default.
         log_level, log_format: ``auto`` is text on a terminal and JSON elsewhere.
     """
 
@@ -209,17 +210,17 @@ class Settings(BaseSettings):
 OTHER_VARIABLES = frozenset(
     {"REAL2SIM_DEBUG", "REAL2SIM_MEMORY", "REAL2SIM_SCENES", "REAL2SIM_TEST_DATA", "REAL2SIM_URL"}
 )
-"""Of the client, the compose file and the tests."""
+"""Settings of the client, the compose file and the tests."""
 
 LIKENESS = 0.8
-"""Share of letters from which on a name is taken for a misspelt one."""
+"""Minimum share of equal letters for a name to count as misspelt."""
 
 
 def read_token(file: Path) -> str:
-    """The token in a file, without the end of its line.
+    """The token in a file, without the newline at its end.
 
     Raises:
-        ValueError: the file cannot be read, or holds what is no token.
+        ValueError: the file cannot be read, or does not contain a token.
     """
     try:
         text = file.read_text("utf-8")

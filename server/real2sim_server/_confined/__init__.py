@@ -1,9 +1,9 @@
 """Run functions on untrusted files in a separate process with limits.
 
-An untrusted file may crash a parser, fill the memory or never end. :func:`run_confined` lets a
-child process have that trouble: it has no environment, no privileges to gain, limits of memory,
-time and written bytes, and can tell nothing but JSON or the files of a folder it was given. However
-it ends, the caller gets a value or an error that says why.
+An untrusted file can crash a parser, fill the memory or never finish. :func:`run_confined` isolates
+this in a child process: it has no environment and cannot gain privileges, its memory, time and
+written bytes are limited, and it can return only JSON or the files of a given folder. In every case
+the caller gets a value or an error with the reason.
 """
 
 from .run import ConfinedError, run_confined

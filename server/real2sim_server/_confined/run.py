@@ -33,7 +33,7 @@ class ConfinedError(Exception):
     """A confined call did not finish; the message gives the reason.
 
     Attributes:
-        out_of_memory: whether it needed more memory than it might take.
+        out_of_memory: whether it exceeded its memory limit.
     """
 
     def __init__(self, reason: str, *, out_of_memory: bool = False) -> None:
@@ -53,8 +53,8 @@ def run_confined(
     Args:
         target: ``module:function`` of this program.
         arguments: keywords of the function, JSON values; paths absolute.
-        limits: what it may use.
-        errors: exceptions of the function, built from one message, that are raised here again.
+        limits: resource limits.
+        errors: exceptions of the function, built from one message, that are re-raised here.
 
     Raises:
         ConfinedError: out of memory or time, crashed, or an exception not among ``errors``.
@@ -174,7 +174,7 @@ class _Starter:
 
 
 def _environment() -> dict[str, str]:
-    """Where the modules are, and nothing that a parser has a use for."""
+    """Only the paths of the modules; a parser needs nothing more."""
     kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
     paths = [os.path.abspath(entry) for entry in sys.path]
     return kept | dict.fromkeys(_ONE_THREAD, "1") | {"PYTHONPATH": os.pathsep.join(paths)}

@@ -34,7 +34,7 @@ _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
 _CAPABILITY_VERSION_3 = 0x20080522
 _CAPABILITIES = 64
 _READ_AND_WRITE_OTHERS = 0b110
-"""CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH: root goes on to reach the files it was given."""
+"""CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH: root can still read and write its input files."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Limits:
     """Limits of one confined call.
 
     Attributes:
-        memory_bytes: address space beyond that of the program itself; files that are mapped count.
-        seconds: until it is ended; also of processor time.
-        written_bytes: largest file it may write; with 0 it writes none.
+        memory_bytes: address space beyond that of the program itself; mapped files count.
+        seconds: wall-clock limit; also of processor time.
+        written_bytes: maximum size of a written file; 0 prohibits writing.
         open_files: descriptors.
     """
 
@@ -55,10 +55,10 @@ class Limits:
 
 
 def apply_limits(limits: Limits) -> None:
-    """Give up everything beyond ``limits``, for good.
+    """Irrevocably give up everything beyond ``limits``.
 
-    What the system does not offer is passed over: limits of address space outside of Linux,
-    a network of its own where namespaces are refused.
+    Unsupported limits are skipped: address space outside Linux, a separate network where namespaces
+    are refused.
     """
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
@@ -98,7 +98,7 @@ def _give_up_privileges() -> None:
 
 
 def _keep_capabilities(libc: ctypes.CDLL, kept: int) -> None:
-    """Leave the capabilities of the mask ``kept`` (all below 32) and no others."""
+    """Drop all capabilities except those of the mask ``kept`` (all below 32)."""
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     held = (ctypes.c_uint32 * 6)()
     if libc.capget(header, held) != 0:
@@ -194,8 +194,10 @@ def _serve(control: socket.socket, children: dict[int, _Child]) -> bool:
 
 
 def _load(name: str) -> None:
-    """Load a module of the program before the fork: then children have it, and need no memory for
-    it. What its functions import late stands in its ``LOADED_EARLY``."""
+    """Load a module of the program before the fork, so that children need no memory for it.
+
+    Late imports of its functions are listed in its ``LOADED_EARLY``.
+    """
     with contextlib.suppress(ImportError):
         module = importlib.import_module(name)
         for late in getattr(module, "LOADED_EARLY", ()):
@@ -219,7 +221,7 @@ def _become_child(answer: int, request: dict[str, Any]) -> None:
 
 
 def _only_descriptor(kept: int) -> int:
-    """Close all descriptors but ``kept``, which moves to 3; standard streams lead nowhere."""
+    """Close all descriptors except ``kept``, which moves to 3; standard streams are discarded."""
     nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):
         os.dup2(nowhere, stream)

@@ -42,7 +42,7 @@ class Bicycle:
             the middle, x forward, z up [m].
         triangles: [T, 3].
         surfaces: [T] index into ``SURFACES``.
-        moves: [V] which of the moving parts a vertex belongs to.
+        moves: [V] moving part of each vertex.
     """
 
     scale: float
@@ -58,7 +58,7 @@ class Bicycle:
         return WHEEL_RADIUS * self.scale
 
     def crank_angle(self, distance: ArrayLike) -> Float:
-        """Of the cranks [T] after distances [T] [m]; they turn forward, about y [rad]."""
+        """Angle of the cranks [T] after distances [T] [m]; they turn forward, about y [rad]."""
         return np.asarray(distance, dtype=np.float64) / (self.wheel_radius * GEAR)
 
     def placed(self, distance: ArrayLike, roll: ArrayLike) -> Float:
@@ -83,7 +83,7 @@ class Bicycle:
         return leaned
 
     def pedal(self, distance: ArrayLike, side: int) -> Float:
-        """Middle of the left (0) or right (1) pedal [T, 3], without lean."""
+        """Centre of the left (0) or right (1) pedal [T, 3], without lean."""
         angle = self.crank_angle(distance) + np.pi * side
         x = np.cos(angle) * CRANK_LENGTH
         z = -np.sin(angle) * CRANK_LENGTH
@@ -97,7 +97,7 @@ class Ride:
 
     Attributes:
         body: the rider.
-        bicycle: below.
+        bicycle: of the rider.
         times: [N] of the path [s].
         distance: [N] covered since its start [m].
         roll: [N] lean to the left [rad].
@@ -110,7 +110,7 @@ class Ride:
     roll: Float
 
     def at(self, times: ArrayLike) -> tuple[Float, Float]:
-        """Distance [T] and roll [T] at times [T] [s]; the path goes straight on at its ends."""
+        """Distance [T] and roll [T] at times [T] [s]; the path continues straight at its ends."""
         times = np.atleast_1d(np.asarray(times, dtype=np.float64))
         distance = np.interp(times, self.times, self.distance)
         for end, beside in ((0, 1), (-1, -2)):
@@ -220,7 +220,7 @@ class Seat:
 
 def seat_rider(body: Body) -> Seat:
     """Sit a body on the bicycle that fits it: legs almost straight below, hands on the grips."""
-    # Frames for tall riders are hardly longer; their saddle is higher.
+    # Frames for tall riders are barely longer; their saddle is higher.
     scale = min(body.leg_length / ADULT_LEG, 1.02)
     pelvis_lean = np.radians(12)
     trial = Seat(body, scale, np.array([SEAT_X * scale, 0, 1.0]), pelvis_lean, 0.0, 0.0)
@@ -244,7 +244,7 @@ def _crotch(body: Body) -> float:
 
 
 def _reaching_lean(body: Body, pelvis: Float, turned: Float, scale: float) -> float:
-    """The least lean of the chest with which bent arms reach the grips [rad]."""
+    """Minimum lean of the chest at which bent arms reach the grips [rad]."""
     bones = [body.joint(f"{name}_l") for name in ("upper_arm", "forearm", "hand")]
     reach = 0.95 * sum(np.linalg.norm(b - a) for a, b in pairwise(bones))
     leans = np.radians(np.arange(5.0, 71.0))
@@ -267,7 +267,7 @@ def _point(xz: tuple[float, float], y: float = 0.0) -> Float:
 
 
 def _crankset(scale: float) -> Bicycle:
-    """A bicycle of which only the drive is asked."""
+    """A bicycle with only the drivetrain."""
     none = np.zeros(0, np.int64)
     return Bicycle(scale, 0.0, np.zeros((0, 3)), none.reshape(0, 3), none, none)
 

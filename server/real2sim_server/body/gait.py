@@ -1,16 +1,17 @@
 """Walking and running along a path, driven by the distance covered.
 
-Steps are laid along the path first: every foot stands on one spot of the ground from heel strike
-to toe-off, and the legs are bent so that they reach their feet. So no foot slides, at any speed, on
-any path. Stride lengths follow from speed and leg length, for walking and running alike:
+Footsteps are placed along the path first: every foot rests at one position on the ground from heel
+strike to toe-off, and the legs are bent so that they reach their feet. So no foot slides, at any
+speed, on any path. Stride lengths follow from speed and leg length, for walking and running alike:
 
     stride = 2.3 (v^2 / (g h))^0.3 h
 
-Alexander, "Estimates of speeds of dinosaurs", Nature 261, 1976, for mammals; people who walk take a
-tenth more (113 steps a minute at 1.4 m/s: Perry and Burnfield, below). The Froude number
-v^2 / (g h) also says when people walk and when they run (about 0.5; Alexander, "Optimization and
-gaits in the locomotion of vertebrates", Physiological Reviews 69, 1989). Angles of the trunk and
-the arms in walking are those of Perry and Burnfield, "Gait analysis", 2010, rounded.
+Alexander, "Estimates of speeds of dinosaurs", Nature 261, 1976, for mammals; walking people take
+strides a tenth longer (113 steps a minute at 1.4 m/s: Perry and Burnfield, below). The Froude
+number v^2 / (g h) also determines when people walk and when they run (about 0.5; Alexander,
+"Optimization and gaits in the locomotion of vertebrates", Physiological Reviews 69, 1989). Angles
+of the trunk and the arms in walking are those of Perry and Burnfield, "Gait analysis", 2010,
+rounded.
 """
 
 from __future__ import annotations
@@ -38,26 +39,26 @@ from .model import (
 
 GRAVITY = 9.81
 WALK_TO_RUN = (0.4, 0.8)
-"""Froude numbers between which walking goes over into running."""
+"""Froude numbers between which walking blends into running."""
 TURN_RADIUS = 0.25
 """Turning on the spot makes steps as going round a circle of this radius would [m]."""
 STANDING = 0.04
-"""Below this speed a person stands [m/s]."""
+"""Below this speed a person stands still [m/s]."""
 LEAD = 3.0
-"""Before and after a path a gait goes straight on for this time [s]."""
+"""Before and after a path, a gait continues straight for this time [s]."""
 _STEP = 0.01
 
 
 @dataclass(frozen=True)
 class GaitStyle:
-    """How somebody walks; ones and zeros are the mean.
+    """Walking style; ones and zeros are the mean.
 
     Attributes:
         stride: factor on the length of strides.
         arms: factor on the swing of the arms.
-        lean: further lean forward [rad].
+        lean: additional forward lean [rad].
         width: factor on the distance between the feet's tracks.
-        phase: steps by which the gait is ahead; one starts with the other foot.
+        phase: phase offset in steps; 1 starts with the other foot.
     """
 
     stride: float = 1.0
@@ -69,12 +70,13 @@ class GaitStyle:
 
 @dataclass(frozen=True, eq=False)
 class Footsteps:
-    """The spots that a foot stands on.
+    """Positions of a foot on the ground.
 
     Attributes:
-        lift, land: [K] steps counted along the walk at which it leaves a spot and meets the next.
+        lift, land: [K] step counts along the walk at which it leaves a position and reaches the
+            next.
         spots: [K + 1, 3] of the middle of its hip's track, on the ground, world frame [m].
-        yaws: [K + 1] which way it points [rad].
+        yaws: [K + 1] direction of the foot [rad].
     """
 
     lift: Float
@@ -85,13 +87,13 @@ class Footsteps:
 
 @dataclass(frozen=True, eq=False)
 class Gait:
-    """How a body goes along a path.
+    """Motion of a body along a path.
 
     Attributes:
-        body, style: who goes, and how.
+        body, style: of the person.
         times: [N] of the path [s].
         path: [N, 4] x, y, z on the ground and yaw, world frame.
-        steps: [N] steps made so far; a foot swings over each whole one.
+        steps: [N] number of steps so far; each whole number is one swing of a foot.
         speeds: [N], smoothed [m/s].
         feet: footsteps of the left and of the right foot.
     """
@@ -119,7 +121,7 @@ class Gait:
 
 
 def stride_length(speed: ArrayLike, leg_length: float) -> Float:
-    """Of a body with hips at ``leg_length`` [m] at speeds [m/s]; see the module's docstring."""
+    """Stride length of a body with hips at ``leg_length`` [m] at speeds [m/s]; see the module."""
     froude = np.asarray(speed, dtype=np.float64) ** 2 / (GRAVITY * leg_length)
     human = 1.1 - 0.1 * running_share(speed, leg_length)
     return human * 2.3 * froude**0.3 * leg_length
@@ -146,20 +148,20 @@ def plan_gait(
     yaws: ArrayLike,
     style: GaitStyle | None = None,
 ) -> Gait:
-    """Lay footsteps along a path.
+    """Place footsteps along a path.
 
     Args:
-        body: who goes.
-        times: [N] rising [s].
+        body: of the person.
+        times: [N] increasing [s].
         positions: [N, 3] of the body's origin on the ground, world frame [m].
-        yaws: [N], which way the body faces [rad].
-        style: how it walks.
+        yaws: [N], direction that the body faces [rad].
+        style: walking style.
 
     Returns:
-        The gait. Before and after the path it goes straight on.
+        The gait. Before and after the path it continues straight.
 
     Raises:
-        ValueError: times that do not rise, or arrays that do not belong together.
+        ValueError: times that do not increase, or arrays of different lengths.
     """
     style = style or GaitStyle()
     times, path = _checked(times, positions, yaws)
@@ -218,9 +220,9 @@ def _smoothed(speed: Float) -> Float:
 def _count_steps(
     times: Float, speed: Float, leg: float, style: GaitStyle
 ) -> tuple[Float, list[tuple[int, int]]]:
-    """Steps made [N], and the first and the last step of each way between two halts.
+    """Step counts [N], and the first and the last step of each segment between two stops.
 
-    From halt to halt there are whole steps: a stride is a little longer or shorter for that.
+    Segments have whole numbers of steps, so strides are slightly adjusted.
     """
     going = speed > STANDING
     length = 0.5 * style.stride * stride_length(np.maximum(speed, STANDING), leg)
@@ -263,7 +265,7 @@ def _lay_footsteps(  # noqa: PLR0917 - all that a step depends on
                 swing = 1 - float(duty_factor(pace, body.leg_length))
                 lift.append(max(n + 0.5 - swing, first))
                 land.append(min(n + 0.5 + swing, last))
-                # The body is over the spot in the middle of the time that the foot stands there.
+                # The body is above the foot in the middle of its stance.
                 spot = _place(known, where, min(n + 1.5, last))
                 spots.append(spot[:3])
                 yaws.append(spot[3])
@@ -277,7 +279,7 @@ def _place(known: Float, where: Float, step: float) -> Float:
 
 
 def _apart(lift: list[float], land: list[float]) -> tuple[list[float], list[float]]:
-    """A foot stands a moment on each spot, however fast its owner runs."""
+    """A foot stays briefly at each position, at any speed."""
     for k in range(1, len(lift)):
         if lift[k] < land[k - 1] + 0.2:
             middle = (lift[k] + land[k - 1]) / 2
@@ -293,7 +295,7 @@ class _Motion:
         self.place, self.steps, self.speed, self.times = place, steps, speed, times
         leg = self.body.leg_length
         self.running = running_share(speed, leg)
-        # How much of a full stride's motion there is: nothing while standing.
+        # Fraction of a full stride's motion: none at standstill.
         self.effort = smooth(speed / (0.55 * np.sqrt(GRAVITY * leg)) * 1.2)
         self.turn = np.pi * (steps + round(self.style.phase))
 
@@ -342,7 +344,7 @@ class _Motion:
     def _swing(
         self, foot: Foot, side: int, spot: NDArray[np.int64]
     ) -> tuple[Float, Float, Float, Float]:
-        """As :meth:`_stance`, on the way from a spot to the next one."""
+        """Like :meth:`_stance`, for the swing to the next position."""
         walk = self.gait.feet[side]
         p = np.clip((self.steps - walk.lift[spot]) / (walk.land[spot] - walk.lift[spot]), 0, 1)
         size = self._sizes(walk)[spot]
@@ -375,7 +377,7 @@ class _Motion:
         return leg * height  # type: ignore[no-any-return]
 
     def _spot(self, walk: Footsteps, index: NDArray[np.int64], side: int) -> Float:
-        """Where the ankle stands flat [T, 3], world frame."""
+        """Position of the ankle with a flat foot [T, 3], world frame."""
         yaw = walk.yaws[index]
         sign = 1.0 - 2.0 * side
         hip = self.body.joint("thigh_l")[1]
@@ -434,7 +436,7 @@ class _Motion:
         chest = about(UP, -np.radians(6) * swing) @ about(LATERAL, lean)
         put_spine(local, pelvis_turn, chest, about(LATERAL, 0.3 * lean))
         for side, sign in (("l", 1.0), ("r", -1.0)):
-            # An arm goes with the leg of the other side.
+            # An arm moves with the opposite leg.
             ahead = (
                 sign * swing * self.style.arms * (np.radians(20) + np.radians(22) * self.running)
             )
@@ -446,12 +448,12 @@ class _Motion:
 
 
 class Foot:
-    """A foot as it is in the rest pose.
+    """A foot in the rest pose.
 
     Attributes:
         ankle, ball: joints [3].
-        heel: [3] its hindmost point on the ground.
-        yaw: which way it points [rad].
+        heel: [3] its rearmost point on the ground.
+        yaw: its direction [rad].
     """
 
     def __init__(self, body: Body, side: str) -> None:
@@ -479,7 +481,7 @@ class Foot:
 
 
 def leg_lengths(body: Body, side: str) -> tuple[float, float]:
-    """Of thigh and calf [m]."""
+    """Lengths of thigh and calf [m]."""
     hip, knee, ankle = (body.joint(f"{name}_{side}") for name in ("thigh", "calf", "foot"))
     return float(np.linalg.norm(knee - hip)), float(np.linalg.norm(ankle - knee))
 
@@ -487,11 +489,11 @@ def leg_lengths(body: Body, side: str) -> tuple[float, float]:
 def put_leg(  # noqa: PLR0917 - hip, ankle and foot are one leg
     body: Body, local: Float, side: str, hip: Float, ankle: Float, foot: Float
 ) -> None:
-    """Turn thigh, calf and foot in rotations ``local`` [T, J, 3, 3], whose pelvis is set.
+    """Rotate thigh, calf and foot in rotations ``local`` [T, J, 3, 3], whose pelvis is set.
 
     Args:
-        body: whose leg it is.
-        local: rotations that are written to.
+        body: with the leg.
+        local: rotations, written.
         side: "l" or "r".
         hip, ankle: joints [T, 3] in the body frame.
         foot: [T, 3, 3] rotation of the foot in the body frame.
@@ -523,11 +525,11 @@ def put_spine(local: Float, pelvis: Float, chest: Float, head: Float) -> None:
 def put_arm(  # noqa: PLR0917 - the angles of one arm
     body: Body, local: Float, side: str, shoulder: Float, elbow: Float, out: ArrayLike
 ) -> None:
-    """Hang an arm.
+    """Pose an arm.
 
     Args:
-        body: whose arm it is.
-        local: [T, J, 3, 3] rotations that are written to.
+        body: with the arm.
+        local: [T, J, 3, 3] rotations, written.
         side: "l" or "r".
         shoulder: [T] swing forward of the upper arm against the chest [rad].
         elbow: [T] bend [rad].

@@ -41,20 +41,20 @@ KEYPOINT_JOINTS = tuple(
 
 @dataclass(frozen=True, eq=False)
 class BodyModel:
-    """What all bodies share.
+    """Data shared by all bodies.
 
     Attributes:
         vertices: [V, 3] mean shape in the rest pose, body frame [m].
         joints: [J, 3] joints of the mean shape [m].
-        basis: [K, V + J, 3] change of vertices and joints by a shape coefficient of one, which is
-            a standard deviation of the builds it was made of [m].
+        basis: [K, V + J, 3] change of vertices and joints per unit of a shape coefficient, which is
+            a standard deviation of the source builds [m].
         builds: shape coefficients [K] of named builds.
-        parents: [J] joint that each hangs on, -1 for the pelvis.
-        weight_joints, weights: [V, 4] joints that move a vertex, and by how much; sums are one.
+        parents: [J] parent joint, -1 for the pelvis.
+        weight_joints, weights: [V, 4] joints that move a vertex, and their weights; sums are one.
         triangles: [T, 3] vertices, anticlockwise seen from outside.
         triangle_groups: [T] index into ``group_names``.
-        group_names: of the triangles that are always there ("body"), and of those that a person
-            may have: "long_hair", "skirt".
+        group_names: of the triangles that are always present ("body"), and of optional ones:
+            "long_hair", "skirt".
         parts: [V] index into ``part_names``.
         part_names: of the parts of a body.
         mirror: [V] vertex on the other side.
@@ -77,14 +77,14 @@ class BodyModel:
     face: NDArray[np.int64]
 
     def shaped(self, shape: ArrayLike | str, *, height: float | None = None) -> Body:
-        """A body of a shape.
+        """A body with a shape.
 
         Args:
             shape: [<= K] coefficients, or the name of a build (``builds``).
-            height: of the body; scales it as a whole [m].
+            height: of the body [m]; scales it as a whole.
 
         Raises:
-            ValueError: an unknown build, too many or unfit coefficients, a height outside
+            ValueError: an unknown build, too many or invalid coefficients, a height outside
                 (0.4, 2.6).
         """
         coefficients = self._coefficients(shape)
@@ -148,7 +148,7 @@ class Body:
 
     @property
     def leg_length(self) -> float:
-        """From the hip to the ground [m]."""
+        """Height of the hip above the ground [m]."""
         return float(self.joint("thigh_l")[2])
 
 
@@ -225,9 +225,9 @@ class Pose:
     """Poses of a body, one or many.
 
     Attributes:
-        rotations: [..., J, 4] ``wxyz``, of each joint against the one it hangs on; the identity
-            in the rest pose.
-        pelvis: [..., 3] where the pelvis joint is, body frame [m].
+        rotations: [..., J, 4] ``wxyz``, of each joint relative to its parent; the identity in the
+            rest pose.
+        pelvis: [..., 3] position of the pelvis joint, body frame [m].
     """
 
     rotations: Float
@@ -350,12 +350,12 @@ def partial_turn(rotations: Float, fraction: float) -> Float:
 
 
 def bend(start: Float, end: Float, upper: float, lower: float, towards: Float) -> Float:
-    """Where the middle joint [T, 3] of two bones is.
+    """Position of the middle joint [T, 3] of two bones.
 
     Args:
-        start, end: of the limb [T, 3]; what is out of reach is met by a straight limb.
+        start, end: of the limb [T, 3]; an end out of reach gives a straight limb.
         upper, lower: lengths of its bones [m].
-        towards: [T, 3], which way the middle joint points.
+        towards: [T, 3], direction of the middle joint.
     """
     line = end - start
     reach = np.clip(
@@ -369,6 +369,6 @@ def bend(start: Float, end: Float, upper: float, lower: float, towards: Float) -
 
 
 def smooth(x: ArrayLike) -> Float:
-    """From 0 to 1 over [0, 1], level at both ends."""
+    """From 0 to 1 over [0, 1], with zero slope at both ends."""
     x = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
     return x * x * (3 - 2 * x)

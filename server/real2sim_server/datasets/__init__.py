@@ -1,10 +1,10 @@
-"""Labelled data sets of edited streets: labels of what is drawn, and writers of public formats.
+"""Labelled data sets of edited streets: labels of rendered frames, and writers of public formats.
 
-- ``drive``: what is exported, a scenario or a recorded episode, instant by instant;
-- ``labels``: what is known of an instant and of every pixel, from one pass per camera;
-- ``clips``: an instant after the other, labelled, in a store of whole clips that survives a kill;
-- ``writers``: one module a format, behind one Protocol;
-- ``export``: the whole way, from a drive to a folder.
+- ``drive``: the exported drive, a scenario or a recorded episode, as states over time;
+- ``labels``: labels of a time step and of every pixel, from one pass per camera;
+- ``clips``: labelled clips, in a crash-safe store;
+- ``writers``: one module per format, behind one Protocol;
+- ``export``: the complete export, from a drive to a folder.
 
-A label says how it was made in the manifest of its export, see :data:`~.labels.HOW`.
+The manifest of an export describes how each label was made, see :data:`~.labels.HOW`.
 """

@@ -1,8 +1,8 @@
-"""Labelled clips as files: what writers read, and what survives when an export is killed.
+"""Labelled clips as files: the input of writers, preserved when an export is killed.
 
-A clip is a folder that appears whole: ``labels.json``, and for each camera and frame images as png:
-``rgb``, ``depth`` (1/256 m), ``instance``, ``semantic``, ``flow_forward`` and ``flow_backward``
-(KITTI: u and v times 64 plus 2^15, and whether it is valid), ``occluded_forward`` and
+A clip is a folder that is created atomically: ``labels.json``, and for each camera and frame images
+as png: ``rgb``, ``depth`` (1/256 m), ``instance``, ``semantic``, ``flow_forward`` and
+``flow_backward`` (KITTI: u and v times 64 plus 2^15, and a validity flag), ``occluded_forward`` and
 ``occluded_backward``; ``points/NNNNNN.npy`` has the points of a frame.
 """
 
@@ -70,7 +70,7 @@ POINT = np.dtype(
 """A row of ``points``: ego frame [m], [m/s]."""
 
 SEED_STEP = 1_000_003
-"""Between the seeds of exports, whose frames add their instant."""
+"""Distance between the seeds of exports; frames add their time step."""
 
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
 ENCODERS = 2
@@ -121,11 +121,11 @@ class Clip:
         return cls(folder, content["name"], content["split"], content["frames"], values)
 
     def file(self, kind: str, camera: str, frame: int) -> Path:
-        """The png of an image of that kind; the first and last frame lack a flow each."""
+        """The png of an image of that kind; the first and the last frame each lack one flow."""
         return self.folder / kind / camera / f"{frame:06d}.png"
 
     def pixels(self, kind: str, camera: str, frame: int) -> NDArray[Any]:
-        """An image as it is in its png; RGB for ``rgb``."""
+        """An image as stored in its png; RGB for ``rgb``."""
         image = cv2.imread(str(self.file(kind, camera, frame)), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise FileNotFoundError(self.file(kind, camera, frame))
@@ -147,8 +147,7 @@ def write_shard(
     backend: str | Backend = "auto",
     on_frame: Callable[[], None] = lambda: None,
 ) -> None:
-    """Draw and label a clip of a sweep, beside its path where the plan says so; as
-    :func:`write_clip`."""
+    """Render and label a clip of a sweep, perturbed if planned; as :func:`write_clip`."""
     drive = variant.drive
     if plan.perturb is not None and clip.copy is not None:
         seed = (plan.seed, int(clip.name), clip.copy)
@@ -176,7 +175,7 @@ def write_clip(
     backend: str | Backend = "auto",
     on_frame: Callable[[], None] = lambda: None,
 ) -> None:
-    """Draw and label a clip into ``folder``, which appears only when it is whole."""
+    """Render and label a clip into ``folder``, which is created atomically."""
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -267,7 +266,7 @@ def _if_known(name: str, points: Float | None) -> dict[str, Any]:
 
 
 def _beside(drive: Drive, t_us: int) -> dict[str, Any]:
-    """How far the ego is beside its path, where it is."""
+    """Lateral and heading offset of the ego from its path, if it is perturbed."""
     if not isinstance(drive, PerturbedDrive):
         return {}
     lateral, heading = drive.offset_at(t_us)
@@ -311,7 +310,7 @@ def _view_labels(
 
 
 class _FileWriter:
-    """Encodes and writes files on threads of its own while the next frame is drawn."""
+    """Encodes and writes files on separate threads while the next frame is rendered."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -327,7 +326,7 @@ class _FileWriter:
             self.finish()
 
     def add(self, kind: str, camera: str, index: int, encode: Callable[[], bytes]) -> None:
-        """Write what ``encode`` gives; an error of it comes out of :meth:`finish`."""
+        """Write the result of ``encode``; :meth:`finish` raises its error."""
         suffix = "npy" if kind == "points" else "png"
         path = self._folder / kind / camera / f"{index:06d}.{suffix}"
 
@@ -338,7 +337,7 @@ class _FileWriter:
         self._pending.append(self._pool.submit(write))
 
     def finish(self) -> None:
-        """Wait for what was added before."""
+        """Wait for all added files."""
         for pending in self._pending:
             pending.result()
         self._pending.clear()
@@ -420,7 +419,7 @@ def _encoded(image: NDArray[Any]) -> bytes:
 # is made again if its maker dies. Clips return as archives, so no shared disk is needed.
 
 Recipe = Callable[[], Sequence[Variant]]
-"""Makes the variants of an export; it can be pickled, and every worker finds its files."""
+"""Makes the variants of an export; can be pickled, and every worker finds its files."""
 
 
 @dataclass(frozen=True)
@@ -444,16 +443,16 @@ class ClipMakers:
         folder: Path,
         on_frames: Callable[[int], None],
     ) -> None:
-        """Make each clip as a folder of its name below ``folder``, which appears when it is whole.
+        """Make each clip as a folder of its name below ``folder``, created atomically.
 
         Args:
             plan: of the export.
             clips: missing clips.
-            folder: for all of them.
+            folder: parent of the clips.
             on_frames: called with the number of frames of each finished clip.
 
         Raises:
-            DatasetError: the makers of a clip die again and again.
+            DatasetError: the makers of a clip die repeatedly.
         """
         named = {clip.name: clip for clip in clips}
 
@@ -495,7 +494,7 @@ class _ClipMaker:
 
 
 def _unpack(archive: bytes, folder: Path) -> None:
-    """Write the files of a clip; the folder appears when it is whole."""
+    """Write the files of a clip; the folder is created atomically."""
     partial_folder = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial_folder, ignore_errors=True)
     partial_folder.mkdir(parents=True)

@@ -23,19 +23,19 @@ from ..world.recording.recording import Recording
 
 
 class DatasetError(ValueError):
-    """An export that cannot be made; the message says what was given and what is allowed."""
+    """An export that cannot be made; the message gives the value and the allowed ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A drive at one instant.
+    """State of a drive at one time.
 
     Attributes:
-        t_us: instant [us].
-        instances: what is drawn.
-        placed: every object that is there.
+        t_us: time [us].
+        instances: to render.
+        placed: all present objects.
         T_world_ego: [4, 4] pose of the ego (rear axle centre on the ground).
-        strides: of people whom no trajectory leads, by object id.
+        strides: of people without a trajectory, by object id.
     """
 
     t_us: int
@@ -47,11 +47,11 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class MetSweep:
-    """What a LiDAR meets in the sweep about an instant.
+    """Targets of a LiDAR during one sweep.
 
     Attributes:
         things: background first, then the objects, see :class:`~..render.cast.SweepScene`.
-        T_world_lidar: [S, 4, 4] at the instants of the sweep.
+        T_world_lidar: [S, 4, 4] at the pose times of the sweep.
     """
 
     things: SweepScene
@@ -72,15 +72,15 @@ class Drive(Protocol):
         ...
 
     def at(self, t_us: int) -> Moment:
-        """Everything that is drawn at an instant of the span."""
+        """The state to render at a time in the span."""
         ...
 
     def placed_at(self, t_us: int) -> PlacedObjects[ObjectState]:
-        """Where the objects are at an instant of the span."""
+        """Poses of the objects at a time in the span."""
         ...
 
     def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
-        """What a LiDAR of the ego meets, everything on its way, in the sweep about an instant."""
+        """Targets of a LiDAR of the ego in the sweep about a time, with moving objects."""
         ...
 
     def ego_at(self, t_us: int) -> Float:
@@ -94,7 +94,7 @@ class Drive(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ScenarioDrive:
-    """A scenario as it was recorded and edited; the ego drives as recorded."""
+    """A scenario as recorded and edited; the ego drives its recorded path."""
 
     scene: Scene
     state: ScenarioState
@@ -129,10 +129,10 @@ class ScenarioDrive:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeDrive:
-    """A recorded episode as it was lived through; its instants are those of its steps.
+    """A recorded episode; its times are those of its steps.
 
     Attributes:
-        scene: that it ran on.
+        scene: of the episode.
         worlds: after each step, by time.
     """
 
@@ -191,7 +191,7 @@ class EpisodeDrive:
         return max(bisect_right(times, t_us) - 1, 0)
 
     def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
-        """See :class:`Drive`; between steps everything moves evenly."""
+        """See :class:`Drive`; between steps all motion is linear."""
         place = self._place(t_us)
         near = self.worlds[max(place - 1, 0) : place + 2]
         world, times = self.worlds[place], t_us + lidar.beams.slots[0]
@@ -208,7 +208,7 @@ class EpisodeDrive:
 
 
 def _way(worlds: Sequence[World], object_id: str) -> Trajectory:
-    """Of an object over a few steps, as far as it is there."""
+    """Trajectory of an object over a few steps, while it exists."""
     rows = []
     for world in worlds:
         for subject, transform in zip(world.agents.objects, world.agents.transforms, strict=True):

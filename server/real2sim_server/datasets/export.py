@@ -1,4 +1,4 @@
-"""The whole way from a drive to a folder of labelled data."""
+"""Export of a drive to a folder of labelled data."""
 
 from __future__ import annotations
 
@@ -51,12 +51,13 @@ def write_previews(clips: Sequence[Clip], cameras: Sequence[Camera], folder: Pat
 # Boxes counted by class, distance and visible share.
 
 ZONE_M, ZONES = 20, 5
-"""Distances from the ego are counted in zones of so many metres; the last has all beyond."""
+"""Width of the distance zones around the ego [m], and their number; the last is unbounded."""
 
 
 def statistics_of(clips: Sequence[Clip]) -> dict[str, Any]:
-    """Boxes by category, and by category and distance from the ego; those in images by category
-    and visibility; objects and frames."""
+    """Boxes by category, and by category and distance from the ego; boxes in images by category and
+    visibility; numbers of objects and frames.
+    """
     boxes: Counter[str] = Counter()
     distances: dict[str, Counter[int]] = {}
     seen: dict[str, Counter[int]] = {}
@@ -125,7 +126,7 @@ class Estimate:
 def estimate(
     drive: Drive | Sequence[Variant], plan: ExportPlan, *, backend: str | Backend = "auto"
 ) -> Estimate:
-    """Of an export that is not made; three of its frames are labelled and thrown away.
+    """Estimate an export from three labelled frames, without writing it.
 
     Raises:
         DatasetError: as :func:`export_dataset`.
@@ -170,29 +171,29 @@ def export_dataset(
     makers: ClipMakers | None = None,
     on_progress: Callable[[str, int, int], None] = lambda _stage, _done, _total: None,
 ) -> Path:
-    """Label a drive and write it to the new folder ``out``, which appears only when it is whole.
+    """Label a drive and write it to the new folder ``out``, which is created atomically.
 
-    What is finished of an export that was stopped is kept beside ``out``: the same call again goes
-    on after the last whole clip, and gives the same bytes.
+    If an export is interrupted, its finished clips are kept next to ``out``. The same call then
+    continues after the last complete clip, and gives the same bytes.
 
     Args:
-        drive: what is shown; or the variants of a sweep, all of one scene.
-        plan: what is exported of it.
+        drive: to export; or the variants of a sweep, all of one scene.
+        plan: export options.
         out: a folder that does not exist yet.
-        made_of: what else decided on the drive (operations, episode ...), for the manifest; JSON
+        made_of: further inputs of the drive (operations, episode ...), for the manifest; JSON
             values only.
-        backend: draws.
+        backend: renderer.
         makers: workers that make the clips, of the same drive; None for this process.
-        on_progress: called with (stage, done, total): frames that are labelled, formats written.
+        on_progress: called with (stage, done, total): labelled frames, written formats.
 
     Returns:
         ``out``: a folder for each format, ``preview`` with a few sheets of labels over pictures,
         ``manifest.json`` and ``LICENSE.txt``.
 
     Raises:
-        DatasetError: ``out`` exists, an unknown format or camera, instants outside of the drive,
-            or a stopped export of something else in the way.
-        RenderError, OSError: it cannot be drawn or written.
+        DatasetError: ``out`` exists, an unknown format or camera, times outside the drive, or an
+            interrupted export with other options.
+        RenderError, OSError: it cannot be rendered or written.
     """
     target = Path(out)
     if target.exists():
@@ -252,7 +253,7 @@ def export_dataset(
 
 
 def work_folder(out: str | Path) -> Path:
-    """Where what is finished of a stopped export to ``out`` lies."""
+    """Folder of the finished clips of an interrupted export to ``out``."""
     target = Path(out)
     return target.with_name(f".{target.name}.export")
 

@@ -1,9 +1,10 @@
-"""Drives beside the recorded path that find back to it: recovery data for planners.
+"""Drives that start off the recorded path and return to it: recovery data for planners.
 
-The ego of a clip starts to the side of its path and turned, and a plan brings it back: the offset
-to the path is a polynomial of fifth order in the way driven, with the slope of the turned heading
-at the start and none at the end. Cameras and LiDAR see what they would have seen there, and the
-ego's future is that plan. After SimScale (arXiv 2511.23369), whose pseudo-expert plans back too.
+The ego of a clip starts with a lateral and a heading offset, and a plan brings it back: the offset
+from the path is a fifth-order polynomial in the driven distance, with the slope of the heading
+offset at the start and slope zero at the end. Cameras and LiDAR are rendered from the perturbed
+poses, and the ego's future is the plan. After SimScale (arXiv 2511.23369), whose pseudo-expert also
+plans back.
 """
 
 from __future__ import annotations
@@ -21,27 +22,29 @@ from ..scene import Lidar, Scene
 from .drive import Drive, MetSweep, Moment
 
 STEP_US = 50_000
-"""Between poses of which the way driven is measured [us]."""
+"""Spacing of poses for measuring the driven distance [us]."""
 MIN_PATH_LENGTH = 8.0
-"""The way back is at least so long [m]."""
+"""Minimum length of the recovery [m]."""
 TRIES = 20
-"""Draws in search of one that is clear of every object; each after the first is smaller."""
+"""Maximum number of samples to find a start clear of all objects; each is smaller than the
+previous.
+"""
 SMALLER = 0.85
 LIMIT = 2.5
-"""Draws are cut at so many standard deviations."""
+"""Samples are clipped at this many standard deviations."""
 CHECK_US = 500_000
 CLEAR_M = 0.3
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Where the ego of each clip starts.
+    """Distribution of the starts of clips.
 
     Attributes:
-        lateral_sigma: standard deviation beside its path [m].
-        heading_sigma: of its heading against the path [rad].
-        recover_s: time in which it finds back, at the speed that it has at the start [s].
-        copies: of each clip, each with a start of its own.
+        lateral_sigma: standard deviation of the lateral offset [m].
+        heading_sigma: of the heading relative to the path [rad].
+        recover_s: recovery time at the initial speed [s].
+        copies: number of perturbed copies of each clip, with different starts.
     """
 
     lateral_sigma: float = 0.5
@@ -52,14 +55,14 @@ class Perturbation:
 
 @dataclass(frozen=True, eq=False)
 class PerturbedDrive:
-    """A drive of which the ego begins beside its path.
+    """A drive with a perturbed start of the ego.
 
     Attributes:
-        base: as it was driven.
-        lateral: offset at the start, to the left [m].
-        heading: at the start, to the left [rad].
-        times_us, way: way driven [m] at instants from the start of the clip on.
-        length: way on which it finds back [m].
+        base: the original drive.
+        lateral: initial offset, to the left [m].
+        heading: initial offset, to the left [rad].
+        times_us, way: driven distance [m] over time from the start of the clip.
+        length: distance to the end of the recovery [m].
     """
 
     base: Drive
@@ -73,7 +76,7 @@ class PerturbedDrive:
     def beside(
         cls, base: Drive, start_us: int, lateral: float, heading: float, recover_s: float
     ) -> PerturbedDrive:
-        """A drive that is beside ``base`` at ``start_us`` and on it from then on again."""
+        """A drive that starts off the path of ``base`` at ``start_us`` and returns to it."""
         times = np.arange(start_us, base.span[1] + 1, STEP_US)
         places = np.array([base.ego_at(int(t))[:2, 3] for t in times])
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
@@ -109,7 +112,7 @@ class PerturbedDrive:
         return moved
 
     def ego_speed_at(self, t_us: int) -> float:
-        """See :class:`Drive`; the slant of the way back makes it longer."""
+        """See :class:`Drive`; the oblique return path is longer."""
         return self.base.ego_speed_at(t_us) / math.cos(self.offset_at(t_us)[1])
 
     def sweep_at(self, lidar: Lidar, t_us: int) -> MetSweep:
@@ -124,14 +127,14 @@ class PerturbedDrive:
         return MetSweep(met.things, ego @ mount)
 
     def offset_at(self, t_us: int) -> tuple[float, float]:
-        """How far it is beside its path, to the left [m], and how it is turned against it [rad]."""
+        """Lateral offset from the path, to the left [m], and heading offset [rad]."""
         share = min(float(np.interp(t_us, self.times_us, self.way)) / self.length, 1.0)
         slope = math.tan(self.heading) * self.length
         offset, rise = _quintic(share, self.lateral, slope)
         return offset, math.atan(rise / self.length)
 
     def _moved(self, ego: Float, lateral: Float | float, heading: Float | float) -> Float:
-        """Poses [N, 4, 4] shifted to their left and turned, as high above the ground as before."""
+        """Poses [N, 4, 4] shifted to the left and rotated, at the same height above the ground."""
         moved = ego.copy()
         moved[:, :3, 3] += ego[:, :3, 1] * np.broadcast_to(lateral, len(ego))[:, None]
         ground = self.scene.ground
@@ -171,7 +174,7 @@ def perturbed(
 def _is_clear(drive: PerturbedDrive, times_us: Sequence[int]) -> bool:
     length, width, height = drive.scene.ego_size
     centre = np.eye(4)
-    # From the rear axle, on the ground, to the middle of the vehicle.
+    # From the rear axle on the ground to the centre of the vehicle.
     centre[:3, 3] = length / 4, 0.0, height / 2 + CLEAR_M
     size = (length + CLEAR_M, width + CLEAR_M, height)
     for t_us in range(times_us[0], times_us[-1] + 1, CHECK_US):
@@ -185,8 +188,10 @@ def _is_clear(drive: PerturbedDrive, times_us: Sequence[int]) -> bool:
 
 
 def _quintic(share: float, start: float, slope: float) -> tuple[float, float]:
-    """Value and derivative at ``share`` of the way from ``start`` and ``slope`` to 0, level and
-    without curvature at the end, without curvature at the start."""
+    """Value and derivative at ``share`` of a quintic from ``start`` and ``slope`` to 0.
+
+    Curvature is zero at both ends, slope is zero at the end.
+    """
     a, b = -10 * start - 6 * slope, 15 * start + 8 * slope
     c = -6 * start - 3 * slope
     u = share

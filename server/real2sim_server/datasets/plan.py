@@ -35,8 +35,9 @@ Degrees = Annotated[float, Field(ge=-360, le=360)]
 
 
 class RigCamera(BaseModel):
-    """A camera of a rig file: one of the scene by its name, or one of its own where ``hfov_deg``
-    is given, which looks along the vehicle's x axis where nothing turns it."""
+    """A camera of a rig file: a scene camera by its name, or a new one if ``hfov_deg`` is given.
+    Without rotation a new camera looks along the vehicle's x axis.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -60,7 +61,7 @@ class Rig(BaseModel):
 
 
 def read_rig(path: Path) -> dict[str, Any]:
-    """The values of a rig file. Raises DatasetError for what is none."""
+    """The values of a rig file. Raises DatasetError for an invalid file."""
     try:
         values = json.loads(path.read_bytes())
         Rig.model_validate(values)
@@ -108,7 +109,7 @@ def _camera(asked: RigCamera, rig: CameraRig) -> Camera:
 
 
 def _turn(asked: RigCamera) -> Any:
-    """Yaw to the left, then pitch upwards, then roll to the right, about the camera's own axes."""
+    """Yaw to the left, then pitch upwards, then roll to the right, about the camera's axes."""
     yaw, pitch, roll = (math.radians(a) for a in (asked.yaw_deg, asked.pitch_deg, asked.roll_deg))
     about_z = [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
     about_y = [
@@ -133,8 +134,8 @@ class Variant:
     """One drive of a sweep.
 
     Attributes:
-        drive: that is exported.
-        values: of the parameters; empty where nothing is swept.
+        drive: to export.
+        values: of the parameters; empty without a sweep.
     """
 
     drive: Drive
@@ -142,18 +143,18 @@ class Variant:
 
 
 def swept(scene: Scene, state: ScenarioState, sweep: DatasetSweep, seed: int) -> list[Variant]:
-    """The variants of a scenario: every combination of lists and ranges, each with ``draws`` draws
-    of what has a distribution.
+    """The variants of a scenario: all combinations of lists and ranges, each with ``draws`` samples
+    of the distributions.
 
     Args:
         scene: of the scenario.
         state: before the edits of the sweep.
-        sweep: parameters, and edits in which ``"$name"`` stands for one's value.
-        seed: of the draws.
+        sweep: parameters, and edits in which ``"$name"`` is replaced by a value.
+        seed: of the samples.
 
     Raises:
-        DatasetError: more than MAX_VARIANTS, an edit that names no parameter, parameters that no
-            edit names, or values that make no edits or edits that cannot be made, which are named.
+        DatasetError: more than MAX_VARIANTS, an edit without a parameter, parameters without an
+            edit, or values with invalid or impossible edits; the message names them.
     """
     _check_names(sweep)
     variants = []
@@ -239,16 +240,16 @@ class ExportPlan:
         cameras: names; empty for all.
         width: of images [px]; None for the cameras' own.
         period_us: between frames [us].
-        start_us, end_us: first and last instant [us]; None for those of the drive.
-        clip_s: length of a clip [s]: a whole that is written, resumed and split as one.
+        start_us, end_us: first and last time [us]; None for those of the drive.
+        clip_s: length of a clip [s], the unit of writing, resuming and splitting.
         splits: share of the clips by name.
-        seed: draws which clip is in which split.
-        flow: whether optical flow is made.
-        lidar: name in the catalogue, or the values of a file of a sensor; None: points are those
-            that the cameras' depth gives.
+        seed: assigns clips to splits.
+        flow: whether to compute optical flow.
+        lidar: name in the catalogue, or the values of a sensor file; None: points come from the
+            cameras' depth.
         rig: values of a rig file, instead of ``cameras``, ``width`` and ``lidar``.
-        perturb: where the ego of each clip starts; None: on its path.
-        noise: of a detector, whose boxes are written beside the true ones; None: none are.
+        perturb: distribution of the starts of clips; None: on the path.
+        noise: of a detector, written as additional boxes; None: no such boxes.
     """
 
     formats: tuple[str, ...]
@@ -274,14 +275,14 @@ class ExportPlan:
 
 @dataclass(frozen=True)
 class PlannedClip:
-    """A stretch of the drive.
+    """A section of the drive.
 
     Attributes:
         name: four digits.
-        split: that it belongs to.
+        split: name of its split.
         times_us: of its frames [us].
-        variant: number of its drive in the sweep.
-        copy: number of its start beside the path; None where it starts on it.
+        variant: index of its drive in the sweep.
+        copy: index of its perturbed start; None if it starts on the path.
     """
 
     name: str
@@ -323,11 +324,12 @@ def planned_lidar(plan: ExportPlan) -> Lidar | None:
 
 
 def planned_shards(variants: Sequence[Variant], plan: ExportPlan) -> list[PlannedClip]:
-    """The clips of all drives, each as often as it is perturbed, numbered through. All of a stretch
-    of time are in one split, so that nothing is trained on that is tested on.
+    """The clips of all drives, once per perturbation, with consecutive numbers.
+
+    All clips of one time section are in the same split, so test data is never trained on.
 
     Raises:
-        DatasetError: as :func:`planned_clips`, or too many frames in all.
+        DatasetError: as :func:`planned_clips`, or too many frames in total.
     """
     copies = (None,) if plan.perturb is None else tuple(range(plan.perturb.copies))
     found = [

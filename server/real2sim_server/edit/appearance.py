@@ -19,8 +19,9 @@ from ..scene.cloud import SH_C0
 from .state import ObjectState, ScenarioState
 
 PARKED = 0.5
-"""An object whose recorded places are all within this of each other is parked; tracks of objects
-that stand still waver by some decimetres [m]."""
+"""An object is parked if all its recorded positions are within this distance of each other [m];
+tracks of stationary objects vary by some decimetres.
+"""
 
 AWAY = 0.5
 """An object this far from its parking place uncovers the ground there [m]."""
@@ -29,24 +30,24 @@ MARGIN = 0.25
 """Colours reach this far beyond a box [m]."""
 
 RIM = 1.2
-"""Ground up to this far beyond the box is taken for what is under it [m]."""
+"""Width of the ground around the box that represents the ground under it [m]."""
 
 LOW = 0.25
 """The ground's Gaussians are less than this above or below the box's bottom [m]."""
 
 FEWEST = 6
 NEIGHBOURS = 48
-"""Of so many the middle colour counts, so that neither a line nor a shadow beside the box is drawn
-out into what was under it."""
+"""Number of neighbours for the median colour, so that neither a line nor a shadow next to the box
+is extended under it.
+"""
 
 
 def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[str, ...]:
-    """Ids of recorded objects that were parked and are not at their places.
+    """Ids of recorded objects that were parked and are no longer in place.
 
     Args:
-        state: knows what was recorded.
-        poses: ``T_world_object`` [4, 4] of all objects that exist, by id; where an edit or impact
-            has brought them.
+        state: with the recorded objects.
+        poses: ``T_world_object`` [4, 4] of all existing objects, by id, after edits and impacts.
     """
     return tuple(
         recorded.object_id
@@ -62,10 +63,10 @@ def vacated_parking(state: ScenarioState, poses: Mapping[str, Float]) -> tuple[s
 
 
 def inpaint_ground(scene: Scene, background: GaussianCloud, left: Iterable[str]) -> GaussianCloud:
-    """The background with the ground coloured like that around it where objects ``left`` stood.
+    """The background with the ground coloured like its surroundings where objects ``left`` stood.
 
-    Gaussians inside a box and above its ground become invisible: they belonged to the object. What
-    is coloured by guess has the uncertainty of what was never seen.
+    Gaussians inside a box and above its ground become invisible, because they belong to the object.
+    Guessed colours get the uncertainty of unseen Gaussians.
 
     Raises:
         UnknownObjectError: ``scene`` has no such object.
@@ -123,7 +124,7 @@ SHADOW_MARGIN = 0.35
 """The shadow reaches this far beyond the footprint [m], fading."""
 
 LIFT = 0.04
-"""Above the ground [m], so that it lies in front of the ground's own Gaussians."""
+"""Height above the ground [m], in front of the ground's own Gaussians."""
 
 DARKNESS = 0.22
 """Opacity of each Gaussian in full shadow. About three overlap at any point: half the light."""
@@ -145,13 +146,13 @@ def contact_shadow(
     *,
     device: torch.device,
 ) -> Instance | None:
-    """The shadow of a box; None where it is too far above the ground.
+    """The shadow of a box; None if the box is too far above the ground.
 
     Args:
         T_world_object: [4, 4] float64, of the box centre.
         size: (length, width, height) [m].
         ground: below it.
-        device: where the shadow's Gaussians should live.
+        device: of the shadow's Gaussians.
     """
     bottom = bottom_centres(T_world_object[None], size)[0]
     height = ground.height(float(bottom[0]), float(bottom[1]))
@@ -203,7 +204,7 @@ HEIGHTS = (-2.0, 6.0)
 """And this far below and above it: the street, not the tree tops [m]."""
 
 GAIN_RANGE = (0.5, 2.0)
-"""Colours are never changed by more; beyond, the guess is likelier wrong than the asset."""
+"""Limits of colour factors; beyond them, the estimate is more likely wrong than the asset."""
 
 LUMA = (0.2126, 0.7152, 0.0722)
 
@@ -222,7 +223,7 @@ def ambient_colour(scene: Scene) -> Colour:
 
 
 def mean_colour(cloud: GaussianCloud) -> Colour | None:
-    """Mean RGB of a cloud, each Gaussian by opacity and area; None where it shows nothing."""
+    """Mean RGB of a cloud, each Gaussian weighted by opacity and area; None if it is invisible."""
     if not len(cloud):
         return None
     largest = cloud.scales.double().topk(2, dim=1).values.prod(dim=1)
@@ -235,15 +236,15 @@ def mean_colour(cloud: GaussianCloud) -> Colour | None:
 
 
 def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) -> Colour:
-    """Factors on the colours of an asset that bring it into the light of ``scene``.
+    """Factors on the colours of an asset that adapt it to the light of ``scene``.
 
-    Where the light is known that the asset was recorded in, they are the ratio of the two ambient
-    colours. Else its brightness is brought to that of the scene's own objects; its tint stays.
+    If the light of the asset's recording is known, they are the ratio of the two ambient colours.
+    Otherwise the brightness is matched to the scene's own objects; the tint does not change.
 
     Args:
-        scene: where the asset is put.
+        scene: target of the asset.
         cloud: of the asset.
-        ambient: see :func:`ambient_colour`, of where the asset was cut out.
+        ambient: of the asset's source, see :func:`ambient_colour`.
     """
     if ambient is not None:
         here = ambient_colour(scene)
@@ -259,12 +260,12 @@ def relighting_gain(scene: Scene, cloud: GaussianCloud, ambient: Colour | None) 
 
 
 def relit(cloud: GaussianCloud, gain: Colour) -> GaussianCloud:
-    """The cloud with its colours multiplied by ``gain``; itself where that is 1."""
+    """The cloud with its colours multiplied by ``gain``; itself if that is 1."""
     if gain == (1.0, 1.0, 1.0):
         return cloud
     factors: Tensor = torch.tensor(gain).to(cloud.sh)
     sh = cloud.sh * factors
-    # The renderer adds 0.5 to what the harmonics give; that part has to be multiplied too.
+    # The renderer adds 0.5 to the harmonics; that part must be multiplied too.
     sh[:, 0] += (factors - 1.0) * 0.5 / SH_C0
     return replace(cloud, sh=sh)
 

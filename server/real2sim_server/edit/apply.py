@@ -33,13 +33,14 @@ OUTSIDE_MAP = 100.0
 """An object this far outside the rectangle that the recording reached is reported [m]."""
 
 SLIP, SLIP_STEPS, MOVING = np.radians(20), 5, 1.0
-"""An object that goes this far off its heading [rad] for so many samples more than in the recording
-is reported; what is slower than this [m/s] counts as standing."""
+"""An object is reported if it slides this far off its heading [rad] for this many samples more than
+in the recording; slower objects [m/s] count as stationary.
+"""
 
 NAMED_OVERLAPS = 5
 
 REMEMBERED_RANGES = 4
-"""Ranges of time whose samples are kept for each trajectory, 26 kB each at most."""
+"""Number of cached time ranges of samples per trajectory, at most 26 kB each."""
 REMEMBERED = 512
 
 _Samples = tuple[Float, NDArray[np.bool_]]
@@ -47,13 +48,13 @@ _samples: WeakKeyDictionary[Trajectory, dict[tuple[int, int], _Samples]] = WeakK
 
 
 def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[EditWarning]:
-    """Warnings about the objects ``touched``, looked at every 0.1 s of their trajectories.
+    """Warnings about the objects ``touched``, checked every 0.1 s of their trajectories.
 
-    Very long trajectories are looked at 201 times at most, evenly spread.
+    Very long trajectories are checked at 201 evenly spread times.
 
     Args:
         state: after the edit.
-        touched: ids that the edit named or created; deleted ones are passed over.
+        touched: ids that the edit named or created; deleted ones are skipped.
     """
     subjects = [state.objects[i] for i in touched if not state.objects[i].deleted]
     for subject in subjects:
@@ -67,9 +68,11 @@ def validate_edit(state: ScenarioState, touched: Sequence[str]) -> Iterator[Edit
 
 
 def _sampled(trajectory: Trajectory, start_us: int, end_us: int) -> _Samples:
-    """The trajectory at the sample times of that range; remembered as long as the trajectory is
-    there, for few objects move. (A cache of so many entries would drop each of them just before it
-    is asked for, once a scenario has one object more.)"""
+    """The trajectory at the sample times of that range, cached for the trajectory's lifetime.
+
+    A cache of fixed size would drop every entry just before its use, once a scenario has one object
+    more than entries.
+    """
     by_range = _samples.setdefault(trajectory, {})
     found = by_range.get((start_us, end_us))
     if found is None:
@@ -110,7 +113,7 @@ def _overlaps(
 def _first_overlap(
     subject: ObjectState, other: ObjectState, times: NDArray[np.int64], own: Float
 ) -> int:
-    """Index of the first of ``times`` at which the boxes overlap; their number where none."""
+    """Index of the first of ``times`` with overlapping boxes; their number if there is none."""
     theirs, covered = _sampled(other.trajectory, int(times[0]), int(times[-1]))
     found: int = first_overlap(
         (own, theirs),
@@ -123,7 +126,7 @@ def _first_overlap(
 
 
 def _within_reach(subject: ObjectState, state: ScenarioState, own: Float) -> Iterator[ObjectState]:
-    """Visible objects whose path, as a box around it, comes near that of ``subject``."""
+    """Visible objects with a bounding box of the path close to that of ``subject``."""
     others = [o for o in state.objects.values() if not o.deleted and o is not subject]
     if not others:
         return
@@ -200,7 +203,7 @@ def _sideways(
 
 
 def _slips(times: NDArray[np.int64], transforms: Float) -> Float:
-    """Angle [T - 1] between way and heading, forwards or backwards [rad]; 0 while it stands."""
+    """Angle [T - 1] between motion and heading, forwards or backwards [rad]; 0 at standstill."""
     way = np.diff(transforms[:, :2, 3], axis=0)
     length = np.linalg.norm(way, axis=1)
     ahead = transforms[:-1, :2, 0] + transforms[1:, :2, 0]
@@ -214,19 +217,19 @@ OPERATION_MODULES = (lifecycle, motion)
 """Importing them registers their operations, see :mod:`.motion`."""
 
 MAX_OBJECTS = 4096
-"""Objects of a scenario, without deleted ones; streets have some hundreds."""
+"""Maximum number of objects in a scenario, without deleted ones; streets have some hundreds."""
 
 
 @dataclass(frozen=True, eq=False)
 class EditOutcome:
-    """What a batch of operations leads to.
+    """Result of a batch of operations.
 
     Attributes:
         state: after all operations.
         created: ids of new objects, regions and colliders, in order.
-        inverse: operations that take the batch back when applied in this order. Numbers come back
-            to within rounding; `Scenario.undo` brings back the exact state.
-        warnings: what a person should look at.
+        inverse: operations that revert the batch when applied in this order. Numbers are restored
+            up to rounding; `Scenario.undo` restores the exact state.
+        warnings: for review by a person.
     """
 
     state: ScenarioState
@@ -236,15 +239,15 @@ class EditOutcome:
 
 
 def apply_operations(state: ScenarioState, operations: Sequence[Operation]) -> EditOutcome:
-    """All of ``operations`` in order, or none of them.
+    """Apply all of ``operations`` in order, or none of them.
 
     Args:
-        state: left as it is.
+        state: not changed.
         operations: validated wire models.
 
     Raises:
-        EditError: UNKNOWN_OBJECT, UNKNOWN_ASSET or INVALID_OPERATION, naming the place in the
-            batch; also for more than MAX_OBJECTS objects.
+        EditError: UNKNOWN_OBJECT, UNKNOWN_ASSET or INVALID_OPERATION, with the index in the batch;
+            also for more than MAX_OBJECTS objects.
     """
     changes: list[AppliedOperation] = []
     after = state
@@ -282,7 +285,7 @@ def _apply_one(state: ScenarioState, operation: Operation, index: int) -> Applie
 
 
 def _check_number(state: ScenarioState, operation: Operation, index: int) -> None:
-    """Only of new edits: a log that went further is replayed as it is."""
+    """Only for new edits: an existing log beyond the limit is replayed unchanged."""
     if len(state.objects) <= MAX_OBJECTS:
         return
     if sum(not found.deleted for found in state.objects.values()) > MAX_OBJECTS:

@@ -1,4 +1,4 @@
-"""From a state to what the renderer draws and what LiDARs see."""
+"""From a scenario state to the instances for the renderer and the targets of LiDARs."""
 
 from __future__ import annotations
 
@@ -33,18 +33,19 @@ T = TypeVar("T")
 
 NO_STRIDES: Mapping[str, Stride] = MappingProxyType({})
 KEPT_BACKGROUNDS = 4
-"""Backgrounds with erased regions that are kept for each scene; one costs 4 bytes a Gaussian, and
-that of its colours too where parked objects were moved."""
+"""Number of cached backgrounds with erased regions per scene; each costs 4 bytes per Gaussian, and
+its colours as well if parked objects were moved.
+"""
 
 
 def instances_at(scene: Scene, state: ScenarioState, t_us: int) -> list[Instance]:
     """Background first, then every visible object that exists at ``t_us``, then soft shadows under
-    objects that an edit has put where they are; only what changes over time is computed.
+    objects placed by edits; only time-dependent parts are computed.
 
     Args:
-        scene: holds the Gaussians; it must be the one that ``state`` was made of.
+        scene: with the Gaussians; ``state`` must be made from it.
         state: objects, poses and scales.
-        t_us: instant [us].
+        t_us: time [us].
 
     Raises:
         UnknownObjectError: ``state`` is of another scene.
@@ -60,9 +61,11 @@ def compose(
     *,
     strides: Mapping[str, Stride] = NO_STRIDES,
 ) -> list[Instance]:
-    """The same for objects that are ``placed`` already, wherever, people among them as far in
-    walking as ``strides`` say by id, others as their trajectories lead them. Raises like
-    :func:`instances_at`."""
+    """The same for objects that are already ``placed``.
+
+    People walk by their ``strides`` by id, or otherwise by their trajectories. Raises like
+    :func:`instances_at`.
+    """
     poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
     instances = [Instance(composed_background(scene, state, poses))]
     edited = []
@@ -77,9 +80,10 @@ def compose(
 def things_of(
     scene: Scene, state: ScenarioState, objects: Iterable[ObjectState]
 ) -> tuple[Instance, ...] | None:
-    """The background and ``objects`` as :func:`compose` draws them, wherever they stand; None
-    where edits make the background hang on where they do, or put shadows under them, or where
-    somebody walks.
+    """The background and ``objects`` as :func:`compose` renders them, independent of their poses.
+
+    None if the background depends on the poses because of edits, if edits add shadows, or if a
+    person walks.
 
     Raises:
         UnknownObjectError: ``state`` is of another scene.
@@ -94,8 +98,9 @@ def things_of(
 
 
 def things_at_start(scene: Scene, state: ScenarioState) -> list[Instance]:
-    """Everything that is drawn of a scenario at its start or comes later, but shadows: the
-    background and every visible object, wherever. Raises like :func:`things_of`."""
+    """Everything that a scenario renders at its start or later, except shadows: the background and
+    every visible object, at any pose. Raises like :func:`things_of`.
+    """
     placed = state.tracks.at(scene.start_us)
     poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}
     background = Instance(composed_background(scene, state, poses))
@@ -135,8 +140,8 @@ def contact_shadows(
 def cloud_of(
     scene: Scene, subject: ObjectState, t_us: int, *, stride: Stride | None = None
 ) -> GaussianCloud:
-    """The Gaussians an object shows at ``t_us``, before its own scale, in its own frame; of a
-    person as far in walking as ``stride`` says, or else as the trajectory leads.
+    """The Gaussians of an object at ``t_us``, before its own scale, in its own frame; for a person,
+    in the walking state ``stride``, or otherwise of the trajectory.
 
     Raises:
         UnknownObjectError: ``subject`` is of another scene.
@@ -160,7 +165,7 @@ def _posed(scene: Scene, subject: ObjectState, t_us: int, stride: Stride | None)
 
 
 def figure_of(scene: Scene, subject: ObjectState) -> Figure | None:
-    """The figure of an object that is a person who walks, as edits let it walk, else None.
+    """The figure of a walking person with edits applied; None for other objects.
 
     Raises:
         UnknownObjectError: ``subject`` is of another scene.
@@ -175,9 +180,9 @@ def figure_of(scene: Scene, subject: ObjectState) -> Figure | None:
 def composed_background(
     scene: Scene, state: ScenarioState, poses: Mapping[str, Float]
 ) -> GaussianCloud:
-    """The background with all Gaussians in erased regions made invisible, and with plain ground
-    where parked objects stood that ``poses`` (``T_world_object`` [4, 4] by id) have elsewhere; the
-    rest is shared."""
+    """The background without the Gaussians in erased regions, and with plain ground in place of
+    parked objects that ``poses`` (``T_world_object`` [4, 4] by id) have moved; the rest is shared.
+    """
     erased, left = state.erased, vacated_parking(state, poses)
     if not erased and not left:
         return scene.background
@@ -190,7 +195,7 @@ def composed_background(
 
 
 def without_regions(background: GaussianCloud, erased: tuple[EraseRegion, ...]) -> GaussianCloud:
-    """The background with the Gaussians whose centres lie in ``erased`` made invisible."""
+    """The background with the Gaussians with centres in ``erased`` made invisible."""
     opacities = background.opacities.clone()
     for region in erased:
         T_region_world = invert_transform(
@@ -230,7 +235,7 @@ def kept(scene: Scene, key: Hashable, make: Callable[[], T]) -> T:
 
 # --- Free poses ----------------------------------------------------------------------------------
 
-# A scene with objects where a request says, without an edit.
+# A scene with objects at the poses of a request, without an edit.
 
 Others = Literal["recorded", "parked", "none"]
 
@@ -238,14 +243,13 @@ Others = Literal["recorded", "parked", "none"]
 def posed_instances(
     scene: Scene, t_us: int, poses: Mapping[str, Pose], *, others: Others = "recorded"
 ) -> list[Instance]:
-    """What is drawn at an instant with objects at ``poses``, as :func:`instances_at` has it.
+    """Instances at a time with objects at ``poses``, as for :func:`instances_at`.
 
     Args:
         scene: without edits.
-        t_us: instant, for the objects that are not posed and for colours [us].
+        t_us: time for the other objects and for colours [us].
         poses: ``T_world_object`` by id.
-        others: what becomes of objects that are not posed: all as recorded, only those of them
-            that are parked, or none.
+        others: treatment of objects without a pose: all as recorded, only parked ones, or none.
 
     Raises:
         EditError: UNKNOWN_OBJECT, for an object that the scene lacks.
@@ -283,10 +287,10 @@ def _shown(subject: ObjectState, others: Others) -> bool:
 
 
 def sweep_of(scene: Scene, state: ScenarioState, lidar: Lidar, t_us: int) -> SweepScene:
-    """What ``lidar`` meets of a scenario in the sweep about ``t_us`` [us].
+    """Targets of ``lidar`` in a scenario during the sweep about ``t_us`` [us].
 
-    Every visible object that exists then, moved, turned, inserted or scaled as the edits say, with
-    its surfaces for LiDARs where the scene has them; the background without erased regions.
+    Every visible object that exists then, with its edits applied, and with its surfaces for LiDARs
+    if the scene has them; the background without erased regions.
 
     Raises:
         UnknownObjectError: ``state`` is of another scene.
@@ -347,7 +351,7 @@ ROW = np.dtype(
 """A point in the world [m]; its normal is the thinnest axis of its Gaussian."""
 
 MIN_OPACITY = 0.1
-"""Fainter Gaussians are left out."""
+"""Fainter Gaussians are omitted."""
 
 _TYPES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
 
@@ -361,17 +365,17 @@ def points_at(
     instance_id: int | None = None,
     least_opacity: float = MIN_OPACITY,
 ) -> NDArray[np.void]:
-    """Rows of ROW of a scenario at an instant.
+    """Rows of ROW of a scenario at a time.
 
     Normals point towards the recorded path, those of objects away from their centre.
 
     Args:
         scene: of the scenario.
         state: the scenario.
-        t_us: instant [us].
+        t_us: time [us].
         part: of the scene.
-        instance_id: of the only object that is wanted; None for all.
-        least_opacity: of a Gaussian that is a point.
+        instance_id: of a single object; None for all.
+        least_opacity: minimum opacity of a Gaussian.
 
     Raises:
         UnknownObjectError: ``state`` is of another scene.

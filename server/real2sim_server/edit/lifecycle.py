@@ -95,7 +95,7 @@ def insert(state: ScenarioState, operation: Insert) -> AppliedOperation:
 
 @operation(Spawn)
 def spawn(state: ScenarioState, operation: Spawn) -> AppliedOperation:
-    """Add a road user that drives; its own track goes straight on."""
+    """Add a moving road user; its initial track goes straight on."""
     _require_free_instance_id(state)
     appearance = _appearance(state, operation)
     if operation.pose is None:
@@ -126,7 +126,7 @@ def spawn(state: ScenarioState, operation: Spawn) -> AppliedOperation:
 def replace_appearance(
     state: ScenarioState, subject: ObjectState, operation: Replace
 ) -> AppliedOperation:
-    """Show something else in the box; the centre of its bottom stays where it is."""
+    """Replace the appearance in the box; the centre of its bottom stays in place."""
     appearance = _appearance(state, operation)
     box = operation.size or subject.scaled_size
     factors = _fitting(box, appearance.size)
@@ -246,7 +246,7 @@ PEOPLE = frozenset({"pedestrian", "person"})
 def set_physics(
     state: ScenarioState, subject: ObjectState, operation: SetPhysics
 ) -> AppliedOperation:
-    """Say what an object is; defaults for what is left out."""
+    """Set physical properties of an object; defaults for omitted ones."""
     inverse = subject.physics or SetPhysics(object_id=subject.object_id)
     return object_changed(
         state,
@@ -287,7 +287,7 @@ def set_gait(state: ScenarioState, subject: ObjectState, operation: SetGait) -> 
 
 @operation(EraseRegion)
 def erase_region(state: ScenarioState, operation: EraseRegion) -> AppliedOperation:
-    """Hide what the background shows in a box."""
+    """Hide the background in a box."""
     region_id = new_id(state, operation.region_id, "region_")
     named = operation.model_copy(update={"region_id": region_id})
     regions = MappingProxyType(dict(state.regions) | {region_id: named})
@@ -297,7 +297,7 @@ def erase_region(state: ScenarioState, operation: EraseRegion) -> AppliedOperati
 
 @operation(AddCollider)
 def add_collider(state: ScenarioState, operation: AddCollider) -> AppliedOperation:
-    """Add what does not yield."""
+    """Add a fixed obstacle."""
     if isinstance(operation.shape, MeshShape):
         mesh = operation.shape
         try:
@@ -317,7 +317,7 @@ def add_collider(state: ScenarioState, operation: AddCollider) -> AppliedOperati
 
 @operation(SetTime)
 def set_time(state: ScenarioState, operation: SetTime) -> AppliedOperation:
-    """Set the span in which the scenario plays."""
+    """Set the time span of the scenario."""
     first, last = state.time_range
     start = first if operation.start_us is None else operation.start_us
     end = last if operation.end_us is None else operation.end_us
@@ -335,6 +335,6 @@ def set_time(state: ScenarioState, operation: SetTime) -> AppliedOperation:
 
 @operation(SetStoryboard)
 def set_storyboard(state: ScenarioState, operation: SetStoryboard) -> AppliedOperation:
-    """Set what happens in episodes; whether they can run it shows when one begins."""
+    """Set the storyboard of episodes; it is validated when an episode starts."""
     after = replace(state, storyboard=operation.storyboard)
     return AppliedOperation(after, SetStoryboard(storyboard=state.storyboard))

@@ -38,13 +38,13 @@ MAX_ID_LENGTH = 80
 
 @dataclass(frozen=True, eq=False)
 class AppliedOperation:
-    """What one operation leads to.
+    """Result of one operation.
 
     Attributes:
         state: after it.
-        inverse: takes it back.
-        touched: id of the object that a person should look at; None where there is none.
-        created: id of what is new; None where nothing is.
+        inverse: reverts it.
+        touched: id of the object for review; None if there is none.
+        created: id of the new object; None if there is none.
     """
 
     state: ScenarioState
@@ -54,7 +54,7 @@ class AppliedOperation:
 
 
 Apply = Callable[[ScenarioState, Any], AppliedOperation]
-"""``apply(state, operation)``: pure; raises EditError or SceneError where it cannot be done."""
+"""``apply(state, operation)``: pure; raises EditError or SceneError if it is impossible."""
 
 ApplyToObject = Callable[[ScenarioState, ObjectState, Any], AppliedOperation]
 """``apply(state, subject, operation)``, for the object that ``operation.object_id`` names."""
@@ -74,9 +74,9 @@ def operation(model: type[Any]) -> Callable[[Apply], Apply]:
 
 
 def object_operation(model: type[Any]) -> Callable[[ApplyToObject], ApplyToObject]:
-    """Register how operations of a model are applied to the object that they name.
+    """Register the function that applies operations of a model to their object.
 
-    The object exists and is not deleted; else the operation raises as :func:`require_object`.
+    The object exists and is not deleted; otherwise the operation raises as :func:`require_object`.
     """
 
     def register(apply: ApplyToObject) -> ApplyToObject:
@@ -171,7 +171,7 @@ def trajectory_of(track: Track) -> Trajectory:
 
 
 MAX_COORDINATE = 1e6
-"""Positions stay within what the wire can carry [m]."""
+"""Limit of positions in the wire format [m]."""
 
 MAX_TIME_US = 2**62
 
@@ -179,7 +179,7 @@ SCALE_RANGE = (1e-3, 1e3)
 """All scalings of an object together stay within this, along each axis."""
 
 BLEND_STEP_US = 50_000
-"""Spacing of the poses in which an edit grows or fades."""
+"""Spacing of the poses in the transition of an edit."""
 
 
 @object_operation(Translate)
@@ -224,7 +224,7 @@ def rotate(state: ScenarioState, subject: ObjectState, operation: Rotate) -> App
 
 @object_operation(Scale)
 def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> AppliedOperation:
-    """Multiply its size; what the anchor names stays where it is."""
+    """Multiply its size; the anchor stays in place."""
     factors = (operation.x, operation.y, operation.z)
     a, b, c = subject.scale
     scaled = rescaled(
@@ -238,7 +238,7 @@ def scale(state: ScenarioState, subject: ObjectState, operation: Scale) -> Appli
 
 @object_operation(SetPose)
 def set_pose(state: ScenarioState, subject: ObjectState, operation: SetPose) -> AppliedOperation:
-    """Let it stand for the whole time range of the scene."""
+    """Fix its pose for the whole time range of the scene."""
     stood = trajectory_of(stationary_track(operation.pose, state.time_range))
     return _follow(state, subject, stood, snap=operation.snap)
 
@@ -274,7 +274,7 @@ def retime(state: ScenarioState, subject: ObjectState, operation: Retime) -> App
 
 
 def stationary_track(pose: Pose, time_range: tuple[int, int]) -> Track:
-    """The trajectory of what stands for the whole time range."""
+    """The trajectory of a stationary object for the whole time range of the scene."""
     times = sorted(set(time_range))
     return Track(
         times_us=times,
@@ -284,8 +284,9 @@ def stationary_track(pose: Pose, time_range: tuple[int, int]) -> Track:
 
 
 def straight_on(pose: Pose, speed: float, start_us: int, end_us: int) -> Trajectory:
-    """The trajectory that goes from a pose along its heading at ``speed`` [m/s], up to ``end_us``
-    or for a second."""
+    """The trajectory from a pose along its heading at ``speed`` [m/s], until ``end_us`` or for a
+    second.
+    """
     times = np.array([start_us, max(end_us, start_us + 1_000_000)], np.int64)
     ahead = transform_from(pose.position, pose.quaternion)[:3, 0]
     way = speed * (times - start_us)[:, None] * 1e-6
@@ -314,7 +315,7 @@ def shifted(
     """The trajectory shifted [m], at each pose by the fraction in ``weights`` [T].
 
     Raises:
-        EditError: INVALID_OPERATION when it leaves what the wire can carry.
+        EditError: INVALID_OPERATION if it exceeds the limits of the wire format.
     """
     offset: Float = np.array(shift)
     if frame == "object":
@@ -416,8 +417,9 @@ def _weights(times_us: NDArray[np.int64], time_range: TimeRange) -> Float:
 
 
 def _smooth(since_us: NDArray[np.int64], blend_us: int) -> Float:
-    """0 before, 1 after; between them 6 s^5 - 15 s^4 + 10 s^3, which starts and ends without
-    velocity or acceleration (Flash and Hogan 1985, minimum jerk)."""
+    """0 before, 1 after; in between 6 s^5 - 15 s^4 + 10 s^3, with zero velocity and acceleration at
+    both ends (Flash and Hogan 1985, minimum jerk).
+    """
     if blend_us == 0:
         return np.where(since_us >= 0, 1.0, 0.0)
     s = np.clip(since_us / blend_us, 0.0, 1.0)

@@ -15,7 +15,7 @@ from .apply import EditOutcome, apply_operations, replay_operations
 from .state import EditError, ScenarioState
 
 KEPT_STATES = 32
-"""States kept in memory; older ones are rebuilt from the log when an undo needs them."""
+"""Number of states in memory; an undo rebuilds older ones from the log."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,13 +23,13 @@ class LogEntry:
     """One revision.
 
     Attributes:
-        revision: grows by one with each entry, from 1.
-        kind: what it did.
-        operations: of an edit; empty for an undo or redo. A log of thousands may hold them as
-            read and check each only when it is looked at.
+        revision: increases by one with each entry, from 1.
+        kind: edit, undo or redo.
+        operations: of an edit; empty for an undo or redo. Long logs may store them unparsed and
+            validate each on access.
         target: revision of the edit that was undone or redone; None for an edit.
         created_at: UTC, ISO 8601.
-        who: as the client named itself; empty where it did not.
+        who: name given by the client; empty without one.
     """
 
     revision: int
@@ -42,18 +42,18 @@ class LogEntry:
 
 @dataclass(frozen=True, eq=False)
 class PlannedEntry:
-    """An entry that may be stored, and what it leads to once committed."""
+    """A valid entry, and its result once committed."""
 
     entry: LogEntry
     outcome: EditOutcome
 
 
 class Scenario:
-    """State of a scenario, moved only by committing planned entries of its log.
+    """State of a scenario, changed only by committing planned entries of its log.
 
-    Planning changes nothing: store the entry, then commit it, so that nothing takes effect that
-    is not on record. Undo returns to the very state before the edit, never by inverse arithmetic.
-    Instance ids of copies that an undo took back may be given to later copies.
+    Planning changes nothing: store the entry, then commit it, so that every change is on record.
+    Undo returns to the exact state before the edit, not by inverse arithmetic. Instance ids of
+    undone copies may be reused.
 
     Attributes:
         scene: name of the scene.
@@ -81,17 +81,17 @@ class Scenario:
         scene_hash: str = "",
         known: tuple[int, ScenarioState] | None = None,
     ) -> Scenario:
-        """The scenario after ``entries``, bit for bit as it was when they were committed.
+        """The scenario after ``entries``, bit-identical to its state when they were committed.
 
         Args:
             initial_state: before any edit.
             entries: the log, oldest first.
             scene: name of the scene.
             scene_hash: its content hash.
-            known: a revision and the state after it, which spares applying what is before.
+            known: a revision and the state after it, to skip earlier entries.
 
         Raises:
-            EditError: INVALID_OPERATION when the entries are no complete log of this scene.
+            EditError: INVALID_OPERATION if the entries are not a complete log of this scene.
         """
         scenario = cls(initial_state, scene=scene, scene_hash=scene_hash)
         for entry in entries:
@@ -102,13 +102,13 @@ class Scenario:
         return scenario
 
     def extended(self, entries: Iterable[LogEntry]) -> Scenario:
-        """A scenario of its own that goes on from this one by entries that others have stored.
+        """A new scenario that continues this one with entries stored by others.
 
         Args:
-            entries: of the log, those behind this scenario's revision, oldest first.
+            entries: of the log after this scenario's revision, oldest first.
 
         Raises:
-            EditError: they do not go on from here.
+            EditError: they do not continue this scenario.
         """
         longer = Scenario(self._states[0], scene=self.scene, scene_hash=self.scene_hash)
         longer.entries, longer._states = list(self.entries), self._states.copy()
@@ -140,12 +140,12 @@ class Scenario:
         base_revision: int | None = None,
         who: str = "",
     ) -> PlannedEntry:
-        """What ``operations`` would lead to.
+        """Plan ``operations`` without applying them.
 
         Args:
             operations: applied all, or none.
             base_revision: the revision they were made for; None for any.
-            who: goes on record.
+            who: recorded in the log.
 
         Raises:
             EditError: STALE_REVISION when ``base_revision`` is not the current one; also as
@@ -191,10 +191,10 @@ class Scenario:
         return PlannedEntry(self._entry("redo", (), edit.revision, who), outcome)
 
     def commit(self, planned: PlannedEntry) -> EditOutcome:
-        """Let a planned entry take effect; the outcome.
+        """Commit a planned entry; returns its outcome.
 
         Raises:
-            EditError: STALE_REVISION when another entry was committed since it was planned.
+            EditError: STALE_REVISION if another entry was committed after it was planned.
         """
         self._append(planned.entry)
         # Kept for undo, but unlikely to be needed soon.
@@ -236,7 +236,9 @@ class Scenario:
         return LogEntry(self.revision + 1, kind, operations, target, now, who)
 
     def _append(self, entry: LogEntry) -> None:
-        """Book an entry; states are not touched, but those of another past are forgotten."""
+        """Append an entry; cached states do not change, except that those of another history are
+        dropped.
+        """
         if entry.revision != self.revision + 1:
             raise EditError(
                 ErrorCode.STALE_REVISION,
@@ -264,10 +266,10 @@ class Scenario:
         return stack.pop()
 
     def _state_after(self, count: int) -> ScenarioState:
-        """State after the first ``count`` edits in effect, from the nearest one kept.
+        """State after the first ``count`` edits in effect, from the nearest cached one.
 
-        The last states on the way there are kept, so that undoing many edits one after the other
-        does not begin from afar each time.
+        The last states on the path are cached, so that repeated undo does not start from a distant
+        one each time.
         """
         nearest = max(n for n in self._states if n <= count)
         state = self._states[nearest]

@@ -22,7 +22,7 @@ from .tracks import PackedTracks
 
 
 class ObjectSource(Protocol):
-    """What is needed of an object of a scene; its Gaussians are not."""
+    """Required properties of a scene object, without its Gaussians."""
 
     @property
     def object_id(self) -> str: ...  # noqa: D102
@@ -54,11 +54,11 @@ class AssetSource(Protocol):
 
 
 AssetLookup = Callable[[str], "AssetSource | None"]
-"""The asset of an id; assets never change, so that logs can be replayed."""
+"""The asset with an id; assets are immutable, so logs can be replayed."""
 
 
 class SceneSource(Protocol):
-    """What is needed of a scene: a Scene, or the summary of one that is not in memory."""
+    """Required properties of a scene: a Scene, or the summary of one that is not in memory."""
 
     @property
     def objects(self) -> Mapping[str, ObjectSource] | Iterable[ObjectSource]: ...  # noqa: D102
@@ -74,19 +74,19 @@ class ObjectState:
 
     Attributes:
         object_id: unique in the scenario, also among deleted objects.
-        source_id: object of the scene whose Gaussians it shows; empty where it shows an asset.
+        source_id: object of the scene with its Gaussians; empty if it shows an asset.
         category: as in the scene.
         size: (length, width, height) in the scene, before ``scale`` [m].
         scale: factors along the object's x, y, z, about its origin.
         trajectory: ``T_world_object``; origin at the box centre; exists only in its range.
         instance_id: value of its pixels in instance images; fixed while the object exists.
-        deleted: a tombstone: not shown, not hit, its id stays taken.
-        asset: what it shows instead of an object of the scene.
-        physics: what it is for the physics; None for defaults throughout.
-        velocity: with which it enters the physics; None for that of its trajectory.
-        gait: how it walks; None where no edit has said so.
-        edited: whether an edit gave it its trajectory or its appearance.
-        driver: that moves it in sessions; None where those say who does.
+        deleted: a tombstone: invisible, without collisions, its id stays reserved.
+        asset: shown instead of an object of the scene.
+        physics: physical properties; None for all defaults.
+        velocity: initial velocity in the physics; None for the trajectory's.
+        gait: walking style; None if no edit has set it.
+        edited: whether an edit set its trajectory or its appearance.
+        driver: moves it in sessions; None if sessions decide.
     """
 
     object_id: str
@@ -106,7 +106,7 @@ class ObjectState:
 
     @property
     def scaled_size(self) -> tuple[float, float, float]:
-        """(length, width, height) of the box as it is now [m]."""
+        """Current (length, width, height) of the box [m]."""
         (length, width, height), (x, y, z) = self.size, self.scale
         return (length * x, width * y, height * z)
 
@@ -118,7 +118,7 @@ class ObjectState:
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
-        """[2, 3] lowest and highest point that the box may reach on its way [m]."""
+        """[2, 3] lowest and highest point that the box can reach along its trajectory [m]."""
         positions = self.trajectory.positions
         low, high = positions.min(axis=0) - self.radius, positions.max(axis=0) + self.radius
         return np.stack([low, high])
@@ -132,20 +132,20 @@ class ObjectState:
 
 @dataclass(frozen=True, eq=False)
 class ScenarioState:
-    """All objects of a scenario at one revision. Immutable; edits make new ones that share parts.
+    """All objects of a scenario at one revision. Immutable; edits make new states that share parts.
 
     Attributes:
-        objects: by id in a stable order: those of the scene, then copies as they were made.
-        next_instance_id: what the next new object gets.
+        objects: by id in a stable order: those of the scene, then copies in order of creation.
+        next_instance_id: for the next new object.
         time_range: first and last time of the scene's clock [us].
-        clock: first and last time at which the scenario plays, within ``time_range`` [us].
-        regions: boxes erased from the background, by id, deleted ones too.
-        colliders: by id, deleted ones too.
+        clock: first and last time of the scenario, within ``time_range`` [us].
+        regions: boxes erased from the background, by id, including deleted ones.
+        colliders: by id, including deleted ones.
         tombstones: ids of deleted regions and colliders.
-        storyboard: that episodes run which bring none of their own; None: none.
-        recorded: the objects as the scene has them, by id.
+        storyboard: default storyboard of episodes; None: none.
+        recorded: the objects of the scene, by id.
         ground: of the scene.
-        assets: the asset library, or None where there is none.
+        assets: the asset library, or None if there is none.
         extent: [2, 2] lowest and highest x, y that the ego or an object reaches in the scene [m].
     """
 
@@ -193,7 +193,7 @@ class ScenarioState:
         )
 
     def with_object(self, changed: ObjectState) -> ScenarioState:
-        """The state in which ``changed`` stands in for the object of its id, or is added last."""
+        """The state with ``changed`` in place of the object with its id, or added at the end."""
         objects = dict(self.objects)
         objects[changed.object_id] = changed
         return replace(
@@ -227,7 +227,7 @@ class ScenarioState:
         return PackedTracks(tuple(o for o in self.objects.values() if not o.deleted))
 
     def forget_tracks(self) -> None:
-        """Free the packed tracks, about 100 bytes a pose; they are packed anew when asked for."""
+        """Free the packed tracks, about 100 bytes per pose; they are packed again on demand."""
         self.__dict__.pop("tracks", None)
 
 
@@ -239,13 +239,13 @@ def _trajectories(scene: SceneSource, sources: list[ObjectSource]) -> list[Traje
 
 
 class EditError(ValueError):
-    """An edit, undo or redo that cannot be done; the state is as before.
+    """An impossible edit, undo or redo; the state does not change.
 
     Attributes:
         code: UNKNOWN_OBJECT, INVALID_OPERATION, STALE_REVISION, NOTHING_TO_UNDO or
             NOTHING_TO_REDO.
-        hint: what to do next, or None.
-        index: place of the refused operation in its batch, or None.
+        hint: suggested next step, or None.
+        index: of the rejected operation in its batch, or None.
     """
 
     def __init__(
@@ -266,7 +266,7 @@ _DRIVER: TypeAdapter[AgentDriver] = TypeAdapter(AgentDriver)
 
 
 def pack_state(state: ScenarioState) -> bytes:
-    """What differs from the recording, as msgpack; the recording itself is not in it."""
+    """Differences from the recording, as msgpack; the recording itself is not included."""
     changed = [o for o in state.objects.values() if state.recorded.get(o.object_id) is not o]
     story = {} if (board := state.storyboard) is None else {"story": board.model_dump(mode="json")}
     return encode(
@@ -283,15 +283,15 @@ def pack_state(state: ScenarioState) -> bytes:
 
 
 def unpack_state(initial: ScenarioState, packed: bytes) -> ScenarioState:
-    """The state that :func:`pack_state` was given.
+    """The state packed by :func:`pack_state`.
 
     Args:
         initial: of the same scene, before any edit.
         packed: the bytes.
 
     Raises:
-        EditError: UNKNOWN_ASSET where an object shows one that is not in the library;
-            INVALID_OPERATION for bytes that hold no state of this scene.
+        EditError: UNKNOWN_ASSET if an object shows an asset missing in the library;
+            INVALID_OPERATION if the bytes are not a state of this scene.
     """
     try:
         document = decode(packed, max_bytes=MAX_BYTES)

@@ -24,7 +24,7 @@ of the next knot is another one."""
 
 @kernel
 def poses_at(t_us, ends, times, knots):
-    """Poses and velocities of the trajectories that cover an instant, K of N.
+    """Poses and velocities of the trajectories that cover a time, K of N.
 
     Args:
         t_us: int64 [us].
@@ -33,7 +33,7 @@ def poses_at(t_us, ends, times, knots):
         knots: [M, 11] float64, see ``KNOT``; [m], [m/s].
 
     Returns:
-        Numbers of the trajectories [K] int64, and in float64 positions [K, 3], quaternions
+        Indices of the trajectories [K] int64, and in float64 positions [K, 3], quaternions
         [K, 4], velocities [K, 3] and transforms [K, 4, 4]. At a knot its pose, bit for bit.
     """
     known, after = _covering(t_us, ends, times)
@@ -150,7 +150,7 @@ class PlacedObjects(Generic[T]):
 
 
 class PackedTracks(Generic[T]):
-    """Trajectories of many objects in common arrays, so that one look-up serves them all.
+    """Trajectories of many objects in common arrays, so that one lookup serves all.
 
     Attributes:
         objects: in the given order, N of them.
@@ -171,7 +171,7 @@ class PackedTracks(Generic[T]):
         self._knots[:, :3] = _stacked([t.positions for t in trajectories], 3)
         self._knots[:, 3:7] = _stacked([t.quaternions for t in trajectories], 4)
         self._knots[:, 7:10] = _stacked([_knot_velocities(t) for t in trajectories], 3)
-        # Objects that stand or drive straight need no slerp.
+        # Objects that are stationary or drive straight need no slerp.
         quaternions = self._knots[:, 3:7]
         self._knots[:-1, 10] = (quaternions[1:] != quaternions[:-1]).any(axis=1)
 
@@ -199,7 +199,7 @@ class PackedTracks(Generic[T]):
         )
 
     def _some(self, known: NDArray[np.int64]) -> tuple[tuple[T, ...], Float]:
-        """Objects by their places, and their sizes; the same tuple as long as they are the same."""
+        """Objects by index, and their sizes; the same tuple while they do not change."""
         places = known.tobytes()
         newest = self._newest
         if newest is None or newest[0] != places:
@@ -222,7 +222,7 @@ def sample(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, 
 def sample_poses(trajectory: Trajectory, times_us: NDArray[np.int64]) -> tuple[Float, Float]:
     """Positions [S, 3] and quaternions [S, 4] at ``times_us`` [S]; the nearest known pose outside.
 
-    Poses that the trajectory holds come back bit for bit.
+    Stored poses are returned bit for bit.
     """
     times = trajectory.times_us
     clipped = np.clip(times_us, times[0], times[-1])
@@ -243,7 +243,7 @@ def _stacked(parts: Sequence[Float], width: int) -> Float:
 
 
 def _knot_velocities(trajectory: Trajectory) -> Float:
-    """Velocity [T, 3] from each knot to the next; the last knot has that of the last segment."""
+    """Velocity [T, 3] from each knot to the next; the last knot repeats the last segment."""
     if len(trajectory.times_us) == 1:
         return np.zeros((1, 3))
     seconds = np.diff(trajectory.times_us)[:, None] * 1e-6

@@ -45,11 +45,11 @@ def bottom_centres(T_world_box: Float, size: ArrayLike) -> Float:
 def box_penetration(
     T_world_a: ArrayLike, size_a: ArrayLike, T_world_b: ArrayLike, size_b: ArrayLike
 ) -> Float:
-    """Shortest distance [...] [m] to shift one box so that the two no longer overlap.
+    """Minimum distance [...] [m] to shift one box so that the two no longer overlap.
 
-    Negative where they are apart; then it is a lower bound of the distance between them, with
-    the sign turned. Separating-axis test over the 15 candidate axes (Gottschalk et al. 1996,
-    OBBTree). Leading dimensions broadcast, so one box can be tested against many.
+    For separate boxes it is negative, and its magnitude is a lower bound of their distance.
+    Separating-axis test over the 15 candidate axes (Gottschalk et al. 1996, OBBTree). Leading
+    dimensions broadcast, so one box can be tested against many.
 
     Args:
         T_world_a, T_world_b: [..., 4, 4] rigid transforms to the world; origin at the box centre.
@@ -91,11 +91,11 @@ def _face_overlaps(turn: Float, centre: Float, half_a: Float, half_b: Float) -> 
 
 
 def _edge_overlaps(turn: Float, centre: Float, half_a: Float, half_b: Float) -> Float:
-    """Least overlap [...] along the products of an edge of a and one of b; see above.
+    """Minimum overlap [...] along the products of an edge of a and one of b; see above.
 
-    Entry [i, j] of what follows belongs to the product of a's axis i and b's axis j. In the frame
-    of a it is (-turn[i + 2, j], turn[i + 1, j]) in the coordinates i + 1 and i + 2, so that the
-    reach of a needs these two rows of ``turn``, and that of b, seen from b, two columns.
+    Entry [i, j] belongs to the product of a's axis i and b's axis j. In the frame of a it is
+    (-turn[i + 2, j], turn[i + 1, j]) in the coordinates i + 1 and i + 2. So the extent of a needs
+    these two rows of ``turn``, and the extent of b, seen from b, two columns.
     """
     size = np.abs(turn)
     next_row, second_row = turn[..., NEXT, :], turn[..., SECOND, :]
@@ -105,7 +105,7 @@ def _edge_overlaps(turn: Float, centre: Float, half_a: Float, half_b: Float) -> 
     )
     reach_b = half_b[..., NEXT] * size[..., SECOND] + half_b[..., SECOND] * size[..., NEXT]
     length = np.sqrt(next_row * next_row + second_row * second_row)
-    # Parallel edges span no axis of their own; the face normals cover that case.
+    # Parallel edges span no axis; the face normals cover that case.
     valid = length > 1e-6
     overlaps = np.where(valid, reach_a + reach_b - gap, np.inf) / np.where(valid, length, 1.0)
     least: Float = overlaps.min((-2, -1))
@@ -118,12 +118,12 @@ MIN_OVERLAP = 1e-9
 """Maximum overlap of boxes that only touch [m]."""
 
 PARALLEL = 1e-6
-"""Sine of the angle below which two edges span no axis of their own."""
+"""Sine of the angle below which two edges span no axis."""
 
 
 @kernel
 def boxes_overlap(T_world_a: Any, size_a: Any, T_world_b: Any, size_b: Any) -> Any:
-    """Whether two boxes share volume; boxes that only touch do not.
+    """Whether two boxes share volume; touching boxes do not.
 
     Separating-axis test over the same axes as :func:`~.box.box_penetration`.
 
@@ -154,9 +154,9 @@ def first_overlap(ways: Any, sizes: Any, covered: Any, reach: Any, standing: Any
     Args:
         ways: of both boxes, two [S, 4, 4] float64, ``T_world_box`` at the same times.
         sizes: of both, (length, width, height) each [m].
-        covered: [S] bool, where there are both.
-        reach: boxes whose centres are farther apart cannot overlap [m].
-        standing: whether both stand, so that one sample tells all.
+        covered: [S] bool, samples at which both exist.
+        reach: boxes with a larger distance of centres cannot overlap [m].
+        standing: whether both are stationary, so that one sample is enough.
     """
     one, other = ways
     for s in range(len(one)):

@@ -136,7 +136,7 @@ def are_rotations(matrices: ArrayLike, *, tolerance: float = 1e-3) -> NDArray[np
 
 
 def _dot(one: Sequence[Float], other: Sequence[Float]) -> Float:
-    """Of vectors given by their three components."""
+    """Dot product of vectors given by their three components."""
     product: Float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
     return product
 

@@ -1,6 +1,7 @@
 """Driving logs: one reader per dataset and the synthetic generator, behind one DrivingLog type.
 
-The generator is in ``real2sim_server.synthetic``; it compiles kernels, so nothing imports it here.
+The generator is in ``real2sim_server.synthetic``. It compiles kernels, so this package does not
+import it.
 """
 
 from .check import LogCheck, check_log

@@ -23,22 +23,22 @@ from .driving_log import ChecksFiles, DrivingLog, LidarSweep, LogError, ObjectTr
 # --- Files ----------------------------------------------------------------------------------------
 
 MAX_DISTANCE_M = 100_000.0
-"""Of the world's zero; single precision is 8 mm there."""
+"""Maximum distance from the world's origin; single precision is 8 mm there."""
 NAMED_FILES = 5
 """How many bad images, and how many bad sweeps, are named in a summary."""
 
 
 @dataclass(frozen=True)
 class LogCheck:
-    """What :func:`check_log` looked at, and what is wrong.
+    """Scope and findings of :func:`check_log`.
 
     Attributes:
-        image_headers, sweep_headers: how many files had their header checked.
-        images, sweeps: how many had all of their contents read.
-        table_problems: what is wrong with times, poses, boxes and cameras, a sentence each.
+        image_headers, sweep_headers: number of files with a checked header.
+        images, sweeps: number of files read completely.
+        table_problems: problems with times, poses, boxes and cameras, one sentence each.
         image_problems: one sentence for each bad image; it names the file.
         sweep_problems: one sentence for each bad sweep; it names the file.
-        empty_sweeps: frames whose sweep holds no points, where those of other frames do.
+        empty_sweeps: frames with an empty sweep, if other frames have points.
     """
 
     image_headers: int
@@ -52,7 +52,7 @@ class LogCheck:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """All of them, one sentence each; empty for a good log."""
+        """All problems, one sentence each; empty for a good log."""
         return (*self.table_problems, *self.image_problems, *self.sweep_problems)
 
     def as_json(self) -> dict[str, Any]:
@@ -60,7 +60,7 @@ class LogCheck:
         return asdict(self)
 
     def summary(self) -> tuple[str, ...]:
-        """The problems for people: how many files are bad, the first of them, what to do."""
+        """The problems in readable form: number of bad files, the first of them, advice."""
         lines = list(self.table_problems)
         for kind, bad, looked_at in (
             ("image", self.image_problems, max(self.image_headers, self.images)),
@@ -76,8 +76,9 @@ class LogCheck:
         return tuple(lines)
 
     def done(self) -> str:
-        """What was looked at, such as "headers of 120 images and 60 sweeps checked, contents of 3
-        sweeps read"."""
+        """The checked parts, such as "headers of 120 images and 60 sweeps checked, contents of 3
+        sweeps read".
+        """
         headers = _listed((self.image_headers, "image"), (self.sweep_headers, "sweep"))
         contents = _listed((self.images, "image"), (self.sweeps, "sweep"))
         told = ([f"headers of {headers} checked"] if headers else []) + (
@@ -106,16 +107,17 @@ def check_log(
     decode_images: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> LogCheck:
-    """Look at every file of a log; a bad one does not keep the others from being looked at.
+    """Check every file of a log; a bad file does not stop the check.
 
-    The header of each image says its size and its end mark whether it is whole; the header of each
-    sweep says which arrays it holds. A source without headers (:class:`ChecksFiles`) has all its
-    sweeps read, and its images only where ``decode_images`` asks for it.
+    The header of each image gives its size, and its end mark shows whether it is complete; the
+    header of each sweep lists its arrays. For a source without headers (:class:`ChecksFiles`), all
+    sweeps are read, and images only with ``decode_images``.
 
     Args:
         log: any log.
-        sweeps: frames whose sweeps are read, which finds values that are not finite; None for all.
-        decode_images: decode every image, which finds damage inside files.
+        sweeps: frames with sweeps to read completely, to find values that are not finite; None for
+            all.
+        decode_images: decode every image, to find damage inside files.
         on_progress: called with (done, total) after each frame.
     """
     source = log.source if isinstance(log.source, ChecksFiles) else None
@@ -149,7 +151,7 @@ def check_log(
     empty = tuple(frame for frame, count in points.items() if count == 0)
     return LogCheck(
         image_headers=headers,
-        # Reading a sweep checks its header too, but says more.
+        # Reading a sweep includes the check of its header.
         sweep_headers=log.frame_count if read < log.frame_count else 0,
         images=decoded,
         sweeps=read,
@@ -214,41 +216,41 @@ def _tracks(log: DrivingLog) -> Iterator[str]:
 
 # --- Plausibility ---------------------------------------------------------------------------------
 
-# These are hints for the owner of the log; nothing is refused. Where a typical mistake explains a
-# value, the hint names it.
+# Hints for the owner of the log; they are not errors. If a typical mistake explains a value, the
+# hint names it.
 
 GAP_FACTOR = 1.6
 """A frame is missing where the time step is this many times the usual one."""
 MIN_RATE, MAX_RATE = 0.2, 500.0
-"""Frames a second beyond which times are hardly in microseconds."""
+"""Frame rates outside this range mean that times are hardly in microseconds [1/s]."""
 PRECISE_DISTANCE_M = 10_000.0
-"""Of the world's zero; the float32 of Gaussians is 1 mm there."""
+"""Distance from the world's origin at which the float32 of Gaussians is 1 mm."""
 MAX_EGO_SPEED = 70.0
 OFF_HEADING, RIGHT_HEADING = math.radians(45), math.radians(15)
 FRAME_OF_BOXES = "T_world_object, not of the vehicle's frame, x forward"
 MANY_OFF = 0.3
-"""A share of the vehicles; a few may drive backwards."""
+"""Share of the vehicles; a few may drive backwards."""
 DRIVEN_STEP_M = 0.3
-"""Between two poses whose direction of motion counts."""
+"""Minimum distance of two poses for a direction of motion."""
 MIN_UP = 0.3
-"""Of an axis that should point up, its part along z."""
+"""Minimum z component of an axis that should point up."""
 CAMERA_REACH = np.array([15.0, 4.0]), (-0.5, 6.0)
-"""How far a camera sits from the rear axle along x and y, and in which heights [m]."""
+"""Maximum distance of a camera from the rear axle along x and y, and its range of heights [m]."""
 NEAR_BOXES = 30.0
 FAR_BOXES = 150.0
 STANDING_M, FLOATS_M = 15.0, 0.6
-"""Boxes so near should stand on the road, to within so much."""
+"""Range of boxes that should stand on the road, and their tolerance."""
 FEW_POINTS = 5
 BETWEEN_SWEEPS_M, SWEEPS_AHEAD = 1.5, 20
-"""The ego's way between two sweeps that are compared, and how many frames it may take."""
+"""Distance of the ego between two compared sweeps, and maximum number of frames in between."""
 COMPARED_POINTS = 4000
 ABOVE_TRAFFIC_M, AROUND_BOX_M = 2.0, 0.3
 BETTER = 0.6
-"""Sweeps fit better in another way where they are that much nearer to each other."""
+"""An alternative alignment of sweeps is better if distances shrink by this factor."""
 
 VEHICLES = ("car", "van", "truck", "bus")
 CATEGORIES = (*CLASS_OF_CATEGORY, "animal", "other")
-"""What objects are told apart by; all others are of no known kind."""
+"""Known categories of objects."""
 MANY_UNKNOWN = 0.2
 """A share of all objects."""
 AXES_OF_CV = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -256,12 +258,11 @@ AXES_OF_CV = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 def questions_to(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
-    """What looks wrong, in plain words; empty for a good log.
+    """Suspicious properties of a log, in plain words; empty for a good log.
 
     Args:
         log: any log.
-        sweeps: some of its sweeps, by frame; empty where none of these could be read. One or two
-            more are read.
+        sweeps: some of its sweeps, by frame; empty if none could be read. One or two more are read.
     """
     found = [*_odd_times(log), *_world(log), *_ego(log)]
     for camera in log.rig:
@@ -360,7 +361,7 @@ def _headings(tracks: tuple[ObjectTrack, ...]) -> list[str]:
 
 
 def _explained(path: Trajectory, expected: str) -> str:
-    """The mistake that would make sense of a trajectory, or what is expected."""
+    """The mistake that would explain a trajectory, or the expected one."""
     swapped = Trajectory(path.times_us, path.positions, path.quaternions[:, [3, 0, 1, 2]])
     if _makes_sense(swapped):
         return "are its quaternions x y z w? They must be w x y z"
@@ -379,7 +380,7 @@ def _makes_sense(path: Trajectory) -> bool:
 
 
 def _off_heading(path: Trajectory) -> float | None:
-    """Median angle between where something drives and its x axis [rad]; None where it stands."""
+    """Median angle between direction of motion and x axis [rad]; None without motion."""
     kept = [0]
     for i, position in enumerate(path.positions):
         if np.linalg.norm(position[:2] - path.positions[kept[-1], :2]) > DRIVEN_STEP_M:
@@ -387,7 +388,7 @@ def _off_heading(path: Trajectory) -> float | None:
     if len(kept) < 3:
         return None
     ways = np.diff(path.positions[kept, :2], axis=0)
-    # The axis in the middle of a way is that of an arc; of its ends it lags or leads.
+    # The axis at the middle of an arc has its direction; at the ends it leads or lags.
     middle = [(a + b) // 2 for a, b in pairwise(kept)]
     axes = np.array([quaternion_to_matrix(path.quaternions[i])[:2, 0] for i in middle])
     crossed = ways[:, 0] * axes[:, 1] - ways[:, 1] * axes[:, 0]
@@ -438,7 +439,7 @@ def _sits_on_a_vehicle(pose: Float) -> bool:
 
 
 def _categories(tracks: tuple[ObjectTrack, ...]) -> list[str]:
-    """Categories that look misspelt, or that many objects have and nothing here knows."""
+    """Categories that look misspelt, or that are unknown and common."""
     unknown = Counter(t.category for t in tracks if t.category not in CATEGORIES)
     found = []
     for category, count in sorted(unknown.items()):
@@ -490,7 +491,7 @@ def _boxes(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
 
 
 def _standing(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
-    """Whether boxes nearby stand on the road."""
+    """Whether nearby boxes stand on the road."""
     bottoms = []
     for frame in sweeps:
         to_vehicle = invert_transform(log.ego.transform(int(log.frame_times_us[frame])))
@@ -547,7 +548,7 @@ def _registration(log: DrivingLog) -> list[str]:
     try:
         one, other = (_standing_points(log, frame) for frame in pair)
     except LogError:
-        return []  # Whoever looks at every file says which.
+        return []  # The complete check names the file.
     if min(len(one), len(other)) < 100:
         return []
     first, second = (log.ego.transform(int(log.frame_times_us[frame])) for frame in pair)
@@ -573,7 +574,7 @@ def _registration(log: DrivingLog) -> list[str]:
 
 
 def _compared_frames(log: DrivingLog) -> tuple[int, int] | None:
-    """Two frames between which the ego has gone some way, as soon as possible."""
+    """The first pair of frames with enough motion of the ego in between."""
     way = np.concatenate([[0.0], np.cumsum(ego_steps(log))])
     for first in range(len(way)):
         later = way[first + 1 : first + 1 + SWEEPS_AHEAD] - way[first]
@@ -584,8 +585,9 @@ def _compared_frames(log: DrivingLog) -> tuple[int, int] | None:
 
 
 def _standing_points(log: DrivingLog, frame: int) -> Float:
-    """Points of what stands: outside of boxes, and above most traffic and the road, which fits
-    itself however it is moved."""
+    """Static points: outside boxes, and above the road and most traffic. The road fits itself under
+    any motion.
+    """
     sweep = log.lidar(frame)
     points = sweep.points.astype(np.float64)
     away = np.linalg.norm(points - sweep.origin, axis=1)

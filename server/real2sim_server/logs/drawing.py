@@ -13,7 +13,7 @@ from ..scene import Camera
 from .driving_log import DrivingLog, LidarSweep, ObjectTrack
 
 NEAR = 0.3
-"""Nothing nearer to the camera than this is drawn [m]."""
+"""Minimum distance of drawn items from the camera [m]."""
 
 DEPTH_RANGE = (3.0, 70.0)
 """Depths [m] at the ends of the colour scale, which is logarithmic."""
@@ -31,8 +31,8 @@ EDGES = (
 def draw_frame(log: DrivingLog, camera: str, frame: int) -> NDArray[np.uint8]:
     """The image of a camera with the sweep's points, coloured by depth, and all boxes.
 
-    Points and boxes are drawn where they are when the image is taken; points of moving objects
-    are as old as they are.
+    Points and boxes are drawn at their positions at the time of the image. Points of moving objects
+    stay at their time of measurement.
 
     Returns:
         RGB uint8 [H, W, 3].
@@ -130,7 +130,7 @@ def _pixels(lens: Camera, points: Float) -> Float:
 
 
 def points_in_box(points: Float, pose: Float, size: tuple[float, float, float]) -> int:
-    """How many points [N, 3] lie in a box of ``pose`` [4, 4] in the same frame."""
+    """Number of points [N, 3] in a box with ``pose`` [4, 4] in the same frame."""
     local = apply_transform(invert_transform(pose), points)
     return int((np.abs(local) <= np.array(size) / 2).all(axis=1).sum())
 
@@ -139,13 +139,13 @@ def points_in_box(points: Float, pose: Float, size: tuple[float, float, float]) 
 
 HEIGHTS = (-0.3, 4.0)
 REACH = 45.0
-"""How far around the way of the vehicle is drawn [m]."""
+"""Drawn distance around the vehicle's path [m]."""
 
 FOOTPRINT = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
 
 
 def draw_top_view(log: DrivingLog, frame: int, sweep: LidarSweep) -> NDArray[np.uint8]:
-    """RGB uint8 [H, W, 3]: a frame with its sweep and boxes, and the ways that are driven."""
+    """RGB uint8 [H, W, 3]: a frame with its sweep and boxes, and the driven paths."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -196,7 +196,7 @@ def _draw_track(axes: Any, track: ObjectTrack, t_us: int) -> None:
 def _draw_footprint(
     axes: Any, pose: Float, size: tuple[float, float, float], colour: Any, *, shift: float = 0.0
 ) -> None:
-    """Outline, and a line from the middle to the front; ``shift`` is where the middle is on x."""
+    """Outline, and a line from the centre to the front; ``shift`` is the centre along x."""
     outline = FOOTPRINT * size[:2] + [shift, 0]
     outline = np.concatenate([outline, [[shift, 0], [shift + size[0] / 2, 0]]])
     placed = apply_transform(pose, np.pad(outline, ((0, 0), (0, 1))))

@@ -16,19 +16,19 @@ from ..scene import CameraRig, LaneGraph, Trajectory
 
 
 class LogError(ValueError):
-    """A log that cannot be read; the message names the file, what is wrong and what is expected."""
+    """A log that cannot be read; the message names the file, the problem and the expectation."""
 
 
 @dataclass(frozen=True, eq=False)
 class LidarSweep:
-    """One sweep of all LiDARs, brought to one instant.
+    """One sweep of all LiDARs, compensated to one time.
 
     Attributes:
         points: [N, 3] float32, vehicle frame at the frame's time stamp [m]; the motion of the
             recording vehicle during the sweep is compensated.
         intensity: [N] float32 in [0, 1].
-        offset_us: [N] int32, when each point was measured relative to the frame's time stamp
-            [us]; a moving object has moved by its own velocity times this.
+        offset_us: [N] int32, time of measurement relative to the frame's time stamp [us]; a moving
+            object has moved by its own velocity times this.
         origin: [3] float32, sensor position in the vehicle frame [m].
     """
 
@@ -68,7 +68,7 @@ class ObjectTrack:
 
 @contextmanager
 def damage_named(where: str) -> Iterator[None]:
-    """Any error of the block as one of a damaged log, as far as a reader did not say it better.
+    """Convert any error of the block to a LogError of a damaged log, unless it already is one.
 
     Raises:
         LogError: with ``where`` and the error.
@@ -103,19 +103,19 @@ class ChecksFiles(Protocol):
         ...
 
     def check_sweep(self, frame: int) -> int | None:
-        """How many points the sweep promises, None where its header does not say.
+        """Number of points according to the sweep's header; None if it has none.
 
-        Raises LogError when the sweep is missing, cut off or lacks arrays of the right shape.
+        Raises LogError when the sweep is missing, truncated or lacks arrays of the right shape.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedMap:
-    """A map of its own format that lies beside a log.
+    """A separate map that belongs to a log.
 
     Attributes:
-        path: the file or folder, as ``maps.read_map`` takes it.
+        path: the file or folder, for ``maps.read_map``.
         T_world_map: [4, 4] from the map's frame to the log's world [m].
     """
 
@@ -125,10 +125,10 @@ class LoggedMap:
 
 @dataclass(frozen=True, eq=False)
 class DrivingLog:
-    """A recorded drive; images and sweeps are read when they are asked for.
+    """A recorded drive; images and sweeps are read on demand.
 
-    World frame: x forward, y left, z up [m]; it is the vehicle frame of the first frame unless
-    the dataset says otherwise, so that coordinates stay small.
+    World frame: x forward, y left, z up [m]. It is the vehicle frame of the first frame unless the
+    dataset defines another, so that coordinates stay small.
 
     Attributes:
         name: short name, from the folder.
@@ -136,13 +136,13 @@ class DrivingLog:
         frame_times_us: [F] int64 [us], increasing.
         ego: ``T_world_vehicle`` at least over all frames (rear axle centre on the ground).
         tracks: every tracked object, in a stable order.
-        source: where images and sweeps come from.
+        source: of images and sweeps.
         ego_size: (length, width, height) of the recording vehicle [m].
         provenance: dataset, sequence, licence, reader (JSON values only).
-        image_times_us: [F] int64 [us] by camera, when its images were really taken, where that
-            differs from the frame's time stamp; see :meth:`image_time_us`.
-        lanes: of the map that the log comes with, in its world frame; None without one.
-        logged_map: where such a map is that has not been read; None without one.
+        image_times_us: [F] int64 [us] by camera, actual times of its images if they differ from the
+            frame's time stamp; see :meth:`image_time_us`.
+        lanes: of the log's map, in its world frame; None without one.
+        logged_map: location of a map that has not been read; None without one.
     """
 
     name: str
@@ -182,10 +182,10 @@ class DrivingLog:
         return image
 
     def image_time_us(self, camera: str, frame: int) -> int:
-        """When ``camera`` took its image of ``frame`` [us]; ``ego`` covers that instant.
+        """Time of the image of ``camera`` in ``frame`` [us], covered by ``ego``.
 
-        Cameras of one vehicle are often triggered one after the other while the LiDAR turns: at
-        10 m/s half a metre lies between the first and the last image of a frame.
+        Cameras of one vehicle are often triggered in sequence while the LiDAR turns: at 10 m/s, the
+        first and the last image of a frame are half a metre apart.
         """
         times = self.image_times_us.get(camera, self.frame_times_us)
         return int(times[self._checked(frame)])
@@ -211,17 +211,17 @@ class DrivingLog:
 # A range of frames, every n-th frame, some cameras.
 
 SELECTION = "selection"
-"""Of a log's provenance: what it is a part of, see :func:`select_from_log`."""
+"""Key of a log's provenance: the selected part, see :func:`select_from_log`."""
 
 
 @dataclass(frozen=True)
 class LogSelection:
-    """Which part of a log is meant.
+    """Selected part of a log.
 
     Attributes:
-        first: number of the first frame.
-        stop: number of the first frame that is no longer part of it; None for the log's end.
-        every: of these frames, each so many-th.
+        first: index of the first frame.
+        stop: index after the last frame; None for the log's end.
+        every: use every Nth of these frames.
         cameras: names; None for all.
     """
 
@@ -232,16 +232,16 @@ class LogSelection:
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing is left out of any log."""
+        """Whether every log is selected completely."""
         return self == LogSelection()
 
 
 def select_from_log(log: DrivingLog, selection: LogSelection) -> DrivingLog:
-    """The part of ``log`` that is selected; its world frame stays.
+    """Select a part of ``log``; its world frame does not change.
 
-    The path and the boxes are those from its first image to its last; objects that are not there
-    meanwhile are left out. ``provenance`` says what was selected, so that the same part can be
-    taken from the same log again, see :func:`same_part`.
+    The path and the boxes cover the time from its first image to its last; objects that do not
+    exist then are dropped. ``provenance`` records the selection, so that the same part can be
+    selected from the same log again, see :func:`same_part`.
 
     Raises:
         LogError: frames or cameras that the log lacks, or no frame at all.
@@ -270,7 +270,7 @@ def select_from_log(log: DrivingLog, selection: LogSelection) -> DrivingLog:
 
 
 def same_part(log: DrivingLog, provenance: Mapping[str, Any]) -> DrivingLog:
-    """The part of ``log`` that a log with this ``provenance`` was, or what was made of it.
+    """Select the part of ``log`` with this ``provenance``, for example of a scene made from it.
 
     Raises:
         LogError: the log has no such frames or cameras.
@@ -286,7 +286,7 @@ def same_part(log: DrivingLog, provenance: Mapping[str, Any]) -> DrivingLog:
 
 
 def log_of_frames(log: DrivingLog, frames: Sequence[int]) -> DrivingLog:
-    """``log`` with these frames alone; paths and boxes stay whole."""
+    """``log`` with only these frames; paths and boxes stay whole."""
     index = np.asarray(frames, np.int64)
     selected = _SelectedFiles if isinstance(log.source, ChecksFiles) else _SelectedFrames
     return replace(
@@ -298,7 +298,7 @@ def log_of_frames(log: DrivingLog, frames: Sequence[int]) -> DrivingLog:
 
 
 class _SelectedFrames:
-    """A source under the numbers of the selected frames; errors name those of the whole log."""
+    """A source with the indices of the selected frames; errors name those of the whole log."""
 
     def __init__(self, log: DrivingLog, frames: Sequence[int]) -> None:
         self._log, self._frames = log, frames

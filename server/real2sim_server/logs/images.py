@@ -15,7 +15,7 @@ PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 END_BYTES = 1024
 MAX_PIXELS = 1 << 27
-"""Of one image; a header may promise more than any memory holds."""
+"""Maximum size of an image; protects from headers with huge sizes."""
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -38,7 +38,7 @@ def encoded_size(data: bytes, where: str) -> tuple[int, int]:
     """(width, height) [px] of an encoded image, from its header only.
 
     Raises:
-        LogError: ``data`` is neither PNG nor JPEG, or its header is cut off; ``where`` names it.
+        LogError: ``data`` is neither PNG nor JPEG, or its header is truncated; ``where`` names it.
     """
     size: tuple[int, int] | None = None
     try:
@@ -60,7 +60,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
     while True:
         marker = data[position + 1]
         (length,) = struct.unpack(">H", data[position + 2 : position + 4])
-        # Start-of-frame markers; C4, C8 and CC fraction the range but hold tables.
+        # Start-of-frame markers; C4, C8 and CC are in the range but contain tables.
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", data[position + 5 : position + 9])
             return width, height
@@ -80,7 +80,7 @@ def decode_image(data: bytes, where: str, size: tuple[int, int] | None = None) -
     """RGB uint8 [H, W, 3] of an encoded image; ``where`` names it in errors.
 
     Raises:
-        LogError: it is broken, cut off, or not of the (width, height) that is expected.
+        LogError: it is broken, truncated, or not of the expected (width, height).
     """
     import cv2
 
@@ -94,14 +94,14 @@ def decode_image(data: bytes, where: str, size: tuple[int, int] | None = None) -
 
 
 def _decode_jpeg(data: bytes, where: str) -> NDArray[np.uint8]:
-    """Unlike OpenCV, which shows damaged parts in grey and says nothing, this refuses them."""
+    """Reject damaged files. OpenCV shows damaged parts in grey without an error."""
     import simplejpeg
 
     try:
         try:
             return np.asarray(simplejpeg.decode_jpeg(data, "RGB"))
         except ValueError as error:
-            # Some cameras put a few bytes between segments, which harms nothing.
+            # Some cameras insert a few harmless bytes between segments.
             if "extraneous bytes" not in str(error):
                 raise
             return np.asarray(simplejpeg.decode_jpeg(data, "RGB", strict=False))

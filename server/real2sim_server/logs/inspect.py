@@ -1,4 +1,4 @@
-"""Reports what a log holds and draws it: a wrong calibration shows at once."""
+"""Report and drawings of a log's contents, which reveal a wrong calibration at a glance."""
 
 from __future__ import annotations
 
@@ -33,23 +33,24 @@ class CameraReport:
 
 @dataclass(frozen=True)
 class LogReport:
-    """What a log holds.
+    """Contents of a log.
 
     Attributes:
-        name, dataset, sequence, reader, licence: where it comes from.
+        name, dataset, sequence, reader, licence: origin.
         cameras: the rig.
         frames: number of frames.
         duration: from the first to the last frame [s].
         rate: frames per second, 0 for a single frame.
         gaps: (frame before the gap, its length [s]).
-        lidar_points: of the inspected sweeps, least, median and most; zeros if none can be read.
+        lidar_points: of the inspected sweeps, minimum, median and maximum; zeros if none can be
+            read.
         lidar_range: 99th percentile of distances [m].
         tracks: number of objects by category.
         moving: number of moving objects by category.
-        ego_distance: way that was driven [m].
-        ego_speed: fastest [m/s].
-        questions: what looks wrong, in plain words; empty for a good log.
-        problems: what cannot be read of the inspected frames, a sentence each.
+        ego_distance: driven distance [m].
+        ego_speed: maximum [m/s].
+        questions: suspicious properties, in plain words; empty for a good log.
+        problems: unreadable parts of the inspected frames, one sentence each.
         drawings: files that were written.
     """
 
@@ -78,7 +79,7 @@ class LogReport:
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """For people, one fact a line; without the problems."""
+        """Readable report, one fact per line; without the problems."""
         rate = f", {self.rate:.4g} a second" if self.rate else ""
         least, median, most = self.lidar_points
         lines = [
@@ -109,13 +110,13 @@ def inspected_frames(log: DrivingLog) -> tuple[int, ...]:
 
 
 def inspect_log(log: DrivingLog, out: str | Path | None = None) -> LogReport:
-    """Inspect a log; a few of its frames are read. What cannot be read is in ``problems``.
+    """Inspect a log from a few of its frames. Unreadable parts are in ``problems``.
 
     Args:
         log: any log.
-        out: folder for drawings, created where it is missing: ``frame_%06d.jpg``, all cameras of
-            a frame with boxes and points coloured by depth, and ``top.png``, the middle frame from
-            above. None draws nothing.
+        out: folder for drawings, created if missing: ``frame_%06d.jpg``, all cameras of a frame
+            with boxes and points coloured by depth, and ``top.png``, the middle frame from above.
+            None draws nothing.
     """
     sweeps: dict[int, LidarSweep] = {}
     problems: list[str] = []
@@ -172,7 +173,7 @@ def _delay(log: DrivingLog, camera: str) -> float:
 def _draw(
     log: DrivingLog, sweeps: dict[int, LidarSweep], out: Path, problems: list[str]
 ) -> list[str]:
-    """Files of the drawings; images that cannot be read are left out and added to ``problems``."""
+    """Files of the drawings; unreadable images are skipped and added to ``problems``."""
     out.mkdir(parents=True, exist_ok=True)
     files: list[str] = []
     for frame in sweeps:

@@ -16,10 +16,10 @@ def open_log(
     Args:
         path: the log's folder.
         format: a reader's name; by default the first reader that recognises the folder.
-        sequence: which drive, where the folder holds several; the only one is the default.
+        sequence: name of a drive in a folder with several; a single one is the default.
 
     Raises:
-        LogError: no such folder, an unknown format, or anything the reader finds wrong.
+        LogError: no such folder, an unknown format, or any problem found by the reader.
     """
     folder = Path(path)
     if not folder.is_dir():

@@ -1,4 +1,6 @@
-"""Maps of other programs as lane graphs, one reader a format; what fits none is refused by name."""
+"""Maps of other programs as lane graphs, one reader per format; unsupported content is rejected by
+name.
+"""
 
 from .align import Alignment, align, driven_poses, laid_on
 from .from_log import LANE_SOURCES, LaneSource, lanes_from_log, lanes_of_log

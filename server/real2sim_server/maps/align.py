@@ -16,7 +16,7 @@ STEP_M = 2.0
 VEHICLES = frozenset({"car", "van", "truck", "bus", "vehicle"})
 ROUNDS, HUBER_M = 40, 1.0
 NEAR_M = 6.0
-"""A map whose lanes lie so near to most of the path is taken to be in the scene's frame nearly."""
+"""A map with lanes this close to most of the path counts as almost aligned with the scene."""
 MEDIAN_M, WITHIN = 1.0, 0.75
 """What a fit must reach: median distance from centre lines, share of poses inside a lane."""
 CANDIDATES, KEPT = 4000, 12
@@ -28,10 +28,10 @@ class Alignment:
     """A rigid motion from a map to a scene, seen from above.
 
     Attributes:
-        yaw: turn about z [rad].
-        x, y: move after the turn [m].
+        yaw: rotation about z [rad].
+        x, y: translation after the rotation [m].
         residual: median distance of driven poses from the centre lines of their lanes [m].
-        within: share of those poses that lie inside a lane of their direction.
+        within: share of those poses inside a lane of their direction.
     """
 
     yaw: float
@@ -41,21 +41,22 @@ class Alignment:
     within: float
 
     def apply(self, graph: LaneGraph, ground: Ground | None = None) -> LaneGraph:
-        """The graph in the scene's frame; on its ground where one is given."""
+        """The graph in the scene's frame; placed on ``ground`` if given."""
         moved = graph.moved(self.yaw, [self.x, self.y, 0.0])
         return moved if ground is None else laid_on(moved, ground)
 
 
 def driven_poses(scene: Scene) -> Float:
-    """Poses [N, 3] (x, y [m], heading [rad]) along the ways of the recording vehicle and of
-    vehicles that move, each ``STEP_M``."""
+    """Poses [N, 3] (x, y [m], heading [rad]) along the paths of the recording vehicle and of moving
+    vehicles, every ``STEP_M``.
+    """
     ways = [scene.ego, *(o.trajectory for o in scene.objects.values() if o.category in VEHICLES)]
     found = [way_poses(way) for way in ways]
     return np.concatenate(found) if found else np.zeros((0, 3))
 
 
 def way_poses(way: Trajectory, *, step: float = STEP_M) -> Float:
-    """Poses [N, 3] (x, y, heading of motion) along a trajectory that leads anywhere; else none."""
+    """Poses [N, 3] (x, y, heading of motion) along a moving trajectory; empty without motion."""
     places = way.positions[:, :2]
     kept = [0]
     for i in range(1, len(places)):
@@ -71,16 +72,16 @@ def way_poses(way: Trajectory, *, step: float = STEP_M) -> Float:
 def align(
     graph: LaneGraph, poses: ArrayLike, *, start: tuple[float, float, float] | None = None
 ) -> Alignment:
-    """The rigid motion that brings a map's lanes under the poses that were driven.
+    """The rigid motion that aligns a map's lanes with the driven poses.
 
     Args:
         graph: in the map's own frame.
         poses: [N, 3] x, y, heading in the scene; see :func:`driven_poses`.
-        start: (yaw, x, y) to begin at; None: from the map's frame as it is where that nearly fits,
-            else from everywhere that the first pose can be on the map.
+        start: (yaw, x, y) to start from; None: the map's own frame if it almost fits, otherwise
+            all possible positions of the first pose on the map.
 
     Raises:
-        MapError: nothing was driven, the map fits nowhere, or in several places alike.
+        MapError: no driven path, no fit, or several equally good fits.
     """
     driven = np.asarray(poses, dtype=np.float64).reshape(-1, 3)
     if len(driven) < 5:
@@ -194,7 +195,7 @@ def _measured(graph: LaneGraph, poses: Float, motion: Float) -> Alignment:
 
 
 def _anywhere(graph: LaneGraph, poses: Float) -> Alignment:
-    """The best of all places at which the first pose can stand on a lane."""
+    """The best of all positions of the first pose on a lane."""
     starts = [
         (*lane.at(s)[:2], lane.at(s)[3])
         for lane in graph.lanes.values()

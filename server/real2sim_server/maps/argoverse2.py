@@ -18,8 +18,9 @@ KINDS: dict[str, LaneKind] = {"VEHICLE": "driving", "BUS": "bus", "BIKE": "bicyc
 
 
 class Argoverse2MapReader:
-    """Reads lane segments, drivable areas and pedestrian crossings; the maps tell neither signals
-    nor speed limits."""
+    """Reads lane segments, drivable areas and pedestrian crossings. The maps contain neither
+    signals nor speed limits.
+    """
 
     name = "argoverse2"
     expects = f"{PATTERN} of Argoverse 2, its folder map/, or the folder of the log"

@@ -1,4 +1,4 @@
-"""Lanes of a log: from its map, or from the drive alone where there is none."""
+"""Lanes of a log: from its map, or from the drive alone if there is none."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ BIN_M, WINDOW_M = 0.05, 20.0
 BRIGHT_SHARE, BRIGHT_MADS, POINTS_MIN = 0.12, 5.0, 200
 MARK_M = (1.0, 2.5)
 UNMARKED_M, MARKED_LEAST_M = 0.4, 0.1
-"""Where people drive in a lane varies by about so much; what marks tell is no better than this."""
+"""Typical lateral variation of driving within a lane, and lower limit of the accuracy from
+markings.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,15 +47,15 @@ class _Way:
 
 
 def lanes_from_log(log: DrivingLog) -> LaneGraph:
-    """The lanes that a recorded drive tells of.
+    """Lanes estimated from a recorded drive.
 
-    The ways of the recording vehicle and of tracked vehicles that moved are gathered into lanes;
-    where LiDAR intensities show markings on either side, the lane's line goes to their middle and
-    its width is theirs. ``accuracy`` of the graph is the median error to expect: 0.4 m where only
-    ways are known, else the spread of what stretches of 20 m say of where the marks are.
+    The paths of the recording vehicle and of moving tracked vehicles are merged into lanes. Where
+    LiDAR intensities show markings on both sides, the centre line and the width follow the
+    markings. ``accuracy`` of the graph is the expected median error: 0.4 m if only paths are known,
+    otherwise the spread of the markings between sections of 20 m.
 
     Raises:
-        MapError: nobody drove 8 m in the log.
+        MapError: no vehicle drove 8 m in the log.
     """
     ways = [_line(log.ego.positions)]
     tracks = (t for t in log.tracks if t.category in VEHICLES)
@@ -72,7 +74,7 @@ def lanes_from_log(log: DrivingLog) -> LaneGraph:
 
 
 def _line(positions: Float) -> Float:
-    """Points [N, 3] each metre along a way, without its standing and its noise; [0, 3] for none."""
+    """Points [N, 3] every metre along a path, without standstill and noise; [0, 3] for none."""
     kept = [0]
     for i in range(1, len(positions)):
         if np.linalg.norm(positions[i, :2] - positions[kept[-1], :2]) >= STEP_M / 2:
@@ -87,7 +89,7 @@ def _line(positions: Float) -> Float:
 
 
 def _smoothed(line: Float) -> Float:
-    """A line without wiggles shorter than some metres; its ends go on as they are going."""
+    """Smooth wiggles shorter than a few metres; the ends keep their direction."""
     reach = int(4 * SMOOTH_M / STEP_M)
     if len(line) < 4:
         return line
@@ -107,8 +109,9 @@ def _headings(line: Float) -> Float:
 
 
 def _beside(line: Float, other: Float) -> tuple[Float, Float, Float]:
-    """Of each point of ``other`` [M]: index of the nearest point of ``line``, signed distance to
-    its left, and cosine of the angle between the directions."""
+    """For each point of ``other`` [M]: index of the nearest point of ``line``, signed distance to
+    its left, and cosine of the angle between the directions.
+    """
     apart = np.linalg.norm(other[:, None, :2] - line[None, :, :2], axis=2)
     k = apart.argmin(axis=1)
     heading = _headings(line)
@@ -120,7 +123,7 @@ def _beside(line: Float, other: Float) -> tuple[Float, Float, Float]:
 
 
 def _gathered(ways: list[Float]) -> list[Float]:
-    """One line for each lane: the first way that took it, with what others add at its ends."""
+    """One line per lane: the first path on it, extended by the others at its ends."""
     lanes: list[Float] = []
     for way in ways:
         for i, line in enumerate(lanes):
@@ -135,7 +138,7 @@ def _gathered(ways: list[Float]) -> list[Float]:
 
 
 def _bridged(lanes: list[Float]) -> list[Float]:
-    """Lanes of which one goes on where another ends, after a stretch that nobody drove, as one."""
+    """Join lanes that continue each other across a section that nobody drove."""
     found = list(lanes)
     for a in range(len(found)):
         for b in range(len(found)):
@@ -157,20 +160,21 @@ def _bridged(lanes: list[Float]) -> list[Float]:
 
 
 def _leads_to(line: Float, other: Float) -> bool:
-    """Whether a line, going on as it bends, meets another within reach."""
+    """Whether a line, extended along its curvature, meets another within reach."""
     d = other[0, :2] - line[-1, :2]
     reach = float(np.linalg.norm(d))
     if not 0.5 < reach < BRIDGED_M:
         return False
     out, into, between = _headings(line)[-1], _headings(other)[0], np.arctan2(d[1], d[0])
     turns = np.angle(np.exp(1j * np.array([between - out, into - between])))
-    # On an arc both turns are the same, half of what the road bends.
+    # On an arc both angles are equal to half of the road's total bend.
     return bool(np.abs(turns).max() < 0.35 and abs(turns[0] - turns[1]) * reach < 2 * SAME_LANE_M)
 
 
 def _extended(line: Float, way: Float, same: Float) -> Float:
-    """A lane's line with the part of a way before its start or after its end, brought to it
-    sideways over some metres."""
+    """A lane's line extended by the part of a path before its start or after its end, blended
+    laterally over some metres.
+    """
     shared = np.flatnonzero(same)
     before, after = way[: shared[0]], way[shared[-1] + 1 :]
     parts = [line]
@@ -182,7 +186,7 @@ def _extended(line: Float, way: Float, same: Float) -> Float:
 
 
 def _is_beyond(end: Float, inner: Float, place: Float) -> bool:
-    """Whether a place lies beyond the end of a line, whose point before is ``inner``."""
+    """Whether a position is beyond the end of a line with the previous point ``inner``."""
     return bool((place - end)[:2] @ (end - inner)[:2] > 0)
 
 
@@ -220,7 +224,7 @@ def _ground_returns(log: DrivingLog) -> tuple[Float, Float]:
 
 
 def _marked(line: Float, points: Float, intensity: Float) -> _Way:
-    """A lane's line between its markings, as far as any are seen."""
+    """A lane's line centred between its markings, where they are visible."""
     shifts, widths = [], []
     reach = int(WINDOW_M / STEP_M)
     places = np.arange(0, len(line), reach // 2)
@@ -248,7 +252,7 @@ def _marked(line: Float, points: Float, intensity: Float) -> _Way:
 
 
 def _marks(line: Float, points: Float, intensity: Float) -> tuple[float, float] | None:
-    """Left and right mark beside a stretch of a lane's line [m], or None."""
+    """Left and right marking next to a section of a lane's line [m], or None."""
     low, high = line[:, :2].min(axis=0) - REACH_M, line[:, :2].max(axis=0) + REACH_M
     near = ((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)
     chosen, levels = points[near], intensity[near]
@@ -279,7 +283,7 @@ def _marks(line: Float, points: Float, intensity: Float) -> tuple[float, float] 
 
 
 def _peak(distance: Float, share: Float) -> float | None:
-    """Where the first marking beyond ``MARK_M[0]`` lies; None without one."""
+    """Position of the first marking beyond ``MARK_M[0]``; None without one."""
     side = np.flatnonzero((distance > MARK_M[0]) & (distance < MARK_M[1]))
     best = side[share[side].argmax()]
     if share[best] < BRIGHT_SHARE:
@@ -289,7 +293,7 @@ def _peak(distance: Float, share: Float) -> float | None:
 
 
 def _across(line: Float, points: Float) -> tuple[Float, Float]:
-    """Distance to the left of a line and height over it of points [N]; inf beyond its ends."""
+    """Distance to the left of a line and height above it of points [N]; inf beyond its ends."""
     left, height = np.full(len(points), np.inf), np.full(len(points), np.inf)
     for a, b in pairwise(line):
         d = b[:2] - a[:2]
@@ -304,7 +308,7 @@ def _across(line: Float, points: Float) -> tuple[Float, Float]:
 
 
 def _neighbours(lanes: list[Lane]) -> list[Lane]:
-    """Lanes that run beside each other over most of the shorter one."""
+    """Mark lanes as adjacent that run side by side over most of the shorter one."""
     found = []
     for lane in lanes:
         beside: dict[str, str | None] = {"left": None, "right": None, "opposite": None}
@@ -330,23 +334,22 @@ def _neighbours(lanes: list[Lane]) -> list[Lane]:
 LaneSource = Literal["map", "log", "none"]
 LANE_SOURCES: tuple[str, ...] = get_args(LaneSource)
 MAP_REACH_M = 250.0
-"""Of a map of a whole town so much about the driven way is kept."""
+"""Part of a town map around the driven path that is used."""
 
 
 def lanes_of_log(log: DrivingLog, *, source: LaneSource = "map") -> LaneGraph | None:
-    """Lanes in the world frame of a log, heights as the map has them.
+    """Lanes in the world frame of a log, with the heights of the map.
 
     Args:
-        log: the drive; ``log.lanes`` come first, then the file that ``log.logged_map`` names.
-        source: ``map``: those of the map that the log comes with; ``log``: these, and where there
-            is no map, what the drive tells of lanes (:func:`.lanes_from_log`), if it tells
-            anything; ``none``: none.
+        log: the drive; ``log.lanes`` take precedence over the file of ``log.logged_map``.
+        source: ``map``: lanes of the log's map; ``log``: the same, or without a map, lanes
+            estimated from the drive (:func:`.lanes_from_log`), if possible; ``none``: none.
 
     Returns:
-        None where there are none.
+        None without lanes.
 
     Raises:
-        MapError: the map is damaged, or none of it lies near the drive; the message names the file.
+        MapError: the map is damaged, or far from the drive; the message names the file.
     """
     if source == "none":
         return None

@@ -38,18 +38,19 @@ AREAS: dict[str, AreaKind] = {
     "intersection_area": "junction",
 }
 GERMAN_LIMIT = re.compile(r"^de274(?:\.1)?-([0-9]+)$")
-"""A sign by its number in the German catalogue of 2017, whose last part is the limit [km/h]."""
+"""Sign number in the German catalogue of 2017; its last part is the limit [km/h]."""
 SPEED = re.compile(r"^\s*([0-9]+(?:\.[0-9]*)?)\s*(km/h|kmh|mph|m/s|mps)?\s*$")
 UNITS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0, None: 1 / 3.6}
 
 
 class Lanelet2Reader:
-    """Reads lanelets as lanes; their order, neighbours and junctions follow from shared points and
-    rims, speed limits, lights, stop lines and right of way from regulatory elements.
+    """Reads lanelets as lanes.
 
-    Places are ``local_x``, ``local_y`` and ``ele`` of the nodes where they have them; else
-    latitude and longitude about the middle of the file, on a plane (within some centimetres for
-    a few kilometres). Elements that an editor has marked as deleted are not there.
+    Order, neighbours and junctions follow from shared points and borders; speed limits, lights,
+    stop lines and right of way from regulatory elements. Positions are ``local_x``, ``local_y`` and
+    ``ele`` of the nodes if present, otherwise latitude and longitude on a plane about the centre of
+    the file (accurate to some centimetres over a few kilometres). Elements that an editor has
+    marked as deleted are ignored.
     """
 
     name = "lanelet2"
@@ -75,7 +76,7 @@ class _Relation:
 
 @dataclass
 class _Osm:
-    """A file's nodes as places, ways as node ids, and relations."""
+    """A file's nodes as positions, ways as node ids, and relations."""
 
     file: str
     places: dict[str, Float]
@@ -115,7 +116,7 @@ class _Osm:
         return [ref for kind, ref in named if kind == "way" and ref in self.ways]
 
     def notes(self) -> tuple[str, ...]:
-        """What was left out, by kind, with how many of them there are and the first names."""
+        """Skipped elements by kind, with their number and first names."""
         return tuple(
             f"{what}: {len(names)} ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})"
             for what, names in self.left_out.items()
@@ -214,13 +215,13 @@ def _graph(osm: _Osm, name: str) -> LaneGraph:
 
 
 def _rims(osm: _Osm, relation: _Relation) -> tuple[list[str], list[str]] | None:
-    """Node ids of both rims, each of one way or several that follow each other."""
+    """Node ids of both borders, each of one or several consecutive ways."""
     sides = [_chained(osm, osm.member_ways(relation, side)) for side in ("left", "right")]
     if any(len(side) < 2 for side in sides):
         return None
     left, right = sides
-    # Where rims run against each other the right one is turned round; which way the traffic
-    # goes then follows from the left rim lying to the left.
+    # If the borders run in opposite directions, the right one is reversed. The left border on the
+    # left side then determines the direction of traffic.
     a, b, c, d = (osm.places[n] for n in (left[0], left[-1], right[0], right[-1]))
     as_they_are = np.linalg.norm(a - c) + np.linalg.norm(b - d)
     if as_they_are > np.linalg.norm(a - d) + np.linalg.norm(b - c):

@@ -20,15 +20,15 @@ WIDTHS_M = (2.0, 8.0)
 
 class NuScenesMapReader:
     """Reads lanes and lane connectors along their arcs, drivable areas, crossings, stop lines and
-    traffic lights. Widths are the areas of the lanes' polygons over their lengths; the maps tell
-    no speed limits and no lanes beside each other.
+    traffic lights. Widths are the areas of the lanes' polygons divided by their lengths. The maps
+    contain neither speed limits nor adjacent lanes.
     """
 
     name = "nuscenes"
     expects = "a file of nuScenes' map expansion, such as maps/expansion/boston-seaport.json"
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a JSON file whose beginning names tables of the expansion."""
+        """Whether it is a JSON file that starts with tables of the expansion."""
         if not path.is_file() or path.suffix != ".json":
             return False
         head = head_of(path)
@@ -66,7 +66,7 @@ class _Tables:
         }
 
     def rows(self, name: str) -> list[dict[str, Any]]:
-        """Rows of a table; none where the file has no such table."""
+        """Rows of a table; empty if the file has no such table."""
         found: list[dict[str, Any]] = self.content.get(name, [])
         return found
 
@@ -109,7 +109,7 @@ class _Tables:
         return found
 
     def stop_lines(self, lanes: list[Lane]) -> list[StopLine]:
-        """Their polygons' longer middle lines, with the lanes that end or lie on them."""
+        """The longer centre lines of their polygons, with the lanes that end or lie on them."""
         graph = joined([lane for lane in lanes if lane.junction is None] or lanes)
         found = []
         for row in self.rows("stop_line"):
@@ -157,11 +157,11 @@ class _Tables:
 
 
 def along(path: Any, where: str) -> Float:
-    """Points [N, 3] about each metre of an arcline path: pieces of three segments, each a left
+    """Points [N, 3] about every metre of an arcline path: pieces of three segments, each a left
     turn, a straight line or a right turn (L, S, R).
 
     Raises:
-        MapError: a piece of no such shape, or longer than 10 km.
+        MapError: an invalid piece, or one longer than 10 km.
     """
     points: list[tuple[float, float, float]] = []
     for piece in path:

@@ -21,7 +21,7 @@ from .reader import MapError, damage_named, head_of, integer, number, read_xml
 
 # --- Links ---------------------------------------------------------------------------------------
 
-# Which lane continues as which: lane links, road links, junctions.
+# Connections between lanes: lane links, road links, junctions.
 
 
 class LaneEnd(NamedTuple):
@@ -39,10 +39,10 @@ ENDS = {"predecessor": "start", "successor": "end"}
 def joined_ends(
     roads: Mapping[str, OpenDriveRoad], junctions: list[ET.Element], file: str
 ) -> set[frozenset[LaneEnd]]:
-    """Pairs of lane ends that meet, whichever way traffic crosses them.
+    """Pairs of connected lane ends, independent of the direction of traffic.
 
     Raises:
-        MapError: a junction names a road that is not there.
+        MapError: a junction refers to a missing road.
     """
     found: set[frozenset[LaneEnd]] = set()
     for road in roads.values():
@@ -62,7 +62,7 @@ def joined_ends(
 
 
 def _within(road: OpenDriveRoad) -> Iterator[tuple[LaneEnd, LaneEnd]]:
-    """From section to section of a road, as either side says."""
+    """Connections between the sections of a road, as declared by either side."""
     for i, section in enumerate(road.sections):
         for lane in section.lanes.values():
             for link, step in (("successor", 1), ("predecessor", -1)):
@@ -82,7 +82,7 @@ def _within(road: OpenDriveRoad) -> Iterator[tuple[LaneEnd, LaneEnd]]:
 def _to_roads(
     road: OpenDriveRoad, roads: Mapping[str, OpenDriveRoad]
 ) -> Iterator[tuple[LaneEnd, LaneEnd]]:
-    """From the ends of a road to the roads that its links name."""
+    """Connections from the ends of a road to its linked roads."""
     for link, road_link in road.links.items():
         other = roads.get(road_link.element)
         if road_link.kind != "road" or other is None:
@@ -99,7 +99,7 @@ def _to_roads(
 def _through(
     junction: ET.Element, roads: Mapping[str, OpenDriveRoad], file: str
 ) -> Iterator[tuple[LaneEnd, LaneEnd]]:
-    """From the roads that lead to a junction to those that cross it."""
+    """Connections from incoming roads of a junction to its connecting roads."""
     name = junction.get("id", "")
     where = f"{file}: junction {name!r}"
     for connection in junction.findall("connection"):
@@ -120,7 +120,7 @@ def _through(
 def _facing_end(
     incoming: OpenDriveRoad, crossing: OpenDriveRoad, contact: str, junction: str
 ) -> str:
-    """The end of the incoming road that meets the crossing one."""
+    """The end of the incoming road at the connecting one."""
     link = crossing.links.get("predecessor" if contact == "start" else "successor")
     if link is not None and link.kind == "road" and link.element == incoming.road_id:
         return link.contact
@@ -138,7 +138,7 @@ def _end_of(road: OpenDriveRoad, contact: str, lane: int) -> LaneEnd:
 
 STOP_LINE_TYPES = {"294"}
 STOP_TYPES, YIELD_TYPES, SPEED_TYPES = {"206"}, {"205"}, {"274"}
-"""Of the German catalogue, which most makers of maps use."""
+"""Sign numbers of the German catalogue, used by most map makers."""
 LIGHT_TYPES = ("1.000.", "1000")
 REACH_M = 25.0
 """A stop line so near before a signal is the signal's."""
@@ -202,7 +202,7 @@ def _ruled(element: ET.Element, road: OpenDriveRoad, line: Road, file: str) -> t
             rules = facing == "none" or along == (facing == "+")
         if rules and _is_travelled(road, s, part.number):
             found.append(part)
-    # Where two sections meet, the one that traffic comes from waits.
+    # At the border of two sections, traffic stops at the end of the one it comes from.
     waits: dict[int, RoadLane] = {}
     for part in found:
         known = waits.setdefault(part.number, part)
@@ -222,7 +222,7 @@ def _is_travelled(road: OpenDriveRoad, s: float, lane: int) -> bool:
 def _signal(
     own: ET.Element, placed: ET.Element, line: Road, lanes: tuple[str, ...], file: str
 ) -> Signal:
-    """A signal as it is declared, where it is placed."""
+    """A signal as declared, at its position."""
     where = f"{file}: signal {own.get('id', '')!r}"
     s, t = number(placed, "s", where), number(placed, "t", where)
     x, y, z, heading = line.at(s, t)
@@ -271,7 +271,7 @@ def _stop_line(
 
 
 def _with_stop_line(signal: Signal, stop_lines: Mapping[str, StopLine]) -> Signal:
-    """The signal with the nearest line at which lanes that it rules wait."""
+    """The signal with the nearest stop line of its lanes."""
     if signal.kind not in ("traffic_light", "stop", "yield"):
         return signal
     place = np.array(signal.position[:2])
@@ -331,11 +331,11 @@ SAME_PLACE_M = 1e-4
 
 
 class OpenDriveReader:
-    """Reads ``.xodr``: every lane of every lane section becomes a lane of the graph, called
-    ``<road>.<section>.<lane>``, in the direction that its traffic drives.
+    """Reads ``.xodr``: every lane of every lane section becomes a lane of the graph, named
+    ``<road>.<section>.<lane>``, in its driving direction.
 
-    Lanes with no width anywhere are left out. Road marks say where lanes may be changed; lateral
-    shapes and heights of lanes above the road are not read.
+    Lanes with zero width are skipped. Road marks determine the allowed lane changes. Lateral shapes
+    and heights of lanes above the road are not read.
     """
 
     name = "opendrive"
@@ -358,7 +358,7 @@ class OpenDriveReader:
 
 @dataclass
 class _Build:
-    """What is known of a file on the way to its graph."""
+    """State of reading a file into a graph."""
 
     file: str
     root: ET.Element
@@ -415,7 +415,7 @@ class _Build:
         if kept.sum() < 2:
             return None
         kept[-1] = True
-        if steps[-1] <= SAME_PLACE_M:  # the end counts, not what lies just before it
+        if steps[-1] <= SAME_PLACE_M:  # the end counts, not a point just before it
             kept[-2] = kept.sum() == 2
         return Lane(
             lane_id(road.road_id, index, lane.number),
@@ -514,7 +514,8 @@ def _with_neighbours(
             return n, None, False
         return n, name, runs_along(road, other) == along
 
-    # Numbers grow to the left of the reference line; of a lane that runs against it, to its right.
+    # Numbers increase to the left of the reference line; to the right of a lane that runs against
+    # it.
     (left_n, left, same_left), (right_n, right, same_right) = (
         beside(step) for step in ((1, -1) if along else (-1, 1))
     )
@@ -549,9 +550,9 @@ def _check_version(root: ET.Element, file: str) -> None:
 
 
 def _geo_reference(root: ET.Element, file: str) -> str:
-    """Projection of the file, and what is to be added to its coordinates for it.
+    """Projection of the file, and the offset of its coordinates for it.
 
-    Coordinates stay those of the file: scenes ask for small ones.
+    Coordinates stay those of the file, because scenes need small ones.
     """
     text = " ".join((root.findtext("header/geoReference") or "").split())[:4000]
     offset = root.find("header/offset")

@@ -23,11 +23,11 @@ from .reader import MapError, integer, number
 MAX_LENGTH_M = 1e6
 STRAIGHT = 1e-12
 MIN_BEND = 1e-9
-"""A spiral whose heading bends less than this beyond an arc's, times its length, is an arc."""
+"""A spiral with a smaller change of curvature times length squared is an arc."""
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 Local = Callable[[Float], Float]
-"""From distances [K] along a piece to x, y and heading [K, 3] in the frame of its start."""
+"""Maps distances [K] along a piece to x, y and heading [K, 3] in the frame of its start."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class PlanView:
 
     @property
     def length(self) -> float:
-        """Of all pieces [m]."""
+        """Total length of the pieces [m]."""
         last = self.pieces[-1]
         return last.s + last.length
 
@@ -124,7 +124,7 @@ def line() -> Local:
 
 
 def arc(curvature: float) -> Local:
-    """A circle's arc of ``curvature`` [1/m], positive to the left."""
+    """A circular arc with ``curvature`` [1/m], positive to the left."""
     if abs(curvature) < STRAIGHT:
         return line()
 
@@ -138,9 +138,9 @@ def arc(curvature: float) -> Local:
 
 
 def spiral(start: float, end: float, length: float) -> Local:
-    """A clothoid whose curvature goes linearly from ``start`` to ``end`` [1/m].
+    """A clothoid with curvature linear from ``start`` to ``end`` [1/m].
 
-    Its place is the integral of (cos, sin)(k d + c d^2 / 2): with the square completed, Fresnel
+    Its position is the integral of (cos, sin)(k d + c d^2 / 2): with the square completed, Fresnel
     integrals.
     """
     change = (end - start) / length
@@ -148,7 +148,7 @@ def spiral(start: float, end: float, length: float) -> Local:
         return arc((start + end) / 2)
     scale = math.sqrt(math.pi / abs(change))
     sign = math.copysign(1.0, change)
-    # Of a curve with positive change of curvature; the other is its mirror image.
+    # Formula for an increasing curvature; a decreasing one is mirrored.
     k, c = sign * start, abs(change)
     rest = k * k / (2 * c)
     sin0, cos0 = fresnel(k / (c * scale))
@@ -164,8 +164,10 @@ def spiral(start: float, end: float, length: float) -> Local:
 
 
 def cubic(u: tuple[float, ...], v: tuple[float, ...], end: float, length: float) -> Local:
-    """The curve (u(p), v(p)) of two cubics for p from 0 to ``end``, by its arc length; ``length``
-    of the road goes to its whole, so that pieces meet where their files say."""
+    """The curve (u(p), v(p)) of two cubics for p from 0 to ``end``, by its arc length.
+
+    ``length`` of the road is scaled to the whole curve, so that pieces meet as in the file.
+    """
     grid = np.linspace(0.0, end, 257)
     du, dv = (np.polynomial.Polynomial(w).deriv() for w in (u, v))
     step = grid[1] - grid[0]
@@ -194,7 +196,7 @@ def _poly3(element: ET.Element, length: float, where: str) -> Local:
     if max(abs(w) for w in v) > 1e6:
         raise MapError(f"{where}: poly3 with a coefficient above a million")
     slope = np.polynomial.Polynomial(v).deriv()
-    # How far along u the curve is as long as its piece; arc length is never below the chord.
+    # Find u where the arc length reaches the length of the piece; arc length is at least the chord.
     grid = np.linspace(0.0, length, 4097)
     middle = (grid[1:] + grid[:-1]) / 2
     passed = np.concatenate([[0.0], np.cumsum(np.hypot(1.0, slope(middle)) * np.diff(grid))])
@@ -226,7 +228,7 @@ class Profile:
     """a + b d + c d^2 + d d^3 with d = s - start of the last record at or before s; 0 without one.
 
     Attributes:
-        starts: [R] float64, increasing places [m].
+        starts: [R] float64, increasing positions [m].
         rows: [R, 4] float64.
     """
 
@@ -234,8 +236,9 @@ class Profile:
     rows: Float
 
     def at(self, s: Float, *, until: float = np.inf) -> Float:
-        """Values [K] at places ``s`` [K]; a record that starts at ``until`` counts no more there,
-        so that ends of sections keep their own."""
+        """Values [K] at positions ``s`` [K]; a record that starts at ``until`` is ignored, so that
+        ends of sections keep their own values.
+        """
         if not len(self.starts):
             return np.zeros_like(s)
         looked_up = np.minimum(s, until - 1e-9)
@@ -253,7 +256,7 @@ def read_profile(
     their starts.
 
     Raises:
-        MapError: an attribute is absent or no number.
+        MapError: an attribute is missing or not a number.
     """
     rows = [[number(e, name, where) for name in (start, "a", "b", "c", "d")] for e in elements]
     table = np.array(sorted(rows, key=lambda row: row[0])).reshape(-1, 5)
@@ -287,15 +290,15 @@ KINDS: dict[str, LaneKind] = {
     "taxi": "bus",
     "walking": "sidewalk",
 }
-"""By the file's name in lower case; what is not here is no part of the carriageway."""
+"""By the file's lower-case name; other types are not part of the carriageway."""
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "": 1.0}
 CHANGES = {"none": (False, False), "increase": (True, False), "decrease": (False, True)}
-"""Of a lane's own mark: whether numbers may be crossed upwards, downwards."""
+"""For a lane's own mark: whether it can be crossed towards higher and lower numbers."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """What a road goes on as: another road at one of its ends, or a junction."""
+    """Continuation of a road: another road at one of its ends, or a junction."""
 
     kind: str
     element: str
@@ -309,8 +312,8 @@ class SectionLane:
     Attributes:
         number: negative to the right of the reference line.
         kind: of the lane.
-        inner, outer: [M] t of its rims at the section's places [m].
-        links: numbers of the lanes that it goes on as, by "predecessor" and "successor".
+        inner, outer: [M] t of its borders at the section's positions [m].
+        links: numbers of connected lanes, by "predecessor" and "successor".
         speed_limit: [m/s] or None.
         may_increase, may_decrease: whether its outer mark may be crossed.
     """
@@ -339,7 +342,7 @@ class OpenDriveRoad:
     """A <road>.
 
     Attributes:
-        road_id, junction: as in the file; ``junction`` None outside of junctions.
+        road_id, junction: as in the file; ``junction`` None outside junctions.
         length: [m].
         plan: reference line seen from above.
         elevation, roll: along it.
@@ -347,7 +350,7 @@ class OpenDriveRoad:
         links: by "predecessor" and "successor".
         sections: along s.
         element: for signals and objects.
-        s: [N] places at which everything is sampled [m].
+        s: [N] sampled positions [m].
     """
 
     road_id: str
@@ -372,7 +375,7 @@ def read_road(element: ET.Element, file: str) -> OpenDriveRoad:
     """A road of a file.
 
     Raises:
-        MapError: names file, road and what is wrong.
+        MapError: names the file, the road and the problem.
     """
     road_id = element.get("id", "")
     where = f"{file}: road {road_id!r}"
@@ -433,15 +436,14 @@ def _section_starts(
         raise MapError(f"{where}: its first lane section starts at s = {found[0][0]}, not at 0")
     found[0] = (0.0, found[0][1])
     ends = [s for s, _ in found[1:]] + [length]
-    # Sections of no length hold nothing that is driven on; files have them at ends of roads.
+    # Sections without length cannot be driven on; files have them at ends of roads.
     return [f for f, end in zip(found, ends, strict=True) if end - f[0] > SAME_S]
 
 
 def _sample_places(
     element: ET.Element, plan: PlanView, length: float, sections: list[float], where: str
 ) -> Float:
-    """Places at which all that changes along a road is sampled: every start of a record, and
-    regularly between."""
+    """Sampled positions of a road: every start of a record, and regular ones in between."""
     breaks = {0.0, length, *sections}
     for record in element.iter():
         if record.tag in ("elevation", "superelevation", "laneOffset", "geometry"):
@@ -473,7 +475,7 @@ def _sample_places(
 
 @dataclass(frozen=True)
 class _Stretch:
-    """Where a lane section lies: its road, the places sampled there, t of its middle line."""
+    """Geometry of a lane section: its road, the sampled positions, t of its centre line."""
 
     road: OpenDriveRoad
     start: float
@@ -506,7 +508,7 @@ def _read_section(element: ET.Element, at: _Stretch) -> Section:
 
 
 def _outer(lane: ET.Element, inner: Float, side: int, at: _Stretch) -> Float:
-    """t of the outer rim: the inner one and a width, or a border, which wins where both are."""
+    """t of the outer border: the inner one plus a width, or a border, which takes precedence."""
     borders = lane.findall("border")
     if borders:
         return at.middle + at.profile(borders)
@@ -540,7 +542,7 @@ def _section_lane(lane: ET.Element, n: int, rims: tuple[Float, Float], at: _Stre
 
 
 def _speed_limit(lane: ET.Element, at: _Stretch) -> float | None:
-    """Of the lane at the middle of its section, else of the road there."""
+    """Speed limit of the lane at the middle of its section, otherwise of the road there."""
     where, middle = at.where, (at.start + at.end) / 2
     own = [(at.start + number(e, "sOffset", where, 0.0), e) for e in lane.findall("speed")]
     types = [(number(e, "s", where), e) for e in at.road.element.findall("type")]

@@ -13,13 +13,13 @@ from ..scene import GaussianCloud, LaneGraph, Scene
 
 REACH_M = 25.0
 ABOVE_M = (-1.0, 0.7)
-"""Heights over the ground of the Gaussians that are drawn [m]: the road, and no trees over it."""
+"""Range of heights above the ground of drawn Gaussians [m]: the road, without trees."""
 PIXEL_M = 0.1
 COLOURS = {"driving": "#ffb454", "bus": "#ff7b72", "bicycle": "#7ee787", "sidewalk": "#79c0ff"}
 
 
 def draw_lanes(lanes: LaneGraph, scene: Scene, path: Path) -> None:
-    """A PNG of lanes over the Gaussians near the ground, around the way of the ego."""
+    """A PNG of lanes over the Gaussians near the ground, around the ego path."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -64,7 +64,7 @@ def _draw_lane(axes: Any, lane: Any, colour: str) -> None:
 def top_view(
     cloud: GaussianCloud, scene: Scene, low: Float, high: Float, *, pixel: float = PIXEL_M
 ) -> NDArray[np.uint8]:
-    """RGB uint8 [H, W, 3] of the Gaussians near the ground, rows along y; grey where none is."""
+    """RGB uint8 [H, W, 3] of the Gaussians near the ground, rows along y; grey if empty."""
     means = cloud.means.detach().cpu().numpy().astype(np.float64)
     inside = ((means[:, :2] > low) & (means[:, :2] < high)).all(axis=1)
     inside &= cloud.opacities.detach().cpu().numpy() > 0.3

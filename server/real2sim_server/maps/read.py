@@ -50,13 +50,13 @@ MAP_READERS: list[MapReader] = [
 
 
 def register_map_reader(reader: MapReader) -> None:
-    """Let :func:`read_map` know one more reader, from outside of this package.
+    """Register a reader from outside this package for :func:`read_map`.
 
     Args:
         reader: of a format that no other reader recognises.
 
     Raises:
-        ValueError: a reader of that name is registered.
+        ValueError: a reader with that name is registered.
     """
     if any(known.name == reader.name for known in MAP_READERS):
         raise ValueError(f"a map reader named {reader.name!r} is registered already")
@@ -71,7 +71,7 @@ def read_map(path: str | PathLike[str], *, format: str | None = None) -> LaneGra
         format: name of a reader; None: the first that recognises it.
 
     Raises:
-        MapError: nothing there, no reader knows it, or it is damaged: the message names the file.
+        MapError: missing, unknown format, or damaged; the message names the file.
     """
     file = Path(path)
     if not file.exists():

@@ -21,22 +21,22 @@ class MapReader(Protocol):
     """Reads one format of maps.
 
     Attributes:
-        name: of the format, as given to ``read_map(format=...)``.
-        expects: one line for users, what the file or folder must be.
+        name: of the format, for ``read_map(format=...)``.
+        expects: one line for users with the required file or folder.
     """
 
     name: str
     expects: str
 
     def recognises(self, path: Path) -> bool:
-        """Whether the file or folder looks like this format; cheap, and never raises."""
+        """Whether the file or folder has this format; cheap, and never raises."""
         ...
 
     def read(self, path: Path) -> LaneGraph:
         """The map at ``path``, in the map's own frame [m]: x and y seen from above, z up.
 
         Raises:
-            MapError: names the file, what is wrong and what is expected.
+            MapError: names the file, the problem and the expected content.
         """
         ...
 
@@ -45,13 +45,14 @@ class MapReader(Protocol):
 
 
 class MapError(ValueError):
-    """A map that cannot be read or does not fit; the message names the file, what is wrong and
-    what is expected."""
+    """A map that cannot be read or does not fit; the message names the file, the problem and the
+    expected content.
+    """
 
 
 @contextmanager
 def damage_named(where: str) -> Iterator[None]:
-    """Any error of the block as one of a damaged map, as far as a reader did not say it better.
+    """Convert any error of the block to a MapError of a damaged map, unless it already is one.
 
     Raises:
         MapError: with ``where`` and the error.
@@ -74,7 +75,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """The object in a file.
 
     Raises:
-        MapError: no such file, too large, no JSON, no object.
+        MapError: no such file, too large, not JSON, or not an object.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -99,10 +100,10 @@ def read_xml(path: Path, root: str) -> ET.Element:
 
     Args:
         path: of the file.
-        root: name that the element must have.
+        root: expected name of the element.
 
     Raises:
-        MapError: no such file, too large, no XML, declares a document type, another root.
+        MapError: no such file, too large, not XML, with a document type, or another root.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -123,7 +124,7 @@ def read_xml(path: Path, root: str) -> ET.Element:
 
 
 def head_of(path: Path, size: int = 4096) -> bytes:
-    """First bytes of a file; empty where it cannot be read."""
+    """First bytes of a file; empty if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(size)
@@ -132,10 +133,10 @@ def head_of(path: Path, size: int = 4096) -> bytes:
 
 
 def number(element: ET.Element, name: str, where: str, default: float | None = None) -> float:
-    """A finite attribute; ``default`` where it is absent.
+    """A finite attribute; ``default`` if it is missing.
 
     Raises:
-        MapError: absent without a default, no number, not finite.
+        MapError: missing without a default, not a number, or not finite.
     """
     text = element.get(name)
     if text is None and default is not None:
@@ -165,10 +166,10 @@ SAME_PLACE_M = 1e-3
 
 
 def between(left: Float, right: Float) -> tuple[Float, Float] | None:
-    """Centre line [N, 3] and widths [N] of the lane between two rims, each about a metre; None
-    where they have no length.
+    """Centre line [N, 3] and widths [N] of the lane between two borders, every metre or so; None if
+    they have no length.
 
-    Both rims are gone along at once, by their share of length, as Lanelet2 and Argoverse do.
+    Both borders are traversed in parallel, by their share of length, as in Lanelet2 and Argoverse.
     """
     if len(left) < 2 or len(right) < 2:
         return None
@@ -199,7 +200,7 @@ def _evenly(line: Float, count: int) -> Float:
 
 
 def joined(lanes: Iterable[Lane], **parts: Any) -> LaneGraph:
-    """A graph of lanes without their references to lanes that a cut-out of a map does not hold.
+    """A graph of lanes without references to lanes outside a map section.
 
     Raises:
         SceneError: as :meth:`LaneGraph.of`.

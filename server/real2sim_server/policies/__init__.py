@@ -1,5 +1,5 @@
-"""Planners compared: many episodes of many planners, their scores, a page that shows them, and a
-policy that is trained by behaviour cloning.
+"""Comparison of planners: many episodes of many planners, their scores, an HTML page, and a policy
+trained by behaviour cloning.
 
-Episodes are driven by the SDK, as a user would, and scored from what the worker recorded.
+The SDK drives the episodes, like a user, and scores come from the worker's recordings.
 """

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 # --- Posed images --------------------------------------------------------------------------------
 
 PERIOD_US = 100_000
-"""Between instants of a scene at which images are drawn."""
+"""Interval of the rendered images."""
 LATERAL_SIGMA, YAW_SIGMA = 1.0, 0.12
-"""Standard deviations of poses beside the path, cut at two of them [m], [rad]."""
+"""Standard deviations of perturbed poses, clipped at two of them [m], [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +68,11 @@ def log_images(log: DrivingLog, shape: PolicyShape) -> Iterator[PosedImage]:
 def scene_images(
     scene: Scene, shape: PolicyShape, *, shifted: int, seed: int
 ) -> Iterator[PosedImage]:
-    """Images drawn along the recorded path of a scene, and ``shifted`` beside it at each instant.
+    """Images rendered along the recorded path of a scene, with ``shifted`` perturbed poses per
+    time.
 
-    A policy that has only seen the path does not know how to come back to it (Pomerleau 1989
-    turned images for that; here the scene is drawn from where the vehicle would be).
+    A policy trained only on the path cannot return to it (Pomerleau 1989 rotated images instead;
+    here the scene is rendered from the perturbed pose).
     """
     rng = np.random.default_rng(seed)
     camera = scene.rig[shape.camera].resized(2 * shape.width)
@@ -95,22 +96,22 @@ def _random_offset(rng: np.random.Generator) -> NDArray[np.float64]:
 
 BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 32, 2e-3, 1e-4
 HOLD_OUT_EVERY = 5
-"""Every fifth frame is kept from training, to measure the error where it was not trained."""
+"""Every fifth frame is held out, to measure the error outside the training set."""
 YAW_WEIGHT = 4.0
-"""An error of a radian counts as much as one of so many units of position."""
+"""Units of position equivalent to an error of one radian."""
 RECOVERY_TIME = 1.5
-"""In which a vehicle beside the path is brought back to it [s]."""
+"""Time in which a perturbed vehicle returns to the path [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class CloningDataset:
-    """What the network is trained on, N examples.
+    """Training data of the network, N examples.
 
     Attributes:
         images: [N, 3, H, W] float32 in [-1, 1].
         states: [N, 4] float32.
-        poses: [N, K, 3] float32, what was driven, in units of the network.
-        held_out: [N] bool, kept from training.
+        poses: [N, K, 3] float32, driven poses, in units of the network.
+        held_out: [N] bool, excluded from training.
     """
 
     images: NDArray[np.float32]
@@ -122,15 +123,15 @@ class CloningDataset:
 def build_dataset(
     ego: Trajectory, shape: PolicyShape, images: Iterable[PosedImage]
 ) -> CloningDataset:
-    """Images with what the recording vehicle did next, in the frame of each of them.
+    """Images with the future poses of the recording vehicle, in the frame of each image.
 
-    A vehicle beside the path is brought back to it within ``RECOVERY_TIME``. Images so late that
-    the recording does not cover the plan are left out.
+    A perturbed vehicle returns to the path within ``RECOVERY_TIME``. Images are dropped if the
+    recording ends before the plan.
 
     Args:
         ego: the recorded drive.
         shape: input and output of the network.
-        images: on the path of the drive, or beside it.
+        images: on the path of the drive, or next to it.
 
     Raises:
         CommandError: too few are left.
@@ -158,8 +159,9 @@ def build_dataset(
 def expert_poses(
     ego: Trajectory, shape: PolicyShape, image: PosedImage
 ) -> NDArray[np.float32] | None:
-    """[K, 3] poses (x, y, yaw) that the recording vehicle came to, in the frame of the image's
-    vehicle, in units of the network; None where the recording ends before."""
+    """[K, 3] future poses (x, y, yaw) of the recording vehicle, in the frame of the image's
+    vehicle, in units of the network; None if the recording ends before.
+    """
     delays = (np.arange(shape.poses) + 1) * shape.spacing
     times = image.t_us + np.round(delays * 1e6).astype(np.int64)
     if times[-1] > ego.end_us:
@@ -197,8 +199,8 @@ def train_network(
         on_progress: called with (epochs done, all).
 
     Returns:
-        Weights by name, and figures: their number, mean errors of positions [m] on examples that
-        were trained on and on those held out.
+        Weights by name, and figures: their number, mean position errors [m] on training and
+        held-out examples.
     """
     import torch
 
@@ -288,11 +290,10 @@ def is_export(folder: Path) -> bool:
 
 
 def exported_shape(folder: Path, camera: str | None) -> PolicyShape:
-    """The shape of a policy that sees ``camera`` of an export, by default the one that looks most
-    nearly ahead.
+    """The shape of a policy for ``camera`` of an export, by default the most forward-looking one.
 
     Raises:
-        CommandError: there is no such camera, or the export was written in other formats only.
+        CommandError: there is no such camera, or the export has only other formats.
     """
     found = _content(folder)["cameras"]
     cameras = {one["name"]: np.array(one["T_vehicle_camera"]) for one in found}
@@ -308,10 +309,10 @@ def exported_examples(
     *,
     on_progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> CloningDataset:
-    """All frames of exports whose drive goes on for as long as a plan; ``ego_future`` is the plan.
+    """All frames of exports that cover a whole plan; ``ego_future`` is the plan.
 
-    Held out are the clips of other splits than ``train``; where there are none, every fifth frame
-    of each clip.
+    Clips of splits other than ``train`` are held out; without such clips, every fifth frame of each
+    clip.
 
     Args:
         folders: exports with the format ``labels``.

@@ -57,11 +57,11 @@ class WorkerTarget:
 
 @dataclass(frozen=True)
 class PlannedEpisode:
-    """An episode to drive in a session that is there.
+    """An episode to drive in an existing session.
 
     Attributes:
         policy: name of the planner.
-        case, seed: what is driven.
+        case, seed: of the episode.
         target: the worker.
         session_id, token: of the session.
     """
@@ -76,13 +76,13 @@ class PlannedEpisode:
 
 @dataclass(frozen=True)
 class DrivenEpisode:
-    """What a planner's process tells of an episode.
+    """Report of a planner's process about an episode.
 
     Attributes:
-        reason: why it ended; None where the planner failed.
-        error: what the planner raised, was refused for, or ended its process with.
+        reason: of the end; None if the planner failed.
+        error: exception of the planner, rejection, or end of its process.
         times_ms: median times of the stages [ms].
-        stills: (seconds since the start, JPEG) of the camera that looks ahead.
+        stills: (seconds since the start, JPEG) of the forward camera.
     """
 
     reason: str | None = None
@@ -94,7 +94,7 @@ class DrivenEpisode:
 class PlannerProcess:
     """A process in which planners drive, one episode after another.
 
-    Where a planner ends it, the next episode starts another.
+    If a planner ends the process, the next episode starts a new one.
     """
 
     def __init__(self) -> None:
@@ -166,7 +166,7 @@ def _serve(pipe: Connection) -> None:
                     load_planner(asked)
                 else:
                     answer = _driven(asked)
-            # Only what a pipe can carry: not every class of errors can be sent.
+            # Some exception classes cannot be sent through a pipe.
             except ValueError as error:
                 answer = ValueError(str(error))
             except real2sim.Real2SimError as error:
@@ -253,7 +253,7 @@ def _standstill_plan(obs: Observation, action: str) -> dict[str, Any]:
 
 
 class _StillCapture:
-    """Takes a few pictures of an episode on the way."""
+    """Captures a few pictures during an episode."""
 
     def __init__(self, session: DriveSession, options: Mapping[str, Any]) -> None:
         welcome = session.welcome
@@ -278,17 +278,17 @@ class _StillCapture:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeResult:
-    """One episode that was driven.
+    """A finished episode.
 
     Attributes:
-        policy, case, seed: which one.
+        policy, case, seed: of the episode.
         file: its recording.
-        recording: as read back from there.
-        reason: why it ended.
-        error: what its planner raised, was refused for, or ended its process with; such an episode
-            has no scores.
+        recording: read from the file.
+        reason: of the end.
+        error: exception of the planner, rejection, or end of its process; such an episode has no
+            scores.
         figures: steps, seconds, times.
-        stills: (seconds since the start, JPEG) of the camera that looks ahead.
+        stills: (seconds since the start, JPEG) of the forward camera.
     """
 
     policy: str
@@ -315,17 +315,17 @@ def run_episodes(
     *,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Run every episode; in the order of ``grid.episodes()``.
+    """Run every episode; results are in the order of ``grid.episodes()``.
 
     Args:
-        grid: what to run.
-        target: where.
-        folder: recordings go there, as ``case/policy/seed.r2e``.
+        grid: episodes to run.
+        target: the worker.
+        folder: for recordings, as ``case/policy/seed.r2e``.
         on_progress: called with (done, all).
 
     Raises:
         Real2SimError: the worker refuses, or has ended.
-        ValueError: a planner that does not exist, or cannot drive in a scene.
+        ValueError: an unknown planner, or one that cannot drive in a scene.
     """
     episodes = grid.episodes()
     with contextlib.ExitStack() as stack:
@@ -355,7 +355,7 @@ def _run_episode(
     folder: Path,
     free: SimpleQueue[PlannerProcess],
 ) -> EpisodeResult:
-    """Drive an episode in a free process; the session is made, recorded and ended from here."""
+    """Drive an episode in a free process; this function creates, records and ends the session."""
     policy, case, seed = episode
     file = folder / case.name / _file_name(policy) / f"{seed}.r2e"
     process = free.get()

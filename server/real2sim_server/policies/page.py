@@ -32,18 +32,18 @@ from .episodes import EpisodeResult
 
 COLORS = ("#1f6feb", "#d1495b", "#2a9d5c", "#e08a00", "#7b4fc9", "#0e8f9e", "#8a5a2b", "#555e68")
 TTC_SHOWN = 4.0
-"""Times to collision above this are drawn there [s]."""
+"""Maximum plotted time to collision [s]."""
 MARGIN = 14.0
 
 Array = NDArray[np.float64]
 
 
 def plot_curves(results: Sequence[EpisodeResult], policies: Sequence[str]) -> bytes:
-    """Speed, time to collision, lateral error and progress over time, of one case.
+    """Speed, time to collision, lateral error and progress over time, for one case.
 
     Args:
-        results: episodes of the case; the first seed is drawn strong, the others faint.
-        policies: all of them, in the order that gives them their colors.
+        results: episodes of the case; the first seed is drawn opaque, the others faint.
+        policies: all planners, in the order of their colors.
     """
     plt = _pyplot()
     figure, axes = plt.subplots(2, 2, figsize=(13, 6.4), dpi=90, sharex=True)
@@ -192,12 +192,12 @@ def film_episode(
     camera: str | None = None,
     width: int = 640,
 ) -> None:
-    """Write an MP4 of an episode as it is replayed, an image a step.
+    """Write an MP4 of a replayed episode, one image per step.
 
     Args:
         recording: the episode.
         replayer: of it, before its first entry.
-        scene: that it ran on.
+        scene: of the episode.
         path: file to write.
         camera: name; None: the first one.
         width: of the film [px].
@@ -285,7 +285,7 @@ class ScoreStatistics:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> ScoreStatistics | None:
-        """Of some values; None without any."""
+        """Statistics of values; None without any."""
         if not values:
             return None
         deviation = statistics.pstdev(values) if len(values) > 1 else None
@@ -294,14 +294,14 @@ class ScoreStatistics:
 
 @dataclass(frozen=True)
 class ScoreGroup:
-    """Episodes of one planner: of one case, or of all where ``case`` is None.
+    """Episodes of one planner in one case, or in all cases if ``case`` is None.
 
     Attributes:
-        scores: by name; None where it is undefined in every episode, or where a planner failed in
-            any: a mean over what is left would flatter it.
+        scores: by name; None if undefined in every episode, or if the planner failed in any: a mean
+            over the others would be biased in its favour.
         collisions, at_fault: summed.
-        reasons: of ending, counted.
-        failed: episodes in which the planner raised or sent what no vehicle can do.
+        reasons: of the ends, counted.
+        failed: episodes in which the planner raised, or sent an infeasible action.
     """
 
     policy: str
@@ -315,7 +315,7 @@ class ScoreGroup:
 
     @classmethod
     def of(cls, policy: str, case: str | None, results: Sequence[EpisodeResult]) -> ScoreGroup:
-        """Of at least one episode."""
+        """Statistics of at least one episode."""
         failed = sum(one.error is not None for one in results)
         found = [one.scores() for one in results]
         scores: dict[str, ScoreStatistics | None] = {}
@@ -347,7 +347,7 @@ def group_scores(results: Sequence[EpisodeResult]) -> list[ScoreGroup]:
 
 
 def report_figures(results: Sequence[EpisodeResult], folder: Path) -> dict[str, Any]:
-    """Everything for JSON; files relative to ``folder``."""
+    """All results as JSON values; files relative to ``folder``."""
     return {
         "metrics": metric_versions(),
         "groups": [asdict(group) for group in group_scores(results)],
@@ -370,11 +370,11 @@ def report_figures(results: Sequence[EpisodeResult], folder: Path) -> dict[str, 
 
 
 def unconfirmed_scores(figures: dict[str, Any], folder: Path) -> list[str]:
-    """Episodes of a report whose scores differ from those of their recordings; none if all agree.
+    """Episodes of a report with scores that differ from their recordings; empty if all agree.
 
     Args:
-        figures: as ``report_figures`` made them.
-        folder: that their files are relative to.
+        figures: from ``report_figures``.
+        folder: base of their relative file paths.
     """
     differing = []
     for episode in figures["episodes"]:

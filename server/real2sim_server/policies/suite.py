@@ -1,8 +1,8 @@
-"""Suites: the cases that planners are compared in.
+"""Suites: sets of cases for the comparison of planners.
 
-A suite is a JSON file, ``{"cases": [{"name": ..., "scene": ..., "reset": {...}}, ...]}``; its
-format is described in docs/policies.md. Files in the folder ``suites`` are shipped, and known by
-their names: a new suite, or a new case of one, needs nothing but its JSON.
+A suite is a JSON file, ``{"cases": [{"name": ..., "scene": ..., "reset": {...}}, ...]}``;
+docs/policies.md describes its format. Files in the folder ``suites`` are shipped and available by
+name: a new suite, or a new case, needs only its JSON.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from ..console import CommandError
 SHIPPED_SUITES = Path(__file__).with_name("suites")
 DEMO_SUITE = "demo"
 SET_BY_EVALUATION = frozenset({"seed", "sensors", "action", "privileged"})
-"""Fields of reset that no case may name: the seed, and what the planner needs."""
+"""Fields of reset that a case must not set: the seed, and the planner's needs."""
 
 
 class Case(BaseModel):
     """One kind of episode.
 
-    Each seed but 0 varies it: every number of ``reset`` that ``jitter`` names by its path, such as
-    ``agents.drivers.car_3.gap``, is drawn uniformly from its value plus or minus the one given.
-    Times (``_us``) are rounded to clock steps. Seed 0 is the case as it is written. For every seed
-    the worker draws what ``randomization`` and ``agents.spawn`` of ``reset`` name. Nothing else in
-    an episode is random: a case with none of them is the same for every seed.
+    Every seed except 0 varies the case: each number of ``reset`` that ``jitter`` names by its path,
+    such as ``agents.drivers.car_3.gap``, is sampled uniformly from its value plus or minus the
+    given one. Times (``_us``) are rounded to clock steps. Seed 0 is the unmodified case. For every
+    seed, the worker samples ``randomization`` and ``agents.spawn`` of ``reset``. An episode has no
+    other randomness: a case without these is the same for every seed.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -84,12 +84,12 @@ class Case(BaseModel):
 
 @dataclass(frozen=True)
 class EpisodeGrid:
-    """Which episodes are run: the product of planners, cases and seeds.
+    """Episodes to run: the product of planners, cases and seeds.
 
     Attributes:
         cases: kinds of episodes.
-        policies: planners by name, as ``load_planner`` takes them.
-        seeds: of every case that is random; the others are run with the first one alone.
+        policies: planners, names for ``load_planner``.
+        seeds: of every random case; the others run only with the first one.
     """
 
     cases: Sequence[Case]
@@ -107,10 +107,10 @@ class EpisodeGrid:
 
 
 def load_suite(suite: str | Path) -> list[Case]:
-    """Cases of a JSON file, or of the shipped suite of that name where there is no such file.
+    """Cases of a JSON file, or of the shipped suite with that name if there is no such file.
 
     Raises:
-        CommandError: no such file or suite, or a case that is not one; the sentence names it.
+        CommandError: no such file or suite, or an invalid case; the message names it.
     """
     path = Path(suite)
     shipped = SHIPPED_SUITES / f"{suite}.json"
@@ -126,10 +126,10 @@ def load_suite(suite: str | Path) -> list[Case]:
 def cases_as_recorded(
     scenes: Sequence[str], scenarios: Sequence[str], reset: Mapping[str, Any] | None = None
 ) -> list[Case]:
-    """One case for each scene and each scenario, as it is, with options of ``reset``.
+    """One case for each scene and each scenario, unmodified, with options of ``reset``.
 
     Raises:
-        CommandError: none is given, two that have one name, or an option that is not allowed.
+        CommandError: no scene or scenario, a duplicate name, or an invalid option.
     """
     options = dict(reset or {})
     try:

@@ -40,10 +40,10 @@ def resized(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
 def points_in_camera(
     log: DrivingLog, camera: Camera, frame: int, t_us: int, *, sweep: LidarSweep | None = None
 ) -> Float:
-    """The sweep of ``frame`` [N, 3] [m] in the frame of ``camera`` as it stood at ``t_us``.
+    """The sweep of ``frame`` [N, 3] [m] in the frame of ``camera`` at its pose at ``t_us``.
 
-    The motion of the recording vehicle between sweep and image is taken out. That of other
-    vehicles is not: it is a few decimetres at most, on few points.
+    Compensates the motion of the recording vehicle between sweep and image. The motion of other
+    vehicles is not compensated: it is a few decimetres at most, on few points.
 
     Args:
         sweep: of ``frame``; None reads it.
@@ -67,17 +67,17 @@ def tracks_mask(
     *,
     margin: float = 0.0,
 ) -> NDArray[np.bool_]:
-    """[H, W] bool, pixels whose centre lies within the outline of any box.
+    """[H, W] bool, pixels with their centre inside the outline of any box.
 
-    Occlusion by other things is ignored.
+    Occlusion by other objects is ignored.
 
     Args:
-        tracks: whose boxes count.
+        tracks: with the boxes.
         camera: gives size and K.
         T_world_camera: [4, 4], OpenCV camera frame.
-        t_us: when [us]; a track just outside its time span counts, see
+        t_us: time [us]; a track just outside its time span counts, see
             ``ObjectTrack.transform_near``.
-        margin: by which boxes grow on every side [m].
+        margin: enlarges boxes on every side [m].
     """
     poses = [(track.transform_near(t_us), track.size) for track in tracks]
     boxes = [box_corners(T, np.add(size, 2 * margin)) for T, size in poses if T is not None]
@@ -90,7 +90,7 @@ def objects_mask(
     """:func:`tracks_mask` of the objects of a scene, seen from its recording vehicle.
 
     Args:
-        only: ids of the objects that count; all by default.
+        only: ids of the objects to include; all by default.
     """
     objects = [o for name, o in scene.objects.items() if only is None or name in only]
     boxes = [o.box_at(t_us) for o in objects if o.trajectory.covers(t_us)]
@@ -106,7 +106,7 @@ def _boxes_mask(boxes: Iterable[Float], camera: Camera, T_world_camera: Float) -
 
 
 def box_outline(corners: Float, k: Float) -> Float:
-    """Convex hull [P, 2] [px] of a box on the image; empty where it lies behind the camera.
+    """Convex hull [P, 2] [px] of a box on the image; empty behind the camera.
 
     Args:
         corners: [8, 3] in the camera frame [m], in the order of ``box_corners``.
@@ -128,7 +128,7 @@ def box_outline(corners: Float, k: Float) -> Float:
 
 
 def fill_outline(mask: NDArray[np.bool_], outline: Float) -> None:
-    """Set the pixels of ``mask`` [H, W] whose centre lies in the convex ``outline`` [P, 2] [px]."""
+    """Set the pixels of ``mask`` [H, W] with their centre in the convex ``outline`` [P, 2] [px]."""
     if len(outline) < 3:
         return
     limit = np.array(mask.shape[::-1])
@@ -167,19 +167,19 @@ OPEN_MARGIN = 3
 GRADIENTS = np.linspace(5.0, 300.0, 40)
 """Candidates for the least gradient of the border (Sobel, of grey from 0 to 255)."""
 SKY_WEIGHT = 2.0
-"""How much more the spread of the sky's colours counts than that of the rest."""
+"""Weight of the variance of the sky's colours against the variance of the rest."""
 GROWING_GRADIENT = 40.0
-"""Greatest gradient across which the sky goes on beyond open columns."""
+"""Maximum gradient across which the sky grows beyond open columns."""
 MIN_SHARE = 0.005
 """Least part of the open columns that counts as sky, and as something else."""
 MIN_PATCH = 0.0005
 """Least part of an image that counts as a patch apart from the sky at the top."""
 ALIKE = 3.0
-"""Standard deviations within which a colour is one of the sky's."""
+"""A colour within this many standard deviations belongs to the sky."""
 MIN_DEVIATION = 4.0
-"""Of the sky's colours at least, since they may all be overexposed; of 0 to 255."""
+"""Minimum standard deviation of the sky's colours, of 255: they may all be overexposed."""
 TRIMMINGS = 3
-"""Rounds in which colours beyond that are dropped, such as those of a tree at the top."""
+"""Rounds of dropping outliers beyond that, such as a tree at the top."""
 BRIGHTER = 1.2
 """The sky is at least this many times as bright as the rest of the image."""
 CLEAR = 2
@@ -194,7 +194,7 @@ def sky_mask(
     *,
     sweep: LidarSweep | None = None,
 ) -> NDArray[np.bool_]:
-    """Pixels [H, W] of an image of a log that show the sky; without LiDAR none.
+    """Sky pixels [H, W] of an image of a log; none without LiDAR.
 
     Args:
         log: with poses.
@@ -223,7 +223,7 @@ def sky_mask(
 def still_surfaces(
     log: DrivingLog, camera: Camera, frame: int, image: NDArray[np.uint8]
 ) -> NDArray[np.bool_]:
-    """Pixels [H, W] that show neither the sky nor the inside of a box; see :func:`sky_mask`."""
+    """Pixels [H, W] outside the sky and outside all boxes; see :func:`sky_mask`."""
     sky = sky_mask(log, camera, frame, image)
     return np.asarray(_outside_of_boxes(log, camera, frame) & ~sky)
 
@@ -231,11 +231,11 @@ def still_surfaces(
 def sky_of_image(
     image: NDArray[np.uint8], blocked: NDArray[np.bool_], is_open: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Pixels [H, W] of an image that show the sky.
+    """Sky pixels [H, W] of an image.
 
     Args:
         image: [H, W, 3] RGB.
-        blocked: [H, W] pixels that do not show it.
+        blocked: [H, W] pixels that do not show the sky.
         is_open: [W] columns in which the search starts.
     """
     import cv2
@@ -276,8 +276,9 @@ def _above_horizon(camera: Camera, pose: Float) -> NDArray[np.bool_]:
 
 
 def _pixels(camera: Camera, points: Float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Column and row [M, 2] of the points [N, 3] in the camera frame that lie ahead, within the
-    columns of the image; and which those are [N]."""
+    """Column and row [M, 2] of the points [N, 3] in the camera frame that are in front of it and
+    within the columns of the image; and a mask [N] of these points.
+    """
     pixels, valid = camera.project(points)
     inside = valid & (points[:, 2] > 0) & (np.abs(pixels) < 1e6).all(1)
     inside &= (pixels[:, 0] >= 0) & (pixels[:, 0] < camera.width)
@@ -320,13 +321,14 @@ def _open_columns(
 
 
 def _first_row(ends: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Row [W] of the first pixel that is set in each column of [H, W]; H where there is none."""
+    """Row [W] of the first set pixel in each column of [H, W]; H if there is none."""
     return np.where(ends.any(0), ends.argmax(0), len(ends))
 
 
 def _merits(image: NDArray[np.uint8], ends: NDArray[np.int64]) -> Float:
-    """How well borders [T, W] part an image: 1 over the spreads of the colours above and below; 0
-    where hardly any pixel is on one of the sides."""
+    """Quality of borders [T, W]: 1 over the variances of the colours above and below; 0 if one of
+    the sides has almost no pixels.
+    """
     colours = image.astype(np.float64)
     products = colours[..., :, None] * colours[..., None, :]
     height, width = image.shape[:2]
@@ -340,7 +342,7 @@ def _merits(image: NDArray[np.uint8], ends: NDArray[np.int64]) -> Float:
 
 
 def _spreads(sums: Float) -> Float:
-    """Determinant and largest eigenvalue of covariances, added; of sums [T, 13] over pixels."""
+    """Determinant plus largest eigenvalue of covariances, from sums [T, 13] over pixels."""
     count = np.maximum(sums[:, :1], 1.0)
     mean = sums[:, 1:4] / count
     covariance = (sums[:, 4:] / count).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
@@ -364,7 +366,7 @@ def _near(values: Float, colours: Float) -> NDArray[np.bool_]:
 
 
 def _connected(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Labels [H, W] of the connected parts of a mask, 0 beside it, and the areas of all labels."""
+    """Labels [H, W] of the connected parts of a mask, 0 outside, and the areas of all labels."""
     import cv2
 
     found = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)

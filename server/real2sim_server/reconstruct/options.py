@@ -13,35 +13,35 @@ from ..maps import LANE_SOURCES, LaneSource
 
 
 class ReconstructError(ValueError):
-    """A log that cannot be reconstructed as asked; the message says what is missing or allowed."""
+    """A log that cannot be reconstructed; the message says what is missing or allowed."""
 
 
 @dataclass(frozen=True)
 class InitialiseOptions:
-    """How a log becomes Gaussians without training.
+    """Options for building Gaussians from a log without training.
 
     Attributes:
-        max_background, max_object: upper bounds of Gaussians in the background and in one object.
-        voxel: edge of the smallest thinning voxels [m]; they double with the distance from the
-            drive so that they never exceed ``voxel + voxel_per_metre * distance`` much.
+        max_background, max_object: maximum number of Gaussians in the background and per object.
+        voxel: edge of the smallest thinning voxels [m]. They double with the distance from the
+            drive and stay at about ``voxel + voxel_per_metre * distance`` or below.
         voxel_per_metre: growth of voxels with the distance from the drive.
         object_voxel: edge of thinning voxels in objects [m].
         ground_spacing: distance of the Gaussians on the road near the drive [m].
         max_range: LiDAR points farther from the sensor are dropped [m].
-        box_margin: how far outside its box a point still belongs to an object [m] (mirrors).
+        box_margin: distance outside its box at which a point belongs to an object [m] (mirrors).
         ground_clearance: height above the box bottom below which points are road, not object [m].
-        max_colour_frames: at most so many frames, evenly spread, give colours.
-        samples: best views that are averaged for the colour of a Gaussian.
-        sky_resolution: edge of a face of the sky's cube map [px].
-        feature_images: images of each camera, at most, whose features give points where no LiDAR
-            beam went; 0 for none.
-        stereo_images: images of each camera, at most, whose depths are found by sweeping planes
-            where no LiDAR beam went; 0 for none.
-        lanes: ``map``: of the map that the log comes with; ``log``: where there is none, gathered
-            from the drive; ``none``.
+        max_colour_frames: maximum number of frames for colours, evenly spread.
+        samples: number of best views to average for the colour of a Gaussian.
+        sky_resolution: edge length of a face of the sky's cube map [px].
+        feature_images: maximum number of images per camera for feature points in regions without
+            LiDAR returns; 0 for none.
+        stereo_images: maximum number of images per camera for plane-sweep depth in regions without
+            LiDAR returns; 0 for none.
+        lanes: ``map``: from the log's map; ``log``: without a map, collected from the drive;
+            ``none``.
 
     Raises:
-        ReconstructError: for a value out of range.
+        ReconstructError: a value is out of range.
     """
 
     max_background: int = 600_000
@@ -84,10 +84,10 @@ ReportStep = Callable[[int, int], None]
 
 
 class Stages:
-    """Times stages into ``timing_s`` and passes on their progress.
+    """Times stages into ``timing_s`` and reports their progress.
 
     Args:
-        on_progress: called when a stage begins, goes on and ends; may be None.
+        on_progress: called at the start, during and at the end of a stage; may be None.
         timing_s: seconds by stage, written; may be None.
     """
 
@@ -97,7 +97,7 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[ReportStep]:
-        """Run a stage; yields a function that takes steps done and steps in all."""
+        """Run a stage; yields a function that takes completed and total steps."""
 
         def report_step(done: int, total: int) -> None:
             if self._on_progress is not None:

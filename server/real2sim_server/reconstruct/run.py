@@ -22,18 +22,19 @@ from .training import OnTraining, TrainOptions, held_out_frames, train, with_box
 
 EVALUATED_FRAMES = 4
 MIN_VIEWS, STEPS_A_VIEW = 4, 30
-"""Views that uncertainty is found by after a training, at least, and one more a so many steps: a
-view costs about as much as one of them."""
+"""Minimum number of views for uncertainty after a training, and training steps per further view: a
+view costs about as much as a step.
+"""
 
 
 @dataclass(frozen=True)
 class TrainingFigures:
-    """What came out of training.
+    """Results of training.
 
     Attributes:
         iterations: of training; ``steps`` of them in this run, the rest before it was resumed.
         steps: see above.
-        seconds: that ``steps`` took.
+        seconds: duration of ``steps``.
         rate: steps per second.
         psnr, ssim: means over all held-out views at training size; PSNR in [dB].
         psnr_objects: PSNR over the boxes of moving objects in these views [dB].
@@ -56,22 +57,22 @@ class TrainingFigures:
 
 @dataclass(frozen=True)
 class ReconstructReport:
-    """What came out of a reconstruction.
+    """Results of a reconstruction.
 
     Attributes:
         scene: folder of the bundle.
         preview: PNG of a logged image above its rendered view.
         frames, cameras: of the log.
         objects: number of objects.
-        gaussians: in background and objects.
-        background_gaussians: in the background.
+        gaussians: number in background and objects.
+        background_gaussians: number in the background.
         gaussians_by_object: by object id.
         psnr_db: mean over the evaluated views, all pixels [dB].
-        psnr_lidar_db: likewise over the pixels that LiDAR covers [dB].
+        psnr_lidar_db: the same over the pixels that LiDAR covers [dB].
         evaluated_frames: indices of the frames behind these figures.
-        total_s: seconds for everything.
+        total_s: total duration [s].
         timing_s: seconds by stage.
-        training: figures of training; None without.
+        training: figures of training; None without training.
     """
 
     scene: str
@@ -92,14 +93,14 @@ class ReconstructReport:
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """How a scene is made from a log.
+    """Options for making a scene from a log.
 
     Attributes:
-        initialise: of stage 0; None takes those of ``training``.
+        initialise: options of stage 0; None uses those of ``training``.
         training: None builds from LiDAR without training.
-        box_noise: scatter added to the boxes of the log, to see how much training mends; see
-            ``with_box_noise``.
-        backend: of the renderer; training lies on its device.
+        box_noise: noise added to the boxes of the log, to measure how well training corrects it;
+            see ``with_box_noise``.
+        backend: of the renderer; training runs on its device.
     """
 
     initialise: InitialiseOptions | None = None
@@ -120,23 +121,23 @@ def reconstruct(
 ) -> ReconstructReport:
     """Build a scene from a log and write it as a bundle.
 
-    Besides the bundle ``out`` a preview ``<out name>.preview.png`` is left next to it, and by
-    training the folder ``<out name>.training`` with checkpoint, metrics and preview pictures.
+    Also writes a preview ``<out name>.preview.png`` next to ``out``. Training adds the folder
+    ``<out name>.training`` with checkpoint, metrics and preview pictures.
 
     Args:
         log: opened, or its folder.
-        out: folder of the bundle, by custom ``<name>.r2s``.
-        options: what is made of it; by default stage 0 as it comes.
-        resume: go on from the checkpoint of a run of the same arguments that was broken off.
+        out: folder of the bundle, by convention ``<name>.r2s``.
+        options: how to build the scene; by default stage 0 with its default options.
+        resume: continue from the checkpoint of an interrupted run with the same arguments.
         overwrite: replace an existing bundle.
-        on_progress: called with the stage, steps done and steps in all.
-        on_training: called with figures of training as it goes on.
+        on_progress: called with the stage, completed and total steps.
+        on_training: called with figures of training during the run.
 
     Raises:
         ReconstructError: the log has nothing to build from, or there is nothing to resume.
         LogError: the log cannot be read.
-        BundleError: ``out`` exists and may not be replaced.
-        RenderError: the renderer is not usable here; said before anything is read.
+        BundleError: ``out`` exists and ``overwrite`` is false.
+        RenderError: the renderer is not usable here; raised before anything is read.
     """
     options = options or ReconstructOptions()
     select_backend(options.backend)

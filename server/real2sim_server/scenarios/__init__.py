@@ -2,7 +2,7 @@
 
 
 class ScenarioError(ValueError):
-    """A file that is no scenario, or asks for something unsupported.
+    """An invalid scenario file, or one with unsupported features.
 
-    The message names the file, the line, and what to do.
+    The message names the file, the line, and a fix.
     """

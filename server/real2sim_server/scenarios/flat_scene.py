@@ -48,19 +48,20 @@ class Recorded(Protocol):
 def fitted_to_scene(
     board: Storyboard, scene: Recorded, *, start_us: int | None = None
 ) -> Storyboard:
-    """The storyboard with its roads laid along the scene's route, so that the ego begins where it
-    was recorded: places on roads by lane and s, places of the world by a rigid motion. Where the
-    storyboard does not place the ego nothing is moved.
+    """Place a storyboard on the scene's route, so that the ego starts at its recorded pose.
+
+    Positions on roads are mapped by lane and s, positions in the world by a rigid motion. If the
+    storyboard does not place the ego, nothing is moved.
 
     Args:
-        board: the storyboard; of its road network one lane's width, 3.5 m, and a straight course
-            are taken for granted where the scene has no map of its own.
+        board: the storyboard. If the scene has no map, its road network is assumed to be straight
+            with lanes 3.5 m wide.
         scene: to run it on.
-        start_us: when the episode begins [us]; None: at the start of the recording.
+        start_us: start of the episode [us]; None: start of the recording.
 
     Raises:
-        ScenarioError: the ego begins in a lane on the left of the road's reference line, whose
-            traffic the scene's route cannot be.
+        ScenarioError: the ego starts in a lane on the left of the road's reference line, which
+            cannot be mapped to the scene's route.
     """
     place = _ego_place(resolved(board))
     fields: dict[str, Any] = board.model_dump()
@@ -85,16 +86,15 @@ def fitted_to_scene(
 
 
 def begun_alone(board: Storyboard, network: RoadNetwork | None = None) -> StoryboardRun:
-    """The start of a storyboard without a scene: an ego that it does not put anywhere stands at
-    the origin.
+    """The start of a storyboard without a scene; an ego without a position is placed at the origin.
 
     Args:
         board: the storyboard.
         network: its roads; None: straight lanes along the x axis, s at x.
 
     Raises:
-        ScenarioError: the storyboard is about objects of a scene.
-        WorldError: what it asks for cannot be.
+        ScenarioError: the storyboard refers to objects of a scene.
+        WorldError: invalid content.
     """
     of_scene = next((e for e in board.entities if e.kind == "object"), None)
     if of_scene is not None:
@@ -121,7 +121,7 @@ def _straight_lanes(board: Storyboard) -> RouteNetwork:
 
 
 def _ego_place(board: Storyboard) -> Any:
-    """Its position; None: the storyboard does not place it."""
+    """Position of the ego; None if the storyboard does not place it."""
     ego = next((e.name for e in board.entities if e.kind == "ego"), None)
     places = [
         entry.action.position
@@ -150,7 +150,7 @@ def _axle_ahead(board: Storyboard, scene: Recorded) -> float:
 def _origin(
     place: WorldPosition, ahead: float, scene: Recorded, start_us: int | None
 ) -> tuple[float, float, float]:
-    """Where the file's frame is in the scene's, so that the ego's place is where it begins."""
+    """Pose of the file's frame in the scene that puts the ego at its start."""
     T = scene.ego.transform(scene.ego.start_us if start_us is None else start_us)
     yaw = math.atan2(T[1, 0], T[0, 0]) - float(place.h)
     x = float(place.x) + ahead * math.cos(float(place.h))
@@ -162,14 +162,14 @@ def _origin(
 # --- Flat scene -----------------------------------------------------------------------------------
 
 BEFORE, SECONDS = 60.0, 40.0
-"""How far the road goes back from where the ego begins [m]; length of the recorded drive [s]."""
+"""Length of the road behind the ego's start [m]; duration of the recorded drive [s]."""
 
 SLOWEST, GAIN = 5.0, 1.0
 """The recorded drive speeds up to this at least, so that it leads somewhere [m/s], [m/s^2]."""
 
 STEP_US = 100_000
 AWAY = (-1000.0, 0.0, -50.0)
-"""Where objects are that only lend their looks, out of sight [m]."""
+"""Out-of-sight position of objects that only provide appearances [m]."""
 ASPHALT, PAINT, GRASS = (0.33, 0.33, 0.35), (0.92, 0.92, 0.9), (0.42, 0.5, 0.36)
 COLOURS = {
     "car": (0.75, 0.16, 0.14), "van": (0.85, 0.85, 0.82), "truck": (0.2, 0.35, 0.6),
@@ -182,21 +182,21 @@ SH0 = 0.28209479177387814
 def flat_scene(
     board: Storyboard, road_file: Path | None = None, *, seconds: float = SECONDS
 ) -> Scene:
-    """A scene on which a storyboard can run by itself.
+    """A scene for a storyboard without a recording.
 
-    Its recorded drive begins where the storyboard puts the ego, as fast as it begins, in a vehicle
-    of its size, and goes along the lane there; without an ego it goes straight on from the origin.
+    Its recorded drive starts at the storyboard's ego position with the ego's speed and size, and
+    follows the lane. Without an ego it goes straight on from the origin.
 
     Args:
         board: the storyboard.
-        road_file: its road network in OpenDRIVE; without one lanes are those along the route.
+        road_file: its road network in OpenDRIVE; without one, lanes follow the route.
         seconds: length of the drive.
 
     Raises:
-        ScenarioError: the road network is needed and not there, or the storyboard is about objects
+        ScenarioError: the road network is required and missing, or the storyboard refers to objects
             of a scene.
         MapError: it cannot be read.
-        WorldError: the ego is put nowhere on it.
+        WorldError: the ego has no valid position on it.
     """
     graph = _graph(board, road_file)
     run = begun_alone(board, None if graph is None else GraphNetwork(graph))
@@ -237,7 +237,7 @@ def _graph(board: Storyboard, road_file: Path | None) -> LaneGraph | None:
 
 
 def _start(run: StoryboardRun) -> tuple[Place, float, dict[str, Any]]:
-    """Where the recorded drive begins, how fast, and what else the scene has of the ego."""
+    """Start of the recorded drive, its speed, and further ego properties of the scene."""
     if run.ego is None:
         return Place(0.0, 0.0, 0.0), SLOWEST, {}
     ego = run.entities[run.ego]
@@ -248,7 +248,7 @@ def _start(run: StoryboardRun) -> tuple[Place, float, dict[str, Any]]:
 
 
 def _gone(speed: float, t: float) -> float:
-    """Distance driven after ``t`` seconds [m]: at the initial speed, which rises to ``SLOWEST``."""
+    """Distance after ``t`` seconds [m], with the initial speed raised to at least ``SLOWEST``."""
     gaining = min(max(t - STEP_US * 1e-6, 0.0), max(SLOWEST - speed, 0.0) / GAIN)
     after = max(t - STEP_US * 1e-6 - gaining, 0.0)
     return speed * (t - after) + GAIN * gaining**2 / 2 + max(speed, SLOWEST) * after
@@ -299,7 +299,7 @@ class _Paint(NamedTuple):
 
 
 def _strip(path: LoggedPath, length: float, offsets: Float, paint: _Paint) -> GaussianCloud:
-    """Flat Gaussians beside a path."""
+    """Flat Gaussians along a path."""
     step, colour, z, dash = paint
     s = np.arange(0.0, length, step)
     s = s[(s % dash) < dash / 3] if dash else s
@@ -326,9 +326,11 @@ def _lane_lines(graph: LaneGraph | None) -> list[GaussianCloud]:
 
 
 def _looks() -> dict[str, SceneObject]:
-    """A person, and a box of each other category, which lend their looks. They stand out of sight
-    before the drive; what stands may be taken to do so for longer where an episode goes on beyond
-    the log."""
+    """A person, and a box per other category, that provide appearances.
+
+    They are out of sight, before the start of the drive. Stationary tracks may be extended when an
+    episode is longer than the log.
+    """
     found = {}
     for name, (size, _) in BOXES.items():
         before = Trajectory(
@@ -398,7 +400,7 @@ def _sky() -> Sky:
 
 
 def _cameras() -> tuple[Camera, ...]:
-    """One behind and above the ego, and one that looks ahead from its windscreen."""
+    """One camera behind and above the ego, and one looking ahead from its windscreen."""
     K = np.array([[460.0, 0.0, 320.0], [0.0, 460.0, 180.0], [0.0, 0.0, 1.0]])
     return (
         Camera("chase", 640, 360, K, _looking((-9.0, 0.0, 6.0), math.radians(16.0))),

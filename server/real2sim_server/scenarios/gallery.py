@@ -1,8 +1,8 @@
 """The gallery of corner cases: storyboards with parameters, for any scene with a road ahead.
 
-All are relative to the ego's start and lane, so they fit every scene; speeds are in m/s. Families
-and values follow Euro NCAP's test protocols of 2023 (AEB car-to-car, AEB/LSS vulnerable road user,
-lane support), rounded.
+All cases are relative to the ego's start and lane, so they fit every scene; speeds are in m/s.
+Families and values follow Euro NCAP's test protocols of 2023 (AEB car-to-car, AEB/LSS vulnerable
+road user, lane support), rounded.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ PICTURES = Path(__file__).parent / "pictures"
 
 @dataclass(frozen=True)
 class CornerCase:
-    """One of the gallery.
+    """A case of the gallery.
 
     Attributes:
-        name: to ask for it by.
-        title: what happens, in a sentence.
-        family: of what kind it is, such as ``crossing``.
+        name: unique name.
+        title: description in one sentence.
+        family: kind of case, such as ``crossing``.
         parameters: their defaults; lengths in m, speeds in m/s, times in s.
-        make: the storyboard's fields.
+        make: builds the storyboard's fields.
     """
 
     name: str
@@ -59,7 +59,7 @@ GALLERY: dict[str, CornerCase] = {}
 
 
 def corner_case(name: str) -> CornerCase:
-    """The case of a name, with or without the prefix ``gallery:``.
+    """The case with a name, with or without the prefix ``gallery:``.
 
     Raises:
         ValueError: there is none.
@@ -95,7 +95,7 @@ def case(
 # --- Parts ---------------------------------------------------------------------------------------
 
 EGO = {"size": (4.6, 1.85, 1.6), "centre": (1.35, 0.0, 0.8)}
-"""Of scenes that do not say more of their vehicle."""
+"""Default vehicle box of scenes without one."""
 
 CAR = {"size": (4.5, 1.85, 1.5), "centre": (1.35, 0.0, 0.75)}
 VAN = {"size": (5.4, 2.0, 2.3), "centre": (1.6, 0.0, 1.15)}
@@ -112,7 +112,7 @@ MASSES = {
 """By category, where it is no car [kg]."""
 
 EGO_WIDTH = 1.85
-"""Of the ego, where a share of it says what is hit [m]."""
+"""Width of the ego, for impact positions as a share of it [m]."""
 
 ALONG = {"h": 0.0, "relative": True}
 """In the direction of the ego's road, also in lanes on its left."""
@@ -121,7 +121,7 @@ AGAINST = {"h": 3.141592653589793, "relative": True}
 
 
 def ahead(ds: Any, *, lanes: int = 0, offset: Any = 0.0, **more: Any) -> Fields:
-    """A place in the ego's lane, or so many lanes on its left, so far ahead of it."""
+    """A position ahead of the ego, in its lane or ``lanes`` lanes to the left."""
     return {
         "kind": "relative_lane", "entity": "Ego", "lanes": lanes, "ds": ds, "offset": offset,
         **more,
@@ -129,7 +129,9 @@ def ahead(ds: Any, *, lanes: int = 0, offset: Any = 0.0, **more: Any) -> Fields:
 
 
 def beside(ds: Any, dt: Any, h: Any = 0.0) -> Fields:
-    """A place along and left of the road from the ego, headed against the road's direction."""
+    """A position relative to the ego along and to the left of the road, facing against its
+    direction.
+    """
     return {
         "kind": "relative_road", "entity": "Ego", "ds": ds, "dt": dt,
         "orientation": {"h": h, "relative": True},
@@ -137,12 +139,12 @@ def beside(ds: Any, dt: Any, h: Any = 0.0) -> Fields:
 
 
 def from_entity(entity: str, dx: Any, dy: Any = 0.0) -> Fields:
-    """A place along and left of an entity's own axes."""
+    """A position along and to the left of an entity's own axes."""
     return {"kind": "relative_object", "entity": entity, "dx": dx, "dy": dy}
 
 
 def put(entity: str, position: Fields, speed: Any = 0.0) -> list[Fields]:
-    """Where an entity begins, and how fast."""
+    """Initial position and speed of an entity."""
     return [
         {"entity": entity, "action": {"kind": "teleport", "position": position}},
         {"entity": entity, "action": {"kind": "speed", "speed": speed}},
@@ -150,13 +152,13 @@ def put(entity: str, position: Fields, speed: Any = 0.0) -> list[Fields]:
 
 
 def speed_to(speed: Any, rate: Any) -> Fields:
-    """To a speed by a constant acceleration [m/s^2]."""
+    """Change to a speed with constant acceleration [m/s^2]."""
     how = {"shape": "linear", "dimension": "rate", "value": rate}
     return {"kind": "speed", "speed": speed, "dynamics": how}
 
 
 def change(lanes: int, entity: str, seconds: Any) -> Fields:
-    """Into the lane so many on the left of an entity's."""
+    """Change to the lane ``lanes`` to the left of an entity's lane."""
     how = {"shape": "sinusoidal", "dimension": "time", "value": seconds}
     return {"kind": "lane_change", "lane": lanes, "relative_to": entity, "dynamics": how}
 
@@ -189,7 +191,7 @@ def near(entity: str, gap: Any, *, of: str = "Ego") -> Fields:
 
 
 def in_time(entity: str, seconds: Any) -> Fields:
-    """Once the ego's front would be at an entity in so many seconds."""
+    """Triggered when the ego's front is ``seconds`` from an entity."""
     return when(
         {
             "kind": "time_to_collision", "entities": ["Ego"], "entity": entity,
@@ -210,7 +212,7 @@ def event(name: str, start: Fields, *actions: Fields) -> Fields:
 def board(
     entities: list[tuple[str, str, Fields]], init: list[Fields], **events: list[Fields]
 ) -> Fields:
-    """Of entities (name, category, box), and of events by entity."""
+    """Storyboard fields from entities (name, category, box) and events by entity."""
     groups = [
         {
             "name": f"{name}_group", "entities": [name],
@@ -277,7 +279,7 @@ def hard_brake() -> Fields:
     gap=15.0, speed=8.0, slow=1.0, seconds=3.0,
 )  # fmt: skip
 def stop_and_go() -> Fields:
-    """A queue in which speeds change linearly."""
+    """A queue with linearly changing speeds."""
     init = put("target", ahead("${$gap + 6}"), "$speed")
     points = [("$seconds", "$slow"), (2.0, "$slow"), ("$seconds", "$speed")]
     profile = {
@@ -339,7 +341,7 @@ def cut_in_brake() -> Fields:
     reveal=25.0,
 )
 def cut_out() -> Fields:
-    """What stands is hidden by a van until then."""
+    """A van hides a stationary object until it leaves the lane."""
     init = put("leader", ahead("${$gap + 6}"), "$speed")
     init += put("standing", ahead(80.0))
     far = near("standing", "$reveal", of="leader")
@@ -352,7 +354,7 @@ def cut_out() -> Fields:
     ahead=45.0, time=2.0, acceleration=2.5, speed=6.0, length=10.0,
 )  # fmt: skip
 def pull_out() -> Fields:
-    """From beside the lane; sideways by the way that it has driven."""
+    """Pulls out from the roadside; its lateral motion depends on the driven distance."""
     init = put("parked", beside("$ahead", -2.8))
     how = {"shape": "sinusoidal", "dimension": "distance", "value": "$length"}
     aside = {"kind": "lane_change", "lane": 0, "relative_to": "Ego", "dynamics": how}
@@ -364,7 +366,7 @@ def pull_out() -> Fields:
     behind=20.0, speed=15.0, duration=2.5,
 )  # fmt: skip
 def lss_overtaking() -> Fields:
-    """Euro NCAP's overtaking vehicle, which comes back early."""
+    """Euro NCAP's overtaking vehicle, which returns too early."""
     init = put("overtaker", ahead("${-1 * $behind}", lanes=1, orientation=ALONG), "$speed")
     past = when(
         {
@@ -389,7 +391,7 @@ def lss_keep() -> Fields:
 
 @case("oncoming", "Wrong way: a car comes towards the ego in its lane", ahead=90.0, speed=8.0)
 def wrong_way() -> Fields:
-    """In the middle of the lane, all the way."""
+    """Drives against the traffic in the middle of the lane."""
     against = ahead("$ahead", orientation=AGAINST)
     return board([("ghost", "car", CAR)], put("ghost", against, "$speed"))
 
@@ -411,7 +413,7 @@ def ccfhos() -> Fields:
     ahead=120.0, speed=11.0, slow=6.0, distance=80.0, duration=2.0,
 )  # fmt: skip
 def ccfhol() -> Fields:
-    """Euro NCAP CCFhol: head-on, lane change; here it is the other car that changes lanes."""
+    """Euro NCAP CCFhol: head-on, lane change; here the other car changes lanes."""
     init = put("overtaken", ahead("${$ahead - 30}", lanes=1), "$slow")
     init += put("overtaker", ahead("$ahead", lanes=1), "$speed")
     out = event("move_out", near("overtaker", "$distance"), change(0, "Ego", "$duration"))
@@ -423,7 +425,7 @@ def ccfhol() -> Fields:
     ahead=90.0, speed=8.0, distance=45.0, drift=2.0,
 )  # fmt: skip
 def lss_oncoming() -> Fields:
-    """Euro NCAP's oncoming vehicle, which is the one that drifts here."""
+    """Euro NCAP's oncoming vehicle, which drifts in this case."""
     init = put("oncoming", ahead("$ahead", lanes=1), "$speed")
     how = {"shape": "sinusoidal", "acceleration": 0.8}
     aside = {"kind": "lane_offset", "offset": "$drift", **how}
@@ -437,9 +439,9 @@ def lss_oncoming() -> Fields:
     ahead=50.0, time=2.2, radius=7.0, acceleration=3.0, speed=7.0,
 )  # fmt: skip
 def ccftap() -> Fields:
-    """Euro NCAP CCFtap: front turn across path; here it is the other car that turns.
+    """Euro NCAP CCFtap: front turn across path; here the other car turns.
 
-    By default it is in the middle of the ego's lane when the ego comes.
+    By default it is in the middle of the ego's lane when the ego arrives.
     """
     init = put("turner", ahead("${$ahead + $radius}", lanes=1))
     corner = [(0.0, 0.0, 1.0), ("$radius", 0.0, 0.7071067811865476), ("$radius", "$radius", 1.0)]
@@ -460,11 +462,11 @@ def ccftap() -> Fields:
 
 # --- Crossing ------------------------------------------------------------------------------------
 
-# A crossing actor starts when the ego reaches the distance from which both meet; the actor then is
-# at a share of the ego's width, counted from the side it comes from.
+# A crossing actor starts when the ego reaches the distance at which both meet. The actor is then at
+# a share of the ego's width, measured from the side that it comes from.
 
 NEAR, FAR = -1.0, 1.0
-"""Side that somebody comes from: right or left."""
+"""Side that the actor comes from: right or left."""
 
 
 @case(
@@ -580,7 +582,7 @@ def animal() -> Fields:
     ahead=45.0, distance=35.0, speed=8.0,
 )  # fmt: skip
 def junction_crossing() -> Fields:
-    """Whatever the ego does, until they meet."""
+    """Constant motion independent of the ego, until they meet."""
     start = beside("$ahead", "${-1 * $distance}", 1.5707963267948966)
     meet = {
         "kind": "synchronize",

@@ -1,6 +1,6 @@
-"""Pictures of corner cases from above: where everybody comes from, and where they meet.
+"""Top views of corner cases with the paths of all entities and their meeting point.
 
-``python -m real2sim_server.scenarios.picture`` writes those that are shipped, into
+``python -m real2sim_server.scenarios.picture`` writes the shipped pictures into
 ``scenarios/pictures``.
 """
 
@@ -21,12 +21,12 @@ from .flat_scene import fitted_to_scene, flat_scene
 from .gallery import GALLERY, PICTURES, CornerCase, corner_case
 
 EGO_SPEED = 10.0
-"""At which the ego goes on straight in the pictures [m/s]."""
+"""Speed of the ego, straight ahead, in the pictures [m/s]."""
 
 MAX_DURATION_S = 12.0
 LANE, MARGIN = 3.5, 6.0
 MAX_WIDTH_M = 20.0
-"""To either side of the ego's lane [m]."""
+"""Maximum distance to either side of the ego's lane [m]."""
 
 ASPECT = 3.0
 """Width by height, of all pictures."""
@@ -44,11 +44,11 @@ class BoxPose(NamedTuple):
 
 
 class DrivenBox(NamedTuple):
-    """Somebody's way through a case.
+    """Path of an entity through a case.
 
     Attributes:
         size: length and width [m].
-        poses: one a clock step.
+        poses: one per time step.
     """
 
     size: tuple[float, float]
@@ -56,8 +56,10 @@ class DrivenBox(NamedTuple):
 
 
 def picture_of(case: CornerCase, scene: Scene) -> str:
-    """An SVG document of a case: an ego that goes straight on, and everybody else, from the start
-    (pale) to where the ego meets one of them, or has passed.
+    """An SVG document of a case.
+
+    The ego drives straight ahead. All entities are shown from the start (pale) until the ego meets
+    one of them, or has passed.
 
     Args:
         case: of the gallery, with its default parameters.
@@ -67,7 +69,7 @@ def picture_of(case: CornerCase, scene: Scene) -> str:
 
 
 def plain_scene() -> Scene:
-    """A straight road with lanes on which cases are driven."""
+    """A straight road with lanes for the pictures."""
     return flat_scene(_with_speed(corner_case("ccrs").storyboard()))
 
 
@@ -88,7 +90,7 @@ def _with_speed(board: Storyboard) -> Storyboard:
 
 
 def _courses(case: CornerCase, scene: Scene) -> list[DrivenBox]:
-    """That of the ego first; relative to where it begins."""
+    """Paths of all entities, the ego first; relative to its start."""
     board = fitted_to_scene(_with_speed(case.storyboard()), scene)
     spec = ResetSpec(
         storyboard=board.model_copy(update={"drives_ego": True}),
@@ -114,7 +116,7 @@ def _courses(case: CornerCase, scene: Scene) -> list[DrivenBox]:
 
 
 def _passed(courses: Sequence[DrivenBox]) -> bool:
-    """Whether the ego, the first, has left all others behind that it could meet."""
+    """Whether the ego, the first entity, has passed all others that it could meet."""
     ego, *others = courses
     rear = ego.poses[-1].x - ego.size[0]
     behind = all(o.poses[-1].x + o.size[0] / 2 < rear and o.poses[0].x > 0 for o in others)
@@ -146,7 +148,7 @@ def _drawn(title: str, courses: Sequence[DrivenBox]) -> str:
 
 
 def _road(low: float, high: float, half: float) -> list[str]:
-    """The ego's lane and the next on its left, and what is beside them; y is down in pictures."""
+    """The ego's lane, the next one on its left, and the surroundings; y points down in pictures."""
     width = high - low
     found = [
         f'<rect x="{low:.1f}" y="{-half:.1f}" width="{width:.1f}" height="{2 * half:.1f}" '

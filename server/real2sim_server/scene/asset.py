@@ -22,19 +22,19 @@ from .scene import box_size
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """A cluster of Gaussians with a box, ready to be inserted into any scene. Immutable.
+    """A cluster of Gaussians with a box that can be inserted into any scene. Immutable.
 
     Attributes:
-        asset_id: name of the asset, unique where assets are kept.
-        category: class of the thing, for example ``car``.
+        asset_id: unique within an asset library.
+        category: class of the object, for example ``car``.
         size: (length, width, height) along the asset's x, y, z [m].
         cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
-        provenance: where it comes from (JSON values only).
-        content_hash: SHA-256 of the bundle it was read from or written to; empty before that.
-        figure: of a person who walks, whose ``cloud`` is in the rest pose; or None.
+        provenance: origin of the asset (JSON values only).
+        content_hash: SHA-256 of the bundle on disk; empty if not saved.
+        figure: of a walking person, with ``cloud`` in the rest pose; or None.
 
     Raises:
-        SceneError: when ``size`` is not three positive lengths, or the figure is of another cloud.
+        SceneError: ``size`` is not three positive lengths, or the figure belongs to another cloud.
     """
 
     asset_id: str
@@ -99,16 +99,16 @@ def person_asset(
     gaussians: int = GAUSSIANS,
     style: GaitStyle | None = None,
 ) -> Asset:
-    """A person who walks along any trajectory.
+    """A person who can walk along any trajectory.
 
     Args:
         asset_id: name of the asset.
-        build: a build of the body model, ``woman`` or ``boy`` for example.
-        height: of the person; default: of the build [m].
+        build: a build of the body model, for example ``woman`` or ``boy``.
+        height: of the person [m]; default: height of the build.
         clothes: colours that differ from ``CLOTHES``.
-        worn: of ``WORN``.
-        gaussians: their number.
-        style: how the person walks.
+        worn: garments from ``WORN``.
+        gaussians: number of Gaussians.
+        style: walking style.
 
     Raises:
         SceneError: an unknown build, garment or piece of clothing, a height outside (0.4, 2.6), or
@@ -163,8 +163,9 @@ def _extent(body: Body) -> tuple[Float, Float]:
 def _samples(
     body: Body, triangles: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.int64], Float]:
-    """Vertices [N, 3] of triangles, chosen by area, and barycentric shares [N, 3]; those of the
-    same body come out the same again."""
+    """Vertices [N, 3] of triangles, sampled by area, and barycentric coordinates [N, 3]; the same
+    for the same body.
+    """
     area = _areas(body, triangles)
     # Evenly along the summed area, so that no patch stays bare.
     along = (np.arange(count) + 0.5) / count * area.sum()

@@ -33,12 +33,13 @@ class Shutter:
     """The readout of an image.
 
     Attributes:
-        direction: ``global``: all pixels at once; or which rows or columns come first.
-        readout_us: time from the first to the last row or column [us]; 0 where ``global``. The
-            instant of an image is the middle of it.
+        direction: ``global``: all pixels at once; otherwise the rows or columns that are read
+            first.
+        readout_us: time from the first to the last row or column [us]; 0 if ``global``. The time
+            of an image is the middle of its readout.
 
     Raises:
-        SceneError: for an unknown direction, or a read-out that is not 1 to 200,000 us.
+        SceneError: an unknown direction, or a readout outside 1 to 200,000 us.
     """
 
     direction: ShutterDirection = "global"
@@ -68,13 +69,16 @@ class Shutter:
 
     def line_times(self, width: int, height: int) -> NDArray[np.float64]:
         """Exposure time of each row (or column), 0 to 1 over the readout; NCore's convention: the
-        first at 0, the last at 1."""
+        first at 0, the last at 1.
+        """
         count = height if self.by_row else width
         times = np.arange(count) / max(count - 1, 1)
         return times if self.direction in {"top_to_bottom", "left_to_right"} else 1 - times
 
     def times_at(self, pixels: Float, width: int, height: int) -> Float:
-        """Exposure times of positions [..., 2] [px]; outside the image, those of its edge."""
+        """Exposure times of positions [..., 2] [px]; positions outside the image get the time of
+        its edge.
+        """
         axis, count = (1, height) if self.by_row else (0, width)
         line = np.clip(np.floor(np.nan_to_num(pixels[..., axis])), 0, count - 1).astype(np.int64)
         return self.line_times(width, height)[line]
@@ -92,11 +96,11 @@ T_VEHICLE_OPTICAL = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """The optics before the images were undistorted; sizes are the camera's.
+    """The optics before the images were undistorted, at the camera's image size.
 
     Attributes:
         K: [3, 3] float64 [px].
-        lens, shutter: as of :class:`Camera`.
+        lens, shutter: as in :class:`Camera`.
     """
 
     K: NDArray[np.float64]
@@ -111,16 +115,15 @@ class Camera:
     Attributes:
         name: unique on its rig.
         width, height: image size [px].
-        K: [3, 3] float64, intrinsics [px]; pixel centres lie at +0.5.
+        K: [3, 3] float64, intrinsics [px]; pixel centres are at +0.5.
         T_vehicle_camera: [4, 4] float64; camera frame is OpenCV (x right, y down, z forward).
         lens: distortion; None for the pinhole.
-        shutter: how images are read out.
-        recorded: what the device really is whose images a log holds free of distortion; None
-            where nothing else is known.
+        shutter: readout of the images.
+        recorded: optics of the device, if the log contains undistorted images; None if unknown.
 
     Raises:
-        SceneError: for sizes below 1, a K without positive focal lengths, a pose that is no
-            rigid transform, or a lens that does not reach what its image shows.
+        SceneError: sizes below 1, a K without positive focal lengths, a pose that is not a rigid
+            transform, or a lens that does not cover the image.
     """
 
     name: str
@@ -172,8 +175,9 @@ class Camera:
             )
 
     def as_recorded(self) -> Camera:
-        """The device itself, with the distortion and the shutter that its images had; the same
-        camera where nothing else is known."""
+        """The device itself, with its original distortion and shutter; the same camera if these are
+        unknown.
+        """
         if self.recorded is None:
             return self
         optics = self.recorded
@@ -191,7 +195,8 @@ class Camera:
 
     def project(self, points: Float) -> tuple[Float, NDArray[np.bool_]]:
         """Image positions [..., 2] [px] of points [..., 3] in the camera frame, and whether the
-        lens sees them; they may lie beside the image. What is not seen lies anywhere."""
+        lens sees them. Positions can be outside the image; those of unseen points are arbitrary.
+        """
         points = np.asarray(points, dtype=np.float64)
         if self.lens is not None:
             plane, valid = self.lens.distort(points)
@@ -224,11 +229,11 @@ class Camera:
         return replace(self, width=width, height=height, K=self.K * scale, recorded=recorded)
 
     def viewmat(self, T_world_vehicle: Float) -> Float:
-        """``T_camera_world`` [4, 4] when the vehicle stands at ``T_world_vehicle``."""
+        """``T_camera_world`` [4, 4] for the vehicle pose ``T_world_vehicle``."""
         return invert_transform(self.pose(T_world_vehicle))
 
     def pose(self, T_world_vehicle: Float) -> Float:
-        """``T_world_camera`` [4, 4] when the vehicle stands at ``T_world_vehicle``."""
+        """``T_world_camera`` [4, 4] for the vehicle pose ``T_world_vehicle``."""
         return T_world_vehicle @ self.T_vehicle_camera
 
 
@@ -309,8 +314,11 @@ class CameraMotion:
 
 
 def moved(pose: Float, linear: Any, angular: Any, seconds: float) -> Float:
-    """A pose [4, 4] after ``seconds`` of uniform motion: ``linear`` [3] of its own origin [m/s],
-    ``angular`` [3] about it [rad/s], both in the world."""
+    """A pose [4, 4] after ``seconds`` of uniform motion.
+
+    ``linear`` [3] is the velocity of its origin [m/s], ``angular`` [3] the rotation about it
+    [rad/s], both in the world frame.
+    """
     found = np.array(pose, dtype=np.float64)
     found[:3, :3] = turned(np.asarray(angular, dtype=np.float64) * seconds) @ found[:3, :3]
     found[:3, 3] += np.asarray(linear, dtype=np.float64) * seconds

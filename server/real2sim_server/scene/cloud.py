@@ -84,10 +84,10 @@ def _tensor_basis(directions: Tensor, count: int) -> Tensor:
 
 
 def sh_rotation(rotation: Float, degree: int) -> Float:
-    """Matrix [K, K] float64 that turns SH coefficients along with ``rotation`` [3, 3].
+    """Matrix [K, K] float64 that rotates SH coefficients by ``rotation`` [3, 3].
 
-    The turned function at R d equals the original at d. Each band is closed under rotation, so the
-    matrix is block-diagonal; a block is the exact solution of an overdetermined linear system over
+    The rotated function at R d equals the original at d. Each band is closed under rotation, so the
+    matrix is block-diagonal. A block is the exact solution of an overdetermined linear system over
     fixed directions.
     """
     directions = _spread_directions()
@@ -97,7 +97,7 @@ def sh_rotation(rotation: Float, degree: int) -> Float:
     for band in range(degree + 1):
         part = slice(band * band, (band + 1) ** 2)
         matrix[part, part] = np.linalg.lstsq(after[:, part], before[:, part], rcond=None)[0]
-    # Rounding noise, which would make turning by nothing change bits.
+    # Without rounding noise, the identity rotation changes no bits.
     matrix[np.abs(matrix) < 1e-12] = 0
     return matrix
 
@@ -137,12 +137,12 @@ class GaussianCloud:
         sh: [N, K, 3] float32, spherical harmonics, K = (degree + 1)^2, degree 0 to 3; RGB is
             ``clamp(sum_k sh_k Y_k(direction) + 0.5, min=0)`` with the direction in the cloud's
             own frame, the basis of :func:`~.spherical_harmonics.sh_basis`.
-        uncertainties: [N] float32 in [0, 1], expected absolute error of the colour where training
-            rays tell it, UNSEEN where none does; None where it is not known.
+        uncertainties: [N] float32 in [0, 1], expected absolute error of the colour, UNSEEN for
+            Gaussians without training rays; None if unknown.
 
     Raises:
-        SceneError: on shapes that do not fit together, a dtype other than float32, or tensors on
-            different devices. Values are not looked at; :meth:`check_values` does that.
+        SceneError: shapes do not match, a dtype is not float32, or tensors are on different
+            devices. Values are not checked; use :meth:`check_values`.
     """
 
     means: Tensor
@@ -226,8 +226,9 @@ class GaussianCloud:
         return GaussianCloud(**{name: t[index].contiguous() for name, t in self.tensors().items()})
 
     def by_importance(self) -> Tensor:
-        """Indices [N] int64, largest coverage first: by opacity times the area [m^2] of the
-        largest ellipse; equals keep their order."""
+        """Indices [N] int64, largest coverage first: by opacity times the area [m^2] of the largest
+        ellipse. The sort is stable.
+        """
         largest = self.scales.sort(dim=1, descending=True).values[:, :2]
         return torch.argsort(self.opacities * largest.prod(dim=1), descending=True, stable=True)
 
@@ -277,20 +278,20 @@ class GaussianCloud:
         )
 
     def stretched(self, factors: tuple[float, float, float]) -> GaussianCloud:
-        """The Gaussians multiplied about the origin along the axes of their frame; colours keep
-        their directions.
+        """The Gaussians scaled about the origin along the axes of their frame; colours keep their
+        directions.
 
         Args:
             factors: of x, y and z, > 0.
 
         Raises:
-            SceneError: for a factor that is not positive.
+            SceneError: a factor is not positive.
         """
         if not all(np.isfinite(f) and f > 0 for f in factors):
             raise SceneError(f"factors of a cloud must be positive, not {factors}")
         by = torch.tensor(factors, dtype=torch.float64, device=self.device)
         turns = torch.from_numpy(quaternion_to_matrix(self.quats.cpu().numpy())).to(self.device)
-        # Columns: the axes of each ellipsoid, as long as it is; its covariance is axes axes^T.
+        # Columns are the scaled axes of each ellipsoid; its covariance is axes axes^T.
         axes = by[:, None] * turns * self.scales.double()[:, None, :]
         variances, vectors = torch.linalg.eigh(axes @ axes.transpose(1, 2))
         vectors = vectors * torch.linalg.det(vectors).sign()[:, None, None]
@@ -309,8 +310,9 @@ class GaussianCloud:
             what: name of the cloud for the message.
 
         Raises:
-            SceneError: values that are not finite, scales not positive, opacities or uncertainties
-                outside [0, 1] or quaternions that are not unit length, each with the count.
+            SceneError: values are not finite, scales not positive, opacities or uncertainties
+                outside
+                [0, 1], or quaternions not of unit length, each with the count.
         """
         parts = self.tensors()
         for name, tensor in parts.items():
@@ -359,18 +361,18 @@ BASES = ("cosine", "real_dft")
 class TimeColour:
     """Time-dependent offset of the constant part of a cloud's colour.
 
-    At phase s, which goes from 0 at ``start_us`` to 1 at ``end_us`` and stays there, the SH
+    The phase s goes from 0 at ``start_us`` to 1 at ``end_us`` and is clamped outside. The SH
     coefficient ``sh[:, 0]`` becomes ``sh[:, 0] + sum_k coefficients[:, k] b_k(s)``, k from 0.
 
     Attributes:
         coefficients: [N, F, 3] float32.
         basis: ``cosine``: b_k = cos(pi (k + 1) s), half periods, so that beginning and end may
             differ (Yan et al. 2024, eq. 4); ``real_dft``: sin(2 pi s), cos(2 pi s), sin(4 pi s)
-            ..., as their released code has it.
+            ..., as in their released code.
         start_us, end_us: [us], start before end.
 
     Raises:
-        SceneError: for other shapes, an unknown basis or an empty span of time.
+        SceneError: wrong shapes, an unknown basis or an empty time span.
     """
 
     coefficients: Tensor
@@ -400,7 +402,7 @@ class TimeColour:
         return colour_basis(phase, int(self.coefficients.shape[1]), self.basis)
 
     def tones_of(self, times_us: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Values [M, F] at several instants [us]; each row equals :meth:`tones`."""
+        """Values [M, F] at several times [us]; each row equals :meth:`tones`."""
         phases = (times_us - self.start_us) / (self.end_us - self.start_us)
         return _basis_values(phases, int(self.coefficients.shape[1]), self.basis)
 
@@ -423,7 +425,7 @@ def colour_basis(phase: float, count: int, basis: str) -> Tensor:
 
 @lru_cache(maxsize=1024)
 def _values_at(phase: float, count: int, basis: str) -> NDArray[np.float32]:
-    """Of one instant: the objects of a scene mostly have colours over the same span of time."""
+    """Cached per phase: the objects of a scene mostly share the time span of their colours."""
     values: NDArray[np.float32] = _basis_values(np.array([phase]), count, basis)[0]
     return values
 

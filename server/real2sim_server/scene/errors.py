@@ -17,7 +17,7 @@ class SceneError(Exception):
 
 
 class TimeOutOfRangeError(SceneError, ValueError):
-    """A pose was requested outside a trajectory's time range; trajectories never extrapolate."""
+    """A pose was requested outside a trajectory's time range; trajectories do not extrapolate."""
 
 
 class UnknownObjectError(SceneError, KeyError):
@@ -32,11 +32,11 @@ class LidarError(SceneError, ValueError):
 
 
 class RadarError(SceneError, ValueError):
-    """The catalogue has no such radar; the message lists the known ones."""
+    """The radar is not in the catalogue; the message lists the known ones."""
 
 
 class BundleError(SceneError, ValueError):
-    """A file or folder cannot be read as a scene; the message gives the place and the reason."""
+    """A file or folder cannot be read as a scene; the message gives the location and the reason."""
 
 
 class BundleTooLargeError(BundleError):

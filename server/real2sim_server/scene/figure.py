@@ -1,13 +1,13 @@
 """People among the objects of a scene: Gaussians that follow the joints of a body.
 
-A person's cluster is stored in the rest pose of the body model. The pose at an instant follows from
-the trajectory: footsteps are placed along the path by the distance covered
-(:mod:`real2sim_server.body.gait`), so a person on another path, or at another speed, takes other
-steps. Poses are tabulated on demand, one segment at a time, and interpolated. A person moved by
-something else walks straight on with every step of a :class:`Stride`.
+A person's cluster is stored in the rest pose of the body model. The trajectory determines the pose
+at each time: footsteps are placed along the path by the distance covered
+(:mod:`real2sim_server.body.gait`), so another path or speed gives other steps. Poses are tabulated
+on demand, one segment at a time, and interpolated. A person without a trajectory walks straight on
+with every step of a :class:`Stride`.
 
 Linear blend skinning moves the means. The blended quaternion of the joints, the rotation nearest to
-the blended transforms, rotates a Gaussian; its scales stay.
+the blended transforms, rotates a Gaussian; its scales do not change.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def pose_gaussians(  # noqa: PLR0917
 
     Args:
         means, quats: [N, 3] and [N, 4] float32, of the rest pose.
-        joints, weights: [N, 4], which joints move a Gaussian, and by how much.
-        turns, shifts: [J, 4] ``wxyz`` and [J, 3]; a joint takes x to turn x + shift.
+        joints, weights: [N, 4], joints that move a Gaussian, and their weights.
+        turns, shifts: [J, 4] ``wxyz`` and [J, 3]; a joint maps x to turn x + shift.
     """
     rows = np.empty((len(turns), 16))
     for j in range(len(turns)):
@@ -96,16 +96,16 @@ def pose_gaussians(  # noqa: PLR0917
 
 
 ROW_US = 20_000
-"""Spacing of tabulated poses [us]; between them joints move straight on."""
+"""Spacing of tabulated poses [us]; joints move linearly in between."""
 PIECE = 100
 """Poses that are tabulated at once."""
 KEPT_PIECES, KEPT_CLOUDS = 16, 4
 MAX_DURATION_US = 3_600_000_000
-"""People on longer trajectories stand still [us]."""
+"""People on longer trajectories do not move their limbs [us]."""
 PACE, FASTEST = 0.05, 8.0
 """Spacing of the paces that striding is tabulated for, and the last of them [m/s]."""
 STRIDE_ROWS = 48
-"""Tabulated poses of a stride, which is two steps."""
+"""Number of tabulated poses in a stride of two steps."""
 KEPT_PACES, KEPT_STYLES = 64, 16
 SETTLING = 0.3
 """Somebody's pace follows the speed within this time [s]."""
@@ -115,8 +115,8 @@ class Stride(NamedTuple):
     """Walking state of a person without a trajectory.
 
     Attributes:
-        steps: made so far; a foot swings over each whole one.
-        pace: that the steps are of [m/s].
+        steps: number so far; each whole number is one swing of a foot.
+        pace: speed that determines the step length [m/s].
     """
 
     steps: float
@@ -133,11 +133,11 @@ class Figure:
         middle: height of the object's origin above the body's, which is on the ground [m].
         joints: [N, 4] uint8, joints that move a Gaussian.
         weights: [N, 4] float32 of these joints; each row sums to one.
-        style: how it walks.
+        style: walking style.
 
     Raises:
-        SceneError: for arrays that do not fit each other or the body model, a shape or height that
-            the model does not know, or values that are not finite.
+        SceneError: arrays do not match each other or the body model, a shape or height is outside
+            the model's range, or values are not finite.
     """
 
     shape: tuple[float, ...]
@@ -192,7 +192,7 @@ class Figure:
         """The same person in another walking style; the same object for the same style.
 
         Args:
-            style: fields of :class:`..body.gait.GaitStyle`; others stay.
+            style: fields of :class:`..body.gait.GaitStyle`; other fields do not change.
         """
         wanted = replace(self.style, **style)
         with self._lock:
@@ -215,7 +215,7 @@ class Figure:
             what: name of the object for the message.
 
         Raises:
-            SceneError: joints that the body lacks, or weights that do not sum to one.
+            SceneError: joints missing in the body, or weights that do not sum to one.
         """
         if len(self) and int(self.joints.max()) >= len(JOINTS):
             raise SceneError(f"{what}: a figure names joint {int(self.joints.max())} of 22")
@@ -240,7 +240,7 @@ class Figure:
         Args:
             cloud: in the rest pose, frame of the object.
             trajectory: of the object; its origin is ``middle`` above the ground.
-            t_us: instant [us]; outside the trajectory the pose is that of the nearer end.
+            t_us: time [us]; outside the trajectory, the pose at its nearer end is used.
 
         Returns:
             The same object as before, if the query repeats the last one of this person.
@@ -266,7 +266,7 @@ class Figure:
         return Stride(steps, float(np.interp(seconds, walk.gait.times, walk.gait.speeds)))
 
     def strode(self, stride: Stride, *, speed: float, seconds: float) -> Stride:
-        """Walking state after ``seconds`` at ``speed`` [m/s]; feet stay in place."""
+        """Walking state after ``seconds`` at ``speed`` [m/s]; feet on the ground do not slide."""
         settled = math.exp(-seconds / SETTLING)
         pace = speed + (stride.pace - speed) * settled
         return Stride(stride.steps + seconds * speed / self._step_length(pace), pace)
@@ -348,7 +348,7 @@ def _joints_at(body: Body, gait: Gait, times: ArrayLike) -> tuple[Float, Float]:
 def _between(
     one: tuple[Float, Float], other: tuple[Float, Float], part: float
 ) -> tuple[Float, Float]:
-    """Joints a part of the way from one pose to the next."""
+    """Interpolate the joints between two poses."""
     (q0, p0), (q1, p1) = one, other
     sign = np.where((q0 * q1).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
     turns = (1 - part) * q0 + part * sign * q1
@@ -391,7 +391,7 @@ class _Walk:
     """A figure's walk along one trajectory: tabulated poses, and the last result."""
 
     def __init__(self, figure: Figure, trajectory: Trajectory) -> None:
-        # No reference to the trajectory: the walk is kept as long as that lives.
+        # No reference to the trajectory: the walk is cached for the trajectory's lifetime.
         self.binding = figure._binding
         self.start_us = trajectory.start_us
         self.span_us = trajectory.end_us - trajectory.start_us

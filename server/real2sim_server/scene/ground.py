@@ -1,7 +1,7 @@
-"""The ground of a scene: a height grid for everything that stands, drives or falls on it.
+"""The ground of a scene: a height grid that supports vehicles, people and falling objects.
 
 Kernels query heights, normals and poses. :class:`OccupiedCells` holds the occupied cells of the
-background above the ground, seen from above; contact tests and simulation colliders use them.
+background above the ground, seen from above, for contact tests and simulation colliders.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ neither the noise of single cells nor the edge of one decides how a vehicle lean
 
 @func
 def height_under(heights: Any, frame: Any, x: float, y: float) -> Any:
-    """Bilinear height between cell centres; outside the nearest place of the rim counts.
+    """Bilinear height between cell centres; positions outside are clamped to the border.
 
     Args:
         heights: [X, Y] float32, at cell centres [m].
         frame: [3] float64, x and y of the centre of cell (0, 0), and the edge of a cell [m].
-        x, y: the place [m].
+        x, y: position [m].
     """
     x0, y0, cell = frame[0], frame[1], frame[2]
     rows, columns = heights.shape
@@ -67,8 +67,9 @@ def heights_at(heights: Any, frame: Any, points: Any) -> Any:
 
 @func
 def normal_over(heights: Any, frame: Any, x: float, y: float, yaw: float) -> Any:
-    """Unit normal of the plane that rises as the ground does between the wheels of a vehicle that
-    stands there with heading ``yaw``."""
+    """Unit normal of the ground plane between the wheels of a vehicle at (x, y) with heading
+    ``yaw``.
+    """
     cos, sin = math.cos(yaw), math.sin(yaw)
     fx, fy = HALF_WHEELBASE * cos, HALF_WHEELBASE * sin
     lx, ly = -HALF_TRACK * sin, HALF_TRACK * cos
@@ -93,7 +94,7 @@ def normals_at(heights: Any, frame: Any, points: Any) -> Any:
 
 @kernel
 def pose_at(heights: Any, frame: Any, x: float, y: float, yaw: float) -> Any:
-    """``T_world_vehicle`` [4, 4] of a vehicle that stands at (x, y) with heading ``yaw``."""
+    """``T_world_vehicle`` [4, 4] of a vehicle on the ground at (x, y) with heading ``yaw``."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     a, b, c = normal_over(heights, frame, x, y, yaw)
     slope = -(a * cos + b * sin) / c
@@ -113,8 +114,8 @@ def pose_at(heights: Any, frame: Any, x: float, y: float, yaw: float) -> Any:
 class Ground:
     """Heights on a grid in the world. Immutable and shared.
 
-    Heights are bilinear between cell centres; outside the grid the nearest point of its border
-    counts. Each position has one height: where a bridge crosses a road, that of the driven one.
+    Heights are bilinear between cell centres; outside the grid, the nearest point of its border is
+    used. Each position has one height: where a bridge crosses a road, the height of the driven one.
 
     Attributes:
         origin: [2] float64, corner of cell (0, 0) [m].
@@ -124,7 +125,8 @@ class Ground:
             under boxes. Elsewhere heights are extrapolated.
 
     Raises:
-        SceneError: shapes differ, a side is below 2, values are not finite, no positive cell.
+        SceneError: shapes differ, a side is below 2, values are not finite, or the cell is not
+            positive.
     """
 
     origin: Float
@@ -184,7 +186,7 @@ class Ground:
         return found
 
     def covers(self, points: Float) -> NDArray[np.bool_]:
-        """Whether ``points`` [S, 2] lie where ground is known, [S] bool."""
+        """Whether ``points`` [S, 2] are on known ground, [S] bool."""
         index = np.floor((points - self.origin) / self.cell).astype(np.int64)
         inside = ((index >= 0) & (index < self.heights.shape)).all(axis=1)
         index = np.clip(index, 0, np.array(self.heights.shape) - 1)
@@ -217,8 +219,10 @@ _making = threading.Lock()
 
 
 def of_bundle(content_hash: str, make: Callable[[], Ground]) -> Ground:
-    """The ground of the bundle with that hash: the one in memory, or what ``make`` makes now. So a
-    scene and summaries of it share one, and none is fitted twice."""
+    """The ground of the bundle with that hash, from memory or from ``make``.
+
+    A scene and its summaries share one ground, and none is fitted twice.
+    """
     with _making:
         known = _of_bundles.get(content_hash)
         if known is None:
@@ -244,10 +248,10 @@ MAX_DISTANCE = 40.0
 """Maximum distance of cells from the recorded path [m]."""
 
 DRIVEN_HALF_WIDTH = 1.1
-"""Half width of the driven corridor, which is free [m]."""
+"""Half width of the driven corridor, which counts as free [m]."""
 
 POSE_SPACING = 0.05
-"""Minimum spacing of recorded poses; closer ones only add noise [m]."""
+"""Minimum spacing of recorded poses [m]; closer ones only add noise."""
 
 PARKED_LENGTH = 1.0
 """Path length of a parked vehicle [m]."""
@@ -319,13 +323,13 @@ class OccupiedCells:
 def occupied_cells(background: GaussianCloud, ground: Ground, path: EgoPath) -> OccupiedCells:
     """Cells in which the background blocks a car.
 
-    A cell is occupied when at least three Gaussians of more than half opacity have their centres in
-    it between 0.4 and 1.6 m above the ground. Where the recorded vehicle drove it is free.
+    A cell is occupied if it contains the centres of at least three Gaussians with more than half
+    opacity, between 0.4 and 1.6 m above the ground. The corridor of the recording vehicle is free.
 
     Args:
         background: of a scene.
         ground: of the same scene.
-        path: of the vehicle that recorded it.
+        path: of the recording vehicle.
     """
     opaque = (background.opacities > OBSTACLE_OPACITY).cpu().numpy()
     points = background.means.cpu().numpy().astype(np.float64)[opaque]

@@ -1,10 +1,10 @@
 """Fitting of the ground to points, the driven path and the bottoms of boxes.
 
 The points are a log's LiDAR or, for a scene without a log, the centres of background Gaussians. The
-paper finds its road among Gaussians: it projects boxes down onto them, keeps those around the
-projections, and finds their plane by RANSAC (Fischler and Bolles 1981). Real roads are not planar,
-so this module fits planes section by section along the drive, and starts a height grid from them,
-which follows the points from coarse to fine.
+paper searches for the road among Gaussians: it projects boxes down onto them, selects those around
+the projections, and fits their plane by RANSAC (Fischler and Bolles 1981). Real roads are not
+planar, so this module fits planes section by section along the drive, and uses them as the initial
+state of a height grid that follows the points from coarse to fine.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ def pull_push(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDAr
 
     Args:
         values: [H, W, C] float32; ignored where the weight is 0.
-        weights: [H, W] float32 in [0, 1], how well a cell is known.
+        weights: [H, W] float32 in [0, 1], confidence of a cell.
 
     Returns:
         [H, W, C] float32: ``values`` where the weight is 1, elsewhere blended with coarser levels.
-        All zeros where nothing is known at all.
+        All zeros if no cell is known.
     """
     height, width = weights.shape
     if height == 1 and width == 1:
@@ -91,10 +91,10 @@ class Level(NamedTuple):
 
     Attributes:
         cell: of its grid [m].
-        tolerance: points so near to the level before are on the ground [m].
+        tolerance: points within this distance of the previous level are on the ground [m].
         growth: of the tolerance with distance from the drive.
-        fraction: which of a cell's points counts, from below: what stands on the ground is never
-            below it, and the lowest of all is noise. Coarse cells reach walls, whose feet count.
+        fraction: quantile of a cell's heights that is used. Objects are never below the ground,
+            and the lowest point of all is noise. Coarse cells contain walls, whose feet are used.
     """
 
     cell: float
@@ -109,29 +109,31 @@ LEVELS = (
     Level(0.25, 0.15, 0.0, 0.35),
 )
 FEW_POINTS = 5_000
-"""With fewer points on the ground the finest level would hold nothing that the one before lacks."""
+"""With fewer ground points, the finest level adds nothing to the previous one."""
 CONTINUED = 1e-3
-"""Weight in cells where nothing is known of the surface so far; it holds some 30 cells from what
-is known."""
+"""Weight of cells without data; it preserves the surface so far within about 30 cells from data."""
 CLOSING = ((25.0, 1.5), (REACH, 4.0))
 """Up to this distance from the drive, gaps of up to twice this many metres are closed."""
 DRIVEN = 3.0
-"""So far aside of the drive there is ground, measured or not [m]."""
+"""The ground is known within this distance of the drive, measured or not [m]."""
 
 FURTHEST = 1e6
-"""From the origin, of the driven path [m]; the wire allows no more either."""
+"""Maximum distance of the driven path from the origin [m], as in the wire format."""
 SPACING = 0.5
-"""Of places along the driven path [m]."""
+"""Spacing of positions along the driven path [m]."""
 TRUSTED = 10.0
-"""A plane under the path is trusted this far to the side [m]; beyond, its rim's height holds."""
+"""A plane under the path is trusted this far to the side [m]; beyond, its border height is used."""
 MANY = 50_000
 MIN_UPRIGHT = 0.5
-"""Normals that lean more than 60 degrees are no ground; it counts as level there."""
+"""Normals that lean more than 60 degrees are not ground; the ground counts as level there."""
 UNDER_WHEELS = (1.25, 2.0)
-"""The ground is the plane under the path up to the first distance from it, and what points say
-from the second on [m]."""
+"""The ground is the plane under the path up to the first distance from it, and the surface fitted
+to points beyond the second [m].
+"""
 BESIDE = 8.0
-"""How far aside of the path what points say is raised or lowered to meet it; fading [m]."""
+"""The surface fitted to points is raised or lowered to meet the path, fading up to this distance
+[m].
+"""
 SMOOTHED = 4
 """Standard deviation of that rise along the path, in places of it."""
 
@@ -142,16 +144,16 @@ ON_PLANE = 0.08
 ROUNDS, SAMPLE = 400, 5_000
 LEAN_MAX = float(np.cos(np.radians(25)))
 STRETCH = 30.0
-"""Length of path over which the road is taken for a plane [m]."""
+"""Length of path over which the road counts as planar [m]."""
 FEW_INLIERS = 100
 OFF_PATH = 0.3
 """A plane farther from the driven path than this is not the road [m]."""
 EGO_BOX = (4.6, 1.85, 1.6)
-"""Size of the box that stands for the ego in the search for the road below its path [m]."""
+"""Size of the ego's box in the search for the road below its path [m]."""
 
 
 class Standing(Protocol):
-    """What stands on the ground: an object of a scene, its summary, or a track of a log."""
+    """An object that stands on the ground: of a scene, its summary, or a track of a log."""
 
     @property
     def size(self) -> Size: ...  # noqa: D102
@@ -178,17 +180,17 @@ class GroundFit:
 
 
 def fit_ground(points: Float, path: DrivenPath, boxes: BoxBottoms) -> GroundFit:
-    """Fit the ground, coarse to fine, starting from where the vehicle drove.
+    """Fit the ground, coarse to fine, starting from the driven path.
 
-    On each level a cell takes a low quantile of those of its points that agree with the level
-    before. Cells without any take the bottom of a box that stood there, or the plane under the
-    path where it was driven, or they are continued from their neighbours. The same points give
+    On each level a cell gets a low quantile of its points that agree with the previous level. Cells
+    without such points get the bottom of a box that stood there, or the plane under the path if
+    they were driven over; all others are interpolated from their neighbours. The same points give
     the same bits.
 
     Args:
-        points: [N, 3], background in the world [m]; none gives what path and boxes tell.
-        path: where the vehicle drove.
-        boxes: what stands on the ground and hides it.
+        points: [N, 3], background in the world [m]; without points, path and boxes are used alone.
+        path: driven by the vehicle.
+        boxes: objects that stand on the ground and hide it.
     """
     coarsest = LEVELS[0].cell
     low = np.floor((path.points[:, :2].min(axis=0) - REACH) / coarsest) * coarsest
@@ -208,12 +210,12 @@ def fit_ground(points: Float, path: DrivenPath, boxes: BoxBottoms) -> GroundFit:
 
 
 def fit_scene_ground(cloud: GaussianCloud, ego: Trajectory, objects: Iterable[Standing]) -> Ground:
-    """The ground of a scene that came without one, from its Gaussians, boxes and ego path.
+    """The ground of a scene without a stored one, from its Gaussians, boxes and ego path.
 
     Args:
         cloud: the background, world frame; on any device.
         ego: path of the recording vehicle, which moved on the ground.
-        objects: what stood there.
+        objects: that stood on the ground.
     """
     points = ground_points(cloud)
     path = road_under(points, DrivenPath.of(ego))
@@ -221,8 +223,9 @@ def fit_scene_ground(cloud: GaussianCloud, ego: Trajectory, objects: Iterable[St
 
 
 def ground_points(cloud: GaussianCloud) -> Float:
-    """Centres [N, 3] float64 of Gaussians that may lie on the ground: solid ones, without the flat
-    ones that stand upright, which are walls."""
+    """Centres [N, 3] float64 of Gaussians that may be ground: opaque ones, without the flat upright
+    ones, which are walls.
+    """
     means, opacities = (v.detach().cpu().numpy() for v in (cloud.means, cloud.opacities))
     scales, quats = (v.detach().cpu().numpy() for v in (cloud.scales, cloud.quats))
     solid = np.flatnonzero(opacities > OPAQUE)
@@ -237,8 +240,9 @@ def ground_points(cloud: GaussianCloud) -> Float:
 OPAQUE = 0.3
 """Fainter Gaussians tell nothing of the ground."""
 FLAT, LYING = 0.5, 0.7
-"""A Gaussian is flat when its shortest axis is below that fraction of the next one, and lies when
-that axis is upright to 45 degrees."""
+"""A Gaussian is flat if its shortest axis is below this fraction of the next one, and horizontal if
+that axis is within 45 degrees of vertical.
+"""
 
 
 # --- the driven path ---------------------------------------------------------------------------
@@ -246,12 +250,12 @@ that axis is upright to 45 degrees."""
 
 @dataclass(frozen=True, eq=False)
 class DrivenPath:
-    """Where the ego's wheels stood.
+    """Contact path of the ego's wheels.
 
     Attributes:
         points: [P, 3] float64, about half a metre apart [m].
-        normals: [P, 3] float64, unit, of the planes it stood on.
-        driven: [P] float64, z of the ego itself [m]; ``points`` may be moved onto a found road.
+        normals: [P, 3] float64, unit, of the ground planes under the ego.
+        driven: [P] float64, z of the ego itself [m]; ``points`` may be moved onto a detected road.
         leaning: [P, 3] float64, the ego's own normals.
     """
 
@@ -265,7 +269,7 @@ class DrivenPath:
         """The path of a trajectory ``T_world_vehicle``, whose origin moves on the ground.
 
         Raises:
-            SceneError: it is further from the origin than numbers can tell metres apart.
+            SceneError: it is too far from the origin for metre precision.
         """
         furthest = float(np.abs(ego.positions).max())
         if furthest > FURTHEST:
@@ -286,7 +290,8 @@ class DrivenPath:
 
     def plane(self, xy: Float, *, trusted: float = np.inf) -> tuple[Float, Float]:
         """Distance [N] [m] of ``xy`` [N, 2] from the path, and z [N] [m] on the plane under its
-        nearest place, which is not continued beyond ``trusted`` metres."""
+        nearest position. The plane is level beyond ``trusted`` metres.
+        """
         distance, nearest = self.nearest(xy)
         offset = xy - self.points[nearest, :2]
         normal = self.normals[nearest]
@@ -296,7 +301,7 @@ class DrivenPath:
 
     def nearest(self, xy: Float) -> tuple[Float, NDArray[np.int64]]:
         """Distance [N] [m] and index [N] of the nearest place of the path."""
-        # Threads cost more than they bring for few places; the answers are the same.
+        # For few positions threads cost more than they save; the results are the same.
         workers = -1 if len(xy) > MANY else 1
         distance, index = self._tree.query(xy, workers=workers)
         return np.asarray(distance), np.asarray(index)
@@ -309,7 +314,7 @@ class DrivenPath:
 
 
 def _apart(positions: Float) -> list[int]:
-    """Indices of poses at least a tenth of SPACING from the last one kept, seen from above."""
+    """Indices of poses at least a tenth of SPACING from the previous one, seen from above."""
     kept = [0]
     x, y = positions[0, :2].tolist()
     for i, (px, py) in enumerate(positions[:, :2].tolist()):
@@ -320,8 +325,11 @@ def _apart(positions: Float) -> list[int]:
 
 
 def _through_path(surface: Ground, distance: NDArray[np.float32], path: DrivenPath) -> Ground:
-    """The surface led through the path: what was driven is certain, and recorded poses must stand
-    on it. Beside it the surface keeps its shape and is raised or lowered as the path asks."""
+    """Bend the surface so that it passes through the path.
+
+    The driven path is certain, and recorded poses must be on the surface. To the sides, the surface
+    keeps its shape and is raised or lowered to meet the path.
+    """
     from scipy.ndimage import gaussian_filter1d
 
     near = np.flatnonzero(distance.ravel() < BESIDE + surface.cell)
@@ -351,13 +359,13 @@ def _fade(distance: Float, inner: float, outer: float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class RoadPlane:
-    """A plane found among points.
+    """A plane fitted to points.
 
     Attributes:
         normal: [3] unit, upwards.
         offset: of its points along the normal [m].
         candidates: [K] indices of the points around the projected boxes.
-        inliers: [K] bool, those of them on the plane.
+        inliers: [K] bool, candidates on the plane.
         rms: distance of inliers from the plane, root mean square [m].
     """
 
@@ -379,11 +387,11 @@ def find_road_plane(
 
     Args:
         points: [N, 3] of the background, world [m].
-        boxes: (``T_world_box`` [4, 4], (length, width, height)) of what stands on the road.
-        seed: of RANSAC's draws; the same seed gives the same plane.
+        boxes: (``T_world_box`` [4, 4], (length, width, height)) of objects on the road.
+        seed: of RANSAC's samples; the same seed gives the same plane.
 
     Raises:
-        SceneError: no boxes, or fewer than three points around them, or no plane near level.
+        SceneError: no boxes, fewer than three points around them, or no nearly level plane.
     """
     if not boxes:
         raise SceneError("no boxes to look for ground under; give at least one")
@@ -400,8 +408,9 @@ def find_road_plane(
 
 
 def road_under(points: Float, path: DrivenPath) -> DrivenPath:
-    """The path with the planes that RANSAC finds below it, stretch by stretch; where it finds none
-    near the path, the ego's own stay."""
+    """The path with the road planes that RANSAC finds below it, section by section. Sections
+    without a plane near the path keep the ego's own.
+    """
     moved, normals = path.points.copy(), path.normals.copy()
     places = max(round(STRETCH / SPACING), 1)
     step = max(round(EGO_BOX[0] / 2 / SPACING), 1)
@@ -423,7 +432,7 @@ def road_under(points: Float, path: DrivenPath) -> DrivenPath:
 
 
 def _ego_box(path: DrivenPath, index: int) -> Float:
-    """``T_world_box`` [4, 4] of a box that stands on the path, headed along it."""
+    """``T_world_box`` [4, 4] of a box on the path, aligned with it."""
     last = len(path.points) - 1
     ahead = path.points[min(index + 1, last)] - path.points[max(index - 1, 0)]
     yaw = float(np.arctan2(ahead[1], ahead[0]))
@@ -515,7 +524,7 @@ def _within(points: Float, low: Float, size: Float) -> Float:
 
 
 def _on_ground(points: Float, path: DrivenPath, level: Level, coarser: _Fitted | None) -> Float:
-    """Those of the points that lie near the level before, or near the plane under the path."""
+    """Points near the surface of the previous level, or near the plane under the path."""
     if coarser is not None:
         expected = coarser.ground.height_at(points[:, :2])
         return points[np.abs(points[:, 2] - expected) < level.tolerance]
@@ -533,7 +542,7 @@ class _Known:
 
 
 def _fit_level(known: _Known, grid: _Grid, level: Level, coarser: _Fitted | None) -> _Fitted:
-    """One level: what is known of each cell, and the rest continued between that."""
+    """Fit one level: data where cells are known, interpolation elsewhere."""
     centres = grid.centres
     distance, below = known.path.plane(centres, trusted=TRUSTED)
     base = below if coarser is None else coarser.ground.height_at(centres)
@@ -544,7 +553,8 @@ def _fit_level(known: _Known, grid: _Grid, level: Level, coarser: _Fitted | None
     heights[under], weights[under] = bottom, 1.0
     cells, measured_heights, counts = _by_cell(known.points, grid, level.fraction)
     heights[cells], weights[cells] = measured_heights, np.minimum(counts / 3, 1)
-    # Only what differs from the level before is spread, so that the ground keeps its shape there.
+    # Only the difference to the previous level is interpolated, so the ground keeps its shape
+    # there.
     change = (heights - base).astype(np.float32).reshape(*grid.shape, 1)
     spread = pull_push(change, weights.astype(np.float32).reshape(grid.shape))[..., 0]
     measured = np.zeros(len(heights), dtype=np.bool_)
@@ -564,7 +574,7 @@ def _by_cell(points: Float, grid: _Grid, fraction: float) -> tuple[NDArray[np.in
 
 
 def _close(level: _Fitted, footprints: Float) -> Ground:
-    """Add gaps between rings, what boxes hide, and what is under the vehicle itself."""
+    """Mark gaps between rings, areas hidden by boxes, and the area under the vehicle as ground."""
     import cv2
 
     surface, distance = level.ground, level.distance
@@ -579,7 +589,7 @@ def _close(level: _Fitted, footprints: Float) -> Ground:
         ground |= np.where(ring, closed, 0).astype(np.uint8)
         inner = reach
     for corners in footprints:
-        # fillConvexPoly wants (column, row); the grid is [x, y].
+        # fillConvexPoly takes (column, row); the grid is [x, y].
         polygon = np.round((corners - surface.origin) / surface.cell - 0.5)[:, ::-1]
         cv2.fillConvexPoly(ground, polygon.astype(np.int32), 1)
     ground[distance < DRIVEN] = 1
@@ -595,7 +605,7 @@ def _close(level: _Fitted, footprints: Float) -> Ground:
 
 @dataclass(frozen=True, eq=False)
 class BoxBottoms:
-    """Where boxes stand on the ground, over all times.
+    """Ground contact areas of boxes, over all times.
 
     Attributes:
         points: [N, 3] float64, spread over the bottoms, world [m].
@@ -612,8 +622,9 @@ def box_bottoms(
     *,
     margin: float = 0.4,
 ) -> BoxBottoms:
-    """Bottoms of boxes at the given times at which they exist; without times at their own poses,
-    of which long tracks give ``POSES`` evenly spread ones."""
+    """Bottoms of boxes at the given times at which they exist. Without times, at their own poses;
+    long tracks contribute ``POSES`` evenly spread ones.
+    """
     points, footprints = [np.zeros((0, 3))], [np.zeros((0, 4, 2))]
     for thing in standing:
         grid, corners = _bottom_grid(thing.size), _bottom_corners(thing.size, margin)

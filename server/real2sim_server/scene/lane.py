@@ -1,6 +1,6 @@
 """Lanes and roads of a map: areas, stop lines, signals, and the reference lines of roads.
 
-A place on a road is (s, t): s along its reference line seen from above, t to the left of it [m].
+A position on a road is (s, t): s along its reference line seen from above, t to its left [m].
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from .errors import SceneError
 
 @dataclass(frozen=True, eq=False)
 class RoadLane:
-    """A stretch of a numbered lane of a road: of one lane section.
+    """A section of a numbered lane of a road.
 
     Attributes:
         number: of the lane: negative to the right of the reference line, positive to its left.
-        lane_id: the lane of the graph that it is.
-        s: [M] float64, increasing places along the road [m], M >= 2.
-        inner: [M] float64, t of the rim towards the reference line [m].
-        outer: [M] float64, t of the other rim [m].
+        lane_id: the corresponding lane of the graph.
+        s: [M] float64, increasing positions along the road [m], M >= 2.
+        inner: [M] float64, t of the border towards the reference line [m].
+        outer: [M] float64, t of the other border [m].
     """
 
     number: int
@@ -48,7 +48,7 @@ class RoadLane:
             )
 
     def centre_t(self, s: float) -> float:
-        """t of the lane's middle at ``s`` [m]; beyond its ends that of the end."""
+        """t of the lane's centre at ``s`` [m], clamped to its ends."""
         inner, outer = np.interp(s, self.s, self.inner), np.interp(s, self.s, self.outer)
         return float(inner + outer) / 2
 
@@ -60,16 +60,18 @@ class RoadLane:
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """The reference line of a road, sampled with its directions: between samples a cubic through
-    both places and directions, which keeps arcs of 5 m radius sampled each 0.5 m within 2 um.
+    """The reference line of a road, sampled with its directions.
+
+    Samples are joined by cubics through positions and directions; arcs of 5 m radius sampled every
+    0.5 m are accurate to 2 um.
 
     Attributes:
         road_id: unique in the graph.
-        s: [N] float64, increasing places [m] from 0, N >= 2.
+        s: [N] float64, increasing positions [m] from 0, N >= 2.
         points: [N, 3] float64, world frame [m].
         headings: [N] float64, direction of increasing s [rad].
-        rolls: [N] float64, superelevation: left rises where it is positive [rad].
-        lanes: stretches of its lanes, by lane section.
+        rolls: [N] float64, superelevation: positive raises the left side [rad].
+        lanes: sections of its lanes.
         junction: the junction that the road is part of, or None.
         drives_right: whether lanes with negative numbers run along s.
     """
@@ -100,13 +102,13 @@ class Road:
 
     @property
     def length(self) -> float:
-        """Of the reference line [m]."""
+        """Length of the reference line [m]."""
         return float(self.s[-1])
 
     def at(self, s: float, t: float = 0.0) -> tuple[float, float, float, float]:
-        """x, y, z [m] and heading [rad] of the place (s, t); ``s`` is held to the road's length.
+        """x, y, z [m] and heading [rad] at (s, t); ``s`` is clamped to the road's length.
 
-        The heading is that of the reference line, whichever way a lane there runs.
+        The heading is the direction of the reference line, independent of the lane's direction.
         """
         x, y, z, heading = self.sample(np.array([s]), np.array([t]))[0].tolist()
         return x, y, z, heading
@@ -138,10 +140,10 @@ class Road:
         return np.column_stack([places, z + t * np.sin(roll), heading])
 
     def lane(self, number: int, s: float) -> RoadLane:
-        """The stretch of lane ``number`` at ``s`` [m]; the later one where two meet.
+        """The section of lane ``number`` at ``s`` [m]; the later one at a border.
 
         Raises:
-            SceneError: naming the lanes that there are.
+            SceneError: there is no such lane; the message lists the lanes.
         """
         there = [p for p in self.lanes if p.s[0] - 1e-6 <= s <= p.s[-1] + 1e-6]
         for part in reversed(there):
@@ -156,7 +158,7 @@ class Road:
     def on_lane(
         self, number: int, s: float, offset: float = 0.0
     ) -> tuple[float, float, float, float]:
-        """x, y, z [m] and heading [rad] of the middle of lane ``number`` at ``s``.
+        """x, y, z [m] and heading [rad] of the centre of lane ``number`` at ``s``.
 
         Args:
             number: of the lane.
@@ -218,19 +220,19 @@ SIGNAL_KINDS: tuple[str, ...] = get_args(SignalKind)
 TRAVELLED: frozenset[str] = frozenset({"driving", "bus"})
 """Kinds of lanes that cars drive along."""
 DRIVABLE: frozenset[str] = TRAVELLED | {"bicycle", "shoulder", "parking"}
-"""Kinds of lanes whose surface a car may touch."""
+"""Kinds of lanes with a surface that a car may use."""
 SAME_PLACE_M = 1e-6
 
 
 class LanePlace(NamedTuple):
-    """A position in a lane's own coordinates.
+    """A position in lane coordinates.
 
     Attributes:
         lane_id: the lane.
         s: arc length along its centre line, seen from above [m].
         offset: distance from it, positive to the left [m].
         heading: of the lane there [rad].
-        inside: whether it lies between the lane's rims.
+        inside: whether the position is between the lane's borders.
     """
 
     lane_id: str
@@ -246,18 +248,18 @@ class Lane:
 
     Attributes:
         lane_id: unique in the graph.
-        kind: what it is for.
+        kind: type of the lane.
         centre: [N, 3] float64, centre line in the world [m], N >= 2, without repeated points.
-        widths: [N] float64, across the centre line, half to each side [m], from 0.
-        speed_limit: [m/s], None where the map states none.
-        successors: lanes that go on where it ends.
-        left, right: neighbours of the same direction, whose traffic shares its rim.
-        opposite: the neighbour to the left that runs the other way.
-        may_change_left, may_change_right: whether markings allow to change to those neighbours.
+        widths: [N] float64, across the centre line, half to each side [m], >= 0.
+        speed_limit: [m/s], None if the map has none.
+        successors: lanes that continue at its end.
+        left, right: adjacent lanes of the same direction.
+        opposite: adjacent lane to the left with the opposite direction.
+        may_change_left, may_change_right: whether markings allow a change to those neighbours.
         junction: the junction that it crosses, or None.
 
     Raises:
-        SceneError: naming the lane.
+        SceneError: invalid values; names the lane.
     """
 
     lane_id: str
@@ -299,7 +301,7 @@ class Lane:
 
     @property
     def length(self) -> float:
-        """Of the centre line seen from above [m]."""
+        """Length of the centre line seen from above [m]."""
         return float(self.s[-1])
 
     @cached_property
@@ -331,7 +333,7 @@ class Lane:
     def at(self, s: float, offset: float = 0.0) -> tuple[float, float, float, float]:
         """x, y, z [m] and heading [rad] at ``s``, ``offset`` to the left of the centre line.
 
-        Before its start and past its end the lane goes on straight.
+        Before its start and past its end the lane continues straight.
         """
         x, y, z = (float(np.interp(s, self.s, self.centre[:, i])) for i in range(3))
         heading = float(np.interp(s, self.s, self.headings))
@@ -354,7 +356,7 @@ class Area:
 
     Attributes:
         area_id: unique among the areas.
-        kind: what it is for.
+        kind: type of the area.
         outline: [N, 3] float64, corners of a simple polygon in the world [m], N >= 3.
     """
 
@@ -378,7 +380,7 @@ class StopLine:
     Attributes:
         stop_line_id: unique among the stop lines.
         points: [N, 3] float64, across the lanes [m], N >= 2.
-        lanes: those whose traffic waits there.
+        lanes: lanes with traffic that stops there.
     """
 
     stop_line_id: str
@@ -397,11 +399,11 @@ class Signal:
 
     Attributes:
         signal_id: unique among the signals.
-        kind: what it orders.
+        kind: type of the signal.
         position: x, y, z in the world [m].
-        heading: where its face looks [rad].
-        lanes: those that it rules.
-        stop_line: where their traffic waits; None: at the lanes' ends.
+        heading: direction that its face looks in [rad].
+        lanes: controlled lanes.
+        stop_line: of their traffic; None: at the lanes' ends.
         value: of a speed limit [m/s], else None.
     """
 
@@ -428,7 +430,7 @@ def points_of(values: ArrayLike, what: str, *, least: int = 2) -> Float:
     """Finite, read-only points [N, 3], N >= ``least``.
 
     Raises:
-        SceneError: naming ``what``.
+        SceneError: invalid points; names ``what``.
     """
     points = np.array(values, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < least:

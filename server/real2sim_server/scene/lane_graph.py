@@ -21,8 +21,8 @@ from .lane import DRIVABLE, TRAVELLED, Area, Lane, LanePlace, Road, Signal, Stop
 # Kernels: lanes near a position.
 
 HEADING_COST = 2.5
-"""What a heading across a lane counts as, beside the distance [m]; against it, twice that: lanes
-of both directions that share a place are told apart, and the next lane beside is none the nearer.
+"""Cost of a heading across a lane, added to the distance [m]; twice that for the opposite heading.
+It separates lanes of both directions at one position, without favouring adjacent lanes.
 """
 
 
@@ -36,8 +36,9 @@ def cell_of(frame: Any, columns: int, rows: int, x: float, y: float) -> Any:
 
 @func
 def on_segment(segments: Any, k: int, x: float, y: float) -> Any:
-    """Share along segment ``k`` of its place nearest to (x, y), and the signed distance: positive
-    to its left [m]."""
+    """Fraction along segment ``k`` of its point nearest to (x, y), and the signed distance:
+    positive to its left [m].
+    """
     ax, ay, bx, by = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
     dx, dy = bx - ax, by - ay
     along = ((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy)
@@ -49,10 +50,10 @@ def on_segment(segments: Any, k: int, x: float, y: float) -> Any:
 
 @func
 def nearest_segment(grid: Any, segments: Any, lane_of: Any, allowed: Any, place: Any) -> Any:
-    """Segment of an allowed lane that costs least, or -1; share along it, signed distance.
+    """Segment of an allowed lane with the lowest cost, or -1; fraction along it, signed distance.
 
-    The heading of ``place`` (x, y, heading) may be NaN: then the distance alone decides.
-    Cells are visited in rings, until no farther one can hold anything nearer.
+    The heading of ``place`` (x, y, heading) may be NaN: then only the distance counts. Cells are
+    visited in rings, until no farther one can contain anything nearer.
     """
     x, y, heading = place
     first, entries, frame, columns, rows = grid
@@ -83,14 +84,14 @@ def nearest_segment(grid: Any, segments: Any, lane_of: Any, allowed: Any, place:
 
 @kernel
 def nearest_lanes(table: Any, allowed: Any, places: Any, found: Any, values: Any) -> None:
-    """For each place [S, 3] (x, y, heading or NaN) the lane, its arc length and the offset.
+    """For each pose [S, 3] (x, y, heading or NaN) the lane, its arc length and the offset.
 
     Args:
         table: (grid, segments, lane_of): the grid is (first, entries, frame, columns, rows),
             segments by cell; segments [K, 7] float64 are x and y of both ends, heading, arc length
             at both ends; lane_of is [K] int32.
-        allowed: [L] bool, lanes that count.
-        found: [S] int64, filled: the lane, or -1 where none is allowed.
+        allowed: [L] bool, lanes to consider.
+        found: [S] int64, filled: the lane, or -1 if none is allowed.
         values: [S, 2] float64, filled: arc length and offset to the left [m].
     """
     grid, segments, lane_of = table
@@ -106,7 +107,7 @@ def nearest_lanes(table: Any, allowed: Any, places: Any, found: Any, values: Any
 
 @func
 def in_quad(quads: Any, k: int, x: float, y: float) -> bool:
-    """Whether a place lies in the quadrilateral ``k`` (rims included), however it is turned."""
+    """Whether a position is inside the quadrilateral ``k`` of any orientation, borders included."""
     positive, negative = False, False
     for a in range(4):
         b = (a + 1) % 4
@@ -118,7 +119,7 @@ def in_quad(quads: Any, k: int, x: float, y: float) -> bool:
 
 @func
 def in_polygon(points: Any, start: int, stop: int, x: float, y: float) -> bool:
-    """Whether a place lies inside the closed outline ``points[start:stop]`` (even-odd rule)."""
+    """Whether a position is inside the closed outline ``points[start:stop]`` (even-odd rule)."""
     inside = False
     b = stop - 1
     for a in range(start, stop):
@@ -131,11 +132,11 @@ def in_polygon(points: Any, start: int, stop: int, x: float, y: float) -> bool:
 
 @kernel
 def inside_any(table: Any, allowed: Any, outlines: Any, places: Any, found: Any) -> None:
-    """Which places [S, 2] lie on an allowed lane or inside one of the outlines.
+    """Which positions [S, 2] are on an allowed lane or inside one of the outlines.
 
     Args:
-        table: (grid, quads, lane_of) with rims of each segment [K, 4, 2] float64 [m].
-        allowed: [L] bool, lanes that count.
+        table: (grid, quads, lane_of) with borders of each segment [K, 4, 2] float64 [m].
+        allowed: [L] bool, lanes to consider.
         outlines: (points [P, 2], first [A + 1], bounds [A, 4]) of areas.
         found: [S] bool, filled.
     """
@@ -276,7 +277,7 @@ class LaneGraph:
     Attributes:
         lanes: by id, in a stable order.
         areas, stop_lines, signals, roads: by id.
-        source: where it comes from: a format and file, or the log.
+        source: origin: a format and file, or the log.
         accuracy: estimated median error of the centre lines [m]; None if unknown (maps of other
             providers).
         geo_reference: projection of the source map (PROJ text), or empty.
@@ -317,7 +318,7 @@ class LaneGraph:
                 ``accuracy``, ``geo_reference``.
 
         Raises:
-            SceneError: an id is given twice, or as the constructor.
+            SceneError: a duplicate id, or as the constructor.
         """
         stored: dict[str, Any] = {"lanes": tuple(lanes), **parts}
         for name, key in _IDS.items():
@@ -349,7 +350,7 @@ class LaneGraph:
                 raise SceneError(f"{what} names lane {name!r}, which the graph does not have")
 
     def lane(self, lane_id: str) -> Lane:
-        """The lane of that id.
+        """The lane with that id.
 
         Raises:
             SceneError: there is none.
@@ -360,7 +361,7 @@ class LaneGraph:
             raise SceneError(f"no lane {lane_id!r} {_known(self.lanes)}") from None
 
     def road(self, road_id: str) -> Road:
-        """The road of that id.
+        """The road with that id.
 
         Raises:
             SceneError: there is none; only maps in OpenDRIVE have roads.
@@ -381,7 +382,7 @@ class LaneGraph:
 
     @cached_property
     def road_places(self) -> Mapping[str, tuple[str, int]]:
-        """(road id, lane number) by id of the lane, of those that lie on roads."""
+        """(road id, lane number) by lane id, for lanes on roads."""
         roads = self.roads.values()
         return {p.lane_id: (road.road_id, p.number) for road in roads for p in road.lanes}
 
@@ -394,12 +395,12 @@ class LaneGraph:
         kinds: Iterable[str] = TRAVELLED,
         within: float = math.inf,
     ) -> LanePlace | None:
-        """The lane nearest to a pose, or None if no lane of these kinds lies ``within`` [m].
+        """The lane nearest to a pose, or None if no lane of these kinds is ``within`` [m].
 
         Args:
             x, y: world position [m].
             heading: preferred direction of the lane [rad]; None: any direction.
-            kinds: of lanes that count.
+            kinds: of lanes to consider.
             within: maximum distance from a centre line [m].
         """
         place = np.array([[x, y, math.nan if heading is None else heading]])
@@ -431,8 +432,9 @@ class LaneGraph:
         return found, values
 
     def is_drivable(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Whether positions [S, 2] [m] lie on the road surface, [S] bool: on a lane of a
-        :data:`DRIVABLE` kind, in a drivable area, a junction or a crosswalk."""
+        """Whether positions [S, 2] [m] are on the road surface, [S] bool: on a lane of a
+        :data:`DRIVABLE` kind, in a drivable area, a junction or a crosswalk.
+        """
         places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
         found = np.zeros(len(places), dtype=np.bool_)
         table = self._table
@@ -478,7 +480,7 @@ class LaneGraph:
 
         Args:
             start, goal: lanes.
-            change_cost: what a change to a neighbour of the same direction counts as [m].
+            change_cost: of a lane change to a neighbour of the same direction [m].
 
         Raises:
             SceneError: there is no such lane.

@@ -1,9 +1,9 @@
 """Lenses other than the pinhole: maps between directions and points of the image plane.
 
 A lens maps directions of the camera frame (x right, y down, z forward) to a plane of focal length
-one, which the camera's ``K`` maps to pixels. So a lens knows no image size and stays what it is
-when the camera is resized. Formulas are those of OpenCV 4 (``projectPoints``, ``fisheye``,
-``omnidir``) and of NVIDIA's f-theta model, in float64.
+one, and the camera's ``K`` maps the plane to pixels. So a lens is independent of the image size and
+does not change when the camera is resized. Formulas are those of OpenCV 4 (``projectPoints``,
+``fisheye``, ``omnidir``) and of NVIDIA's f-theta model, in float64.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ class Lens(Protocol):
 
     Attributes:
         model: its name in files and on the wire.
-        perspective: whether it shows straight lines nearly straight, at less than 90 degrees from
-            its axis; depth images of such a camera hold depths along z, others ranges along rays.
-        reach: angle from the axis up to which directions have pixels [rad].
+        perspective: whether straight lines stay almost straight, with a field of view of less than
+            90 degrees from the axis. Depth images of such a camera hold depths along z, others
+            ranges along rays.
+        reach: maximum angle from the axis with a pixel [rad].
     """
 
     model: ClassVar[str]
@@ -47,12 +48,13 @@ class Lens(Protocol):
 
     @property
     def reach(self) -> float:
-        """Angle from the axis up to which directions have pixels [rad]."""
+        """Maximum angle from the axis with a pixel [rad]."""
         ...
 
     def distort(self, directions: Float) -> tuple[Float, Valid]:
         """Positions [..., 2] on the plane of ``directions`` [..., 3] of any length, and whether
-        they have one; what has none lies anywhere."""
+        they exist; other positions are arbitrary.
+        """
         ...
 
     def undistort(self, plane: Float) -> tuple[Float, Valid]:
@@ -66,12 +68,12 @@ class BrownConrady:
     """Radial, tangential and thin-prism distortion: OpenCV's rational model (6 + 2 + 4).
 
     Attributes:
-        radial: k1 to k6; the last three divide.
+        radial: k1 to k6; the last three are in the denominator.
         tangential: p1, p2.
         thin_prism: s1 to s4.
 
     Raises:
-        SceneError: for other counts, values that are not finite, or a radius that never grows.
+        SceneError: wrong counts, values that are not finite, or a radius that never grows.
     """
 
     radial: tuple[float, ...] = (0.0,) * 6
@@ -86,8 +88,9 @@ class BrownConrady:
 
     @cached_property
     def valid_radius(self) -> float:
-        """Distance x from the axis of the undistorted plane up to which the radius grows with it;
-        beyond it the image folds back."""
+        """Undistorted radius up to which the distorted radius grows; beyond it the image folds
+        back.
+        """
         # Denser near the axis, where lenses are meant to be used.
         x = np.geomspace(1e-3, FLATTEST, SAMPLES)
         grows = self._radius_grows(x)
@@ -103,7 +106,7 @@ class BrownConrady:
 
     @property
     def reach(self) -> float:
-        """Angle from the axis up to which directions have pixels [rad]."""
+        """Maximum angle from the axis with a pixel [rad]."""
         return math.atan(self.valid_radius)
 
     def distort(self, directions: Float) -> tuple[Float, Valid]:
@@ -183,11 +186,10 @@ class Fisheye:
 
     Attributes:
         k: k1 to k4.
-        max_angle: from the axis, beyond which nothing is seen [rad]; None: as far as the radius
-            grows.
+        max_angle: maximum angle from the axis [rad]; None: the limit of growth of the radius.
 
     Raises:
-        SceneError: for other counts, values that are not finite or angles outside (0, pi].
+        SceneError: wrong counts, values that are not finite or angles outside (0, pi].
     """
 
     k: tuple[float, ...] = (0.0,) * 4
@@ -202,7 +204,7 @@ class Fisheye:
 
     @cached_property
     def reach(self) -> float:
-        """Angle from the axis up to which directions have pixels [rad]."""
+        """Maximum angle from the axis with a pixel [rad]."""
         return _growing(self.model, self._slope, self.max_angle or OPENING)
 
     def distort(self, directions: Float) -> tuple[Float, Valid]:
@@ -228,8 +230,9 @@ class Fisheye:
 
 @dataclass(frozen=True)
 class Omnidirectional:
-    """OpenCV's omnidirectional lens: the unit sphere seen from ``xi`` behind its centre, then
-    distorted (Mei and Rives 2007).
+    """OpenCV's omnidirectional lens (Mei and Rives 2007).
+
+    The unit sphere seen from ``xi`` behind its centre, then distorted.
 
     Attributes:
         xi: at least 0; 0 is a pinhole with distortion, 1 the parabolic mirror.
@@ -237,7 +240,7 @@ class Omnidirectional:
         p: p1, p2.
 
     Raises:
-        SceneError: for other counts, values that are not finite, or a negative ``xi``.
+        SceneError: wrong counts, values that are not finite, or a negative ``xi``.
     """
 
     xi: float = 1.0
@@ -258,7 +261,7 @@ class Omnidirectional:
 
     @cached_property
     def reach(self) -> float:
-        """Angle from the axis up to which directions have pixels [rad]."""
+        """Maximum angle from the axis with a pixel [rad]."""
         limit = math.acos(-1 / self.xi) if self.xi > 1 else math.acos(-self.xi)
         return _last_true(lambda angle: bool(self._radius_of(angle)), 0.0, limit - 1e-6)
 
@@ -291,16 +294,16 @@ class FTheta:
     """NVIDIA's f-theta lens: a polynomial between the angle from the axis and the radius.
 
     Attributes:
-        polynomial: coefficients from the constant (0) on, at most degree 5. Radii are those of a
-            plane of focal length one, see :meth:`of_pixels`.
-        reference: what the polynomial takes: ``angle`` gives radii, ``radius`` gives angles; the
-            other way goes by Newton's method.
-        linear: c, d, e: the plane is [[c, d], [e, 1]] times what the polynomial gives.
-        max_angle: from the axis, beyond which nothing is seen [rad].
+        polynomial: coefficients starting with the constant (0), at most degree 5. Radii are those
+            of a plane of focal length one, see :meth:`of_pixels`.
+        reference: argument of the polynomial: ``angle`` gives radii, ``radius`` gives angles; the
+            inverse uses Newton's method.
+        linear: c, d, e: the plane is [[c, d], [e, 1]] times the result of the polynomial.
+        max_angle: maximum angle from the axis [rad].
 
     Raises:
-        SceneError: for values that are not finite, a constant that is not 0, a matrix that cannot
-            be inverted, or a radius that does not grow.
+        SceneError: values that are not finite, a constant that is not 0, a singular matrix, or a
+            radius that does not grow.
     """
 
     polynomial: tuple[float, ...] = (0.0, 1.0)
@@ -338,7 +341,10 @@ class FTheta:
         max_angle: float = math.pi,
     ) -> FTheta:
         """From a polynomial in pixels, for a camera whose ``K`` has the focal length ``focal``
-        [px] (any: it only says in what unit radii are kept)."""
+        [px].
+
+        Any focal length works: it only sets the unit of the stored radii.
+        """
         scaled = [
             value / focal if reference == "angle" else value * focal**power
             for power, value in enumerate(polynomial)
@@ -347,14 +353,14 @@ class FTheta:
 
     @cached_property
     def reach(self) -> float:
-        """Angle from the axis up to which directions have pixels [rad]."""
+        """Maximum angle from the axis with a pixel [rad]."""
         if self.reference == "angle":
             return _growing(self.model, self._slope, self.max_angle)
         return min(self.max_angle, float(self._polynomial(np.array(self._last_radius))))
 
     @cached_property
     def _last_radius(self) -> float:
-        """Where the angle reaches ``max_angle``, or stops growing."""
+        """Radius at which the angle reaches ``max_angle``, or stops growing."""
         radius = 1.0
         while radius < 1e6 and float(self._polynomial(np.array(radius))) < self.max_angle:
             if not (self._slope(np.linspace(0, radius, SAMPLES)) > 0).all():
@@ -417,7 +423,7 @@ def lens_from(values: dict[str, Any] | None) -> Lens | None:
     """The lens of such values.
 
     Raises:
-        SceneError: an unknown model or key, or values that its class refuses.
+        SceneError: an unknown model or key, or values that its class rejects.
     """
     if values is None or values.get("model") == "pinhole":
         return None
@@ -480,7 +486,7 @@ def _from_radius(
     slope_of: Callable[[Float], Float],
     reach: float,
 ) -> tuple[Float, Valid]:
-    """Directions of a lens whose radius depends on the angle alone."""
+    """Directions of a lens with a radius that depends only on the angle."""
     plane = np.asarray(plane, dtype=np.float64)
     radius = np.linalg.norm(plane, axis=-1)
     angle, valid = _inverted(radius, radius_of, slope_of, reach)
@@ -493,9 +499,9 @@ def _inverted(
     slope_of: Callable[[Float], Float],
     last: float,
 ) -> tuple[Float, Valid]:
-    """Where in [0, last] a growing function takes ``values``, and whether it does.
+    """Position in [0, last] at which a growing function has ``values``, and whether it exists.
 
-    Newton's method from a table; the table alone is right to 1e-6.
+    Newton's method from a table; the table alone is accurate to 1e-6.
     """
     table = np.linspace(0.0, last, SAMPLES)
     known = function(table)

@@ -19,22 +19,22 @@ from .cloud import GaussianCloud
 from .errors import SceneError
 
 MAX_REFLECTIVITY = 4.0
-"""Of what sends light back to where it came from (signs, number plates)."""
+"""Reflectivity of retroreflectors (signs, number plates)."""
 RANGE_STEPS = (
     *(0.0, 1.5, 2.0, 2.25, 2.5, 2.75, 3.0, 3.25, 3.5, 3.75, 4.0, 4.5, 5.0, 5.5, 6.0, 7.0, 8.0),
     *(9.0, 10.0, 12.0, 14.0, 17.0, 20.0, 25.0, 30.0, 40.0, np.inf),
 )
-"""Ranges between which a ring answers alike [m]."""
+"""Range steps with the same response of a ring [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reflector:
-    """Gaussians that a LiDAR sees.
+    """Gaussians as a LiDAR sees them.
 
     Attributes:
         cloud: in the frame of the background or of the object.
-        attributes: [N, 2] float32: reflectivity for light that meets the surface squarely, 0 to
-            MAX_REFLECTIVITY, and share of rays lost there, 0 to 1.
+        attributes: [N, 2] float32: reflectivity at normal incidence, 0 to MAX_REFLECTIVITY, and
+            share of lost rays, 0 to 1.
 
     Raises:
         SceneError: attributes of another shape or type.
@@ -103,11 +103,11 @@ class RingResponse:
         ring: NDArray[np.int32],
         distance: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Intensities [R] that the sensor makes of reflectivities [R].
+        """Intensities [R] of the sensor for reflectivities [R].
 
         Args:
             elevation: [B'] of the rings of a sweep [rad].
-            ring: [R], of each ray; -1 for those of none.
+            ring: [R], of each ray; -1 for rays without a ring.
             distance: [R] range [m].
         """
         row, step = self.rows(self.elevation, elevation, ring), self.step_of(distance)
@@ -118,8 +118,9 @@ class RingResponse:
     def rows(
         known: NDArray[np.floating], elevation: NDArray[np.floating], ring: NDArray[np.int32]
     ) -> NDArray[np.int64]:
-        """Which of the ``known`` rings each ray's is: the same number where sweeps have as many
-        rings, else that of the nearest elevation; 0 for rays of none."""
+        """Index of each ray's ring in ``known``: the same number if the counts of rings are equal,
+        otherwise the ring of nearest elevation; 0 for rays without a ring.
+        """
         if len(known) == len(elevation):
             return np.maximum(ring, 0).astype(np.int64)
         nearest = np.abs(elevation[:, None] - known).argmin(1).astype(np.int64)
@@ -133,18 +134,17 @@ class RingResponse:
 
 @dataclass(frozen=True, eq=False)
 class LidarSurfaces:
-    """The second set of a scene.
+    """The second set of Gaussians of a scene, for LiDARs.
 
     Attributes:
         background: in the world.
-        objects: by object id, in the object's frame; an object that is missing shows its own
-            Gaussians.
-        incidence: share of reflected light that does not mind how squarely it met the surface,
-            0 to 1; the rest goes with the cosine.
-        response: of the sensor that recorded the log, where its scans tell rings.
+        objects: by object id, in the object's frame; a missing object shows its own Gaussians.
+        incidence: share of reflected light that is independent of the incidence, 0 to 1; the rest
+            is proportional to the cosine.
+        response: of the sensor that recorded the log, if its scans have rings.
 
     Raises:
-        SceneError: a share outside of 0 to 1.
+        SceneError: a share outside 0 to 1.
     """
 
     background: Reflector

@@ -31,7 +31,7 @@ from ..geometry.transform import Float, is_rigid
 from .errors import LidarError, RadarError
 
 MAX_SLOTS = 2048
-"""Instants of a sweep at which poses are sampled: 0.05 ms apart at 10 Hz, 0.4 mm at 15 m/s."""
+"""Maximum number of pose times per sweep: 0.05 ms apart at 10 Hz, 0.4 mm at 15 m/s."""
 MAX_RANGE_M = 2000.0
 MAX_DIVERGENCE = 0.1
 
@@ -43,14 +43,14 @@ class Beams:
     Attributes:
         azimuth: [...] float64 [rad], from x towards y.
         elevation: [...] float64 [rad], from the horizontal plane upwards.
-        time_us: [...] float64, when each ray is fired, relative to the sweep's time stamp [us].
+        time_us: [...] float64, firing time of each ray, relative to the sweep's time stamp [us].
 
     The shape is [B, C] (row of the sensor, column of the turn) for spinning sensors and [R] for
-    tables; results of a cast have the same.
+    tables; results of a cast have the same shape.
 
     Raises:
-        LidarError: shapes that differ, values that are not finite, elevations beyond 90 degrees,
-            no ray, or more than MAX_RAYS.
+        LidarError: shapes differ, values are not finite, elevations exceed 90 degrees, there is no
+            ray, or there are more than MAX_RAYS.
     """
 
     azimuth: Float
@@ -98,14 +98,14 @@ class Beams:
             elevation: [B] of each row [rad].
             columns: azimuth steps of a sweep, C.
             rate_hz: turns per second; a sweep takes a whole turn.
-            azimuth_offset: [B] or one number, of the rows against the column's azimuth [rad].
-            clockwise: as seen from above.
-            start: azimuth at which the first column begins [rad].
-            field_of_view: azimuth covered by the columns [rad]; less than a turn looks about the
+            azimuth_offset: [B] or one number, of the rows relative to the column's azimuth [rad].
+            clockwise: seen from above.
+            start: azimuth of the first column [rad].
+            field_of_view: azimuth range of the columns [rad]; less than a turn is centred on the
                 middle of the turn. The time stamp of a sweep is the middle of the turn.
 
         Raises:
-            LidarError: counts or numbers out of range, named.
+            LidarError: counts or numbers out of range; the message names them.
         """
         rows = np.atleast_1d(np.asarray(elevation, dtype=np.float64))
         offsets = np.broadcast_to(np.asarray(azimuth_offset, dtype=np.float64), rows.shape)
@@ -130,7 +130,7 @@ class Beams:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of all arrays and of a cast's results."""
+        """Shape of all arrays and of a cast's results."""
         return tuple(self.azimuth.shape)
 
     @property
@@ -147,10 +147,10 @@ class Beams:
 
     @cached_property
     def slots(self) -> tuple[Float, NDArray[np.int32]]:
-        """Instants [S] [us] at which poses are taken, increasing, and the slot of each ray [...].
+        """Pose times [S] [us], increasing, and the slot of each ray [...].
 
-        Every instant of its own where there are few enough, as with columns; else MAX_SLOTS evenly
-        spread ones.
+        All distinct times if there are at most MAX_SLOTS, as with columns; otherwise MAX_SLOTS
+        evenly spread ones.
         """
         times, index = np.unique(self.time_us.ravel(), return_inverse=True)
         if len(times) > MAX_SLOTS:
@@ -165,13 +165,13 @@ class Detection:
     """Thresholds of the detector for a return.
 
     Attributes:
-        range_m, reflectivity: a diffuse surface of this reflectivity, in (0, 1], at this distance
-            is just seen. Power falls with the square of the distance.
-        loss: share of rays lost whatever they meet, 0 to 1.
-        softness: width of the passage from seen to lost, as a share of the limiting power.
+        range_m, reflectivity: a diffuse surface of this reflectivity, in (0, 1], is just detected
+            at this distance. Power falls with the square of the distance.
+        loss: share of rays lost independent of the target, 0 to 1.
+        softness: width of the transition from detected to lost, as a share of the limiting power.
 
     Raises:
-        LidarError: a value out of range.
+        LidarError: a value is out of range.
     """
 
     range_m: float = 120.0
@@ -192,19 +192,19 @@ class Lidar:
 
     Attributes:
         name: unique on its vehicle.
-        beams: which way and when.
+        beams: directions and times of the rays.
         T_vehicle_lidar: [4, 4] float64, sensor frame x forward, y left, z up.
-        min_range, max_range: of returns; what is nearer is not seen and hides nothing [m].
+        min_range, max_range: of returns [m]; nearer surfaces are invisible and occlude nothing.
         divergence: (horizontal, vertical) full angle of a beam at 1/e^2 of its power [rad]; its
             standard deviation on a surface is a quarter of its diameter there.
         returns: 1 (the median of the light), 2 (first and last) or 3 (and the strongest).
-        pulse: echoes nearer to each other along the ray are one return [m].
+        pulse: echoes closer than this along the ray form one return [m].
         range_noise: standard deviation of a measured range [m].
-        detection: what is seen.
-        source: where the numbers come from.
+        detection: thresholds.
+        source: origin of the numbers.
 
     Raises:
-        LidarError: a value out of range, named with what is allowed.
+        LidarError: a value is out of range; the message gives the allowed range.
     """
 
     name: str
@@ -242,7 +242,7 @@ class Lidar:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of a cast's results: [B, C] or [R]."""
+        """Shape of a cast's results: [B, C] or [R]."""
         return self.beams.shape
 
     def placed(self, T_vehicle_lidar: ArrayLike) -> Lidar:
@@ -289,10 +289,10 @@ def catalogue_lidar(name: str) -> Lidar:
 
 
 def find_lidar(name: str) -> Lidar:
-    """By a name of the catalogue, or the path of a JSON file (which ends in ``.json``).
+    """Find a LiDAR by a catalogue name, or by the path of a JSON file (ending in ``.json``).
 
     Raises:
-        LidarError: unknown, or a file that holds none.
+        LidarError: an unknown name, or a file without a LiDAR.
     """
     return read_lidar(name) if name.endswith(".json") else catalogue_lidar(name)
 
@@ -301,7 +301,7 @@ def read_lidar(path: str | PathLike[str]) -> Lidar:
     """The LiDAR of a JSON file.
 
     Raises:
-        LidarError: the file is missing, too large, or holds no LiDAR; with the place and reason.
+        LidarError: the file is missing, too large, or not a LiDAR; with the location and reason.
     """
     file = Path(path)
     try:
@@ -335,10 +335,10 @@ def lidar_from_values(values: Any) -> Lidar:
 
 
 def lidar_of(model: LidarModel) -> Lidar:
-    """The sensor; at LIDAR_MOUNT where the model names no pose.
+    """The sensor; at LIDAR_MOUNT if the model has no pose.
 
     Raises:
-        LidarError: a value out of range, named with what is allowed.
+        LidarError: a value is out of range; the message gives the allowed range.
     """
     pose = np.eye(4)
     pose[:3, 3] = LIDAR_MOUNT
@@ -408,8 +408,9 @@ def _grid(beams: GridBeams) -> Beams:
 
 
 def _rosette(beams: RosetteBeams) -> Beams:
-    """In the order of time. The deflections of the prisms add up:
-    (azimuth, elevation) = r/2 (e^(i a t) + e^(i b t))."""
+    """Rosette scan in time order. The deflections of the prisms add up: (azimuth, elevation) = r/2
+    (e^(i a t) + e^(i b t)).
+    """
     seconds = ((np.arange(beams.rays) + 0.5) / beams.rays - 0.5) / beams.rate_hz
     first, second = (2 * np.pi * turns / 60 * seconds for turns in beams.turns_per_minute)
     half = np.radians(beams.radius_deg) / 2
@@ -460,7 +461,7 @@ RADARS: Mapping[str, RadarModel] = {
         ray_spacing_deg=0.3,
     ),
 }
-"""Radars of 77 GHz of four kinds, by orders of magnitude; no maker's figures."""
+"""Four kinds of 77 GHz radars with typical orders of magnitude; not a maker's figures."""
 
 RADAR_MOUNT = (3.6, 0.0, 0.5)
 """Default position of radars, from the vehicle's rear axle [m]."""
@@ -477,7 +478,7 @@ def catalogue_radar(name: str) -> RadarModel:
     """The radar of that name in the catalogue.
 
     Raises:
-        RadarError: it has none; with those it has.
+        RadarError: it is not in the catalogue; lists the known ones.
     """
     if name not in RADARS:
         raise RadarError(f"no radar {name!r} in the catalogue; it has {', '.join(RADARS)}")
@@ -490,11 +491,11 @@ class Radar:
 
     Attributes:
         name: unique on its vehicle.
-        model: what it resolves and detects.
+        model: resolution and detection limits.
         T_vehicle_radar: [4, 4] float64, sensor frame x along its axis, y left, z up.
 
     Raises:
-        RadarError: the pose is no rigid transform.
+        RadarError: the pose is not a rigid transform.
     """
 
     name: str

@@ -36,8 +36,8 @@ class Sky:
         faces: [6, R, R, 3] float32 RGB in [0, 1], order +x -x +y -y +z -z. On each face the pixel
             (row, column) centre at u, v = (column + 0.5, row + 0.5) / R * 2 - 1 looks along the
             direction of :func:`face_directions`.
-        uncertainties: [6, R, R] float32 in [0, 1] of the texels, as those of a cloud's Gaussians;
-            None where they are not known.
+        uncertainties: [6, R, R] float32 in [0, 1] of the texels, as for a cloud's Gaussians; None
+            if unknown.
     """
 
     faces: Tensor
@@ -78,7 +78,7 @@ class Sky:
         return {"faces": self.faces, **known}
 
     def check_values(self) -> None:
-        """Check every value. Raises SceneError for non-finite ones and those out of range."""
+        """Check every value. Raises SceneError for non-finite values and those out of range."""
         if not bool(torch.isfinite(self.faces).all()):
             raise SceneError("sky: faces hold values that are not finite")
         given = self.uncertainties
@@ -116,7 +116,7 @@ def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Face index [...] and coordinates u (column), v (row) [...] in [-1, 1] of ``directions``.
 
     ±x faces: u = ∓y, v = -z; ±y faces: u = ±x, v = -z; +z face: u = -y, v = +x;
-    -z face: u = -y, v = -x, each over the largest absolute component. Side faces stand upright
+    -z face: u = -y, v = -x, each over the largest absolute component. Side faces are upright
     seen from inside.
     """
     x, y, z = directions.unbind(-1)
@@ -159,14 +159,14 @@ def face_directions(resolution: int) -> NDArray[np.float32]:
 
 
 MAX_OBJECTS = 65_534
-"""Instance images are uint16: 0 is the background, 65535 is kept free."""
+"""Instance images are uint16: 0 is the background, 65535 is reserved."""
 
 
 def box_size(size: Iterable[float], what: str) -> tuple[float, float, float]:
     """(length, width, height) [m] as plain floats.
 
     Raises:
-        SceneError: naming ``what``, when ``size`` is anything but three positive lengths.
+        SceneError: ``size`` is not three positive lengths; names ``what``.
     """
     lengths = tuple(float(v) for v in size)
     if len(lengths) != 3 or not all(np.isfinite(lengths)) or min(lengths) <= 0:
@@ -180,15 +180,15 @@ class SceneObject:
 
     Attributes:
         object_id: unique in the scene, for example ``car_3``.
-        category: class of the thing, for example ``car``, ``truck``, ``pedestrian``.
+        category: class of the object, for example ``car``, ``truck``, ``pedestrian``.
         size: (length, width, height) along the object's x, y, z [m].
         cloud: Gaussians in the object frame: origin at the box centre, x forward, z up.
         trajectory: ``T_world_object`` over time; the object exists only in its range.
-        colour: how the cloud's colour changes over time, or None; see :meth:`cloud_at`.
-        figure: of a person who walks, whose ``cloud`` is in the rest pose; or None.
+        colour: change of the cloud's colour over time, or None; see :meth:`cloud_at`.
+        figure: of a walking person, with ``cloud`` in the rest pose; or None.
 
     Raises:
-        SceneError: for a size that is none, or a colour or figure of another number of Gaussians.
+        SceneError: an invalid size, or a colour or figure with another number of Gaussians.
     """
 
     object_id: str
@@ -210,14 +210,16 @@ class SceneObject:
         object.__setattr__(self, "size", box_size(self.size, f"object {self.object_id!r}"))
 
     def cloud_at(self, t_us: int) -> GaussianCloud:
-        """The cloud as it is at ``t_us``, with its colours and in the pose of its own trajectory;
-        the cloud itself where nothing changes."""
+        """The cloud at ``t_us``, with its colours and in the pose of its own trajectory; the cloud
+        itself if nothing changes over time.
+        """
         cloud = self.posed_at(t_us, self.trajectory)
         return cloud if self.colour is None else self.colour.at(cloud, t_us)
 
     def posed_at(self, t_us: int, trajectory: Trajectory) -> GaussianCloud:
-        """The cloud in the pose that it has at ``t_us`` along a trajectory, that of an edit for
-        example; the cloud itself, with colours unchanged, where it is rigid."""
+        """The cloud in its pose at ``t_us`` along a trajectory, for example from an edit; the cloud
+        itself, with unchanged colours, if it is rigid.
+        """
         return (
             self.cloud if self.figure is None else self.figure.posed(self.cloud, trajectory, t_us)
         )
@@ -244,7 +246,7 @@ class SceneObject:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A reconstructed drive. Immutable; sessions hold only what differs from it.
+    """A reconstructed drive. Immutable; sessions store only their differences from it.
 
     World frame: right-handed, x forward, y left, z up [m], recentred near the drive.
 
@@ -257,9 +259,9 @@ class Scene:
         ego: ``T_world_vehicle`` of the recording vehicle (rear axle centre on the ground).
         frame_times_us: [F] int64 time stamps of the recorded frames [us], increasing.
         ego_size: (length, width, height) of the recording vehicle's box [m].
-        provenance: where it comes from: source, reader, settings, versions (JSON values only).
-        content_hash: SHA-256 of the bundle it was read from or written to; empty before that.
-        stored_ground: as the reconstruction fitted it, or None. Use :attr:`ground` instead.
+        provenance: origin: source, reader, settings, versions (JSON values only).
+        content_hash: SHA-256 of the bundle on disk; empty if not saved.
+        stored_ground: fitted by the reconstruction, or None. Use :attr:`ground` instead.
         lidar: Gaussians for LiDARs, or None: LiDARs see the same Gaussians as cameras.
         lanes: of its roads, from a map or the log, or None.
     """
@@ -313,8 +315,7 @@ class Scene:
 
     @cached_property
     def ground(self) -> Ground:
-        """The ground that everything stands on and falls to: the stored one, else fitted now to
-        Gaussians, boxes and the ego's path, once."""
+        """The ground: stored, otherwise fitted once to Gaussians, boxes and the ego path."""
         if self.stored_ground is not None:
             return self.stored_ground
         if self.content_hash:
@@ -336,7 +337,7 @@ class Scene:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all Gaussians, sky, stored ground, lanes and what LiDARs see [bytes]."""
+        """Memory of all Gaussians, sky, stored ground, lanes and Gaussians for LiDARs [bytes]."""
         sky = self.sky.nbytes if self.sky else 0
         ground = self.stored_ground.nbytes if self.stored_ground else 0
         objects = sum(o.nbytes for o in self.objects.values())
@@ -346,12 +347,12 @@ class Scene:
 
     @property
     def start_us(self) -> int:
-        """First time the ego path knows [us]."""
+        """Start of the ego path [us]."""
         return self.ego.start_us
 
     @property
     def end_us(self) -> int:
-        """Last time the ego path knows [us]."""
+        """End of the ego path [us]."""
         return self.ego.end_us
 
     def to(self, device: torch.device | str) -> Scene:

@@ -67,8 +67,7 @@ class Trajectory:
             raise SceneError("quaternions of a trajectory must have unit length (wxyz)")
         object.__setattr__(self, "times_us", times)
         object.__setattr__(self, "positions", positions)
-        # Unit quaternions stay bit for bit as they are, so that reading back what was written
-        # gives the same trajectory.
+        # Unit quaternions stay bit-identical, so that a saved trajectory reads back unchanged.
         unit = np.abs(norms - 1) < 1e-15
         object.__setattr__(
             self, "quaternions", np.where(unit[:, None], quaternions, quaternions / norms[:, None])
@@ -141,10 +140,10 @@ class Trajectory:
         return transform_from(*self.pose(t_us))
 
     def velocity(self, t_us: int) -> Float:
-        """Velocity [3] [m/s] in the fixed frame of the segment that holds ``t_us``.
+        """Velocity [3] [m/s] in the fixed frame of the segment that contains ``t_us``.
 
-        At an inner time stamp the later segment counts, at the end the last one. A trajectory of
-        one pose stands still. Raises like :meth:`pose`.
+        At an inner time stamp the later segment is used, at the end the last one. A trajectory with
+        one pose has velocity zero. Raises like :meth:`pose`.
         """
         self.pose(t_us)
         if len(self.times_us) == 1:
@@ -159,7 +158,7 @@ class Trajectory:
         """The part within [start_us, end_us], with interpolated poses at the cuts.
 
         Raises:
-            TimeOutOfRangeError: nothing of it lies there.
+            TimeOutOfRangeError: the trajectory does not overlap this range.
         """
         if start_us > end_us or end_us < self.start_us or start_us > self.end_us:
             raise TimeOutOfRangeError(

@@ -1,4 +1,4 @@
-"""One episode without a network: a world, and a planner that sees what a worker would send."""
+"""One episode without a network: a world, and a planner with the observations of a worker."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from ..world.storyboard.run import object_ids_of
 
 @kernel
 def signed_gaps_into(box, centres, yaws, sizes, found):
-    """See :func:`.signed_gaps`; into ``found`` [K]."""
+    """See :func:`.signed_gaps`; written to ``found`` [K]."""
     x, y, yaw, length, width = box
     c, s = math.cos(yaw), math.sin(yaw)
     for k in range(len(yaws)):
@@ -118,13 +118,13 @@ Array = NDArray[np.float64]
 def signed_gaps(
     box: tuple[float, float, float, float, float], centres: Array, yaws: Array, sizes: Array
 ) -> Array:
-    """[K] float64 metres from a rectangle to others; below 0 the depth by which they overlap.
+    """[K] float64 distances from a rectangle to others [m]; negative values are the overlap depth.
 
-    Disjoint convex shapes are nearest at a corner of one of them; the depth is the least over the
+    Disjoint convex shapes are nearest at a corner of one of them. The depth is the minimum over the
     directions of their sides (separating axes, Gottschalk et al. 1996).
 
     Args:
-        box: centre x, y [m], yaw [rad], length, width [m]; one without length is a bumper.
+        box: centre x, y [m], yaw [rad], length, width [m]; length 0 is a bumper.
         centres: [K, 2 or 3] [m].
         yaws: [K] [rad].
         sizes: [K, 2 or 3] length and width first [m].
@@ -135,12 +135,13 @@ def signed_gaps(
 
 
 PER_METRE = 2.0
-"""What a metre between both counts [s/m]: to pass somebody half a metre aside is as near as to meet
-them in a second."""
+"""Time equivalent of a gap [s/m]: passing at half a metre is as critical as a collision in one
+second.
+"""
 SHARPNESS = 16.0
-"""Of the smooth minimum over time [1/s]."""
+"""Sharpness of the smooth minimum over time [1/s]."""
 FARTHEST = 100.0
-"""Margins are cut here [s]: half as many metres away, nobody is told from nobody."""
+"""Upper limit of margins [s], reached at half as many metres."""
 AT_FAULT, PER_SPEED = 0.5, 0.05
 """An at-fault collision, and each m/s of its speed."""
 NOT_AT_FAULT = -1.0
@@ -150,12 +151,13 @@ NOT_AT_FAULT = -1.0
 def adversaries_of(
     reset: Mapping[str, Any], operations: Sequence[Mapping[str, Any]] = ()
 ) -> frozenset[str]:
-    """Objects that a case is about: those with drivers, in a storyboard, or edited. Empty where it
-    names none, which means everybody.
+    """Adversaries of a case: objects with drivers, in a storyboard, or edited.
+
+    Empty if the case names none; then all objects count.
 
     Args:
         reset: options of an episode.
-        operations: edits when it begins, as JSON.
+        operations: edits at its start, as JSON.
     """
     names = set(reset.get("agents", {}).get("drivers", {}))
     names |= {str(o["object_id"]) for o in operations if o.get("object_id")}
@@ -167,18 +169,19 @@ def adversaries_of(
 
 @dataclass
 class Danger:
-    """Followed over an episode, instant by instant.
+    """Criticality of an episode, updated at each time step.
 
-    The margin of an instant is how soon the front bumper would meet another if all kept their
-    velocities, with what is missing to a touch counted as time: what comes from behind or stands
-    beside says nothing about the driver. The episode's is a smooth minimum over time;
-    :meth:`criticality` is its negative, in seconds, and above 0 only for collisions at fault.
+    The margin of a time step is the time until the front bumper touches another object at constant
+    velocities, with the remaining lateral gap converted to time. Objects behind or alongside are
+    ignored, because they say nothing about the driver. The margin of the episode is a smooth
+    minimum over time. :meth:`criticality` is its negative in seconds, and is positive only for
+    at-fault collisions.
 
     Attributes:
-        adversaries: whose margins count, see :func:`adversaries_of`: parked cars that everybody
-            passes would hide how near those come who make the case. Empty for all.
-        gap: smallest from the ego's box to another's so far, below 0 where they overlap [m].
-        margin: smallest so far [s].
+        adversaries: objects to consider, see :func:`adversaries_of`; empty for all. Parked cars
+            on the route would otherwise mask the distance to the adversaries of the case.
+        gap: minimum distance from the ego's box to another's so far [m], negative if they overlap.
+        margin: minimum so far [s].
     """
 
     adversaries: frozenset[str] = frozenset()
@@ -217,14 +220,17 @@ class Danger:
         self._margins.append(margin)
 
     def criticality(self, world: World) -> float:
-        """Of the episode up to now: -100 far from everybody, towards 0 the nearer; above 0 for a
-        collision at fault, more with its speed."""
+        """Criticality of the episode so far.
+
+        -100 far from everybody, rising towards 0 at closer range; positive for an at-fault
+        collision, increasing with its speed.
+        """
         if sum(world.accumulator.at_fault.values()):
             return AT_FAULT + PER_SPEED * (world.accumulator.first_impact or 0.0)
         margins = np.array(self._margins or [FARTHEST])
         least = float(margins.min())
         smooth = least - math.log(np.exp(-SHARPNESS * (margins - least)).sum()) / SHARPNESS
-        # Without fault it cannot be a failure, however near.
+        # Without fault it is not a failure, at any distance.
         found = min(-smooth, 0.0)
         return min(found, NOT_AT_FAULT) if world.accumulator.collisions else found
 
@@ -236,20 +242,20 @@ RGB = RasterOptions(depth=False, instance=False)
 
 @dataclass(frozen=True, eq=False)
 class CameraFeed:
-    """The colour images that a planner asks for.
+    """The colour images for a planner.
 
     Attributes:
-        cameras: resized to what it wants.
+        cameras: resized to the planner's needs.
     """
 
     cameras: tuple[Camera, ...]
 
     @classmethod
     def of(cls, scene: Scene, needs: Needs) -> CameraFeed | None:
-        """What a planner needs; None for one that is blind.
+        """The feed that a planner needs; None for one without images.
 
         Raises:
-            ValueError: images other than colour, or a camera that the scene lacks.
+            ValueError: images other than colour, or a camera missing in the scene.
         """
         if not needs.modalities:
             return None
@@ -269,10 +275,10 @@ class CameraFeed:
 
 
 def draw_frames(worlds: Sequence[World], camera: Camera) -> list[Frame]:
-    """What a camera sees in each of several worlds of one scene, drawn in one call.
+    """Images of a camera in several worlds of one scene, rendered in one call.
 
     Args:
-        worlds: at their instants; one at least.
+        worlds: at their current times; at least one.
         camera: of the ego.
     """
     views = [View(w.instances(), camera.viewmat(w.T_world_body), camera.K) for w in worlds]
@@ -306,9 +312,9 @@ class Drive:
     """One episode to drive.
 
     Attributes:
-        planner: by name, as ``load_planner`` takes it.
-        reset: options, the seed among them; without what the planner needs.
-        operations: edits when it begins, as JSON.
+        planner: name for ``load_planner``.
+        reset: options including the seed, without the planner's needs.
+        operations: edits at the start, as JSON.
     """
 
     planner: str
@@ -338,14 +344,14 @@ class Drive:
 
 @dataclass(eq=False)
 class Driven:
-    """An episode that was driven.
+    """A finished episode.
 
     Attributes:
-        world: at its end; None where it could not begin.
-        danger: seen on the way.
-        error: why it could not begin, or what its planner raised; None for one that went well.
-        entries: what a recording holds; empty unless asked for.
-        worlds: at every step; empty unless asked for.
+        world: at its end; None if it could not start.
+        danger: criticality over the episode.
+        error: the reason why it could not start, or the planner's exception; None on success.
+        entries: contents of a recording; empty unless requested.
+        worlds: at every step; empty unless requested.
     """
 
     world: World | None
@@ -361,15 +367,15 @@ class Driven:
 
     @property
     def criticality(self) -> float:
-        """See :meth:`.criticality.Danger.criticality`; NaN for one that could not begin."""
+        """See :meth:`.criticality.Danger.criticality`; NaN if it could not start."""
         return math.nan if self.world is None else self.danger.criticality(self.world)
 
 
 def begin(scene: Scene, drive: Drive, needs: Needs, *, privileged: bool) -> World:
-    """The world of an episode at its first instant, before its edits.
+    """The world of an episode at its start time, before its edits.
 
     Raises:
-        WorldError, ValidationError: the episode cannot run as asked.
+        WorldError, ValidationError: the episode cannot run with these options.
     """
     options = {**drive.reset, "action": needs.action, "privileged": privileged}
     return World(scene, ScenarioState.of(scene), ResetSpec.model_validate(options))
@@ -384,22 +390,21 @@ def drive_episode(
     keep_worlds: bool = False,
     on_world: Callable[[World], None] | None = None,
 ) -> Driven:
-    """Let a planner drive an episode; what it raises ends it.
+    """Let a planner drive an episode; an exception of the planner ends it.
 
-    As over the network, edits are made at the first instant, which the planner has seen without
-    them.
+    As over the network, edits are applied at the start time, after the planner's first observation.
 
     Args:
         scene: of the case.
         drive: the episode.
         planner: as loaded.
-        keep_entries: so that it can be recorded.
-        keep_worlds: so that others can go on from each of its steps.
-        on_world: shown the world at every instant.
+        keep_entries: keep the entries for a recording.
+        keep_worlds: keep the world of each step, to continue from it.
+        on_world: called with the world at every time step.
     """
     needs = needs_of(planner)
     try:
-        # A planner that does not say what it needs gets everything, as in `real2sim drive`.
+        # A planner without declared needs gets everything, as in `real2sim drive`.
         privileged = needs.privileged or not hasattr(planner, "needs")
         world = begin(scene, drive, needs, privileged=privileged)
     except (WorldError, ValidationError) as error:
@@ -447,7 +452,7 @@ def observation_of(world: World, feed: CameraFeed | None = None) -> Observation:
 
 
 def recording_of(scene: Scene, driven: Driven) -> Recording:
-    """The recording of an episode whose entries were kept."""
+    """The recording of an episode with saved entries."""
     replayer = Replayer.on(scene, ScenarioState.of(scene))
     return record(replayer, driven.entries, scene_hash=scene.content_hash or "")
 

@@ -33,7 +33,7 @@ from real2sim_proto.sweeps import (
 
 MAX_CHARACTERS = 200
 MAX_POWER = 64.0
-"""An exponent beyond this is refused: such numbers are a mistake."""
+"""Larger exponents are rejected as mistakes."""
 
 BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -71,10 +71,10 @@ def evaluate(expression: str, values: Mapping[str, float], *, check_only: bool =
     Args:
         expression: text.
         values: of the names in it.
-        check_only: what cannot be computed with these values is no error.
+        check_only: errors caused by these values are ignored.
 
     Raises:
-        ValueError: another thing than arithmetic, an unknown name, or no finite result.
+        ValueError: not arithmetic, an unknown name, or no finite result.
     """
     try:
         found = float(_value(_parsed(expression).body, values))
@@ -157,13 +157,13 @@ class FloatRange(FloatParameter):
         return self.low + (self.high - self.low) * u
 
     def coordinate(self, value: Any) -> float:
-        """Of a value."""
+        """Coordinate of a value."""
         if self.log:
             return math.log(value / self.low) / math.log(self.high / self.low)
         return (float(value) - self.low) / (self.high - self.low)
 
     def levels(self, count: int) -> list[float]:
-        """Coordinates of a grid with so many values, the ends among them."""
+        """Coordinates of a grid with ``count`` values, including the ends."""
         return [k / (count - 1) for k in range(count)] if count > 1 else [0.5]
 
 
@@ -250,10 +250,10 @@ def values_at(parameters: Mapping[str, Parameter], point: Sequence[float]) -> di
 
     Args:
         parameters: of the space.
-        point: coordinates from 0 to 1 of those that are drawn.
+        point: coordinates from 0 to 1 of the sampled parameters.
 
     Raises:
-        ValueError: a derived one cannot be computed.
+        ValueError: a derived parameter cannot be computed.
     """
     drawn = drawn_parameters(parameters)
     values: dict[str, Value] = {
@@ -267,7 +267,7 @@ def values_at(parameters: Mapping[str, Parameter], point: Sequence[float]) -> di
 
 
 def check_derived(parameters: Mapping[str, Parameter]) -> None:
-    """Raises ValueError: one that is derived from what is not before it."""
+    """Raises ValueError if a parameter is derived from one that does not precede it."""
     known = {k for k, p in parameters.items() if not isinstance(p, Derived)}
     for name, parameter in parameters.items():
         if isinstance(parameter, Derived):
@@ -305,8 +305,9 @@ def points_of(
 
 
 def spread(kind: str, count: int, dimensions: int, *, seed: int) -> Points:
-    """[count, dimensions] in [0, 1); the first of them are those of a longer sequence, but for
-    Latin hypercubes."""
+    """[count, dimensions] in [0, 1). The points are a prefix of longer sequences, except for Latin
+    hypercubes.
+    """
     from scipy.stats import qmc
 
     if dimensions == 0:
@@ -315,7 +316,7 @@ def spread(kind: str, count: int, dimensions: int, *, seed: int) -> Points:
         return np.random.default_rng(seed).random((count, dimensions))
     if kind == "sobol":
         engine = qmc.Sobol(dimensions, rng=seed)
-        # A whole power of two is drawn, which is what its balance holds for.
+        # Sample a whole power of two, as required for a balanced sequence.
         whole = engine.random_base2(max(math.ceil(math.log2(count)), 0))
         return np.asarray(whole[:count], np.float64)
     makers = {"latin_hypercube": qmc.LatinHypercube, "halton": qmc.Halton}
@@ -333,7 +334,7 @@ def _grid(method: GridMethod, drawn: Mapping[str, Drawn]) -> Points:
 
 
 def _weighted(method: ImportanceMethod, drawn: Mapping[str, Drawn]) -> tuple[Points, Points]:
-    """In coordinates the nominal density is 1, whatever a parameter's distribution."""
+    """In coordinates the nominal density is 1, for any distribution of a parameter."""
     _check_names(method.towards, drawn)
     rng, names = np.random.default_rng(method.seed), list(drawn)
     points = rng.random((method.count, len(names)))

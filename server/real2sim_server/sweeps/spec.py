@@ -59,7 +59,7 @@ from .parameters import (
 
 
 def open_scene(name: str, folder: Path | None = None) -> Scene:
-    """The bundle of that path, or of that name below a folder; the demo's street without one.
+    """The bundle at that path, or with that name below a folder; the demo street by default.
 
     Raises:
         CommandError: there is none.
@@ -70,7 +70,7 @@ def open_scene(name: str, folder: Path | None = None) -> Scene:
         if place.is_dir():
             return load_scene(place)
     if name == DEMO_SCENE:
-        # As a bundle, whose hash recordings name: the demo's worker has it so too.
+        # As a bundle, because recordings store its hash, as on the demo's worker.
         with tempfile.TemporaryDirectory(prefix="real2sim-street-") as made:
             unpack_street(Path(made), DEMO_SCENE)
             return load_scene(Path(made) / DEMO_SCENE)
@@ -82,11 +82,11 @@ def open_scene(name: str, folder: Path | None = None) -> Scene:
 
 GALLERY = "gallery:"
 SECONDS = 15.0
-"""That an episode lasts where the case does not say."""
+"""Default duration of an episode."""
 MAX_FILE_BYTES = 16 << 20
 MAX_VALUES = 1000
 WIDTHS = 4.0
-"""Standard deviations at which a normal is cut off that gives no range."""
+"""Cut-off of a normal distribution without a range, in standard deviations."""
 
 
 class ScenarioSource(BaseModel):
@@ -94,10 +94,11 @@ class ScenarioSource(BaseModel):
 
     Attributes:
         file: OpenSCENARIO file (.xosc), storyboard (.json) or ``gallery:NAME``.
-        ego: entity that is the ego; None: the one that is called so.
-        leave_out: elements that are not supported and are left out.
-        as_it_is: the scene's world is the file's, so that nothing is laid along the scene's route.
-        alone: nothing beside an OpenSCENARIO file is read: no catalogs, no road network.
+        ego: entity that is the ego; None: the one with the ego's name.
+        leave_out: unsupported elements to ignore.
+        as_it_is: the scene's world is the file's world, so nothing is placed along the scene's
+            route.
+        alone: read only the OpenSCENARIO file, without catalogs and road network.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -111,16 +112,16 @@ class ScenarioSource(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class StoryboardSpace:
-    """What makes the storyboard of each point of a space.
+    """Makes the storyboard of each point of a space.
 
-    The file is read anew for each, so that a parameter is varied wherever it stands: in numbers as
-    well as in names, counts and texts.
+    The file is read again for each point, so a parameter can be used anywhere: in numbers as well
+    as in names, counts and texts.
 
     Attributes:
-        source: what is read.
-        folder: that its name is relative to.
-        scene: that it is laid out in.
-        start_us: when episodes begin [us]; None: with the recording.
+        source: scenario source.
+        folder: base of its relative path.
+        scene: scene to place it in.
+        start_us: start of episodes [us]; None: start of the recording.
         names: parameters of the storyboard.
     """
 
@@ -134,7 +135,7 @@ class StoryboardSpace:
         """The file with values of its parameters, in its own frame. Raises as :meth:`at`."""
         mine = {name: value for name, value in values.items() if name in self.names}
         found = read_scenario(self.source, self.folder, mine)
-        # What the file draws is drawn by the space.
+        # Distributions of the file are sampled by the space.
         fields = {"distributions": {}, "drives_ego": False}
         board = found.board.model_copy(update=fields)
         return ScenarioFile(board, found.road_file, found.notes)
@@ -158,7 +159,7 @@ class StoryboardSpace:
 
 
 def is_scenario(name: str) -> bool:
-    """Whether a name is that of a scenario file or of a case of the gallery."""
+    """Whether a name refers to a scenario file or a gallery case."""
     return name.startswith(GALLERY) or name.endswith(".xosc")
 
 
@@ -190,14 +191,14 @@ def read_scenario(
 def write_scenario_file(
     folder: Path, name: str, read: ScenarioFile, source: ScenarioSource
 ) -> ScenarioSource:
-    """Write a storyboard with the road network that it names; how it is read again.
+    """Write a storyboard with its road network; returns the source to read it again.
 
     Args:
         folder: of the file.
-        name: of the file, without its suffix: ``.xosc``, or ``.json`` where OpenSCENARIO has no
-            words for it.
+        name: of the file, without its suffix: ``.xosc``, or ``.json`` if OpenSCENARIO cannot
+            express it.
         read: in the frame of its file.
-        source: that it was read from.
+        source: its original source.
     """
     board = read.board
     if isinstance(board.roads, MapRoads) and read.road_file is not None:
@@ -215,7 +216,7 @@ def write_scenario_file(
 
 
 def run_options(board: Storyboard, *, seed: int, seconds: float) -> dict[str, Any]:
-    """Options of the reset with which ``real2sim run`` drives a storyboard."""
+    """Reset options with which ``real2sim run`` drives a storyboard."""
     return {
         "storyboard": board.model_dump(mode="json"),
         "seed": seed,
@@ -227,19 +228,19 @@ def run_options(board: Storyboard, *, seed: int, seconds: float) -> dict[str, An
 def with_storyboard(
     fields: Mapping[str, Any], folder: Path, scenes: Path | None = None
 ) -> dict[str, Any]:
-    """Fields of a space whose ``storyboard`` names a scenario, with what makes storyboards of it.
+    """Fields of a space whose ``storyboard`` names a scenario, with the factory of storyboards.
 
-    Parameters of the space that have no path are those of the storyboard of that name; those that
-    the file draws from distributions need not be named.
+    Parameters of the space without a path set the storyboard's parameters of the same name.
+    Parameters with distributions in the file can be omitted.
 
     Args:
         fields: of the file.
-        folder: that the name is relative to.
-        scenes: folder of bundles, as of :func:`~.open_scene`.
+        folder: base of the relative path.
+        scenes: folder of bundles, as for :func:`~.open_scene`.
 
     Raises:
-        CommandError: no such scenario, or one that is no space; the sentence says why.
-        ValueError: fields that are none.
+        CommandError: no such scenario, or one that cannot be a space; the message says why.
+        ValueError: invalid fields.
     """
     asked = fields["storyboard"]
     source = ScenarioSource.model_validate({"file": asked} if isinstance(asked, str) else asked)
@@ -271,7 +272,7 @@ def _name(file: str) -> str:
 
 
 def _parameters(given: Mapping[str, Any], found: ScenarioFile, file: str) -> dict[str, Any]:
-    """Those that the space names, and those that the file draws beside them."""
+    """Parameters named by the space, and further ones with distributions in the file."""
     board = found.board
     # What a space names itself may have any distribution in the file.
     drawn = {n: d for n, d in board.distributions.items() if n not in given}
@@ -299,7 +300,7 @@ def _is(parameter: Any) -> bool:
 
 
 def _parameter(name: str, found: Distribution) -> dict[str, Any]:
-    """A parameter of a space that is drawn as a storyboard's is."""
+    """A parameter of a space with the distribution of a storyboard's parameter."""
     if isinstance(found, Uniform):
         return {"kind": "float", "low": found.low, "high": found.high}
     if isinstance(found, Normal) and not found.log:
@@ -323,7 +324,7 @@ def _parameter(name: str, found: Distribution) -> dict[str, Any]:
 
 
 def _of_cases(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Parameters of which the cases of a deterministic distribution are all combinations."""
+    """Parameters of a deterministic distribution whose cases are all combinations."""
     if not cases:
         return {}
     found = {name: list(dict.fromkeys(c[name] for c in cases)) for name in cases[0]}
@@ -351,14 +352,15 @@ SHIPPED_SPACES = Path(__file__).with_name("spaces")
 
 
 class Space(BaseModel):
-    """A case and what is varied in it.
+    """A case and its varied parameters.
 
-    The same for a sweep, which drives points of it, and for a search, which chooses them.
+    Used by a sweep, which drives points of it, and by a search, which selects them.
 
     Attributes:
-        case: as of a suite, with a scene.
+        case: as in a suite, with a scene.
         parameters: by name.
-        storyboard: makes the storyboard of each point; None where the case has none, or its own.
+        storyboard: makes the storyboard of each point; None if the case has no storyboard, or a
+            fixed one.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -400,12 +402,12 @@ class SweepSpec(Space):
     """A sweep: ``sweep.yaml``.
 
     Attributes:
-        method: which points.
-        seeds: each point is driven with each.
-        planners: by name, as ``load_planner`` takes them; each drives each point.
-        stop: when enough is known; None drives all.
-        metrics: scores that get columns.
-        worst: so many episodes, by ``rank_by`` from the highest on, leave recordings.
+        method: selects the points.
+        seeds: each point is driven with each seed.
+        planners: names for ``load_planner``; each drives each point.
+        stop: stop rule; None drives all points.
+        metrics: scores to add as columns.
+        worst: number of episodes to record, with the highest ``rank_by``.
         rank_by: a column.
     """
 
@@ -435,17 +437,18 @@ def load_sweep(path: Path, scenes: Path | None = None) -> SweepSpec:
 
     Args:
         path: the file.
-        scenes: folder of bundles, where a storyboard is laid out in one.
+        scenes: folder of bundles, for a storyboard placed in a scene.
 
     Raises:
-        CommandError: it cannot be read, or is none; the sentence says why.
+        CommandError: it cannot be read, or is not a sweep; the message says why.
     """
     return _loaded(path, SweepSpec, "sweep", scenes)
 
 
 def load_space(name: str | Path, scenes: Path | None = None) -> Space:
-    """A space in a YAML or JSON file, or the shipped one of that name, or that of the distributions
-    of an OpenSCENARIO file; what a sweep has beyond a space is left out.
+    """A space in a YAML or JSON file, a built-in one, or the distributions of an OpenSCENARIO file.
+
+    Fields of a sweep beyond a space are ignored.
 
     Raises:
         CommandError: as :func:`load_sweep`.
@@ -473,7 +476,7 @@ def _loaded(path: Path, kind: type[S], what: str, scenes: Path | None) -> S:
 def _validated(
     fields: dict[str, Any], folder: Path, kind: type[S], named: tuple[str, str], scenes: Path | None
 ) -> S:
-    """Args: fields; the folder of names in them; what they are of; file and kind for messages."""
+    """Args: fields; base folder of names in them; model; file and kind for messages."""
     name, what = named
     if kind is Space:
         fields = {k: v for k, v in fields.items() if k in Space.model_fields}
@@ -493,7 +496,7 @@ def _content(path: Path) -> dict[str, Any]:
     if (size := path.stat().st_size) > MAX_BYTES:
         raise ValueError(f"{size} bytes; at most {MAX_BYTES} are read")
     text = path.read_text(encoding="utf-8")
-    # Aliases let a small file stand for a huge one, and no sweep needs them.
+    # Aliases let a small file expand to a huge one, and no sweep needs them.
     if path.suffix != ".json" and any(
         isinstance(e, yaml.events.AliasEvent) for e in yaml.parse(text, yaml.SafeLoader)
     ):
@@ -505,8 +508,9 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _put(fields: dict[str, Any], path: str, value: Value) -> None:
-    """Set what a path names: ``reset.agents.drivers.van_0.gap``, the same without ``reset``, or
-    ``operations.0.delta.1``."""
+    """Set the value at a path: ``reset.agents.drivers.van_0.gap``, the same without ``reset``, or
+    ``operations.0.delta.1``.
+    """
     parts = path.split(".")
     if parts[0] not in {"reset", "operations"}:
         parts.insert(0, "reset")

@@ -41,14 +41,13 @@ MAX_LINE = 1 << 20
 
 
 class Journal:
-    """A file that only grows: ``checksum key row`` a line.
+    """An append-only file with lines ``checksum key row``.
 
-    What was being written when the program was killed is the last line, whose checksum then does
-    not fit; it is cut off. Lines that are damaged elsewhere are left out, and their episodes driven
-    again.
+    If the program is killed during a write, the checksum of the last line is wrong and the line is
+    cut off. Other damaged lines are skipped, and their episodes driven again.
 
     Args:
-        path: of the file; it is made where it is not there.
+        path: of the file; it is created if missing.
 
     Raises:
         ValueError: a file of another kind, or too large.
@@ -93,7 +92,7 @@ class Journal:
         os.fdatasync(self._file.fileno())
 
     def _read(self) -> int:
-        """Take in all whole lines; where the last of them ends."""
+        """Read all whole lines; returns the end of the last one."""
         if (size := self._path.stat().st_size) > MAX_BYTES:
             raise ValueError(f"{self._path} has {size} bytes; at most {MAX_BYTES} are read")
         end = 0
@@ -129,12 +128,12 @@ def _row(line: bytes) -> tuple[str, dict[str, Any]] | None:
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, type]) -> None:
-    """Write rows, whole or not at all; equal rows are equal bytes.
+    """Write rows atomically; equal rows give equal bytes.
 
     Args:
         path: of the file.
-        rows: in their order.
-        types: of the columns, in their order: ``bool``, ``int``, ``float`` or ``str``.
+        rows: in order.
+        types: of the columns, in order: ``bool``, ``int``, ``float`` or ``str``.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -162,7 +161,7 @@ def _as(kind: type, value: Any) -> Any:
 # --- Worker --------------------------------------------------------------------------------------
 
 Row = dict[str, Any]
-"""Columns of one episode: numbers, text, truth values, None for what is not known."""
+"""Columns of one episode: numbers, text, booleans, None for unknown values."""
 
 COLUMNS: Mapping[str, type] = {
     "reason": str,
@@ -182,7 +181,7 @@ COLUMNS: Mapping[str, type] = {
     "impact_object": str,
     "impact_kind": str,
 }
-"""What is measured of every episode; wall-clock times are not, so that tables can be compared."""
+"""Measured columns of every episode; without wall-clock times, so that tables are comparable."""
 
 
 def recipe_of(scene: str, scenes: Path | None, metrics: Sequence[str] = ()) -> Recipe:
@@ -218,7 +217,7 @@ class EpisodeWorker:
 
 
 def row_of(driven: Driven, metrics: Sequence[str] = ()) -> Row:
-    """Columns of an episode that was driven, and the scores that are asked for."""
+    """Columns of a finished episode, and the requested scores."""
     row: Row = dict.fromkeys(COLUMNS)
     row |= {f"score_{name}": None for name in metrics}
     row["error"] = driven.error
@@ -244,7 +243,7 @@ def row_of(driven: Driven, metrics: Sequence[str] = ()) -> Row:
 
 
 def _impact(driven: Driven) -> Row:
-    """Of the first contact, where the episode ended with it."""
+    """Columns of the first contact, if the episode ended with it."""
     assert driven.world is not None
     begun = [c for c in driven.world.instant.contacts if c.begun]
     if not begun:
@@ -265,7 +264,7 @@ def _finite(value: float) -> float | None:
 JOURNAL, TABLE = "episodes.journal", "episodes.parquet"
 RECORDINGS, SCENARIOS = "recordings", "scenarios"
 AT_ONCE = 64
-"""With a stop rule, so many episodes are handed out before it is asked again."""
+"""With a stop rule, number of episodes to start before it is evaluated again."""
 
 Report = Callable[[str, int, int], None]
 
@@ -275,8 +274,8 @@ class PlannedEpisode:
     """One row of the table before it is driven.
 
     Attributes:
-        point: number of the point of the space.
-        planner, seed: who drives it, and with which seed.
+        point: index of the point in the space.
+        planner, seed: of the episode.
         weight: of its point.
         values: of the parameters.
         drive: the episode.
@@ -292,7 +291,7 @@ class PlannedEpisode:
     key: str
 
     def columns(self) -> Row:
-        """What the table says of it beside what was measured."""
+        """Columns that do not depend on the result."""
         given = {"point": self.point, "planner": self.planner, "seed": self.seed}
         return {**given, "weight": self.weight, **self.values, "episode": self.key}
 
@@ -305,24 +304,24 @@ def run_sweep(
     scenes: Path | None = None,
     on_progress: Report = lambda _stage, _done, _total: None,
 ) -> dict[str, Any]:
-    """Drive a sweep into a folder; what is there already of the same episodes is not driven again.
+    """Drive a sweep into a folder; episodes that are already there are not driven again.
 
-    The table depends on the spec, the scene and the version alone: not on who drives, in which
-    order, nor on how often the sweep was killed on the way.
+    The table depends only on the spec, the scene and the version, not on the executor, the order,
+    or interruptions of the sweep.
 
     Args:
-        spec: what is driven.
+        spec: the sweep.
         out: folder of ``episodes.parquet``, ``recordings/``, ``scenarios/`` and the journal.
-        executor: who drives.
+        executor: runs the episodes.
         scenes: folder of bundles; every worker finds it at the same path.
         on_progress: called with (stage, done, all).
 
     Returns:
-        Figures: episodes, those that were driven now, collisions, at-fault ones; keys of the worst.
+        Figures: episodes, newly driven ones, collisions, at-fault ones; keys of the worst.
 
     Raises:
         CommandError: no such scene, planner, score or column.
-        ExecutorError: the executor cannot go on.
+        ExecutorError: the executor cannot continue.
     """
     assert spec.case.scene is not None
     scene = open_scene(spec.case.scene, scenes)
@@ -372,7 +371,7 @@ def planned_episodes(spec: SweepSpec, scene_hash: str) -> list[PlannedEpisode]:
     """Rows of a sweep, in the order of its table: by point, planner, seed.
 
     Raises:
-        CommandError: a point at which a derived parameter, or the case, is not allowed.
+        CommandError: a derived parameter, or the case, is invalid at a point.
     """
     points, weights = points_of(spec.method, drawn_parameters(spec.parameters))
     found, keys = [], set()
@@ -435,8 +434,7 @@ def _parts(planned: list[PlannedEpisode], stop: StopRule | None) -> Iterator[lis
 
 
 def _enough(planned: list[PlannedEpisode], rows: Mapping[str, Row], stop: StopRule) -> int | None:
-    """How many rows of the table are enough, counted in its order; None where all driven so far
-    are not."""
+    """Number of rows that satisfy the stop rule, in table order; None if not yet satisfied."""
     at_fault = collisions = 0
     for number, episode in enumerate(planned, start=1):
         if (row := rows.get(episode.key)) is None:
@@ -463,7 +461,7 @@ def _worst(
 
 
 def _record(scene: Scene, drive: Drive, path: Path) -> None:
-    """A recording, for which the episode is driven once more: the same bits."""
+    """Make a recording by driving the episode again: the same bits."""
     if not path.exists():
         driven = drive_episode(scene, drive, load_planner(drive.planner), keep_entries=True)
         save_recording(recording_of(scene, driven), path)

@@ -72,8 +72,8 @@ def append_geometry(
     """Append meshes to a geometry, for :func:`refit`.
 
     Returns:
-        The geometry; of each mesh the order of its triangles, the row of the first, and its first
-        node and the one behind its last.
+        The geometry; for each mesh the order of its triangles, the row of the first, and its first
+        node and the one after its last.
     """
     parts: list[tuple[NDArray[np.generic], ...]] = [geometry]
     places = []
@@ -265,7 +265,7 @@ def new_stack():
 
 @func
 def _enter(bounds, node, ox, oy, oz, ix, iy, iz, limit):
-    """Distance at which a ray enters a node's box, infinity where it misses it."""
+    """Distance at which a ray enters a node's box, infinity if it misses."""
     a, b = (bounds[node, 0] - ox) * ix, (bounds[node, 3] - ox) * ix
     near, far = min(a, b), max(a, b)
     a, b = (bounds[node, 1] - oy) * iy, (bounds[node, 4] - oy) * iy
@@ -288,9 +288,9 @@ def _inverse(x):
 def cast_mesh(  # noqa: PLR0912, PLR0915 - one loop; parting it costs a call per node
     bounds, children, counts, edges, root, ox, oy, oz, dx, dy, dz, limit, any_hit, stack
 ):
-    """Nearest hit below ``root``: (distance, triangle, u, v), triangle -1 where there is none.
+    """Nearest hit below ``root``: (distance, triangle, u, v), triangle -1 without a hit.
 
-    With ``any_hit`` the first one found. Moeller and Trumbore, "Fast, minimum storage ray/triangle
+    With ``any_hit`` the first hit found. Moeller and Trumbore, "Fast, minimum storage ray/triangle
     intersection", 1997.
     """
     nodes, entries = stack

@@ -53,7 +53,7 @@ class SyntheticLog(DrivingLog):
             T_world_camera: [4, 4], OpenCV camera frame.
             k: [3, 3] intrinsics [px], pixel centres at +0.5.
             width, height: image size [px].
-            t_us: time [us]; outside the drive vehicles go straight on.
+            t_us: time [us]; outside the drive vehicles move straight on.
 
         Returns:
             RGB uint8 [H, W, 3]; depth float32 [H, W] along the camera's z [m], 0 in the sky;
@@ -74,16 +74,16 @@ class SyntheticLog(DrivingLog):
         """Ground truth of an edited street: with only these vehicles, at these poses.
 
         Args:
-            T_world_camera, k: as of :meth:`render`.
+            T_world_camera, k: as in :meth:`render`.
             size: width and height [px].
-            vehicles: [N] indices into ``tracks``, one as often as it shall be there.
+            vehicles: [N] indices into ``tracks``, may repeat.
             T_world_objects: [N, 4, 4] poses of their boxes.
 
         Returns:
             As :meth:`render`; instances are 1 + index into ``vehicles``.
 
         Raises:
-            ValueError: an index of somebody on foot or on a bicycle.
+            ValueError: an index of a person on foot or on a bicycle.
         """
         source = self.source
         assert isinstance(source, SyntheticSource)
@@ -146,16 +146,16 @@ class SyntheticLog(DrivingLog):
         height: int,
         times_us: tuple[int, int],
     ) -> NDArray[np.float32]:
-        """The true optical flow from a picture to the next one.
+        """The true optical flow from one picture to the next.
 
         Args:
-            T_world_camera, T_world_next: [4, 4], where the camera is in both.
-            k, width, height: as of :meth:`render`.
+            T_world_camera, T_world_next: [4, 4], camera poses in both.
+            k, width, height: as in :meth:`render`.
             times_us: of both.
 
         Returns:
-            [H, W, 2] float32, where the surface seen at a pixel's centre goes [px], whether it is
-            hidden then or not; NaN in the sky and for what gets behind the camera.
+            [H, W, 2] float32, motion of the surface at a pixel's centre [px], even if it is then
+            occluded; NaN in the sky and for surfaces that move behind the camera.
         """
         source = self.source
         assert isinstance(source, SyntheticSource)
@@ -166,11 +166,11 @@ class SyntheticLog(DrivingLog):
         """The true sweep of a LiDAR on the vehicle about ``t_us`` [us], without noise or losses.
 
         Args:
-            lidar: whose rays are [B, C] with one instant for each column.
+            lidar: with [B, C] rays and one time per column.
             t_us: time stamp of the sweep.
 
         Returns:
-            Ranges [B, C] [m], 0 where nothing is; reflectivity [B, C] in [0, 1].
+            Ranges [B, C] [m], 0 without a hit; reflectivity [B, C] in [0, 1].
         """
         source = self.source
         assert isinstance(source, SyntheticSource)
@@ -381,8 +381,8 @@ class SyntheticSource:
     def lidar(self, frame: int) -> LidarSweep:
         """One turn of the LiDAR, clockwise, looking ahead at the frame's time stamp.
 
-        Every column is cast with the vehicles and the sensor where they are at its own instant;
-        the sensor's motion is then taken out exactly, that of the vehicles is left in.
+        Every column is cast with the vehicles and the sensor at its own time. The sensor's motion
+        is then compensated exactly; the vehicles' motion is not.
         """
         config, t_us = self.config, int(self.drive.frame_times_us[frame])
         if config.lidar_beams == 0:
@@ -409,7 +409,7 @@ class SyntheticSource:
 
 
 def _joined(vehicles: Instances, people: Instances) -> Instances:
-    """One after the other; poses have an axis of instants in front."""
+    """Concatenate instances; poses have a leading time axis."""
     return Instances(
         *(
             np.concatenate(

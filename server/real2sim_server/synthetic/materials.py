@@ -1,7 +1,7 @@
 """Materials of surfaces: albedo and gloss as functions of texture coordinates.
 
-Every material takes the size of a pixel on the surface and fades what is finer, so that textures
-do not alias at a distance. Colours are linear RGB; the last value is the fraction of mirror
+Every material takes the size of a pixel on the surface and fades finer detail, so that textures do
+not alias at a distance. Colours are linear RGB; the last value is the fraction of mirror
 reflection.
 """
 
@@ -72,7 +72,7 @@ def layered_noise(x, y, octaves, footprint, seed):
 
 @func(fastmath=True)
 def band(x, low, high, footprint):
-    """Fraction of a pixel of width ``footprint`` around x that lies in [low, high]."""
+    """Fraction of a pixel of width ``footprint`` around x inside [low, high]."""
     half = 0.5 * max(footprint, 1e-6)
     return max(0.0, min(x + half, high) - max(x - half, low)) / (2.0 * half)
 

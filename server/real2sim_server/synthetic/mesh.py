@@ -15,11 +15,11 @@ PAINT_WIDTH = 8
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles.
+    """A triangle mesh.
 
     Attributes:
         corners: [T, 3, 3] [m].
-        uv: [T, 3, 2], what the material makes of them.
+        uv: [T, 3, 2], texture coordinates of the material.
         normals: [T, 3, 3], at the corners, unit.
         material: [T] int32, see :mod:`.materials`.
         paint: [T] int32, row of the paint table.
@@ -72,7 +72,7 @@ class MeshBuilder:
                 local[:, axis] = bounds[side, axis]
                 local[:, i] = bounds[[0, 1, 1, 0], i]
                 local[:, j] = bounds[[0, 0, 1, 1], j]
-                # Vertical faces get (along, up), so that textures stand upright.
+                # Vertical faces get (along, up), so that textures are upright.
                 uv = local[:, [j, i]] if j != 2 else local[:, [i, j]]
                 self.quad(np.asarray(origin) + local @ axes, material, paint, uv)
 

@@ -30,10 +30,10 @@ class PersonMesh:
     """A person's triangles, and their position in the world's arrays.
 
     Attributes:
-        person: whose they are.
+        person: the person.
         triangles: [T, 3] vertices, body and bicycle.
-        parts: [T] what they belong to, see :func:`part_names`.
-        order: [T] triangle at each place of the world's arrays from ``first`` on.
+        parts: [T] part of each triangle, see :func:`part_names`.
+        order: [T] triangle at each position of the world's arrays from ``first`` on.
         first: row of the first triangle.
         nodes: rows of the hierarchy, from and to; the first is its root.
     """
@@ -164,7 +164,7 @@ class PeopleTruth:
 
 
 def people_truth(people: Sequence[PlannedPerson], first: int, t_us: int) -> PeopleTruth:
-    """Of people whose first is track ``first``."""
+    """Truth for people, with ``first`` as the track of the first one."""
     joints, keypoints = np.zeros((len(people), 22, 3)), np.zeros((len(people), 17, 3))
     for i, person in enumerate(people):
         pose = poses_at(person.trajectory, np.array([float(t_us)]))[0]

@@ -55,7 +55,7 @@ def sky_colour(x, y, z, seed):
 
 @func(fastmath=True)
 def ambient(nz, openness):
-    """Light of sky and ground on a surface whose normal has the z component ``nz``."""
+    """Light of sky and ground on a surface with z component ``nz`` of its normal."""
     up = 0.5 + 0.5 * nz
     r = blend(0.36, 0.62, up) * openness
     g = blend(0.34, 0.72, up) * openness
@@ -92,9 +92,9 @@ CAR_SHADE_REACH = 1.1
 
 
 class RaycastWorld(NamedTuple):
-    """Everything that a ray can hit, without the poses of vehicles.
+    """All static geometry and vehicle shapes for ray casting, without the poses of vehicles.
 
-    One flat tuple, because parallel kernels take no nested ones.
+    One flat tuple, because parallel kernels do not support nested ones.
 
     Attributes:
         bounds, children, counts, edges, uv, normals, material, paint: as in :class:`.bvh.Geometry`;
@@ -156,7 +156,7 @@ def surface_at(world, instances, hit, ox, oy, oz, dx, dy, dz, spread):
     gx, gy, gz = _unit(gx, gy, gz)
     if gx * dx + gy * dy + gz * dz > 0.0:
         gx, gy, gz = -gx, -gy, -gz
-    # Leaves are lit as the crown they belong to, whichever way each one is turned.
+    # Leaves are lit like their crown, independent of their orientation.
     if nx * gx + ny * gy + nz * gz < 0.0 and g.material[k] != LEAVES:
         nx, ny, nz, bx, by, bz = -nx, -ny, -nz, -bx, -by, -bz
     f = t * spread
@@ -200,10 +200,10 @@ def _unit(x, y, z):
 
 @func(fastmath=True)
 def _footprint(f, dx, dy, dz, gx, gy, gz):
-    """Size of a pixel along u and v: stretched along the view on slanted surfaces.
+    """Size of a pixel along u and v, stretched along the view on slanted surfaces.
 
-    On level ground u runs along the street, that is along x within some degrees; on walls u runs
-    level and v up, and a wall is seen slanted along u.
+    On level ground u follows the street, within some degrees of x. On walls u is horizontal and v
+    vertical, and the view is slanted along u.
     """
     slant = min(1.0 / max(-(dx * gx + dy * gy + dz * gz), 0.02), 30.0)
     if abs(gz) > 0.5:
@@ -218,10 +218,10 @@ def _footprint(f, dx, dy, dz, gx, gy, gz):
 
 @func(fastmath=True, forceinline=True)
 def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
-    """A ray whose nearest hit is known: linear (r, g, b), key, normal and plane offset.
+    """Shade a ray with a known nearest hit: linear (r, g, b), key, normal and plane offset.
 
-    The key names what was hit and whether the sun reaches it; equal keys, normals and offsets of
-    neighbouring pixels mean that one sample each will do. Negative keys ask for more anyway.
+    The key identifies the surface and whether it is in the sun. Neighbouring pixels with equal
+    keys, normals and offsets need only one sample each. Negative keys always need more.
     """
     t, k, _, _, instance = hit
     if k < 0:
@@ -271,7 +271,7 @@ def ray_colour(world, instances, hit, ox, oy, oz, dx, dy, dz, spread, stack):
 
 @func(fastmath=True, forceinline=True)
 def _openness(instances, instance, x, y, z, nz):
-    """Fraction of the sky's light that reaches a point: less beside and under vehicles."""
+    """Fraction of the sky's light that reaches a point: less next to and under vehicles."""
     fraction = 1.0
     if instance >= 0:
         height = z - (instances.to_world[instance, 2, 3] - instances.half_size[instance, 2])
@@ -344,9 +344,9 @@ def shoot_image(
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint16]]:
     """RGB uint8 [height, width, 3], depth float32 and instance uint16 [height, width].
 
-    One ray through every pixel's centre, which gives depth and instance; then ``samples``^2 rays
-    where the surface, its direction or its shadow changes between neighbours. Textures are
-    band-limited and need no more than one.
+    One ray through every pixel's centre gives depth and instance. Pixels where the surface, its
+    direction or its shadow differs from a neighbour get ``samples``^2 rays. Textures are
+    band-limited and need only one.
     """
     row, column = np.divmod(np.arange(width * height), width)
     centres = np.stack([column + 0.5, row + 0.5], axis=1)
@@ -370,8 +370,8 @@ def shoot_image(
 def _sheared_grid(samples: int) -> Float:
     """Sample positions [samples^2, 2] relative to a pixel's centre.
 
-    No two share a row or a column, which smooths level and upright edges best; and being the same
-    in every pixel they add no grain.
+    No two share a row or a column, which gives the best antialiasing of horizontal and vertical
+    edges. The same pattern in every pixel adds no grain.
     """
     j, i = np.divmod(np.arange(samples * samples), samples)
     x = (i + (j + 0.5) / samples) / samples
@@ -383,7 +383,7 @@ def _sheared_grid(samples: int) -> Float:
 def _shoot(world, instances, m, k, positions, size):
     """Fields of :class:`Samples` for rays through image positions [N, 2].
 
-    ``m`` is the camera's pose in the world, ``size`` the fraction of a pixel that a ray stands for.
+    ``m`` is the camera's pose in the world, ``size`` the fraction of a pixel per ray.
     """
     n = len(positions)
     colours, planes = np.empty((n, 3), np.float32), np.empty((n, 4), np.float32)
@@ -417,9 +417,9 @@ def shoot_rays(world, instances, origins, directions, sizes):
 
     Args:
         world: static part.
-        instances: vehicles at one instant.
+        instances: vehicles at one time.
         origins, directions: [N, 3] of the rays in the world, unit length.
-        sizes: [N], angle that a ray stands for [rad].
+        sizes: [N], angular size of a ray [rad].
     """
     n = len(origins)
     colours, ranges = np.empty((n, 3), np.float32), np.zeros(n, np.float32)
@@ -465,7 +465,7 @@ def trace(world, instances, m, k, width, height):
 
 @kernel
 def _find_edges(keys, planes):
-    """Mask [H, W] of pixels whose surface differs from one of their eight neighbours'."""
+    """Mask [H, W] of pixels with a surface that differs from one of their eight neighbours."""
     edges = np.zeros(keys.shape, np.bool_)
     for row in range(keys.shape[0]):
         for column in range(keys.shape[1]):
@@ -487,7 +487,7 @@ def _is_edge(keys, planes, row, column):
                 turned -= planes[row, column, i] * planes[y, x, i]
             if key > 0 and turned > 0.06:
                 return True
-            # Flat surfaces of one kind at different depths; on curved ones offsets drift slowly.
+            # Flat surfaces of one kind at different depths; on curved ones offsets change slowly.
             if abs(planes[row, column, 3] - planes[y, x, 3]) > 0.08 and turned < 1e-5:
                 return True
     return False
@@ -495,14 +495,14 @@ def _is_edge(keys, planes, row, column):
 
 @kernel(parallel=True)
 def shoot_lidar(world, sweeps, origins, directions, limit):
-    """Ranges [C, B], reflectivity [C, B] in [0, 1] of one turn; range 0 where nothing returns.
+    """Ranges [C, B], reflectivity [C, B] in [0, 1] of one turn; range 0 without a return.
 
     Args:
         world: static part.
-        sweeps: vehicles at each column's instant, arrays with a leading [C] axis.
-        origins: [C, 3] of the sensor in the world at each column's instant [m].
+        sweeps: vehicles at each column's time, arrays with a leading [C] axis.
+        origins: [C, 3] of the sensor in the world at each column's time [m].
         directions: [C, B, 3] unit, in the world.
-        limit: farthest return [m].
+        limit: maximum range [m].
     """
     columns, beams = directions.shape[:2]
     ranges = np.zeros((columns, beams), np.float32)

@@ -48,26 +48,26 @@ DEFAULT_CAMERAS = (
 
 @dataclass(frozen=True)
 class SyntheticConfig:
-    """A synthetic drive; the same values give the same bits.
+    """Configuration of a synthetic drive; the same values give the same bits.
 
     Attributes:
-        seed: of everything random: street, traffic, textures, LiDAR noise.
+        seed: of all randomness: street, traffic, textures, LiDAR noise.
         frames: number of frames.
         hz: frames per second, and turns of the LiDAR per second.
         width, height: image size of every camera [px].
         cameras: the rig.
-        samples: rays per pixel along each image axis, where there are edges.
-        moving_cars: vehicles that drive, ahead of the ego vehicle and towards it.
-        parked_cars: vehicles at the kerbs; fewer where the street has no room for more.
+        samples: rays per pixel along each image axis, at edges.
+        moving_cars: number of moving vehicles, ahead of the ego vehicle and oncoming.
+        parked_cars: number of vehicles at the kerbs; fewer if the street has no room for more.
         speed: mean speed of the ego vehicle [m/s].
         lidar_beams, lidar_columns: beams, and azimuth steps per turn; 0 beams for no LiDAR.
-        lidar_range: farthest return [m].
+        lidar_range: maximum range [m].
         lidar_noise: standard deviation of the measured range [m].
-        pedestrians, cyclists: who walk, wait, cross and run, and who ride; a street with them has
-            the vehicles of the one without.
+        pedestrians, cyclists: number of people on foot and on bicycles; they do not change the
+            vehicles of a street.
 
     Raises:
-        ValueError: a value that gives no drive.
+        ValueError: an invalid value.
     """
 
     seed: int = 0
@@ -118,7 +118,7 @@ class SyntheticConfig:
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> SyntheticConfig:
-        """From the JSON values of ``dataclasses.asdict``, as a log's provenance holds them.
+        """From the JSON values of ``dataclasses.asdict``, as in a log's provenance.
 
         Raises:
             KeyError, TypeError, ValueError: values of another version of this class.

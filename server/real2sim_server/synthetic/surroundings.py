@@ -81,7 +81,7 @@ class House:
 
     @property
     def height(self) -> float:
-        """Of the eaves [m]."""
+        """Height of the eaves [m]."""
         return self.floors * self.floor_height + 0.5
 
 
@@ -110,10 +110,10 @@ def design_house(rng: np.random.Generator, builder: MeshBuilder) -> House:
 
 
 class Facade:
-    """Places flat pieces in a house's own axes: u along the front, w out of it, z up."""
+    """Places flat pieces in a house's own axes: u along the front, w outwards, z up."""
 
     def __init__(self, builder: MeshBuilder, start: ArrayLike, end: ArrayLike) -> None:
-        """The front runs from ``start`` to ``end`` [2]; the street lies to its right."""
+        """The front runs from ``start`` to ``end`` [2]; the street is to its right."""
         self.builder = builder
         self.start = np.asarray(start, dtype=np.float64)
         span = np.asarray(end, dtype=np.float64) - self.start
@@ -344,7 +344,7 @@ def _add_house_row(
         width = min(rng.uniform(9, 17), street.end - s)
         setback = float(rng.choice([0.0, 0.0, 0.4, 0.8, 5.0], p=[0.4, 0.15, 0.15, 0.15, 0.15]))
         ends = street.point([s, s + width], side * (FACADE + setback))
-        # The street must lie to the right of a front's direction.
+        # The street must be to the right of a front's direction.
         start, end = ends if side > 0 else ends[::-1]
         house = design_house(rng, builder)
         add_house(Facade(builder, start, end), house, rng)

@@ -1,7 +1,7 @@
 """Traffic of a synthetic drive: the ego vehicle's path, other vehicles, pedestrians, cyclists.
 
-People are planned after the vehicles and give way to them, so a street with people has the same
-vehicles as the one without.
+People are planned after the vehicles and yield to them, so people do not change the vehicles of a
+street.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ ADULTS = (
 CHILDREN = ("girl", "boy", "small_girl", "small_boy")
 WOMEN = ("woman", "girl")
 HEIGHTS = {"tall_man": 1.92, "tall_woman": 1.8}
-"""Of builds whose default height is larger than the name suggests [m]."""
+"""Heights of builds whose default height is too large for their name [m]."""
 
 LOW, HIGH = 7.1, 8.5
 """Range of distances from the centre line for walking on a pavement [m]."""
@@ -79,8 +79,8 @@ class PlannedPerson:
         doing: "walks", "waits", "crosses", "turns", "runs" or "rides".
         motion: gait or ride; its times are those of the drive in seconds.
         looks: clothes and colours.
-        trajectory: ``T_world_object`` of the box, which stands still in the body's frame.
-        size: (length, width, height) of a box that holds every pose of the drive [m].
+        trajectory: ``T_world_object`` of the box, which is fixed in the body's frame.
+        size: (length, width, height) of a box that contains every pose of the drive [m].
         middle: height of the box's centre above the origin of the body's frame [m].
     """
 
@@ -109,7 +109,7 @@ class PlannedPerson:
         return joint_positions(body, transforms) - down, points - down
 
     def pose(self, times: Float) -> Pose:
-        """Pose of the body [T], whose frame is ``middle`` below the box's centre."""
+        """Pose of the body [T]; its frame is ``middle`` below the box's centre."""
         return self.motion.pose(times)
 
 
@@ -251,7 +251,7 @@ class _Planner:
         return s, d, np.full_like(s, KERB_HEIGHT), np.full_like(s, facing)
 
     def _cross(self, body: Body) -> Path:
-        """Over the crossing, after a moment at the kerb or already on the way."""
+        """Across the crossing, after a moment at the kerb or already moving."""
         side = self.rng.choice([-1.0, 1.0])
         speed = self.rng.uniform(0.38, 0.5) * np.sqrt(9.81 * body.leg_length)
         begin = self.rng.uniform(-8.0, max(self.t[-1] - 1.0, -2.0))
@@ -527,7 +527,7 @@ def _moving(
     turn: float,
 ) -> PlannedVehicle:
     z = SHAPES[shape].size[2] / 2
-    # Both directions keep right, so those who come towards us drive left of the centre line.
+    # Traffic keeps right, so oncoming vehicles drive left of the centre line.
     d = EGO_OFFSET if turn == 0.0 else -EGO_OFFSET
     trajectory = _follow(street, s, np.full_like(s, d), times_us, turn=turn, z=z)
     return PlannedVehicle(shape, _colour(rng), trajectory)
@@ -578,8 +578,8 @@ def _seconds(times_us: NDArray[np.int64]) -> Float:
 def poses_at(trajectory: Trajectory, times_us: Float) -> Float:
     """``T_fixed_moving`` [T, 4, 4] at any times [T] [us].
 
-    Between time stamps as :class:`Trajectory` does it; before and after them straight on with
-    the velocity of the nearest segment.
+    Between time stamps as in :class:`Trajectory`; outside, straight on with the velocity of the
+    nearest segment.
     """
     known = trajectory.times_us
     if len(known) == 1:

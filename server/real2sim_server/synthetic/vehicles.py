@@ -37,10 +37,10 @@ class VehicleShape:
         rear_window: likewise; equal values for none.
         axles: x / length of the rear and the front axle.
         wheel_radius, clearance: of wheels, and below the sill.
-        pillars: number of pillars that part the side glass.
+        pillars: number of pillars between the side windows.
         boxiness: exponent of the roof's cross-section, small for boxy.
         cargo: x / length from and to of a box behind the cab; equal values for none.
-        weight: how often it is seen.
+        weight: relative frequency.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""What is known of an instant: boxes, masks, visibility, depth, flow, tracks and futures.
+"""Labels of a time step: boxes, masks, visibility, depth, flow, tracks and futures.
 
-All of it comes from one pass per camera, from passes of objects alone and from the poses that the
-drive has; :data:`HOW` says which label from what.
+All labels come from one pass per camera, passes of single objects, and the poses of the drive;
+:data:`HOW` describes the source of each label.
 """
 
 from .boxes import ObjectBox, boxes_at, ego_future, ego_state, futures_at, projected_box

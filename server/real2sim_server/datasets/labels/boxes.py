@@ -33,7 +33,7 @@ EDGES = (
 """Edges between corners in the order of ``box_corners``."""
 
 Box2D = tuple[float, float, float, float]
-"""Left, top, right, bottom [px]; pixel (0, 0) reaches from 0 to 1."""
+"""Left, top, right, bottom [px]; pixel (0, 0) extends from 0 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +77,9 @@ def boxes_at(placed: PlacedObjects[ObjectState]) -> list[ObjectBox]:
 def projected_box(
     T_world_object: Float, size: Sequence[float], camera: Camera, T_world_camera: Float
 ) -> Box2D | None:
-    """Bounding box [px] of a projected 3D box, not cut at the border of the image; None where all
-    of it is behind the near plane."""
+    """Bounding box [px] of a projected 3D box, not clipped to the image; None if it is completely
+    behind the near plane.
+    """
     T_camera_object = invert_transform(T_world_camera) @ T_world_object
     corners = box_corners(T_camera_object, size)
     depths = corners[:, 2].tolist()
@@ -93,7 +94,7 @@ def projected_box(
 
 
 def _ahead(corners: Float) -> Float:
-    """Corners in front of the near plane, and where edges meet it."""
+    """Corners in front of the near plane, and intersections of edges with it."""
     seen = [corner for corner in corners if corner[2] >= NEAR]
     for i, j in EDGES:
         a, b = corners[i], corners[j]
@@ -103,7 +104,7 @@ def _ahead(corners: Float) -> Float:
 
 
 def cut_at_border(box: Box2D, width: int, height: int) -> Box2D | None:
-    """The part of a box that is in an image; None where there is none."""
+    """The part of a box inside an image; None if there is none."""
     left, top, right, bottom = box
     cut = (max(left, 0.0), max(top, 0.0), min(right, float(width)), min(bottom, float(height)))
     return cut if cut[0] < cut[2] and cut[1] < cut[3] else None
@@ -131,14 +132,14 @@ REACH = 60.0
 
 @dataclass(frozen=True)
 class BoxNoise:
-    """Errors of a detector.
+    """Error model of a detector.
 
     Attributes:
         position: standard deviation of each coordinate of the centre [m].
-        size: of each edge, as a share of it.
+        size: of each edge, relative to its length.
         heading: [rad].
-        missed: share of boxes that are not found.
-        false: mean number of boxes in a frame where nothing is.
+        missed: share of missed boxes.
+        false: mean number of false positives per frame.
     """
 
     position: float = 0.0
@@ -215,7 +216,8 @@ AGENT_STEPS, EGO_STEPS = 16, 8
 
 def futures_at(drive: Drive, t_us: int, object_ids: Sequence[str]) -> dict[str, list[list[float]]]:
     """The next 8 s of each object at 2 Hz, by id: rows (seconds, x, y, z, heading) in the world,
-    as far as the object is there and the drive goes."""
+    while the object exists and until the end of the drive.
+    """
     futures: dict[str, list[list[float]]] = {object_id: [] for object_id in object_ids}
     for step in range(1, AGENT_STEPS + 1):
         then = t_us + step * STEP_US
@@ -238,8 +240,9 @@ def _rows(placed: PlacedObjects[ObjectState], step: int) -> dict[str, list[float
 
 
 def ego_future(drive: Drive, t_us: int) -> list[list[float]]:
-    """The ego's next 4 s at 2 Hz: rows (seconds, x, y, heading) in its own frame at ``t_us``, as
-    far as the drive goes."""
+    """The ego's next 4 s at 2 Hz: rows (seconds, x, y, heading) in its own frame at ``t_us``, until
+    the end of the drive.
+    """
     to_ego = invert_transform(drive.ego_at(t_us))
     rows = []
     for step in range(1, EGO_STEPS + 1):
@@ -253,8 +256,9 @@ def ego_future(drive: Drive, t_us: int) -> list[list[float]]:
 
 
 def ego_state(drive: Drive, path: LoggedPath, t_us: int) -> dict[str, Any]:
-    """What a planner is told at ``t_us``, as in a session: ``speed`` [m/s], ``command``, and
-    ``route``, 20 places 2 m apart in the ego's frame [m] along ``path``, the recorded drive."""
+    """Planner input at ``t_us``, as in a session: ``speed`` [m/s], ``command``, and ``route``, 20
+    points 2 m apart in the ego's frame [m] along ``path``, the recorded drive.
+    """
     pose = drive.ego_at(t_us)
     x, y = pose[:2, 3].tolist()
     yaw = float(quaternion_yaw(matrix_to_quaternion(pose[:3, :3])))

@@ -1,4 +1,4 @@
-"""The images of an instant, from one pass per camera where the backend can; optical flow."""
+"""The images of a time step, from one pass per camera if the backend supports it; optical flow."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .pixels import BODY, TYRE, carry, on_bodies, tell_apart
 
 # --- Windows -------------------------------------------------------------------------------------
 
-# The part of an image in which all of an object shows.
+# The part of an image that contains the whole object.
 
 MARGIN = 0.1
 """Gaussians of an object reach beyond its box: by this share of its projection, at least 8 px."""
@@ -60,11 +60,11 @@ def window_about(instance_id: int, whole: Box2D, camera: Camera) -> Window:
 
 # --- Surfaces ------------------------------------------------------------------------------------
 
-# A reconstructed object holds the dark ground below it too, which moves with it. Those pixels
-# are the ground's; the object's box tells where they are, for road vehicles also their wheels.
+# A reconstructed object also contains the dark ground below it, which moves with it. Those pixels
+# are ground. The object's box locates them, for road vehicles together with the wheels.
 
 SURFACE_MARGIN = 0.1
-"""Surface may lie so far outside of the box [m]: boxes are as exact as who drew them."""
+"""Distance of surfaces outside the box [m]: boxes are as exact as their annotation."""
 
 CLEARANCE = 0.12
 """What is less above the box's lowest face, below it too, is the ground [m]."""
@@ -79,14 +79,15 @@ WHEELED = {
     "bus": (0.12, 0.155, 0.29, 0.26),
     "trailer": (0.15, 0.145, 0.36, 0.26),
 }
-"""Of road vehicles: where their sides end below and the radius of their wheels as shares of the
-height, how far the axles are ahead of the centre and behind it as shares of the length."""
+"""For road vehicles: lower edge of the sides and radius of the wheels as shares of the height,
+distance of the axles in front of and behind the centre as shares of the length.
+"""
 
 AXLES = 0.18, 0.43
-"""Wheels lie between these shares of the length, ahead of the centre and behind."""
+"""Range of the wheels in front of and behind the centre, as shares of the length."""
 
 CONTACT = 0.08
-"""Of wheels, what is less above the box's lowest face is the ground [m]."""
+"""Wheel points lower than this above the bottom of the box are ground [m]."""
 
 
 def on_surface(
@@ -134,17 +135,17 @@ IDS = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class CameraImages:
-    """What one camera sees.
+    """Images of one camera.
 
     Attributes:
-        camera: that looks.
+        camera: of the images.
         T_world_camera: [4, 4] its pose, OpenCV.
         rgb: [H, W, 3] uint8.
-        depth: [H, W] float32, along the camera's z axis [m], 0 where nothing is.
-        instance: [H, W] uint16 ids, 0 is background, shadows of objects too.
+        depth: [H, W] float32, along the camera's z axis [m], 0 for empty pixels.
+        instance: [H, W] uint16 ids, 0 is background, including shadows of objects.
         semantic: [H, W] uint8, see SEMANTIC_CLASSES.
-        alone: by instance id the window of an object that is in the image, and its depths [h, w]
-            float32 there, as if it stood alone; empty where passes draw that.
+        alone: by instance id the window of an object in the image, and its depths [h, w] float32
+            without other objects; empty if separate passes render these.
     """
 
     camera: Camera
@@ -203,7 +204,7 @@ def _in_passes(
     boxes: Sequence[ObjectBox],
     backend: Backend,
 ) -> list[CameraImages]:
-    """By backends that draw a pass for each label; objects alone are drawn when asked for."""
+    """For backends with one pass per label; single objects are rendered on demand."""
     frames = render_cameras(
         moment.instances,
         cameras,
@@ -228,7 +229,7 @@ def _in_passes(
 def _tell_apart(
     scene: Scene, moment: Moment, images: CameraImages, boxes: Sequence[ObjectBox]
 ) -> None:
-    """Write the semantic image; what is the shadow of an object becomes ground."""
+    """Write the semantic image; shadows of objects become ground."""
     tell_apart(
         images.depth,
         images.instance,
@@ -258,7 +259,7 @@ def slots_of(boxes: Sequence[ObjectBox]) -> NDArray[np.int16]:
 
 # --- Flow ----------------------------------------------------------------------------------------
 
-# From depth and poses, in both directions, with what is hidden in the other image.
+# From depth and poses, in both directions, with occlusion in the other image.
 
 BLOCK = np.ones((3, 3), np.uint8)
 
@@ -269,21 +270,21 @@ def flow_between(
     boxes_here: Sequence[ObjectBox],
     boxes_there: Sequence[ObjectBox],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Where the surface of each pixel of ``here`` is in the image ``there`` of the same camera.
+    """Position of the surface of each pixel of ``here`` in the image ``there`` of the same camera.
 
-    Objects are carried by their poses, all else stands still. What has no depth lies infinitely
+    Objects move with their poses, everything else is static. Pixels without depth are infinitely
     far away (sky).
 
     Returns:
-        Flow [H, W, 2] float32 [px]; valid [H, W] bool, False where the surface is behind the
-        camera then or its object is no longer there; occluded [H, W] bool, where the flow is valid
-        and the other image shows something else at its end, or ends before.
+        Flow [H, W, 2] float32 [px]; valid [H, W] bool, False where the surface is then behind the
+        camera or its object no longer exists; occluded [H, W] bool, where the flow is valid and the
+        other image shows something else at its end, or ends before.
     """
     shape = here.depth.shape
     flow, valid = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
     occluded = np.empty(shape, np.bool_)
     motions, slots = _motions(here, there, boxes_here, boxes_there)
-    # Metres lie between two rows of a road far away: its surface is met between neighbours.
+    # On a distant road, two rows are metres apart: its surface is found between neighbours.
     low, high = (spread(there.depth, BLOCK) for spread in (cv2.erode, cv2.dilate))
     shown = low, high, there.instance
     carry(here.depth, here.instance, slots, motions, shown, flow, valid, occluded)
@@ -296,7 +297,9 @@ def _motions(
     boxes_here: Sequence[ObjectBox],
     boxes_there: Sequence[ObjectBox],
 ) -> tuple[NDArray[np.float32], NDArray[np.int16]]:
-    """Of what stands and of each object, and which one each instance id has, see :func:`carry`."""
+    """Motions of the static scene and of each object, and their index by instance id, see
+    :func:`carry`.
+    """
     to_camera = invert_transform(there.T_world_camera)
     later = {box.instance_id: box for box in boxes_there}
     slots = np.zeros(IDS, np.int16)

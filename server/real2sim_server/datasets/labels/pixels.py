@@ -1,4 +1,4 @@
-"""What is done for each pixel of labels, compiled: what it shows, and where that goes."""
+"""Compiled per-pixel operations of labels: the visible surface, and its flow."""
 
 # Kernels take arrays by position.
 # ruff: noqa: PLR0917
@@ -23,17 +23,18 @@ TOLERANCE = 0.15
 """What is nearer to the ground's height shows it [m]."""
 
 UNDER_BODY = 0.6
-"""A shadow is drawn as high above the ground as the body's underside may be [m]; what an object
-shows outside of its body farther up is what stands behind it."""
+"""Maximum height of a shadow above the ground [m], the height of the body's underside. Higher
+pixels of an object outside its body are background behind it.
+"""
 
 TYRE = 0.24
 """Wheels reach so far inwards from the sides of the box [m]."""
 
 ROUNDED = 0.06
-"""A vehicle's sides and corners lie about so far inside of its box below [m]."""
+"""Rounding of a vehicle's lower sides and corners inside its box [m]."""
 
 SEEN_FARTHER = 0.05
-"""A front may be farther outside of the box than what is measured [m], and its ray less."""
+"""Additional tolerance outside the box for a pixel's point [m]; subtracted for its ray."""
 
 NO_STEP = 1e-9
 """Rays that go less far are followed as if they went so far [m]."""
@@ -42,7 +43,7 @@ FLATTEST = 0.01
 """Rays that fall less by metre of depth are not followed to the ground."""
 
 MET = 0.05
-"""From the second step towards the ground the ray may still be so far above or below it [m]."""
+"""Tolerance in height from the second step towards the ground on [m]."""
 
 BEHIND = F32(1e-3)
 """What is less far in front of the other camera is behind it [m]."""
@@ -54,14 +55,14 @@ much more [m]."""
 
 @func(inline="always")
 def is_surface(body: Any, x: float, y: float, z: float) -> bool:
-    """Whether a place of the world is of a body and not of its shadow.
+    """Whether a point of the world belongs to a body and not to its shadow.
 
     Args:
         body: at least 21 numbers: ``T_object_world`` [3, 4]; half length, width and height; margin
-            about the box; lowest place of the surface; sill, below which are wheels alone, and
-            wheels: how far aside they begin, and between which places ahead and behind they are
-            [m].
-        x, y, z: place in the world [m].
+            about the box; lowest point of the surface; sill, below which there are only wheels;
+            and wheels: their inner lateral limit, and their range in front of and behind the
+            centre [m].
+        x, y, z: point in the world [m].
     """
     a = abs(body[0] * x + body[1] * y + body[2] * z + body[3])
     b = abs(body[4] * x + body[5] * y + body[6] * z + body[7])
@@ -77,8 +78,9 @@ def is_surface(body: Any, x: float, y: float, z: float) -> bool:
 
 @func(inline="always")
 def within(a: float, b: float, reach: float, other: float, from_a: float, from_b: float) -> Any:
-    """Shares of a segment from ``from`` to (a, b) and on, between which it is inside of a
-    rectangle of half sizes ``reach`` and ``other``; the first is the larger where it never is."""
+    """Fractions along a segment from ``from`` through (a, b) between which it is inside a rectangle
+    of half sizes ``reach`` and ``other``; the first is larger if it is never inside.
+    """
     first, last = 0.0, 1e9
     for size, start, end in ((reach, from_a, a), (other, from_b, b)):
         step = end - start
@@ -90,7 +92,7 @@ def within(a: float, b: float, reach: float, other: float, from_a: float, from_b
 
 @func(inline="always")
 def meets_wheel(body: Any, a: float, b: float, c: float, fa: float, fb: float, fc: float) -> bool:
-    """Whether the ray from (fa, fb, fc) through (a, b, c) meets one of a body's four tyres."""
+    """Whether the ray from (fa, fb, fc) through (a, b, c) hits one of a body's four tyres."""
     radius = body[22]
     up, along, across = c - fc, a - fa, b - fb
     across = across if abs(across) > NO_STEP else NO_STEP
@@ -116,16 +118,15 @@ def meets_wheel(body: Any, a: float, b: float, c: float, fa: float, fb: float, f
 def shows_surface(
     body: Any, x: float, y: float, z: float, from_x: float, from_y: float, from_z: float
 ) -> bool:
-    """Whether a ray that ends at a place of the world shows a body there and not its shadow.
+    """Whether a ray that ends at a point of the world shows a body there and not its shadow.
 
-    Where a pixel's front lies below a vehicle is known to decimetres: seen flatly from afar the
-    road is nowhere far below the sill. Where the ray comes in below the sides is known as well as
-    the box.
+    The point of a pixel below a vehicle is accurate to decimetres: at a grazing angle the road
+    appears not far below the sill. The entry of the ray below the sides is as accurate as the box.
 
     Args:
-        body: as of is_surface; and from [21] the sill of what wheels, 0 for other bodies, radius of
-            the wheels, and how far their axles are ahead and behind [m].
-        x, y, z: place in the world [m].
+        body: as in is_surface; and from [21] the sill of vehicles with wheels, 0 for other bodies,
+            radius of the wheels, and distance of their axles in front of and behind the centre [m].
+        x, y, z: point in the world [m].
         from_x, from_y, from_z: of the camera.
     """
     if body[21] <= 0:
@@ -152,18 +153,20 @@ def shows_surface(
 
 @kernel(parallel=PARALLEL_LOOPS)
 def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, heights, frame):
-    """Make depth, instance and semantic image of fronts; shadows of objects become ground.
+    """Write the semantic image, and correct depth and instance image; shadows of objects become
+    ground.
 
     Args:
-        depth: [H, W] float32 [m], 0 where nothing is; of the ground that of its heights, changed.
+        depth: [H, W] float32 [m], 0 for empty pixels; changed to the depth of ``heights`` on the
+            ground.
         instance: [H, W] uint16, changed.
         semantic: [H, W] uint8, written.
-        rays: [3, 4] float64: a pixel (x, y) of depth d lies at d * rays[:, :3] @ (x, y, 1)
-            + rays[:, 3] of the world.
+        rays: [3, 4] float64: a pixel (x, y) of depth d is at d * rays[:, :3] @ (x, y, 1)
+            + rays[:, 3] in the world.
         slots: [65536] int16, body of an instance id, -1 for none.
         bodies: [K, BODY] see shows_surface.
         classes: [65536] uint8, by instance id.
-        behind: class where nothing is.
+        behind: class of empty pixels.
         heights, frame: of the ground.
     """
     x0, y0, per_cell = frame[0], frame[1], 1.0 / frame[2]
@@ -192,7 +195,7 @@ def tell_apart(depth, instance, semantic, rays, slots, bodies, classes, behind, 
                 if abs(above) < (UNDER_BODY if shadow else TOLERANCE):
                     found = GROUND
                 if found == GROUND and slope < -FLATTEST:
-                    # Heights are known to a centimetre, what is drawn there to several: along a
+                    # Heights are accurate to a centimetre, rendered surfaces to several: along a
                     # road a centimetre of height is a decimetre of depth.
                     steepness = 1.0 / slope
                     met = d - above * steepness
@@ -235,20 +238,20 @@ def surface_mask(depth, left, top, rays, body, mask):
 
 @kernel
 def on_bodies(points, body, found):
-    """Which points [N, 3] of the world are of a body; ``found`` [N] bool is written."""
+    """Write which points [N, 3] of the world belong to a body to ``found`` [N] bool."""
     for k in range(points.shape[0]):
         found[k] = is_surface(body, points[k, 0], points[k, 1], points[k, 2])
 
 
 @kernel(parallel=PARALLEL_LOOPS)
 def carry(depth, instance, slots, motions, there, flow, valid, occluded):
-    """Flow of each pixel, whether it is valid, and whether the other image shows something else.
+    """Flow of each pixel, its validity, and whether the other image shows something else.
 
     Args:
-        depth: [H, W] float32 [m], 0 for what is infinitely far away.
+        depth: [H, W] float32 [m], 0 for infinity.
         instance: [H, W] uint16.
-        slots: [65536] int16, motion of an instance id, 0 for what stands, -1 for what is not there
-            then.
+        slots: [65536] int16, motion of an instance id, 0 for static, -1 for absent in the other
+            image.
         motions: [K, 3, 4] float32, K_there times T_there_here, so that a pixel (x, y) of depth d is
             at d * motion[:, :3] @ (x, y, 1) + motion[:, 3] there, times its depth.
         there: lowest and highest depth about each pixel of the other image [H, W] float32, and its
@@ -260,7 +263,7 @@ def carry(depth, instance, slots, motions, there, flow, valid, occluded):
     still = motions[0]
     for row in prange(depth.shape[0]):
         v = F32(row) + F32(0.5)
-        # Where everything would be that stands still, in a loop without branches.
+        # Positions under the assumption of a static scene, in a branch-free loop.
         places = np.empty((3, depth.shape[1]), np.float32)
         xs, ys, zs = places[0], places[1], places[2]
         first = still[0, 1] * v + still[0, 2]
@@ -296,6 +299,6 @@ def carry(depth, instance, slots, motions, there, flow, valid, occluded):
                 z = z if d > 0 else F32(0)
                 slack = slack if d > 0 else F32(0)
                 same = low[i, j] - slack <= z <= high[i, j] + slack
-                # Sky is met where there is sky about; nothing else has depth 0.
+                # Sky has sky around it; nothing else has depth 0.
                 hidden = not (same and shown[i, j] == number)
             occluded[row, column] = hidden

@@ -19,7 +19,7 @@ from .boxes import ObjectBox
 from .images import CameraImages, on_surface
 
 ROOF = (0.9, 0.0, 1.73)
-"""Where a LiDAR stands that is not placed itself, in the ego frame [m]."""
+"""Default position of a LiDAR, in the ego frame [m]."""
 BEAMS, COLUMNS = 64, 1024
 ELEVATION = (np.radians(-25.0), np.radians(3.0))
 NEAR, FARTHEST = 1.0, 80.0
@@ -46,7 +46,7 @@ def points_in_boxes(points: ArrayLike, transforms: ArrayLike, sizes: ArrayLike) 
 
 
 class PointsByX:
-    """Points in the order of their x, so that who asks for a place need not look at all of them."""
+    """Points sorted by x, so that a query scans only some of them."""
 
     def __init__(self, points: Float) -> None:
         """Sort [N, 3] points."""
@@ -63,17 +63,17 @@ class PointsByX:
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """Points of surfaces, as cameras or a LiDAR see them.
+    """Points on surfaces, from cameras or a LiDAR.
 
     Attributes:
         points: [N, 3] float32, ego frame [m].
         intensity: [N] float32, brightness of the pixel or reflectivity, 0 to 1.
-        beam: [N] uint8, row of the sensor, 0 is the lowest; 0 of sensors without rows.
+        beam: [N] uint8, row of the sensor, 0 is the lowest; 0 for sensors without rows.
         instance: [N] uint16, 0 is background.
         semantic: [N] uint8, see SEMANTIC_CLASSES.
         velocity: [N, 3] float32, of the surface along the ego's axes [m/s].
-        time_us: [N] int32, when each was measured, relative to the frame.
-        return_number: [N] uint8, of several returns of a ray the nearest is 1.
+        time_us: [N] int32, time of measurement relative to the frame.
+        return_number: [N] uint8, 1 for the nearest of several returns of a ray.
     """
 
     points: NDArray[np.float32]
@@ -91,8 +91,8 @@ def seen_points(
 ) -> SeenPoints:
     """Points of the depth images along the beams of a spinning LiDAR on the roof.
 
-    The nearest pixel of each beam counts, so that they are spread as those of a LiDAR are; what
-    only a LiDAR would see, behind the cameras and beside them, is not there.
+    The nearest pixel of each beam is used, for the distribution of a LiDAR. Points outside the
+    cameras' fields of view are missing.
     """
     to_ego = invert_transform(T_world_ego)
     parts = [_beams_of(image, to_ego) for image in images]
@@ -129,7 +129,7 @@ def _beams_of(image: CameraImages, to_ego: Float) -> tuple[NDArray[np.generic], 
     azimuth = np.arctan2(y.ravel()[chosen], x.ravel()[chosen])
     turn = (azimuth * np.float32(COLUMNS / (2 * np.pi)) + COLUMNS // 2).astype(np.int64) % COLUMNS
     place = beam.ravel()[chosen].astype(np.int64) * COLUMNS + turn
-    # Of several pixels on a beam the last one written counts: the nearest to it.
+    # If several pixels are on a beam, the last one written is used: the nearest to the beam.
     farthest_first = np.argsort((off.ravel()[chosen] * -60_000).astype(np.int16), kind="stable")
     nearest = np.full(BEAMS * COLUMNS, -1)
     nearest[place[farthest_first]] = chosen[farthest_first]
@@ -159,7 +159,7 @@ def _velocities(
 # A sweep through the scene, labelled ray by ray.
 
 SAME_SURFACE = 0.3
-"""A return is of what the median of the light meets where it is no farther from it [m]."""
+"""A return belongs to the surface at the median of the light within this distance [m]."""
 
 
 def lidar_points(
@@ -216,7 +216,7 @@ def _returns(sweep: Sweep) -> tuple[NDArray[np.int64], Float, NDArray[np.uint8]]
 
 
 def _rows(lidar: Lidar) -> NDArray[np.uint8]:
-    """Row of each ray, the lowest is 0; 0 where the sensor has none."""
+    """Row of each ray, the lowest is 0; 0 if the sensor has no rows."""
     if len(lidar.shape) != 2:
         return np.zeros(lidar.beams.count, np.uint8)
     elevation = lidar.beams.elevation.mean(axis=1)
@@ -231,9 +231,11 @@ def _objects(
     points: Float,
     boxes: Sequence[ObjectBox],
 ) -> tuple[NDArray[np.uint16], Float]:
-    """Object of each return, and how it moves there in the world [m/s]: the object of the median
-    where the return is on its surface, and of returns elsewhere the one in whose box they are,
-    everything at the instant of the ray."""
+    """Object of each return, and its velocity there in the world [m/s].
+
+    The object is that of the median if the return is on its surface, otherwise the one whose box
+    contains the return at the time of the ray.
+    """
     ray, ranges, slots = returned
     median = np.abs(echo.range.ravel()[ray] - ranges) <= SAME_SURFACE
     met = np.where(median, echo.instance.ravel()[ray], 0)

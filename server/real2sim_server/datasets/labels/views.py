@@ -65,12 +65,12 @@ class ObjectView:
     """One object in one image.
 
     Attributes:
-        object_id, instance_id: which.
-        amodal_box: of the projected 3D box, cut at near plane and border [px].
-        modal_box: of the object's pixels; None where none is seen [px].
+        object_id, instance_id: of the object.
+        amodal_box: of the projected 3D box, clipped to near plane and image [px].
+        modal_box: of the object's pixels; None if none is visible [px].
         visible_pixels: of the object in the scene.
-        alone_pixels: that it fills in this image when it is drawn alone.
-        truncation: share of the projected box outside of the image, 0 to 1.
+        alone_pixels: of the object in this image without other objects.
+        truncation: share of the projected box outside the image, 0 to 1.
     """
 
     object_id: str
@@ -102,13 +102,13 @@ def views_of(
     *,
     backend: str | Backend = "auto",
 ) -> CameraView:
-    """Every object whose box is in the image.
+    """Every object with its box in the image.
 
     Args:
         images: of the camera.
-        boxes: of all objects of the instant.
-        instances: what was drawn.
-        backend: draws objects alone.
+        boxes: of all objects at this time.
+        instances: rendered instances.
+        backend: renders single objects.
     """
     camera = images.camera
     found = []
@@ -165,7 +165,7 @@ def without_blobs(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _drawn_alone(
     window: Window, images: CameraImages, instances: Sequence[Instance], backend: str | Backend
 ) -> NDArray[np.float32]:
-    """Depths [h, w] of an object when nothing else is drawn."""
+    """Depths [h, w] of an object rendered alone."""
     left, top, right, bottom = window.left, window.top, window.right, window.bottom
     own = [i for i in instances if i.instance_id == window.instance_id]
     if not own or left >= right or top >= bottom:
@@ -202,7 +202,7 @@ def _pixels_of(
 # COCO's 17 keypoints of people: where they are, and whether an image shows them.
 
 UNDER = 0.2
-"""A joint lies at most so far under the skin that is seen of it [m]."""
+"""Maximum depth of a joint below its visible skin [m]."""
 
 OUTSIDE, HIDDEN, VISIBLE = 0, 1, 2
 """COCO's flags: not in the image, in it behind something, seen."""
@@ -215,13 +215,13 @@ def keypoints_at(
     *,
     strides: Mapping[str, Stride] = NO_STRIDES,
 ) -> dict[str, Float]:
-    """Keypoints [17, 3] of everybody who is a walking body, world frame [m], by object id.
+    """Keypoints [17, 3] of all walking people, world frame [m], by object id.
 
     Args:
-        scene: that the objects are of.
-        placed: where they are.
-        t_us: instant [us].
-        strides: of those whom no trajectory leads.
+        scene: of the objects.
+        placed: their poses.
+        t_us: time [us].
+        strides: of people without a trajectory.
     """
     found = {}
     for subject, transform in zip(placed.objects, placed.transforms, strict=True):
@@ -236,9 +236,10 @@ def keypoints_at(
 def keypoints_in_image(
     points: Float, images: CameraImages, instance_id: int
 ) -> list[tuple[float, float, int]]:
-    """Where an image has keypoints [17, 3] of the world: u, v [px] and OUTSIDE, HIDDEN or VISIBLE.
+    """Keypoints [17, 3] of the world in an image: u, v [px] and OUTSIDE, HIDDEN or VISIBLE.
 
-    A keypoint is seen where the person's own surface is close before it. What is outside has 0, 0.
+    A keypoint is visible if the person's own surface is close in front of it. Keypoints outside
+    have position 0, 0.
 
     Args:
         points: of one person.

@@ -28,7 +28,7 @@ WRITERS: list[DatasetWriter] = [
 
 
 def writer_names() -> list[str]:
-    """In the order of their registration."""
+    """Names of the writers in the order of registration."""
     return [writer.name for writer in WRITERS]
 
 
@@ -41,10 +41,10 @@ def writer_of(name: str) -> DatasetWriter:
 
 
 def register_writer(writer: DatasetWriter) -> None:
-    """Let exports know one more writer, from outside of this package.
+    """Register a writer from outside this package.
 
     Raises:
-        ValueError: a writer of that name is registered.
+        ValueError: a writer with that name is registered.
     """
     if writer.name in writer_names():
         raise ValueError(f"a writer named {writer.name!r} is registered already")

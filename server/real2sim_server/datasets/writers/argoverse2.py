@@ -1,8 +1,8 @@
-"""Argoverse 2, sensor data set: a log for each clip.
+"""Argoverse 2, sensor data set: one log per clip.
 
-Source: the user guide and ``av2`` package of the data set (Wilson et al. 2021). The ego frame lies
-on the rear axle, 0.33 m above the ground; pixel centres lie on whole numbers; boxes are in the ego
-frame of their instant.
+Source: the user guide and ``av2`` package of the data set (Wilson et al. 2021). The ego frame is on
+the rear axle, 0.33 m above the ground; pixel centres are at integers; boxes are in the ego frame at
+their time.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CATEGORIES = {
     "motorcycle": "MOTORCYCLE",
     "sign": "SIGN",
 }
-"""Category by ours; others are written in capitals as they are."""
+"""Category names; other categories are written unchanged in capitals."""
 
 QUATERNION, POSITION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
 SIZE = ("length_m", "width_m", "height_m")
@@ -163,7 +163,7 @@ def _pose_columns(poses: Float) -> dict[str, Any]:
 
 
 def _shift(z: float) -> Float:
-    """Of the ego frame along its z axis."""
+    """Shift of the ego frame along its z axis."""
     matrix = np.eye(4)
     matrix[2, 3] = z
     return matrix

@@ -28,8 +28,9 @@ CATEGORY_IDS = {
     "animal": 96, "barrier": 97, "cone": 98, "debris": 99, "pole": 100, "sign": 101,
     "traffic_sign": 102,
 }  # fmt: skip
-"""Every export has these categories. Up to 90 they are COCO's own; all others have an id of 1000
-and above that follows from their name."""
+"""Categories of every export. Ids up to 90 are COCO's own; all others have an id from 1000 on,
+derived from their name.
+"""
 
 COCO_NAMES = {"pedestrian": "person", "traffic_light": "traffic light"}
 """COCO's name by ours, where they differ."""
@@ -38,7 +39,7 @@ STUFF_FROM = 200
 """A category of the background is this plus its semantic class."""
 
 THINGS_FROM = 1 << 16
-"""The panoptic id of an object is this plus its number; that of background is its category."""
+"""The panoptic id of an object is this plus its number; the id of background is its category."""
 
 QUALITY = 95
 PERSON = {
@@ -226,7 +227,7 @@ class _Split:
         )
 
     def _people(self) -> list[dict[str, Any]]:
-        """The annotations of people whose keypoints are known, with these."""
+        """Annotations with keypoints, for people with known keypoints."""
         found = []
         for row in self.annotations:
             points = self.keypoints.get(row["id"])

@@ -32,13 +32,13 @@ CLASSES = {
 """Class by category; all others are ``Misc``."""
 
 OCCLUDED = (0.85, 0.45)
-"""Visibility from which an object is fully (0) and partly (1) visible; below it is 2."""
+"""Minimum visibility of fully (0) and partly (1) visible objects; below it is 2."""
 
 VELODYNE = (0.9, 0.0, 1.73)
-"""Where the scanner stands in the vehicle's frame [m], as KITTI's stands over the road."""
+"""Position of the scanner in the vehicle's frame [m], at KITTI's height above the road."""
 
 ROUNDS = 8
-"""In which a place is found that comes out right when the motion is taken out again."""
+"""Iterations to find a point that is right after motion compensation."""
 
 
 class KittiWriter:
@@ -112,7 +112,7 @@ def _track_numbers(clip: Clip) -> dict[str, int]:
 
 
 def _seen_rows(frame: Mapping[str, Any], camera: Camera) -> list[dict[str, Any]]:
-    """Objects of which the camera sees a pixel."""
+    """Objects with at least one visible pixel in the camera."""
     objects = objects_of(frame)
     return [
         {**objects[view["object_id"]], **view}
@@ -156,7 +156,7 @@ def _wrapped(angle: float) -> float:
 
 
 def _calibration(camera: Camera, rectification: str, velo_to_cam: str) -> list[str]:
-    """The camera stands where KITTI's colour camera does, and is its own reference."""
+    """The camera takes the place of KITTI's colour camera, and is its own reference."""
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     projection = np.concatenate([K, np.zeros((3, 1))], axis=1)
@@ -171,8 +171,7 @@ def _calibration(camera: Camera, rectification: str, velo_to_cam: str) -> list[s
 
 
 def velodyne_in_camera(camera: Camera) -> Float:
-    """The scanner looks where the camera does, as KITTI's layout has it: a vehicle frame whose x
-    axis is the camera's."""
+    """Pose of the scanner, aligned with the camera, as in KITTI's vehicle frame."""
     T_vehicle_velo = np.eye(4)
     T_vehicle_velo[:3, :3] = camera.T_vehicle_camera[:3, :3] @ T_VEHICLE_OPTICAL[:3, :3].T
     T_vehicle_velo[:3, 3] = T_vehicle_velo[:3, :3] @ np.array([VELODYNE[0], VELODYNE[1], 0.0])
@@ -181,7 +180,7 @@ def velodyne_in_camera(camera: Camera) -> Float:
 
 
 def vehicle_in_ego(camera: Camera) -> Float:
-    """Pose of the vehicle of KITTI's layout, which looks where the camera does."""
+    """Pose of KITTI's vehicle frame, aligned with the camera's direction."""
     return camera.T_vehicle_camera @ velodyne_in_camera(camera) @ invert_transform(shift(VELODYNE))
 
 
@@ -218,7 +217,7 @@ def _as_measured(points: Float, poses: Float, frame: int, to_velo: Float) -> Flo
 
 
 def numbers(values: Any) -> str:
-    """With nine digits, as tables of KITTI have them."""
+    """Nine digits, as in KITTI's tables."""
     return " ".join(f"{value + 0.0:.9g}" for value in np.asarray(values).tolist())
 
 
@@ -236,7 +235,7 @@ def _write_lines(path: Path, lines: Sequence[str]) -> None:
 
 DAY = "2011_09_26"
 LATITUDE, LONGITUDE, ALTITUDE = 49.0, 8.4, 110.0
-"""Where the world of the scene begins: any place will do."""
+"""Arbitrary geographic position of the scene's world origin."""
 EARTH_RADIUS = 6_378_137.0
 
 
@@ -324,7 +323,7 @@ def _tracklets(clip: Clip, camera: Camera) -> str:
 
 
 def _runs(clip: Clip) -> Iterator[list[tuple[int, Mapping[str, Any]]]]:
-    """Frames in which an object is there, one after the other, for each object."""
+    """Runs of consecutive frames with an object, for each object."""
     at_hand: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
     for k, frame in enumerate(clip.frames):
         present = {subject["object_id"]: subject for subject in frame["objects"]}

@@ -36,10 +36,10 @@ CONSOLIDATED = ".zmetadata.cbor.xz"
 
 
 class ZarrStore:
-    """A store that is written once, from its root on.
+    """A store that is written once, starting at its root.
 
     Args:
-        folder: of the store; made anew.
+        folder: of the store; newly created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,7 +47,7 @@ class ZarrStore:
         self._metadata: dict[str, Any] = {}
 
     def group(self, path: str, attributes: Mapping[str, Any] | None = None) -> str:
-        """A group at ``path`` (empty: the root), which is given back."""
+        """Create a group at ``path`` (empty: the root) and return it."""
         self._write(path, ".zgroup", {"zarr_format": 2})
         if attributes is not None:
             self._write(path, ".zattrs", dict(attributes))
@@ -134,7 +134,7 @@ VERSION, COMPONENT_VERSION = "v4", "v1"
 INSTANCE = "default"
 RIG, WORLD, LIDAR = "rig", "world", "lidar_top"
 START_US = 1_000_000
-"""Added to all instants, which NCore holds without a sign [us]."""
+"""Offset of all times, which NCore stores unsigned [us]."""
 QUALITY = 95
 LABELS = ("depth", "instance", "semantic")
 POINT_LABELS = ("instance", "semantic", "velocity", "beam", "time_us", "return_number")

@@ -1,8 +1,8 @@
 """nuScenes v1.0 with lidarseg and panoptic: key frames at 2 Hz, all other frames as sweeps.
 
 Source: Caesar et al., "nuScenes: A multimodal dataset for autonomous driving", CVPR 2020, and
-``docs/schema_nuscenes.md`` of its development kit. A clip is a scene, the world of the drive the
-map's frame; ``LIDAR_TOP`` are the labelled points. Pixel centres lie on whole numbers.
+``docs/schema_nuscenes.md`` of its development kit. A clip is a scene, the world of the drive is the
+map's frame; ``LIDAR_TOP`` holds the labelled points. Pixel centres are at integers.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ PANOPTIC = 1000
 """A panoptic label is this times the index of the category, plus the object's number."""
 SPEED_MOVING = 0.2
 MAP_CELL = 0.1
-"""Of the mask of the ground, as the development kit has it [m]."""
+"""Cell of the ground mask, as in the development kit [m]."""
 MAX_MAP = 4096
 
 
@@ -101,7 +101,7 @@ def _scene_name(clip: Clip) -> str:
 
 
 def channels_of(cameras: Sequence[Camera]) -> dict[str, str]:
-    """Channel of each camera by its name: the one that looks ahead most is CAM_FRONT."""
+    """Channel of each camera by its name: the most forward-looking one is CAM_FRONT."""
     ahead = max(cameras, key=lambda c: float(c.T_vehicle_camera[0, 2]))
     names = {c.name: f"CAM_{c.name.upper().removeprefix('CAM_')}" for c in cameras}
     for name, channel in names.items():
@@ -112,7 +112,7 @@ def channels_of(cameras: Sequence[Camera]) -> dict[str, str]:
 
 
 class _Tables:
-    """Rows of all tables, in the order in which they come."""
+    """Rows of all tables, in insertion order."""
 
     def __init__(self, drive: LabelledDrive) -> None:
         self.drive = drive

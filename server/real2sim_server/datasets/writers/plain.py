@@ -1,4 +1,4 @@
-"""Simple formats: raw labels, pictures with labels drawn over them, WebDataset shards."""
+"""Simple formats: raw labels, pictures with overlaid labels, WebDataset shards."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ BACKGROUND = {
 }
 MODAL, AMODAL = (255, 255, 255), (255, 210, 0)
 FLOW_SHOWN = 40.0
-"""Flow of so many pixels has full colour."""
+"""Flow with full colour saturation [px]."""
 
 Image = NDArray[np.uint8]
 
@@ -161,7 +161,7 @@ def _classes(rgb: Image, semantic: NDArray[np.uint8]) -> Image:
 
 
 def _flow(clip: Clip, camera: Camera, index: int, rgb: Image) -> Image:
-    """Direction as hue, length as colour; what is hidden afterwards is dark."""
+    """Direction as hue, length as colour; pixels occluded in the other image are dark."""
     if not clip.file("flow_forward", camera.name, index).exists():
         return rgb // 3
     flow, valid = read_flow(clip.pixels("flow_forward", camera.name, index))
@@ -234,7 +234,7 @@ def _sample(clip: Clip, camera: Camera, frame: dict[str, Any]) -> Iterator[tuple
 
 
 def _add(shard: tarfile.TarFile, name: str, data: bytes) -> None:
-    """Without the day, the user or the rights of whoever writes."""
+    """Add a file without date, user or permissions, so that archives are reproducible."""
     member = tarfile.TarInfo(name)
     member.size, member.mtime, member.mode = len(data), 0, 0o644
     shard.addfile(member, io.BytesIO(data))

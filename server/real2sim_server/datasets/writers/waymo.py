@@ -1,8 +1,8 @@
-"""Waymo Open Dataset (perception), edition 2: Parquet files, one a component and clip.
+"""Waymo Open Dataset (perception), edition 2: one Parquet file per component and clip.
 
 Source: the components of ``waymo_open_dataset.v2.perception`` and Sun et al., "Scalability in
 Perception for Autonomous Driving: Waymo Open Dataset", CVPR 2020. A frame's time stamp is the start
-of a sweep; pose, boxes, images and points hold for its middle. Boxes turn about the vehicle's
+of a sweep; pose, boxes, images and points refer to its middle. Boxes rotate about the vehicle's
 vertical axis only.
 """
 
@@ -64,7 +64,7 @@ PANOPTIC = "[CameraSegmentationLabelComponent]"
 POINT_CLASS = "[LiDARSegmentationLabelComponent].range_image_return"
 GLOBAL_SHUTTER = 5
 COLUMNS = 4096
-"""Of range images: finer than those of any LiDAR of the catalogue, so that no cell has two."""
+"""Columns of range images: finer than any LiDAR of the catalogue, so no cell has two returns."""
 LEVEL_1, LEVEL_2, FEW_POINTS = 1, 2, 5
 """A box with this few points or fewer is hard, as in the data set's own evaluation."""
 DIVISOR = 1000
@@ -105,8 +105,8 @@ class WaymoWriter:
 
 
 def camera_numbers(cameras: Sequence[Camera]) -> dict[str, int]:
-    """Waymo's number of each camera: 1 for the one that looks ahead most, others by their names as
-    far as they are Waymo's, and else what is free.
+    """Waymo's number of each camera: 1 for the most forward-looking one, others by Waymo's names if
+    they match, otherwise free numbers.
 
     Raises:
         DatasetError: more than five.
@@ -125,7 +125,7 @@ def camera_numbers(cameras: Sequence[Camera]) -> dict[str, int]:
 
 
 class _Components:
-    """A Parquet file for each component of a segment; every call adds a row group."""
+    """One Parquet file per component of a segment; every call adds a row group."""
 
     def __init__(self, root: Path, segment: str) -> None:
         self._root, self._segment = root, segment
@@ -218,7 +218,7 @@ def _write_frame(
 
 
 def _velocity(clip: Clip, frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Of the vehicle along and about the world's axes, from the frames before and after."""
+    """Velocity of the vehicle along and about the world's axes, from the adjacent frames."""
     before, after, seconds = _around(clip, frame)
     poses = np.array([before["T_world_ego"], after["T_world_ego"]])
     moved = poses[1, :3, 3] - poses[0, :3, 3]
@@ -232,8 +232,9 @@ def _velocity(clip: Clip, frame: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _around(clip: Clip, frame: Mapping[str, Any]) -> tuple[Any, Any, float]:
-    """The frames before and after one, or itself at an end of the clip, and what lies between [s];
-    where it is the only one, itself twice and 1."""
+    """The frames before and after a frame, or the frame itself at an end of the clip, and the time
+    between them [s]; for a single frame, itself twice and 1.
+    """
     place = next(k for k, other in enumerate(clip.frames) if other["index"] == frame["index"])
     before = clip.frames[max(place - 1, 0)]
     after = clip.frames[min(place + 1, len(clip.frames) - 1)]
@@ -241,7 +242,7 @@ def _around(clip: Clip, frame: Mapping[str, Any]) -> tuple[Any, Any, float]:
 
 
 def _cameras_covered(cameras: Sequence[Camera]) -> dict[str, bytes]:
-    """By camera a png that says how many cameras see each of its pixels, far away."""
+    """Per camera a png with the number of cameras that see each of its pixels, at infinity."""
     covered = {}
     for camera in cameras:
         directions = _directions(camera)
@@ -337,7 +338,7 @@ def _write_camera_boxes(
                 for k, axis in enumerate("xy")
             },
             f"{CAMERA_BOX}.type": pa.array(types, pa.int8()),
-            # Of pictures people say how hard they are.
+            # Difficulty is a human label of pictures.
             f"{CAMERA_BOX}.difficulty_level.detection": pa.array([0] * len(seen), pa.int8()),
             f"{CAMERA_BOX}.difficulty_level.tracking": pa.array([0] * len(seen), pa.int8()),
         },
@@ -398,7 +399,7 @@ Place = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def _returns(rows: NDArray[Any], laser: Laser) -> list[tuple[Place, NDArray[Any]]]:
-    """Row and column of the points of both returns; a third in a cell is left out."""
+    """Row and column of the points of both returns; a third in a cell is dropped."""
     x, y, _ = (rows["xyz"].astype(np.float64) - laser.T_vehicle_laser[:3, 3]).T
     assert laser.inclinations is not None
     row = len(laser.inclinations) - 1 - rows["beam"].astype(np.int64)
@@ -419,11 +420,12 @@ def _ranges(rows: NDArray[Any], laser: Laser) -> Float:
 def _pixel_poses(
     returns: Sequence[tuple[Place, NDArray[Any]]], laser: Laser, T_world_ego: Float
 ) -> NDArray[np.float32]:
-    """[H, W, 6] such that a point is where it was measured, not in the middle of its cell: the
-    ego's turn, and its place with what the cell rounds away."""
+    """[H, W, 6] poses that put each point at its measured position instead of the middle of its
+    cell: the ego's rotation, and its position with the rounding error of the cell.
+    """
     assert laser.inclinations is not None
     poses = np.zeros((len(laser.inclinations), COLUMNS, 6), np.float32)
-    # The first return of a cell goes last, so that it is the one which is exact.
+    # The first return of a cell is written last, so it is the exact one.
     for place, rows in reversed(returns):
         values = np.zeros((len(laser.inclinations), COLUMNS, 2), np.float32)
         values[place[0], place[1], 0] = _ranges(rows, laser)
@@ -436,7 +438,7 @@ def _pixel_poses(
 
 
 def _inclinations(drive: LabelledDrive, clip: Clip) -> Float:
-    """Of each beam, ascending [rad]: the median over the clip's first frame with points."""
+    """Elevation of each beam, ascending [rad]: medians in the clip's first frame with points."""
     for frame in clip.frames:
         rows = clip.points(frame["index"])
         if len(rows):

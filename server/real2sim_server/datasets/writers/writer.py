@@ -1,4 +1,4 @@
-"""What a writer of a format is, and what it is given."""
+"""Interface of format writers, and their input."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from ..clips import Clip
 
 @dataclass(frozen=True, eq=False)
 class LabelledDrive:
-    """Everything that writers read.
+    """Input of writers.
 
     Attributes:
         name: of the data set.
-        digest: SHA-256 of what it was made of; tokens are derived from it.
-        cameras: in their order, of the size that the images have.
+        digest: SHA-256 of its inputs; tokens are derived from it.
+        cameras: in order, at the size of the images.
         ego_size: (length, width, height) of the ego [m].
         period_us: between frames [us].
-        clips: in their order.
+        clips: in order.
         ground: of the scene.
-        licence: terms under which it may be used.
-        lidar_position: where the LiDAR stands, in the ego frame [m].
+        licence: terms of use.
+        lidar_position: of the LiDAR, in the ego frame [m].
     """
 
     name: str
@@ -49,7 +49,7 @@ class DatasetWriter(Protocol):
     """Writes one format."""
 
     name: str
-    """As it is asked for."""
+    """Name of the format."""
 
     holds: str
     """What is written, in one line."""

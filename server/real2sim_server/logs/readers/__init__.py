@@ -26,13 +26,13 @@ READERS: list[LogReader] = [
 
 
 def register_reader(reader: LogReader) -> None:
-    """Let ``open_log`` know one more reader, from outside of this package.
+    """Register a reader from outside this package for ``open_log``.
 
     Args:
         reader: of a layout that no other reader recognises.
 
     Raises:
-        ValueError: a reader of that name is registered.
+        ValueError: a reader with that name is registered.
     """
     if any(known.name == reader.name for known in READERS):
         raise ValueError(f"a log reader named {reader.name!r} is registered already")

@@ -1,10 +1,10 @@
 """Argoverse 2, sensor data set.
 
 Source: the user guide and ``av2`` package of the data set (Wilson et al. 2021). Points are
-egomotion-compensated to the time stamp of their sweep, which is its start; boxes hold
-for the same instant. The ego frame lies on the rear axle, here it is put on the ground. Cameras run
-at 20 Hz by their own clock; a frame has the image that is nearest in time. Pixel centres are taken
-to lie on whole numbers, as with OpenCV's calibrations.
+egomotion-compensated to the time stamp of their sweep, which is its start; boxes refer to the same
+time. The data set's ego frame is on the rear axle; here it is moved to the ground. Cameras run at
+20 Hz by their own clock; a frame has the image nearest in time. Pixel centres are assumed at
+integers, as in OpenCV's calibrations.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Argoverse2Reader:
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
         """The log ``sequence``; the only one by default.
 
-        Every sweep is a frame; frames at the ends that lack images are dropped. Cameras without
-        any image, and the stereo pair, are left out and named in the provenance.
+        Every sweep is a frame; frames without images at both ends are dropped. Cameras without any
+        image, and the stereo pair, are dropped and named in the provenance.
 
         Raises:
             LogError: see :class:`LogReader`.
@@ -158,7 +158,7 @@ def _list_images(folder: Path, cameras: Sequence[str]) -> tuple[dict[str, TimedI
 
 
 def _read_ego(path: Path) -> Trajectory:
-    """``T_city_vehicle``; the vehicle frame lies on the ground."""
+    """``T_city_vehicle``; the vehicle frame is on the ground."""
     table = read_feather(path, ["timestamp_ns", *QUATERNION, *POSITION])
     order = np.argsort(table["timestamp_ns"], kind="stable")
     times_us, kept = np.unique(table["timestamp_ns"][order] // 1000, return_index=True)

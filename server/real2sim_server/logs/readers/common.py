@@ -52,12 +52,12 @@ def upright_pose(centre: Iterable[float], heading: float) -> Float:
 def build_tracks(boxes: Iterable[FrameBox]) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
     """Tracks in order of first appearance, and the dataset's name of each by object id.
 
-    An object has its median size and its most frequent category; it is called
+    An object has its median size and its most frequent category; it is named
     ``<category>_<number>``.
 
     Raises:
-        LogError: a size that is not positive, a pose that is not finite or no rigid transform, or
-            two boxes of one object at one instant.
+        LogError: a size that is not positive, a pose that is not finite or not a rigid transform,
+            or two boxes of one object at the same time.
     """
     by_key: dict[str, list[FrameBox]] = defaultdict(list)
     for box in sorted(boxes, key=lambda b: (b.time_us, b.key)):
@@ -118,7 +118,7 @@ class MatchedImages:
     """Images by frame.
 
     Attributes:
-        frames: [F] which of the given frames have an image of every camera: a run without gaps.
+        frames: [F] frames with an image of every camera: a run without gaps.
         files: F files by camera.
         times_us: [F] time stamps by camera.
     """
@@ -137,13 +137,13 @@ def match_images(
 ) -> MatchedImages:
     """The nearest image of every camera for every frame.
 
-    Frames at both ends, for which some camera has none, are dropped: sensors start and stop at
-    different moments.
+    Frames at both ends without an image of some camera are dropped, because sensors start and stop
+    at different times.
 
     Args:
         frame_times_us: [F] increasing.
         cameras: at least one image each.
-        tolerance_us: how far an image may be from its frame.
+        tolerance_us: maximum time between an image and its frame.
         where: the log, for errors.
 
     Raises:
@@ -192,10 +192,10 @@ SHOWN = 20
 
 
 def select_sequence(folder: Path, known: list[str], sequence: str | None) -> str:
-    """``sequence``, or the only one that is known.
+    """``sequence``, or the only known one.
 
     Raises:
-        LogError: there is none, ``sequence`` is not among them, or it must be named.
+        LogError: there is none, ``sequence`` is not among them, or several need a name.
     """
     if not known:
         raise LogError(f"{folder}: holds no sequence")
@@ -216,14 +216,15 @@ def select_sequence(folder: Path, known: list[str], sequence: str | None) -> str
 def compensate_sweep(
     points: Float, offset: Float, vehicle_poses: Float, frame: int
 ) -> NDArray[np.float32]:
-    """Points as if all had been measured at the frame's time stamp, were the world static.
+    """Motion-compensated points, as if all had been measured at the frame's time stamp in a static
+    world.
 
-    Between frames the vehicle moves with constant velocity and constant angular velocity;
-    before the first and after the last frame it goes on as in the nearest interval.
+    Between frames the vehicle moves with constant velocity and constant angular velocity; before
+    the first and after the last frame it moves as in the nearest interval.
 
     Args:
-        points: [N, 3] float64, vehicle frame at each point's own instant [m].
-        offset: [N] float64, that instant relative to the frame's, in frame periods.
+        points: [N, 3] float64, vehicle frame at each point's own time [m].
+        offset: [N] float64, that time relative to the frame's, in frame periods.
         vehicle_poses: ``T_world_vehicle`` [F, 4, 4] of all frames.
         frame: index of the frame.
 
@@ -274,7 +275,7 @@ def _advance(points: Float, fraction: Float, motion: Float) -> Float:
 
 # --- Lenses --------------------------------------------------------------------------------------
 
-# Logs promise pinhole images; distorted ones are rectified.
+# Logs provide pinhole images; distorted ones are rectified.
 
 MAX_ZOOM = 4.0
 
@@ -298,8 +299,8 @@ class Lens:
     def pinhole_K(self) -> Float:
         """``K`` [3, 3] of the undistorted images, which have the same size.
 
-        It is the lens's own K, with focal lengths made just so much longer that every pixel lies
-        inside the recorded image: no undistorted image has black corners.
+        The lens's own K with focal lengths increased just enough that every pixel is inside the
+        recorded image: undistorted images have no black corners.
         """
         if not any(self.distortion) or self._fits(1.0):
             return self.K.copy()
@@ -310,11 +311,11 @@ class Lens:
         return self._zoomed(high)
 
     def camera(self, name: str, T_vehicle_camera: Float, shutter: Shutter = GLOBAL) -> Camera:
-        """The pinhole camera of the undistorted images, which knows the lens and the shutter that
-        they had; not a lens that folds inside the image, through which nothing can be drawn.
+        """The pinhole camera of the undistorted images, with the original lens and shutter. A lens
+        that folds inside the image is omitted, because it cannot be rendered.
 
         Raises:
-            SceneError: values that make no camera.
+            SceneError: invalid camera values.
         """
         pinhole = Camera(name, self.width, self.height, self.pinhole_K, T_vehicle_camera)
         k1, k2, p1, p2, k3 = self.distortion
@@ -383,24 +384,24 @@ class LogReader(Protocol):
     """Reads one dataset layout.
 
     Attributes:
-        name: the format's name, as given to ``open_log(format=...)``.
-        expects: one line for users, what the folder must hold.
+        name: the format's name, for ``open_log(format=...)``.
+        expects: one line for users with the required content of the folder.
     """
 
     name: str
     expects: str
 
     def recognises(self, path: Path) -> bool:
-        """Whether the folder looks like this layout; cheap, and never raises."""
+        """Whether the folder has this layout; cheap, and never raises."""
         ...
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The log at ``path``; images and sweeps stay on disk until they are asked for.
+        """The log at ``path``; images and sweeps are read on demand.
 
-        ``sequence`` picks one where a folder holds several; the only one is the default.
+        ``sequence`` selects one in a folder with several; a single one is the default.
 
         Raises:
-            LogError: names the file (and line), what is wrong and what is expected. Tables are
+            LogError: names the file (and line), the problem and the expected content. Tables are
                 checked here; images and sweeps when they are read, or by ``check_log``.
         """
         ...

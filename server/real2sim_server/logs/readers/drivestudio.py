@@ -1,9 +1,9 @@
-"""The preprocessed folder of drivestudio (Chen et al. 2024), made of Waymo segments.
+"""The preprocessed folder of drivestudio (Chen et al. 2024), made from Waymo segments.
 
 Source: ``datasets/waymo`` of the released program and its documentation. Unlike those of Street
-Gaussians, extrinsics are in Waymo's own axes. There are no time stamps: frames are 0.1 s apart.
-The other data sets it can prepare differ in ways that their folders do not show, and are better
-read from their own files.
+Gaussians, extrinsics are in Waymo's own axes. There are no time stamps: frames are 0.1 s apart. The
+other data sets that it can prepare differ in ways that are not visible in their folders; read their
+original files instead.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class DrivestudioReader:
         return (path / "ego_pose" / "000.txt").is_file() and not (path / "timestamps.json").exists()
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The drive in the folder ``path``; ``sequence`` is refused: a folder holds one.
+        """The drive in the folder ``path``; ``sequence`` is rejected, because a folder contains
+        one.
 
         Raises:
             LogError: see :class:`LogReader`.

@@ -1,4 +1,4 @@
-"""File formats of data sets, read strictly; every failure is a LogError that names the file."""
+"""Strict readers for file formats of data sets; every failure is a LogError that names the file."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def read_json(path: Path) -> Any:
 
 
 class Tables:
-    """A folder of JSON tables, whose rows refer to each other by ``token``."""
+    """A folder of JSON tables with rows that refer to each other by ``token``."""
 
     def __init__(self, folder: Path, names: Sequence[str]) -> None:
         """Read the tables ``names``. Raises LogError naming a file that is missing or wrong."""
@@ -82,7 +82,7 @@ class Tables:
         return self._rows[name]
 
     def row(self, name: str, token: str) -> Mapping[str, Any]:
-        """The row with a token. Raises LogError where there is none."""
+        """The row with a token. Raises LogError if there is none."""
         try:
             return self._by_token[name][token]
         except (KeyError, TypeError):
@@ -90,7 +90,7 @@ class Tables:
 
 
 class _Row(dict[str, Any]):
-    """A row that says which file lacks which key."""
+    """A row whose errors name the file and the missing key."""
 
     def __init__(self, content: Mapping[str, Any], path: Path) -> None:
         super().__init__(content)
@@ -107,9 +107,9 @@ CACHE_BYTES = 1 << 30
 
 
 class ParquetFile:
-    """One Parquet file, whose columns are read when they are asked for.
+    """One Parquet file with columns that are read on demand.
 
-    Cells of heavy columns are read row group by row group; the latest ones stay in memory.
+    Cells of large columns are read by row group; the latest groups are cached.
     """
 
     def __init__(self, path: Path) -> None:
@@ -159,7 +159,7 @@ class ParquetFile:
         return [str(value) for value in self.lists(name)]
 
     def lists(self, name: str) -> list[Any]:
-        """A whole column as Python values; for small columns whose lists differ in length."""
+        """A whole column as Python values; for small columns with lists of different lengths."""
         column = self._whole(name)
         with _broken_named(f"{self.path}: column {name!r}"):
             return list(column.to_pylist())
@@ -204,7 +204,7 @@ class ParquetFile:
 
 
 def check_feather(path: Path, columns: Sequence[str]) -> None:
-    """Raise LogError when a Feather file is cut off or lacks a column; reads no values."""
+    """Raise LogError when a Feather file is truncated or lacks a column; reads no values."""
     import pyarrow as pa
     from pyarrow import ipc
 
@@ -253,7 +253,7 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
 
 @contextmanager
 def _broken_named(where: str) -> Iterator[None]:
-    """Values that pyarrow cannot convert, such as text that is none, as LogError."""
+    """Convert errors for values that pyarrow cannot convert, such as invalid text, to LogError."""
     import pyarrow as pa
 
     try:
@@ -281,7 +281,7 @@ def _line(error: Exception) -> str:
 
 
 def count_rows(path: Path, columns: int, hint: str = "is the file cut off?") -> int:
-    """How many rows of ``columns`` float32 a file holds, by its size; ``hint`` ends an error.
+    """Number of rows of ``columns`` float32 in a file, from its size; ``hint`` ends an error.
 
     Raises:
         LogError: it is missing or empty, or ends within a row.
@@ -368,10 +368,10 @@ def check_rigid(matrix: Float, where: str) -> Float:
 
 
 def check_frame_times(times_us: NDArray[np.int64], where: str) -> NDArray[np.int64]:
-    """The time stamps themselves when they increase strictly and there is at least one.
+    """The time stamps themselves if they are strictly increasing and not empty.
 
     Raises:
-        LogError: naming the first frame that is out of order.
+        LogError: names the first frame out of order.
     """
     if len(times_us) == 0:
         raise LogError(f"{where}: a log needs at least one frame")

@@ -52,7 +52,7 @@ class KittiRawReader:
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
         """The drive ``sequence``; the only one by default.
 
-        Poses come from the GPS/IMU unit, boxes from ``tracklet_labels.xml`` where it exists.
+        Poses come from the GPS/IMU unit, boxes from ``tracklet_labels.xml`` if it exists.
 
         Raises:
             LogError: see :class:`LogReader`.
@@ -160,7 +160,7 @@ def _vehicle_poses(folder: Path, count: int, calibration: KittiCalibration) -> F
 def _read_tracklets(
     path: Path, T_world_velo: Float, times_us: NDArray[np.int64]
 ) -> tuple[tuple[ObjectTrack, ...], dict[str, str]]:
-    """Tracks of ``tracklet_labels.xml``; poses are of the middle of the box's bottom."""
+    """Tracks of ``tracklet_labels.xml``; poses refer to the centre of the box's bottom."""
     if not path.exists():
         return (), {}
     boxes = []

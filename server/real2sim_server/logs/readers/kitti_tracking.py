@@ -85,18 +85,18 @@ class KittiLabel:
 def read_calibration(path: Path) -> KittiCalibration:
     """Read ``calib/NNNN.txt`` in either spelling of its keys.
 
-    The vehicle frame is placed by the published set-up: the IMU rides over the rear axle, the
-    Velodyne on the centre line 1.73 m above the road. Its axes are those of the rectified
-    cameras, which were levelled to the road more closely than the Velodyne or the IMU.
+    The vehicle frame follows the published setup: the IMU is above the rear axle, the Velodyne on
+    the centre line 1.73 m above the road. Its axes are those of the rectified cameras, which are
+    levelled to the road more accurately than the Velodyne or the IMU.
 
     Raises:
-        LogError: a matrix is missing, has a wrong number of values, or is no rigid transform.
+        LogError: a matrix is missing, has a wrong number of values, or is not a rigid transform.
     """
     return calibration_from(read_entries(path), path)
 
 
 def calibration_from(entries: Mapping[str, Float], path: Path) -> KittiCalibration:
-    """A calibration of its matrices, named as in the tracking set; ``path`` is for errors."""
+    """A calibration from its matrices, named as in the tracking set; ``path`` is for errors."""
     rectification = _rigid(path, entries, _KEYS["rectification"])
     T_cam0_velo = rectification @ _rigid(path, entries, _KEYS["velo_to_cam"])
     T_velo_imu = _rigid(path, entries, _KEYS["imu_to_velo"])
@@ -115,10 +115,11 @@ def calibration_from(entries: Mapping[str, Float], path: Path) -> KittiCalibrati
 
 
 def read_entries(path: Path, *, words: Sequence[str] = ()) -> dict[str, Float]:
-    """Lines ``key: numbers`` of a calibration file; ``words`` are keys of text, left out.
+    """Lines ``key: numbers`` of a calibration file; ``words`` are keys with text, which are
+    skipped.
 
     Raises:
-        LogError: with the line, for values that are no finite numbers.
+        LogError: values that are not finite numbers; names the line.
     """
     entries = {}
     for number, line in enumerate(read_lines(path), start=1):
@@ -248,9 +249,9 @@ def _parse_label(words: list[str], where: str, frame_count: int) -> KittiLabel:
 
 SWEEP_US = 100_000
 COLUMNS = 4
-"""Of a scan's points: x, y, z, reflectance."""
+"""Columns of a scan's points: x, y, z, reflectance."""
 MISSING_SCANS = {"0001": range(177, 181)}
-"""Scans that the published data set lacks, by sequence; these frames get an empty sweep."""
+"""Scans missing in the published data set, by sequence; these frames get an empty sweep."""
 
 KITTI_EGO_SIZE = (4.77, 1.82, 1.50)
 """VW Passat B6 Variant, the recording car [m]."""
@@ -273,11 +274,11 @@ class KittiReader:
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
         """The drive ``sequence`` under the data set's root or its ``training`` folder.
 
-        Cameras are named after their folders (``image_02``); the baselines in P0 to P3 are part
-        of ``T_vehicle_camera``. Boxes come from ``boxes_surround`` (all vehicles in every frame)
-        where that exists, else from ``label_02``. Sweeps are brought to image time with the
-        vehicle's own motion: the scanner turns clockwise and looks ahead when images are taken,
-        so a point at azimuth a was measured ``-a / (2 pi) * 0.1 s`` later.
+        Cameras are named after their folders (``image_02``); the baselines in P0 to P3 are part of
+        ``T_vehicle_camera``. Boxes come from ``boxes_surround`` (all vehicles in every frame) if it
+        exists, else from ``label_02``. Sweeps are compensated to image time with the vehicle's own
+        motion: the scanner turns clockwise and looks ahead when images are taken, so a point at
+        azimuth a was measured ``-a / (2 pi) * 0.1 s`` later.
 
         Raises:
             LogError: see :class:`LogReader`.
@@ -324,7 +325,7 @@ def _select_sequence(root: Path, sequence: str | None) -> str:
 
 
 def _image_files(root: Path, sequence: str) -> dict[str, list[Path]]:
-    """Files of every camera; as many for each as the camera with the most images has."""
+    """Files of every camera; all lists have the length of the longest."""
     folders, suffixes, frame_count = {}, {}, 0
     for folder in (root / f"image_{i:02d}" / sequence for i in range(4)):
         if folder.is_dir():
@@ -429,7 +430,7 @@ def _tracks(
 
 @dataclass(frozen=True, eq=False)
 class KittiSource:
-    """Files of a KITTI drive, and what it takes to bring scans to image time."""
+    """Files of a KITTI drive, and the data for motion compensation to image time."""
 
     rig: CameraRig
     images: dict[str, list[Path]]

@@ -31,7 +31,7 @@ VERSION = 1
 MANIFEST = "log.json"
 LANES = "lanes.json"
 MAX_SWEEP_BYTES = 1 << 30
-"""Of a sweep when unpacked: thirty million points."""
+"""Maximum size of an unpacked sweep: thirty million points."""
 LOG_KEYS = (
     "format", "version", "name", "frame_times_us", "cameras", "ego", "tracks", "lidar",
     "image_times_us", "provenance",
@@ -41,7 +41,7 @@ POSE_KEYS = ("times_us", "positions", "quaternions")
 EGO_KEYS = ("size", *POSE_KEYS)
 TRACK_KEYS = ("object_id", "category", "size", *POSE_KEYS)
 SWEEP_SHAPES = {"points": (-1, 3), "intensity": (-1,), "offset_us": (-1,), "origin": (3,)}
-"""-1 stands for the number of points."""
+"""-1 is the number of points."""
 MAX_OFFSET_US = 10_000_000
 """Points of one sweep are measured nearer to its frame's time than this."""
 
@@ -87,7 +87,7 @@ class NativeReader:
 
 
 def _read_lanes(path: Path) -> LaneGraph | None:
-    """Of a log that has a map; None without the file."""
+    """The log's map; None without the file."""
     if not path.exists():
         return None
     try:
@@ -120,7 +120,7 @@ class _JsonSection:
     where: str
 
     def only(self, keys: Sequence[str]) -> _JsonSection:
-        """The section itself, which has none but these keys."""
+        """The section itself, after a check that it has no other keys."""
         for key in self.content:
             if key not in keys:
                 like = difflib.get_close_matches(str(key), keys, n=1)
@@ -151,7 +151,7 @@ class _JsonSection:
         return found
 
     def numbers(self, key: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Finite float64 array; -1 in ``shape`` stands for any length."""
+        """Finite float64 array; -1 in ``shape`` matches any length."""
         try:
             values = np.array(self.get(key, list), dtype=np.float64)
         except (ValueError, TypeError) as error:
@@ -205,7 +205,7 @@ def _read_rig(content: _JsonSection) -> CameraRig:
 
 
 def _read_optics(entry: _JsonSection) -> Optics | None:
-    """What a camera really is; the key may be left out. Raises SceneError or ValidationError."""
+    """Optics of the physical camera; the key is optional. Raises SceneError or ValidationError."""
     given = entry.content.get("recorded")
     return None if given is None else OpticsPart.model_validate(given).build()
 
@@ -238,7 +238,7 @@ def _read_tracks(content: _JsonSection) -> tuple[ObjectTrack, ...]:
 def _read_image_times(
     content: _JsonSection, rig: CameraRig, times_us: NDArray[np.int64], ego: Trajectory
 ) -> dict[str, NDArray[np.int64]]:
-    """Times of images by camera; the key may be left out, and so may any camera."""
+    """Times of images by camera; the key and any camera are optional."""
     if "image_times_us" not in content.content:
         return {}
     section, found = content.section("image_times_us"), {}
@@ -349,7 +349,7 @@ def _sweep_archive(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _check_arrays(path: Path, headers: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> int:
-    """How many points a sweep has whose arrays have these shapes and types."""
+    """Number of points in a sweep whose arrays have these shapes and types."""
     missing = [name for name in SWEEP_SHAPES if f"{name}.npy" not in headers]
     if missing:
         raise LogError(
@@ -378,7 +378,7 @@ def write_native_log(
     image_format: str = "png",
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write ``log`` to the folder ``path``, which appears only when it is complete.
+    """Write ``log`` to the folder ``path``, which is created atomically.
 
     Args:
         log: any log.

@@ -2,8 +2,8 @@
 
 Source: ``docs/schema_nuscenes.md`` of the data set's development kit. Cameras run at 12 Hz and the
 LiDAR at 20 Hz; a frame is an image of CAM_FRONT with the images and the sweep nearest in time.
-Sweeps are motion-compensated to their time stamp, which is its end. Boxes exist at 2 Hz
-and are interpolated by the tracks. Pixel centres are taken to lie on whole numbers.
+Sweeps are motion-compensated to their time stamp, which is their end. Boxes exist at 2 Hz and
+tracks interpolate them. Pixel centres are assumed at integers.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LIDAR, FRONT = "LIDAR_TOP", "CAM_FRONT"
 TOLERANCE_US = 60_000
 HALF_SWEEP_US = 25_000
 COLUMNS = 5
-"""Of a sweep's points: x, y, z, intensity, ring."""
+"""Columns of a sweep's points: x, y, z, intensity, ring."""
 EGO_SIZE = (4.084, 1.73, 1.562)
 """Renault Zoe [m]."""
 
@@ -121,7 +121,7 @@ class NuScenesReader:
 def _map_beside(
     root: Path, folder: Path, scene: Mapping[str, Any], T_world_map: Float
 ) -> LoggedMap | None:
-    """The map expansion of a scene's town, where it was unpacked beside the tables."""
+    """The map expansion of a scene's town, if it was unpacked next to the tables."""
     if not (folder / "log.json").is_file():
         return None
     log = Tables(folder, ("log",)).row("log", str(scene["log_token"]))
@@ -132,7 +132,7 @@ def _map_beside(
 def _match(
     root: Path, folder: Path, recordings: Mapping[str, _Recording]
 ) -> tuple[NDArray[np.int64], MatchedImages]:
-    """Times of all images of the front camera, and what there is near them."""
+    """Times of all images of the front camera, and the images and sweeps nearest to them."""
     front = check_frame_times(recordings[FRONT].times_us, f"{folder / 'sample_data.json'}")
     timed = {
         (c if c == LIDAR else c.lower()): TimedImages(r.files(root), r.times_us)

@@ -1,8 +1,8 @@
-"""The preprocessed folder of Street Gaussians (Yan et al. 2024), made of Waymo segments.
+"""The preprocessed folder of Street Gaussians (Yan et al. 2024), made from Waymo segments.
 
-Source: ``script/waymo`` and ``lib/utils/waymo_utils.py`` of the released program. Extrinsics are in
-OpenCV's axes already, boxes and points in the vehicle frame. Images are as recorded, with the
-lens's distortion in them; they are straightened when they are read.
+Source: ``script/waymo`` and ``lib/utils/waymo_utils.py`` of the released program. Extrinsics are
+already in OpenCV's axes, boxes and points in the vehicle frame. Images are stored with lens
+distortion and undistorted when they are read.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from .waymo_common import (
 
 # --- Pickled arrays ------------------------------------------------------------------------------
 
-# Read without running what a pickle may contain.
+# Read a pickle without running its code.
 
 MAX_ENTRY_BYTES = 4 << 30
-"""Of an entry when unpacked; a drive of 200 frames has less than one."""
+"""Maximum size of an unpacked entry; a drive of 200 frames has less than 1 GiB."""
 MAX_ARRAYS = 100_000
 MAX_DIMENSIONS = 8
 SECONDS = 300.0
@@ -52,13 +52,13 @@ _NUMBERS = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
 
 
 def read_pickled_arrays(path: Path, name: str) -> dict[Any, NDArray[Any]]:
-    """The dictionary of arrays that ``numpy.savez`` put under ``name`` as a pickled object.
+    """The dictionary of arrays that ``numpy.savez`` stored under ``name`` as a pickled object.
 
-    A pickle is a program, and what interprets it was not made for untrusted files. It is read in a
-    process of its own; only plain ``.npy`` files of numbers come back.
+    A pickle is a program, and its interpreter is not made for untrusted files. It is read in a
+    separate process that returns only plain ``.npy`` files of numbers.
 
     Raises:
-        LogError: the file is missing or broken, has no such entry, or its pickle holds anything
+        LogError: the file is missing or broken, has no such entry, or its pickle contains anything
             but a dictionary of arrays of numbers.
     """
     try:
@@ -142,11 +142,11 @@ def _read_object(entry: IO[bytes]) -> Any:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Reads what an array was made of, and makes nothing.
+    """Reads the components of an array without building any object.
 
-    A pickle names functions of any module and calls them. Here the names of NumPy's own stand for
-    the classes below, which keep their arguments; every other name is refused. No class and no
-    function of NumPy is ever in reach of the file.
+    A pickle names functions of any module and calls them. Here NumPy's own names are mapped to the
+    classes below, which store their arguments; every other name is rejected. The file can reach no
+    class or function of NumPy.
     """
 
     def find_class(self, module: str, name: str) -> Any:
@@ -172,7 +172,7 @@ class _ArrayClass(_Kept):
 
 
 class _Type(_Kept):
-    """A ``numpy.dtype``: its text, with the order of bytes that its state says."""
+    """A ``numpy.dtype``: its text, with the byte order from its state."""
 
     __slots__ = ("text",)
 
@@ -278,7 +278,7 @@ def _key(key: Any) -> int | str:
 TYPES = {"vehicle": 1, "pedestrian": 2, "sign": 3, "cyclist": 4, "misc": 0}
 MAX_TIME_S = 1e12
 LASER = (1.43, 0.0, 2.184)
-"""Where Waymo's TOP laser sits on the vehicle [m]; the folder does not say."""
+"""Position of Waymo's TOP laser on the vehicle [m]; it is not in the folder."""
 
 
 class StreetGaussiansReader:
@@ -295,7 +295,8 @@ class StreetGaussiansReader:
         return (path / "ego_pose").is_dir() and (path / "timestamps.json").is_file()
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The drive in the folder ``path``; ``sequence`` is refused: a folder holds one.
+        """The drive in the folder ``path``; ``sequence`` is rejected, because a folder contains
+        one.
 
         Raises:
             LogError: see :class:`LogReader`.
@@ -345,7 +346,7 @@ class _Times:
             raise LogError(f"{path}: expected an object with 'FRAME'")
 
     def time_us(self, sensor: str, frame: int) -> int | None:
-        """Time stamp [us]; None where the file does not speak of the sensor."""
+        """Time stamp [us]; None if the file does not contain the sensor."""
         by_frame = self._content.get(sensor)
         if by_frame is None:
             return None
@@ -362,7 +363,7 @@ def _camera_indices(folder: Path) -> list[int]:
 def _read_camera(path: Path, index: int) -> WaymoCamera:
     intrinsics, extrinsics = (path / n / f"{index}.txt" for n in ("intrinsics", "extrinsics"))
     images = sorted((path / "images").glob(f"*_{index}.*"))
-    # Without images the size does not matter: the camera is left out.
+    # Without images the size is irrelevant: the camera is dropped.
     size = image_size(images[0]) if images else (1, 1)
     return waymo_camera(
         index + 1,
@@ -386,7 +387,7 @@ def _matrix(path: Path) -> Float:
 
 
 def _image_files(path: Path, camera: int, count: int) -> list[Path]:
-    """A file per frame; none where the camera has no image at all."""
+    """One file per frame; none if the camera has no image at all."""
     found = sorted((path / "images").glob(f"*_{camera}.*"))
     if not found:
         return []

@@ -1,9 +1,9 @@
-"""What both editions of the Waymo Open Dataset have in common, and the log they become.
+"""Common parts of both editions of the Waymo Open Dataset, and the resulting log.
 
 A frame's time stamp in the files is the start of a sweep of the TOP laser. Its pose, its boxes and
-its points hold for the middle of the sweep, which is when the FRONT camera is triggered: the pose
-of the frame is that of the FRONT image (github.com/waymo-research/waymo-open-dataset, issue 464).
-That instant is the frame's time in the log. Pixel centres lie at +0.5, as in a Camera.
+its points refer to the middle of the sweep, when the FRONT camera is triggered: the pose of the
+frame is that of the FRONT image (github.com/waymo-research/waymo-open-dataset, issue 464). That is
+the frame's time in the log. Pixel centres are at +0.5, as in a Camera.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .files import check_frame_times, check_rigid
 # ``range_image_utils``; the notes of ``dataset.proto``.
 
 TOP = 1
-"""Number of the only laser whose range images have a pose per pixel."""
+"""Number of the only laser with a pose per pixel in its range images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +48,10 @@ class Laser:
     T_vehicle_laser: Float
 
     def rows(self, height: int, where: str) -> Float:
-        """Inclination [height] of each row of a range image; the first row looks up the most.
+        """Inclination [height] of each row of a range image; the first row is the highest.
 
         Raises:
-            LogError: the image has another number of rows than the laser has beams.
+            LogError: the number of rows differs from the number of the laser's beams.
         """
         if self.inclinations is None:
             low, high = self.limits
@@ -78,8 +78,8 @@ class RangeImage:
     Attributes:
         laser: its calibration.
         values: [H, W, C] float32: range [m] (0 or below: nothing), intensity, ...
-        pixel_poses: [H, W, 6] float32 roll, pitch, yaw, x, y, z of ``T_world_vehicle`` when each
-            pixel was measured; None: all points are in the vehicle frame of the frame already.
+        pixel_poses: [H, W, 6] float32 roll, pitch, yaw, x, y, z of ``T_world_vehicle`` at the time
+            of each pixel; None: all points are already in the vehicle frame of the frame.
         where: file and place, for errors.
     """
 
@@ -91,7 +91,7 @@ class RangeImage:
 
 @dataclass(frozen=True)
 class SweepTiming:
-    """Times of one sweep of the TOP laser, which goes from behind over the left to the front.
+    """Times of one sweep of the TOP laser, which turns from behind over the left to the front.
 
     Attributes:
         start_us: of the first column, relative to the frame's time stamp.
@@ -107,13 +107,13 @@ def merge_range_images(
 ) -> LidarSweep:
     """All points of a frame in its vehicle frame.
 
-    Points of the TOP laser were measured while it turned; those of the others are given without
-    times, their offset is 0. Intensities are clipped to [0, 1].
+    Points of the TOP laser are measured while it turns; those of the others have no times and get
+    offset 0. Intensities are clipped to [0, 1].
 
     Args:
         images: all returns of all lasers.
         T_world_vehicle: pose of the frame [4, 4], in the world of the pixel poses.
-        timing: when the columns of the TOP laser were measured.
+        timing: times of the columns of the TOP laser.
     """
     points, intensities, offsets = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0)]
     origin = np.zeros(3)
@@ -184,7 +184,7 @@ SHUTTERS = {
 }
 CATEGORIES = {0: "other", 1: "car", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 TRUCK_LENGTH = 7.0
-"""Waymo has one type for all vehicles; longer ones than this [m] are called trucks."""
+"""Waymo has one type for all vehicles; those longer than this [m] become trucks."""
 
 EGO_SIZE = (5.18, 2.05, 1.78)
 """Chrysler Pacifica without its roof sensors [m]."""
@@ -289,7 +289,7 @@ class WaymoFrame:
 
 
 def with_sweeps(frames: Sequence[WaymoFrame]) -> tuple[list[int], list[WaymoFrame]]:
-    """Indices of frames that have a sweep, all of them in a segment without LiDAR; and the others.
+    """Indices of frames with a sweep (all in a segment without LiDAR), and of the others.
 
     A frame without the TOP laser, which has most of the points, counts as one without a sweep.
     """
@@ -319,8 +319,8 @@ def build_waymo_log(
 ) -> DrivingLog:
     """The log; its world is the vehicle frame of the first frame.
 
-    The ego's path goes through the poses of all frames and of all images. Cameras without any
-    image, and the frames ``left_out`` for want of a sweep, are named in the provenance.
+    The ego's path passes through the poses of all frames and of all images. Cameras without any
+    image, and the frames ``left_out`` because they lack a sweep, are named in the provenance.
 
     Raises:
         LogError: times out of order, poses that are not rigid, images or boxes that are missing
@@ -369,7 +369,7 @@ def _check_complete(
 
 
 def _camera(camera: WaymoCamera, frames: Sequence[WaymoFrame]) -> Camera:
-    """The camera of the undistorted images, with what it really is. Raises SceneError."""
+    """The camera of the undistorted images, with its original optics. Raises SceneError."""
     said = _shutter(camera, frames)
     readout_us = round(said["readout_us"])
     rolls = said["direction"] in DIRECTIONS[1:] and 0 < readout_us <= MAX_READOUT_US

@@ -52,7 +52,7 @@ _CRC_POLYNOMIAL = 0x82F63B78
 
 @dataclass(frozen=True)
 class Record:
-    """Where the payload of one record lies: offset in the file and length [bytes]."""
+    """Payload of one record: offset in the file and length [bytes]."""
 
     offset: int
     length: int
@@ -62,7 +62,7 @@ def list_records(path: Path) -> list[Record]:
     """All records of a TFRecord file; headers are read and checked, payloads are skipped.
 
     Raises:
-        LogError: the file is missing, empty, cut off, or a header's checksum is wrong.
+        LogError: the file is missing, empty, truncated, or a header's checksum is wrong.
     """
     records = []
     try:
@@ -158,7 +158,7 @@ class ProtoMessage:
             raise LogError(f"{where}: is no protocol-buffer message ({error})") from error
 
     def message(self, number: int, name: str) -> ProtoMessage:
-        """The nested message of a field; an empty one where it is absent."""
+        """The nested message of a field; an empty one if it is absent."""
         found = self.messages(number, name)
         return found[-1] if found else ProtoMessage(b"", f"{self.where}: {name}")
 
@@ -410,7 +410,7 @@ class _WaymoV1Source:
         raise LogError(f"{self.file} frame {frame}: has no image of camera {camera!r}")
 
     def _message(self, frame: int) -> ProtoMessage:
-        """The frame's message; the latest is kept, since all cameras of a frame are in one."""
+        """The frame's message; the latest is cached, because all cameras of a frame are in one."""
         with self._lock:
             if frame not in self._latest:
                 payload = read_record(self.file, self.records[frame])

@@ -66,9 +66,9 @@ class WaymoV2Reader:
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
         """The segment ``sequence``; the only one by default.
 
-        Images are undistorted when they are read, all lasers and both returns are merged, and
-        the pixels of the TOP laser are moved by their own poses where ``lidar_pose`` is there.
-        See :mod:`.waymo` for times.
+        Images are undistorted when they are read, all lasers and both returns are merged, and the
+        pixels of the TOP laser are moved by their own poses if ``lidar_pose`` exists. See
+        :mod:`.waymo` for times.
 
         Raises:
             LogError: see :class:`LogReader`.
@@ -351,7 +351,7 @@ def _range_images(files: _Lidar, start_us: int) -> list[RangeImage]:
 def _array(
     file: ParquetFile, prefix: str, row: int, *, channels: int
 ) -> NDArray[np.float32] | None:
-    """[H, W, C] of a cell with C >= ``channels``; None where the cell is empty."""
+    """[H, W, C] of a cell with C >= ``channels``; None if the cell is empty."""
     shape = file.cell(f"{prefix}.shape", row).as_py()
     cell = file.cell(f"{prefix}.values", row)
     if not shape or 0 in shape or not cell.is_valid:

@@ -17,15 +17,15 @@ from ..driving_log import LidarSweep
 
 # --- Ground of a sweep ---------------------------------------------------------------------------
 
-# Tracking runs before a scene has a ground, on single sweeps in the frame of the vehicle, and
-# only needs to know which points stand up. A scene's ground is `real2sim_server.scene.Ground`.
+# Tracking runs before a scene has a ground, on single sweeps in the vehicle frame, and only needs
+# the points above the ground. A scene's ground is `real2sim_server.scene.Ground`.
 
 GROUND_CELL = 1.0
 WINDOW = 7
-"""Cells; wider than any vehicle, so that no roof is taken for the road."""
+"""Window size in cells; wider than any vehicle, so that no roof counts as road."""
 
 LOWEST = 10.0
-"""Percentile of heights in a cell that counts as its lowest point; below it is noise."""
+"""Percentile of heights in a cell that counts as its lowest point; lower points are noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,8 @@ class SweepGround:
 def find_sweep_ground(points: Float, reach: float) -> SweepGround:
     """The ground under points [N, 3] in the vehicle frame, within ``reach`` [m].
 
-    The lowest points of each cell, opened (a minimum, then a maximum over a window), which takes
-    away whatever is narrower than the window and stands out, then smoothed.
+    The lowest points of each cell, opened (a minimum, then a maximum over a window), which removes
+    everything above the ground that is narrower than the window, then smoothed.
     """
     side = int(np.ceil(2 * reach / GROUND_CELL))
     cells = np.floor((points[:, :2] + reach) / GROUND_CELL).astype(int)
@@ -74,7 +74,7 @@ def _lowest(heights: Float, index: NDArray[np.intp], cells: int) -> Float:
 
 
 def _fill(heights: Float) -> Float:
-    """Empty cells get the height of the nearest one that is not."""
+    """Empty cells get the height of the nearest known one."""
     empty = np.isnan(heights)
     if empty.all():
         return np.zeros_like(heights)
@@ -121,9 +121,9 @@ def find_clusters(
 ) -> list[LidarCluster]:
     """Objects on the ground within ``reach`` [m] of the vehicle.
 
-    Points in the same or in neighbouring cells of a grid seen from above belong together; what is
-    too long, too few points, too flat or too far above the ground for something that drives or
-    walks is left out.
+    Points in the same or in adjacent cells of a grid seen from above form a cluster. Clusters are
+    dropped if they are too long, have too few points, or are too flat or too far above the ground
+    for a vehicle or person.
     """
     points = sweep.points.astype(np.float64)
     near = (np.abs(points[:, :2]) < reach).all(axis=1) & ~_on_ego(points, ego_size)
@@ -156,7 +156,7 @@ def find_clusters(
 
 
 def _on_ego(points: Float, size: tuple[float, float, float]) -> NDArray[np.bool_]:
-    """Points on the recording vehicle itself; its rear axle is at the origin."""
+    """Mask of points on the recording vehicle itself; its rear axle is at the origin."""
     length, width, _ = size
     along = (points[:, 0] > -0.35 * length - EGO_MARGIN) & (points[:, 0] < 0.85 * length)
     return np.asarray(along & (np.abs(points[:, 1]) < width / 2 + EGO_MARGIN / 2))
@@ -180,7 +180,7 @@ def _groups(points: Float, reach: float) -> list[NDArray[np.intp]]:
 
 # --- Free space ----------------------------------------------------------------------------------
 
-# Distinguishes free space from what is merely occluded.
+# Distinguishes free space from occluded space.
 
 BEAM = 0.013
 """A beam observes directions this near to its own [rad]."""
@@ -201,17 +201,17 @@ class SweepRays:
 
     @cached_property
     def _beams(self) -> tuple[cKDTree, Float]:
-        """Directions as a tree, and ranges; built when it is needed first."""
+        """Directions as a tree, and ranges; built on first use."""
         rays = self.points - self.sensor
         ranges = np.linalg.norm(rays, axis=1)
         seen = ranges > MIN_RANGE
         return cKDTree(rays[seen] / ranges[seen, None]), ranges[seen]
 
     def count(self, points: Float) -> tuple[int, int]:
-        """How many of points [N, 3] in the world are observed free, and how many occupied.
+        """Number of points [N, 3] in the world that are observed free, and observed occupied.
 
-        A beam that passes a point observes free space there, one that ends at the point observes
-        it occupied, and one that ends before it observes nothing.
+        A beam that passes a point observes free space, one that ends at the point observes it
+        occupied, and one that ends before it observes nothing.
         """
         tree, ranges = self._beams
         rays = points - self.sensor
@@ -225,7 +225,7 @@ class SweepRays:
         found = np.where(known, ranges[np.minimum(index, len(ranges) - 1)], np.nan)
         beyond = found - distance[:, None]
         occupied = (np.abs(beyond) < SAME_RANGE).any(axis=1)
-        # NaN compares false: what no beam observes is neither.
+        # NaN compares false: points without a beam are neither.
         passed = (beyond > SAME_RANGE).sum(axis=1)
         free = ~occupied & (passed > 0) & (passed == known.sum(axis=1))
         return int(free.sum()), int(occupied.sum())
@@ -274,7 +274,7 @@ class KalmanState:
         return float(np.sqrt(residual @ np.linalg.solve(innovation_covariance, residual)))
 
     def update(self, position: Float, deviation: float) -> KalmanState:
-        """With a measured position [2] of a standard deviation [m]."""
+        """Update with a measured position [2] with a standard deviation [m]."""
         innovation_covariance = (
             OBSERVATION @ self.covariance @ OBSERVATION.T + deviation** 2 * np.eye(2)
         )
@@ -286,7 +286,7 @@ class KalmanState:
 
 
 def smooth(times: Float, positions: Sequence[Float | None], deviation: float) -> Float:
-    """States [T, 4] at ``times`` [T] [s] from measured positions, None where there is none.
+    """States [T, 4] at ``times`` [T] [s] from measured positions, None for missing ones.
 
     Forward Kalman filter and backward pass; the first position must be known.
     """
@@ -322,7 +322,7 @@ def _process_noise(seconds: float) -> Float:
 
 
 DEVIATION = 0.5
-"""Of a cluster's centre from frame to frame [m]: its visible part changes."""
+"""Standard deviation of a cluster's centre between frames [m]: its visible part changes."""
 
 MAHALANOBIS_GATE = 3.5
 """Farthest match, as a Mahalanobis distance."""
@@ -372,7 +372,7 @@ def associate(
 
 
 def _match(tracks: Sequence[Track], clusters: Sequence[LidarCluster], frame: int) -> list[int]:
-    """Assign clusters to tracks (Hungarian method); returns the indices left unassigned."""
+    """Assign clusters to tracks (Hungarian method); returns the unassigned indices."""
     if not tracks or not clusters:
         return list(range(len(clusters)))
     centres = np.array([c.centre for c in clusters])
@@ -406,17 +406,17 @@ def _extent_change(track: Track, cluster: LidarCluster) -> float:
 # A box of one size is fitted to all clusters of an object.
 
 BOX_DEVIATION = 0.15
-"""Of the middle of a fitted box [m]."""
+"""Standard deviation of the centre of a fitted box [m]."""
 
 MIN_HEADING_SPEED = 0.7
-"""Below this speed [m/s] the direction of motion says nothing about the heading."""
+"""Below this speed [m/s] the direction of motion does not determine the heading."""
 
 EXTENT_PERCENTILE = 80.0
 """Percentile of extents that counts as the size: the largest may have a neighbour in it."""
 
 
 TYPICAL_LENGTHS = ((1.85, 4.4), (2.5, 5.1), (np.inf, 6.5))
-"""Of vehicles up to a height [m]: cars, vans, lorries [m]."""
+"""Typical lengths of vehicles up to a height: cars, vans, lorries [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,9 +455,9 @@ class FittedBox:
 def fit_box(clusters: Mapping[int, LidarCluster], times: Float) -> FittedBox:
     """A box of the size observed over all frames, with a smooth path and headings along it.
 
-    A scanner sees the near sides only (an L from above), so the box is anchored to those: along
-    each of its axes the face towards the sensor is where the points begin, and the far face
-    follows from the size. A car only seen from behind is given a car's typical length.
+    A scanner sees only the near sides (an L from above), so the box is anchored to those: along
+    each of its axes the near face is at the first points, and the far face follows from the size. A
+    car seen only from behind gets a typical length.
 
     Args:
         clusters: by frame, in the world.
@@ -491,7 +491,7 @@ def fit_box(clusters: Mapping[int, LidarCluster], times: Float) -> FittedBox:
 
 
 def _headings(states: Float) -> Float:
-    """Direction of motion [T]; while standing, that of the nearest moment of motion."""
+    """Direction of motion [T]; at standstill, the direction at the nearest time with motion."""
     velocity = states[:, 2:]
     fast = np.flatnonzero(np.linalg.norm(velocity, axis=1) > MIN_HEADING_SPEED)
     if not len(fast):
@@ -509,9 +509,9 @@ def _running_mean(values: Float, reach: int = 3) -> Float:
 
 
 def _faces(cluster: LidarCluster, heading: float, velocity: Float) -> Float:
-    """Where the points begin and end [2, 2] (axis; low, high) along and across the heading.
+    """Limits of the points [2, 2] (axis; low, high) along and across the heading.
 
-    Points that were measured earlier or later than the frame are moved along.
+    Points measured earlier or later than the frame are moved with the object.
     """
     flat = cluster.points[:, :2] - cluster.offset[:, None] * velocity
     local = flat @ _axes(heading).T
@@ -542,7 +542,7 @@ def _size(
 def _anchor_box(
     faces: Float, cluster: LidarCluster, heading: float, size: tuple[float, float, float]
 ) -> Float:
-    """Middle [2] of a box whose near faces are where the points begin."""
+    """Centre [2] of a box with its near faces at the first points."""
     axes = _axes(heading)
     sensor = axes @ cluster.sensor[:2]
     middle = np.empty(2)

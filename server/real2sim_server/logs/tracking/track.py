@@ -1,4 +1,4 @@
-"""From a log without boxes to tracks of everything that moves."""
+"""Tracks of all moving objects from a log without boxes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .association import (
 
 MAX_LENGTH, MAX_WIDTH, MAX_HEIGHT = 20.0, 3.9, 4.3
 MIN_STRAIGHTNESS = 0.6
-"""Least displacement as a fraction of the path length: what jitters goes nowhere."""
+"""Minimum displacement as a fraction of the path length; lower values are jitter."""
 
 MIN_FREE_FRACTION = 0.6
 """Least fraction of the tested points at former positions that must be seen to be empty."""
@@ -37,7 +37,7 @@ RAYS_EVERY = 4
 MARGIN = 0.3
 EGO_PART_MOTION, EGO_PART_SIZE = 0.4, 1.2
 MAX_RESIDUAL = 0.5
-"""A track whose fit leaves more than this [m] is of several objects."""
+"""A track with a larger residual of its fit [m] contains several objects."""
 
 JOIN_SPEED = 1.5
 MAX_COMMON_APART = 4
@@ -47,14 +47,14 @@ JOIN_DISTANCE = 1.0
 
 @dataclass(frozen=True)
 class TrackingOptions:
-    """What counts as a moving object.
+    """Criteria for moving objects.
 
     Attributes:
-        reach: how far from the vehicle objects are detected [m], along each axis.
-        least_distance: how far an object must go [m].
-        least_speed: its least mean speed [m/s].
-        least_frames: in how many frames it must be seen.
-        max_missed: a track ends after so many frames without a cluster.
+        reach: maximum distance from the vehicle along each axis [m].
+        least_distance: minimum travelled distance [m].
+        least_speed: minimum mean speed [m/s].
+        least_frames: minimum number of frames with the object.
+        max_missed: a track ends after this many frames without a cluster.
     """
 
     reach: float = 55.0
@@ -70,19 +70,19 @@ def track_moving_objects(
     *,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> tuple[ObjectTrack, ...]:
-    """Find what moves in the LiDAR sweeps of a log, with the log's own poses.
+    """Detect and track moving objects in the LiDAR sweeps of a log, using the log's poses.
 
     Ground points are removed, the rest is clustered, clusters are associated from frame to frame,
-    and boxes of constant size are fitted to the tracks that move: the positions that a moving
-    object has left are free space afterwards.
+    and boxes of constant size are fitted to the moving tracks: a moving object leaves free space at
+    its former positions.
 
     Args:
         log: with LiDAR; its tracks are ignored.
-        options: see there.
+        options: see :class:`TrackingOptions`.
         on_progress: called with (done, total) after each sweep.
 
     Returns:
-        Tracks in order of appearance, called ``<category>_<number>``; headings along the motion.
+        Tracks in order of appearance, named ``<category>_<number>``; headings along the motion.
 
     Raises:
         LogError: a sweep cannot be read.
@@ -174,7 +174,7 @@ def _same_object(one: FittedBox, two: FittedBox, times: Float) -> bool:
 
 
 def _inside(box: FittedBox, index: int, positions: Float) -> NDArray[np.bool_]:
-    """Which positions [..., >= 2] lie above or below the box, or next to it."""
+    """Mask of positions [..., >= 2] inside the box seen from above, with a margin."""
     cos, sin = np.cos(box.headings[index]), np.sin(box.headings[index])
     x, y = positions[..., 0] - box.centres[index, 0], positions[..., 1] - box.centres[index, 1]
     along, across = cos * x + sin * y, cos * y - sin * x
@@ -276,7 +276,7 @@ INSTANTS = 9
 def merge_tracks(
     given: Sequence[ObjectTrack], found: Sequence[ObjectTrack]
 ) -> tuple[ObjectTrack, ...]:
-    """``given``, then those of ``found`` that are none of them, under ids of their own."""
+    """``given``, then the tracks of ``found`` that are not among them, with new ids."""
     tracks = list(given)
     taken = {track.object_id for track in given}
     for track in found:
@@ -292,7 +292,7 @@ def merge_tracks(
 
 
 def same_object(track: ObjectTrack, other: ObjectTrack) -> bool:
-    """Whether a track lies in the box of another for half of the time that both are there."""
+    """Whether a track is inside the box of another for half of their common time."""
     first = max(track.trajectory.start_us, other.trajectory.start_us)
     last = min(track.trajectory.end_us, other.trajectory.end_us)
     if last < first:

@@ -1,4 +1,4 @@
-"""How close a scene comes to its log: images, moving objects, depth, and how fast it is drawn."""
+"""Evaluation of a scene against its log: images, moving objects, depth, and frame rate."""
 
 from .images import PSNR_CAP, mean_psnr, psnr, ssim
 from .lidar import CoverageReport, CoverageScore, evaluate_views, lidar_mask

@@ -67,7 +67,7 @@ def ssim(image: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
 
 
 def mean_psnr(values: Iterable[float]) -> float:
-    """Mean of ratios [dB], infinite ones taken as PSNR_CAP and nan left out; nan for none."""
+    """Mean PSNR [dB]; infinite values count as PSNR_CAP, nan values are dropped; nan for none."""
     known = [min(value, PSNR_CAP) for value in values if not np.isnan(value)]
     return float(np.mean(known)) if known else float("nan")
 
@@ -75,16 +75,16 @@ def mean_psnr(values: Iterable[float]) -> float:
 # Ground truth: a synthetic log's street can be rebuilt.
 
 SAME_DB = 30.0
-"""A street built again must show the logged image at least this closely; jpg keeps more [dB]."""
+"""Minimum PSNR of a rebuilt street against the logged image [dB]; JPEG compression stays above."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A street that can be seen from anywhere, or why there is none.
+    """A street that can be viewed from anywhere, or the reason why it is missing.
 
     Attributes:
-        log: the street; None where there is none.
-        missing: why; empty where there is one.
+        log: the street; None if missing.
+        missing: the reason; empty if the street is available.
     """
 
     log: SyntheticLog | None
@@ -139,10 +139,10 @@ class SideScore:
 
     Attributes:
         object_id: of the vehicle.
-        azimuth: of the camera about the vehicle [rad], 0 from ahead, pi from behind.
+        azimuth: of the camera about the vehicle [rad], 0 in front, pi behind.
         seen: whether a camera of the log saw this side.
-        psnr: [dB]; what is missing counts as black.
-        coverage: fraction of the pixels where anything of the vehicle is drawn.
+        psnr: [dB]; missing pixels count as black.
+        coverage: fraction of the pixels with a rendered part of the vehicle.
     """
 
     object_id: str
@@ -154,11 +154,11 @@ class SideScore:
 
 @dataclass(frozen=True)
 class AroundScore:
-    """Means over views of all vehicles, apart for sides that the log saw and that it did not.
+    """Means over views of all vehicles, separately for sides that the log saw and did not see.
 
     Attributes:
-        psnr_seen, psnr_unseen: [dB], nan where there are no such views.
-        coverage_seen, coverage_unseen: in [0, 1], nan where there are no such views.
+        psnr_seen, psnr_unseen: [dB], nan without such views.
+        coverage_seen, coverage_unseen: in [0, 1], nan without such views.
         sides: every view.
     """
 
@@ -191,7 +191,7 @@ def evaluate_around(
 
 
 def logged_azimuths(log: SyntheticLog, track: ObjectTrack) -> list[float]:
-    """Azimuths [rad] in the object's frame of the cameras in whose images its centre is."""
+    """Azimuths [rad] in the object's frame of the cameras with its centre in the image."""
     azimuths = []
     for camera in log.rig:
         for frame in range(log.frame_count):

@@ -28,9 +28,9 @@ from .rendering import render_logged_view
 NEAR, FAR = 0.5, 80.0
 """Points at other depths are not compared [m]."""
 HIDDEN_BEHIND = 0.3
-"""What lies so much nearer hides a point, unless the road alone recedes as quickly [m]."""
+"""An occluder is nearer than a point by at least this much, plus the recession of the road [m]."""
 REACH = 0.006
-"""Radius on the image within which an occluder is searched [rad]; about two beams apart."""
+"""Radius of the search for occluders on the image [rad]; about two beams apart."""
 ROAD_BELOW = 1.2
 """The road is at least so far below the cameras [m]."""
 
@@ -40,10 +40,10 @@ def seen_points(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Rows [M], columns [M] and depths [M] [m] of the points that the camera can see.
 
-    The LiDAR stands elsewhere than the camera and looks over things that hide what is behind
-    them. A point counts as hidden when any point within REACH of it on the image is nearer by
-    more than HIDDEN_BEHIND plus what a road ROAD_BELOW the camera recedes over that distance,
-    z^2 angle / height, so that far stretches of road are compared too.
+    The LiDAR is at another position than the camera and sees over objects that occlude others. A
+    point counts as hidden when any point within REACH of it on the image is nearer by more than
+    HIDDEN_BEHIND plus the recession of a road ROAD_BELOW the camera over that distance, z^2 angle /
+    height. The second term keeps distant stretches of road.
 
     Args:
         points: [N, 3] in the camera frame [m].
@@ -61,7 +61,7 @@ def seen_points(
     np.minimum.at(nearest, (row, column), depth)
     focal = camera.K[0, 0]
     reach = max(1, round(REACH * focal))
-    # The default border is the largest finite number, which hides nothing.
+    # The default border is the largest finite number and hides nothing.
     nearest = np.asarray(cv2.erode(nearest, np.ones((2 * reach + 1,) * 2, np.uint8)))
     # One pixel more, as points are rounded to pixels.
     recedes = depth**2 * (reach + 1) / (focal * ROAD_BELOW)
@@ -85,15 +85,15 @@ def depth_errors(depth: NDArray[np.float32], points: Float, camera: Camera) -> N
 
 
 def median_error(errors: NDArray[np.float64]) -> float:
-    """Median [m]; nan for no points, infinite where most are holes."""
+    """Median [m]; nan without points, infinite if most are holes."""
     # The mean of a finite and an infinite middle value is infinite, as it should be.
     return float(np.median(errors)) if len(errors) else float("nan")
 
 
 def mean_error(errors: NDArray[np.float64]) -> float:
-    """Mean over the points that are no holes [m]; nan where there are none.
+    """Mean over the points that are not holes [m]; nan without such points.
 
-    What a median hides shows here: surfaces that are haze have long tails.
+    Reveals long tails from hazy surfaces, which the median hides.
     """
     finite = errors[np.isfinite(errors)]
     return float(finite.mean()) if len(finite) else float("nan")
@@ -106,7 +106,7 @@ def error_p90(errors: NDArray[np.float64]) -> float:
     """
     if len(errors) == 0:
         return float("nan")
-    # Between a finite and an infinite value there is nothing to interpolate.
+    # Percentiles between a finite and an infinite value cannot be interpolated.
     return float(np.percentile(errors, 90, method="inverted_cdf"))
 
 
@@ -122,9 +122,9 @@ class CoverageScore:
     """One rendered view against its logged image.
 
     Attributes:
-        camera, frame: which view.
+        camera, frame: of the view.
         psnr: over all pixels [dB].
-        psnr_lidar: over the pixels that LiDAR covers [dB]; nan where there are none.
+        psnr_lidar: over the pixels that LiDAR covers [dB]; nan without such pixels.
         lidar_fraction: fraction of pixels that LiDAR covers, 0 to 1.
     """
 
@@ -161,9 +161,8 @@ def evaluate_views(
     """Render logged views and compare them with the logged images.
 
     A pixel counts as covered by LiDAR when a point of that frame's own sweep, at least
-    COVERAGE_NEAR in front of the camera, projects into it or into one of the pixels around it,
-    up to 1/600 of the image width away (2 px at 1242 px). Points are taken as the log gives
-    them, without an occlusion test.
+    COVERAGE_NEAR in front of the camera, projects into it or into a pixel up to 1/600 of the image
+    width away (2 px at 1242 px). There is no occlusion test.
 
     Args:
         scene: reconstructed from ``log``.
@@ -242,16 +241,16 @@ class SweepScore:
 
     Attributes:
         frame: of the log; -1 for means.
-        rays: compared.
+        rays: number of compared rays.
         median_m, median_squared_m2, p90_m: absolute error of the range where both return.
-        expected_m: median absolute error of the mean range of the light, which tells haze.
+        expected_m: median absolute error of the mean range of the light, which reveals haze.
         chamfer_m2: see CHAMFER.
-        f_score: share of points within 5 cm of the others, mean of both ways.
-        hit_miss: share of rays for which it is right whether anything is there; of a recorded
-            sweep, whose rays all returned, the share that hit.
+        f_score: share of points within 5 cm of the other cloud, mean of both directions.
+        hit_miss: share of rays with the right answer to whether they hit anything. For a recorded
+            sweep, where all rays returned, the share that hit.
         intensity_rmse: of the reflectivity where both return.
-        drop_accuracy: share of rays for which it is right whether they return; nan where nobody
-            knows which did not.
+        drop_accuracy: share of rays with the right answer to whether they return; nan if the lost
+            rays are unknown.
     """
 
     frame: int
@@ -273,10 +272,10 @@ class LidarScore:
 
     Attributes:
         against: ``ray-cast truth`` or ``recorded returns``.
-        chamfer: convention of the distance of two clouds.
-        mean: of all sweeps.
-        sweeps: one each.
-        ring_residual_deg: of the fitted beam table; nan where none was.
+        chamfer: convention of the distance between two clouds.
+        mean: over all sweeps.
+        sweeps: one score each.
+        ring_residual_deg: of the fitted beam table; nan if none was fitted.
     """
 
     against: str
@@ -287,10 +286,10 @@ class LidarScore:
 
 
 def evaluate_sweeps(scene: Scene, log: DrivingLog, frames: Sequence[int]) -> LidarScore | None:
-    """Cast the sweeps of ``frames``; None where the log has none.
+    """Cast the sweeps of ``frames``; None if the log has no sweeps.
 
-    Synthetic logs are compared with rays cast into their street, without noise and losses; others
-    with their recorded returns.
+    Sweeps of synthetic logs are compared with rays cast into their street, without noise and
+    losses; other sweeps with their recorded returns.
 
     Raises:
         LogError: a sweep cannot be read.

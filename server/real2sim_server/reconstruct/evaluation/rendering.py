@@ -1,4 +1,4 @@
-"""Rendered views of a scene: which frames and cameras, recorded or shifted poses, frame rate."""
+"""Rendered views of a scene: selected frames and cameras, recorded or shifted poses, frame rate."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def render_view(
 def render_uncertainty(
     scene: Scene, camera: Camera, t_us: int, *, backend: str = "auto"
 ) -> NDArray[np.float32]:
-    """Uncertainty [H, W] of what ``camera`` on the recording vehicle sees at ``t_us``.
+    """Uncertainty [H, W] of the view of ``camera`` on the recording vehicle at ``t_us``.
 
     Raises:
-        RenderError: the scene knows none.
+        RenderError: the scene has no uncertainties.
         TimeOutOfRangeError: the scene's ego path does not cover ``t_us``.
     """
     [frame] = render_cameras(
@@ -99,11 +99,11 @@ def render_logged_view(
 
 @dataclass(frozen=True)
 class RenderRate:
-    """How fast a scene is drawn.
+    """Render speed of a scene.
 
     Attributes:
-        frames_per_second: camera images per second, colour only, all cameras in one call: their
-            number by the median time of a call.
+        frames_per_second: camera images per second, colour only, all cameras in one call: number
+            of cameras divided by the median duration of a call.
         cameras: number of cameras.
         seconds: of each measured call.
     """
@@ -121,9 +121,9 @@ def measure_rate(
     repeats: int = 10,
     backend: str = "auto",
 ) -> RenderRate:
-    """Draw all ``cameras`` at ``times_us`` in turn, ``repeats`` times after one that is not timed.
+    """Render all ``cameras`` at ``times_us`` in turn, ``repeats`` times after an untimed pass.
 
-    Images reach the memory of the host, as they do for users.
+    The time includes the transfer of images to host memory, as in normal use.
     """
     options = RasterOptions(depth=False, instance=False)
     seconds = []
@@ -146,7 +146,7 @@ def measure_rate(
 # Selection of the frames and cameras to compare.
 
 DEFAULT_HOLD_OUT = 4
-"""One of so many frames is held out where a scene does not say otherwise."""
+"""Every Nth frame is held out if the scene does not list its held-out frames."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class SelectedFrames:
 
     Attributes:
         frames: indices, increasing.
-        held_out: whether the scene says that none of them was used to make it.
+        held_out: whether the scene lists all of them as unused in its training.
     """
 
     frames: tuple[int, ...]
@@ -163,17 +163,18 @@ class SelectedFrames:
 
 
 def select_frames(scene: Scene, log: DrivingLog, frames: str | Sequence[int]) -> SelectedFrames:
-    """The frames that are asked for.
+    """The selected frames.
 
-    ``held-out`` means those that training kept back, as the scene's provenance lists them. A
-    scene that lists none (made without training, or on all frames, or elsewhere) is compared at
-    every fourth frame by the same rule, 2, 6, 10 ..., and they do not count as held out.
+    ``held-out`` selects the frames that training held out, as listed in the scene's provenance. A
+    scene that lists none (built without training, on all frames, or elsewhere) is compared at every
+    fourth frame by the same rule, 2, 6, 10 ..., and these do not count as held out.
 
     Args:
         frames: ``held-out``, ``all``, or indices.
 
     Raises:
-        ReconstructError: an unknown word, no frame, or one the log or the scene's path lacks.
+        ReconstructError: an unknown word, no frame, or a frame missing in the log or on the
+            scene's path.
     """
     listed = listed_held_out(scene)
     if frames == "held-out":
@@ -211,7 +212,7 @@ def select_cameras(scene: Scene, log: DrivingLog, width: int | None) -> tuple[Ca
 
 
 def listed_held_out(scene: Scene) -> list[int]:
-    """Frames that the scene says were not used to make it; none where it says nothing."""
+    """Frames that the scene lists as unused in its training; empty if it lists none."""
     reconstruction = scene.provenance.get("reconstruction")
     listed = reconstruction.get("held_out_frames") if isinstance(reconstruction, dict) else None
     return sorted({int(frame) for frame in listed}) if listed else []

@@ -27,7 +27,7 @@ from .shifted import true_view
 # Images for visual comparison: errors and depth in colour, crops of moving objects.
 
 ERROR_FULL = 64.0
-"""Error at which the colours of error images end, of 255."""
+"""Error at the end of the colour scale of error images, of 255."""
 DEPTH_NEAR, DEPTH_FAR = 2.0, 80.0
 """Ends of the logarithmic colours of depth images [m]."""
 CROP_MARGIN = 0.15
@@ -60,8 +60,8 @@ def object_crops(
 ) -> list[tuple[str, tuple[slice, slice]]]:
     """Id and rows and columns of at most ``limit`` moving objects, the largest on the image first.
 
-    Only objects that lie on the image with at least half of their outline's box are taken, and
-    not those whose middle is behind another one.
+    An object needs at least half of its outline's bounding box on the image, and a centre that no
+    other object occludes.
     """
     t_us = image_time(log, camera.name, frame)
     T_camera_world = camera.viewmat(log.ego.transform(t_us))
@@ -175,11 +175,11 @@ def write_report(
     *,
     options: EvaluateOptions | None = None,
 ) -> Path:
-    """Write ``report.html`` into ``folder``, which is made where it is missing.
+    """Write ``report.html`` into ``folder``, which is created if needed.
 
     Args:
-        scene, log, options: as given to ``evaluate_scene``.
-        evaluation: what came out.
+        scene, log, options: as passed to ``evaluate_scene``.
+        evaluation: its result.
 
     Returns:
         The page.

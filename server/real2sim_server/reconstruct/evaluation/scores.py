@@ -32,8 +32,8 @@ from .uncertainty import UncertaintyScore, evaluate_uncertainty
 def box_error(scene: Scene, log: DrivingLog) -> float:
     """Median distance between the centres of moving objects and of their boxes in ``log`` [m].
 
-    On a synthetic log, whose boxes are exact, this is the error of the scene's trajectories. Nan
-    where no moving object of the log is in the scene.
+    On a synthetic log, with its exact boxes, this is the error of the scene's trajectories. Nan if
+    the scene contains no moving object of the log.
     """
     distances = []
     for track in moving_tracks(log):
@@ -55,21 +55,21 @@ def box_error(scene: Scene, log: DrivingLog) -> float:
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """What is measured.
+    """Options of an evaluation.
 
     Attributes:
         frames: ``held-out``, ``all`` or indices; see :func:`.rendering.select_frames`.
         width: of the compared images [px]; as logged by default.
-        shifts: distances beside the recorded path [m]: of whole images where truth exists, of the
-            road by LiDAR and other images on every log.
-        shifted_frames: at most so many frames, evenly spread, are rendered from there.
+        shifts: lateral distances from the recorded path [m]. Whole images are compared if truth
+            exists, the road by LiDAR and other images on every log.
+        shifted_frames: maximum number of frames rendered from there, evenly spread.
         repeats: timed renders.
         backend: of the renderer.
-        around: whether vehicles are rendered from all around, where truth exists.
-        lidar: whether LiDAR sweeps are cast and compared, where the log has any.
+        around: whether to render vehicles from all sides, if truth exists.
+        lidar: whether to cast and compare LiDAR sweeps, if the log has any.
 
     Raises:
-        ReconstructError: a value out of range.
+        ReconstructError: a value is out of range.
     """
 
     frames: str | tuple[int, ...] = "held-out"
@@ -97,18 +97,17 @@ class LoggedViewScore:
     """One rendered view against its logged image.
 
     Attributes:
-        camera, frame: which view.
+        camera, frame: of the view.
         psnr: over all pixels [dB]; infinite for equal images.
         ssim: structural similarity, at most 1.
-        psnr_objects: over the pixels within the boxes of moving objects [dB]; nan where these
-            are fewer than 50.
-        object_pixels: how many these are.
+        psnr_objects: over the pixels within the boxes of moving objects [dB]; nan below 50 pixels.
+        object_pixels: number of these pixels.
         depth_error_m: median absolute error of the rendered depth at the LiDAR points of the
-            same sweep that the camera can see [m]; infinite where most hit nothing, nan without
+            same sweep that the camera can see [m]; infinite if most hit nothing, nan without
             points.
         depth_error_p90_m: 90th percentile of the same errors [m].
-        lidar_points: how many these are.
-        lidar_missed: fraction of them at which nothing is rendered, 0 to 1.
+        lidar_points: number of these points.
+        lidar_missed: fraction of them without a rendered surface, 0 to 1.
     """
 
     camera: str
@@ -142,25 +141,25 @@ class Evaluation:
     Attributes:
         scene, log: names.
         frames: indices of the compared frames.
-        frames_unseen: whether the scene says that none of them was used to make it.
-        gaussians: of the scene.
+        frames_unseen: whether the scene lists all of them as unused in its training.
+        gaussians: number in the scene.
         psnr, ssim: means over views, all pixels [dB], [1].
         psnr_objects: mean over the views that show moving objects, within their boxes [dB].
         depth_error_m: median over all compared LiDAR points of all views [m].
         depth_error_p90_m: 90th percentile over the same points [m].
-        depth_error_mean_m: mean over those of them at which anything is rendered [m].
-        box_error_m: median over moving objects and their times of how far their centres are from
-            those of the log's boxes [m]; nan where the log has none of the scene's objects.
-        frames_per_second: camera images drawn per second, see :class:`.rendering.RenderRate`.
+        depth_error_mean_m: mean over the points with a rendered surface [m].
+        box_error_m: median distance between the centres of moving objects and of the log's boxes
+            over all their times [m]; nan if the log has none of the scene's objects.
+        frames_per_second: camera images rendered per second, see :class:`.rendering.RenderRate`.
         width, height: of the first camera's compared image [px].
-        by_camera: the same by camera.
+        by_camera: the same per camera.
         views: one score each, camera by camera within a frame.
-        shifted: views from beside the path; empty where no truth exists.
-        no_shifted: why it is empty; empty where it is not.
-        lane_band: the road from beside the path against what other images show of it.
-        around: vehicles from all sides; None unless asked for, or where no truth exists.
-        lidar: sweeps against what was there; None unless asked for, or without sweeps.
-        uncertainty: drawn uncertainty against true errors; None where the scene knows none.
+        shifted: views shifted from the path; empty without truth.
+        no_shifted: the reason why it is empty; empty otherwise.
+        lane_band: the road seen from shifted poses, against its appearance in other images.
+        around: vehicles from all sides; None unless requested, or without truth.
+        lidar: sweeps against the measured or true ones; None unless requested, or without sweeps.
+        uncertainty: rendered uncertainty against true errors; None if the scene has none.
     """
 
     scene: str
@@ -189,9 +188,9 @@ class Evaluation:
     timing_s: dict[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """JSON values; infinite ratios become PSNR_CAP, what is unknown null.
+        """JSON values; infinite ratios become PSNR_CAP, unknown values null.
 
-        ``shifted`` is left out where no truth exists, and ``no_shifted`` says why.
+        Without truth, ``shifted`` is missing and ``no_shifted`` gives the reason.
         """
         values = _plain(asdict(self))
         values.pop("no_shifted" if self.shifted else "shifted")
@@ -210,9 +209,9 @@ def evaluate_scene(
 ) -> Evaluation:
     """Render logged views, compare them with images and LiDAR, time it, render shifted views.
 
-    Every view is rendered when its image was taken, by the scene's own calibration and objects'
-    poses, which training may have refined. Where moving objects are is taken from the log. Of a
-    scene that was made of a part of the log that part is taken, and its frames count from 0.
+    Every view is rendered at the time of its image, with the scene's own calibration and object
+    poses, which training may have refined. The positions of moving objects come from the log. For a
+    scene made of a part of the log, only that part is used, and its frames count from 0.
 
     Raises:
         ReconstructError: the scene and the log do not belong together, or no frame is left.

@@ -1,4 +1,4 @@
-"""Views from beside the recorded path: the next lane, and the road band without truth."""
+"""Views shifted sideways from the recorded path: the next lane, and the road band without truth."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from .rendering import render_view, shifted_pose
 # Views from the next lane against the truth.
 
 MIN_OBJECT_PIXELS = 50
-"""Views in which moving objects cover fewer pixels do not count for them."""
+"""Views in which moving objects cover fewer pixels are not scored for objects."""
 CLEARANCE = 0.3
-"""Views from within a box, or closer to one, are left out [m]."""
+"""Views from within a box, or closer to one, are excluded [m]."""
 DEPTH_STRIDE = 4
-"""Depth is compared at every so many pixels along each image axis."""
+"""Depth is compared at every Nth pixel along each image axis."""
 
 
 @dataclass(frozen=True)
 class ShiftScore:
-    """Views from beside the recorded path against the truth.
+    """Views shifted from the recorded path against the truth.
 
     Attributes:
-        shift_m: how far to the left and to the right [m].
+        shift_m: distance to the left and to the right [m].
         psnr: mean over views [dB].
         ssim: mean over views.
         psnr_objects: mean over the views with moving objects, within their boxes [dB].
         depth_error_m: median over pixels of all views, depth along z against the true one [m].
-        views: how many views were compared.
-        views_in_objects: how many were left out as another vehicle stands where the camera is.
+        views: number of compared views.
+        views_in_objects: number of excluded views, with another vehicle at the camera's position.
     """
 
     shift_m: float
@@ -63,9 +63,9 @@ def evaluate_shifts(
     """Move the recording vehicle ``shifts`` [m] to its left and to its right and compare.
 
     Args:
-        scene: its ego path and that of ``truth`` both cover ``times_us``.
-        cameras: at the size that is compared.
-        on_view: called with views done and views in all.
+        scene: its ego path and the path of ``truth`` both cover ``times_us``.
+        cameras: at the compared size.
+        on_view: called with the number of finished views and of all views.
     """
     total, scores = 2 * len(shifts) * len(cameras) * len(times_us), []
     done = 0
@@ -125,7 +125,7 @@ def _compare(
 
 
 def within_an_object(log: DrivingLog, position: Float, t_us: int) -> bool:
-    """Whether ``position`` [3] in the world [m] lies in a box at ``t_us``, or within CLEARANCE."""
+    """Whether ``position`` [3] in the world [m] is in a box at ``t_us``, or within CLEARANCE."""
     for track in log.tracks:
         pose = track.transform_near(t_us)
         if pose is not None:
@@ -164,7 +164,7 @@ def _score(shift: float, compared: list[_Compared], total: int) -> ShiftScore:
 # next lane. Only these pixels are compared.
 
 COLOURED_WITHIN = (4.0, 12.0)
-"""Road takes its colour from images that show it at such depths [m]."""
+"""Depth range of images that colour the road [m]."""
 COMPARED_WITHIN = (5.0, 25.0)
 """And is compared at these [m]."""
 ON_ROAD = 0.1
@@ -176,16 +176,17 @@ MIN_PIXELS = 100
 
 @dataclass(frozen=True)
 class LaneBandScore:
-    """Views of the road from beside the path.
+    """Views of the road shifted from the path.
 
     Attributes:
-        shift_m: how far to the left and to the right [m].
-        psnr: over the pixels whose road other images show from near by, mean over views [dB]; nan
-            where no view shows enough of it.
-        images_psnr: the same of the recorded images at their own places [dB]: where shadows move or
-            boxes are off, colours from other images are wrong, and scores beyond this say nothing.
-        pixels: how many are compared, in all views.
-        views: how many views were compared; none from within a box or close to one.
+        shift_m: distance to the left and to the right [m].
+        psnr: over the pixels with road that other images show at close range, mean over views
+            [dB]; nan if no view shows enough of it.
+        images_psnr: the same for the recorded images at their own poses [dB]. Moving shadows and
+            inexact boxes make colours from other images wrong; scores above this value are
+            meaningless.
+        pixels: number of compared pixels in all views.
+        views: number of compared views; views from within a box or close to one are excluded.
     """
 
     shift_m: float
@@ -301,7 +302,7 @@ def road_colours(log: DrivingLog, camera: Camera, ground: Ground) -> RoadColours
 def projected_road(
     road: RoadColours, log: DrivingLog, camera: Camera, t_us: int, left: float
 ) -> tuple[NDArray[np.int64], Float]:
-    """Row-major pixels [M] that show the road from beside, and its mean colours [M, 3] there."""
+    """Row-major pixels [M] that show the road from a shifted pose, and its mean colours [M, 3]."""
     near, far = COMPARED_WITHIN
     pose = camera.pose(shifted_pose(log.ego.transform(t_us), left))
     x, y, z = (apply_transform(invert_transform(pose), road.points) @ camera.K.T).T

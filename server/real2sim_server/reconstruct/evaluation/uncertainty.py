@@ -41,19 +41,19 @@ from .rendering import (
 VIEWS = 48
 """Training views that are looked at, at most."""
 WIDTH = 640
-"""Of their images, at most [px]."""
+"""Maximum width of the images [px]."""
 PRIOR_PIXELS, PRIOR_WIDTH = 0.05, 240
 """Rays that UNSEEN counts for: pixels of an image of that width [px]."""
 
 
 @dataclass(frozen=True)
 class UncertaintyReport:
-    """What was found.
+    """Result of the estimation.
 
     Attributes:
-        views: training views that were compared.
-        seen: share of the Gaussians that their rays tell more of than the prior does.
-        mean: uncertainty of these, mean over the rays that met them.
+        views: number of compared training views.
+        seen: share of the Gaussians with more evidence from their rays than from the prior.
+        mean: mean uncertainty of these Gaussians over the rays that hit them.
     """
 
     views: int
@@ -63,7 +63,7 @@ class UncertaintyReport:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Of each Gaussian or texel over views: its blending weights [px], and these by residuals."""
+    """Per Gaussian or texel, over views: its blending weights [px], and weights times residuals."""
 
     weights: Tensor
     errors: Tensor
@@ -73,7 +73,7 @@ class _Sums:
         return cls(torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.float64))
 
     def add(self, gradient: Tensor | None, unit: float) -> None:
-        """The gradient [..., 3] of constant colours; channel 0 of weights, 1 of errors."""
+        """Add the gradient [..., 3] of constant colours; channel 0 of weights, 1 of errors."""
         if gradient is not None:
             self.weights.add_(gradient[..., 0].cpu().double().clamp(min=0) / unit)
             self.errors.add_(gradient[..., 1].cpu().double().clamp(min=0) / unit)
@@ -92,21 +92,21 @@ def fit_uncertainties(
     backend: str | Backend = "auto",
     on_view: Callable[[int, int], None] | None = None,
 ) -> tuple[Scene, UncertaintyReport]:
-    """The scene with uncertainties of its Gaussians and its sky, from views it was trained on.
+    """The scene with uncertainties of its Gaussians and its sky, from its training views.
 
-    Frames that the scene held out are left aside.
+    Held-out frames are not used.
 
     Args:
-        scene: made of ``log``.
+        scene: made from ``log``.
         log: the same part of it.
-        views: at most so many images, evenly over all of them.
-        backend: of the renderer; it must carry gradients.
-        on_view: called with views done and views in all.
+        views: maximum number of images, evenly spread over all of them.
+        backend: of the renderer; it must support gradients.
+        on_view: called with the number of finished views and of all views.
 
     Raises:
         ReconstructError: the scene and the log do not belong together, or no image is left.
         LogError: an image cannot be read.
-        RenderError: the renderer carries no gradients.
+        RenderError: the renderer does not support gradients.
     """
     chosen = _views(scene, log, views)
     drawing = select_backend(backend) if isinstance(backend, str) else backend
@@ -130,7 +130,7 @@ def fit_uncertainties(
 
 
 def _views(scene: Scene, log: DrivingLog, count: int) -> list[tuple[Camera, int]]:
-    """Cameras and frames, evenly over those that training saw, each camera at frames of its own."""
+    """Cameras and frames, evenly spread over the training frames, other frames for each camera."""
     held_out = set(listed_held_out(scene))
     cameras = [
         camera.resized(min(WIDTH, camera.width))
@@ -165,7 +165,7 @@ def _add_view(
     sums: list[_Sums],
     sky: _Sums | None,
 ) -> None:
-    """Add what one view tells."""
+    """Add the evidence of one view."""
     t_us = image_time(log, camera.name, frame)
     viewmat = camera.viewmat(scene.ego.transform(t_us))[None]
     instances = scene_instances(scene, t_us)
@@ -192,7 +192,7 @@ def _add_view(
         drawn = draw(coloured, None if faces is None else Sky(faces))
         torch.autograd.backward(drawn[..., 0].sum() + (drawn[..., 1] * residual).sum())
     for item, colour in zip(instances, colours, strict=True):
-        # Ids count from 1 over the scene's objects; the background has 0.
+        # Ids count from 1 over the scene's objects; the background is 0.
         sums[item.instance_id].add(None if colour.grad is None else colour.grad[:, 0], SH_C0)
     if sky is not None and faces is not None:
         sky.add(faces.grad, 1.0)
@@ -218,7 +218,7 @@ def _with(scene: Scene, sums: list[_Sums], sky: _Sums | None, prior: float) -> S
 Values = NDArray[np.float32]
 """An image [H, W], or a part of one."""
 BLUR = 9
-"""Edge of the squares over whose means both are compared as well [px]."""
+"""Edge of the squares for the comparison of local means [px]."""
 MAX_VIEWS = 24
 
 
@@ -227,14 +227,14 @@ class UncertaintyScore:
     """Means over views.
 
     Attributes:
-        spearman: rank correlation of uncertainty and absolute error, by pixel.
+        spearman: rank correlation of uncertainty and absolute error, per pixel.
         spearman_regions: of their means over squares of 9 by 9 pixels.
-        sparsification: error that is left above the least possible when the most uncertain pixels
-            are dropped, over all shares dropped: 0 where uncertainty ranks as the error itself, 1
-            where it ranks as chance does.
-        uncertainty: that is drawn.
-        error: that there is, of a colour in [0, 1].
-        views: how many.
+        sparsification: remaining error above the minimum when the most uncertain pixels are
+            dropped, over all dropped shares: 0 if uncertainty ranks like the error itself, 1 if it
+            ranks at random.
+        uncertainty: mean rendered uncertainty.
+        error: mean true error, of a colour in [0, 1].
+        views: number of views.
     """
 
     spearman: float
@@ -252,12 +252,12 @@ def evaluate_uncertainty(
     *,
     backend: str = "auto",
 ) -> UncertaintyScore | None:
-    """Compare drawn uncertainty with errors; None where the scene knows none.
+    """Compare rendered uncertainty with errors; None if the scene has no uncertainties.
 
     Args:
         scene: with uncertainties.
-        log: it was made of.
-        views: cameras and frames, of which at most MAX_VIEWS are taken, evenly spread.
+        log: the log that the scene was made from.
+        views: cameras and frames, of which at most MAX_VIEWS, evenly spread, are used.
         backend: of the renderer.
 
     Raises:
@@ -290,7 +290,7 @@ def _smooth(image: Values) -> Values:
 
 
 def rank_correlation(first: Values, second: Values) -> float:
-    """Spearman's; equal values share the mean of their ranks. 0 where one is constant."""
+    """Spearman's rank correlation; equal values share their mean rank. 0 if one is constant."""
     from scipy.stats import rankdata
 
     a, b = (rankdata(values.ravel()) for values in (first, second))
@@ -300,8 +300,11 @@ def rank_correlation(first: Values, second: Values) -> float:
 
 
 def sparsification(uncertainty: Values, error: Values) -> float:
-    """Area between the curve of the mean error left by dropping the most uncertain and that by
-    dropping the worst, over that of dropping at random."""
+    """Area between two curves, divided by the area for dropping at random.
+
+    The curves are the mean remaining error after dropping the most uncertain values, and after
+    dropping the largest errors.
+    """
     overall, errors = float(error.mean()), error.ravel()
     by_uncertainty = _left(errors[np.argsort(-uncertainty.ravel(), kind="stable")])
     least = _left(np.sort(errors)[::-1])
@@ -310,7 +313,7 @@ def sparsification(uncertainty: Values, error: Values) -> float:
 
 
 def _left(ordered: Values) -> Float:
-    """Mean of what is left when the first k are dropped, by k."""
+    """Mean of the remaining values when the first k are dropped, for each k."""
     sums = np.cumsum(ordered[::-1].astype(np.float64))[::-1]
     return sums / np.arange(len(ordered), 0, -1)
 

@@ -22,11 +22,11 @@ __all__ = [
 def import_checkpoint(
     path: str | PathLike[str], options: CheckpointOptions | None = None
 ) -> ImportedScene:
-    """Read a checkpoint of Street Gaussians or drivestudio; its keys say which.
+    """Read a checkpoint of Street Gaussians or drivestudio; its keys identify the format.
 
     Raises:
-        CheckpointError: neither of them, parts that are missing or do not fit, or a file that
-            could only be read by executing what is in it.
+        CheckpointError: another format, missing or mismatched parts, or a file that could only be
+            read by executing code in it.
     """
     file = Path(path)
     state = load_checkpoint(file)

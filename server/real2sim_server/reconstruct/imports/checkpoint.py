@@ -31,8 +31,7 @@ from ..options import ReconstructError
 # --- Files of torch.save --------------------------------------------------------------------------
 
 # ``torch.load(weights_only=True)`` builds few types, but it still interprets a pickle and the
-# strides that the file gives. It runs in a confined process, which returns a safetensors file and
-# JSON.
+# strides in the file. It runs in a confined process, which returns a safetensors file and JSON.
 
 GIB = 1024**3
 SECONDS = 600.0
@@ -41,15 +40,15 @@ TENSOR_FILE = "tensors.safetensors"
 
 
 class TorchFileError(ValueError):
-    """A file that is none of torch, is damaged, or holds other objects."""
+    """Not a torch file, a damaged one, or one with other objects."""
 
 
 def read_torch_file(path: Path) -> Any:
-    """What ``torch.save`` wrote: containers of tensors, numbers and texts, on the CPU.
+    """Contents of a ``torch.save`` file: containers of tensors, numbers and strings, on the CPU.
 
     Raises:
-        TorchFileError: no file of torch, damaged, with other objects, or one whose reading takes
-            more memory or time than its size explains.
+        TorchFileError: not a torch file, damaged, with other objects, or reading it takes more
+            memory or time than its size justifies.
         OSError: it cannot be read.
     """
     size = path.stat().st_size
@@ -68,13 +67,14 @@ def read_torch_file(path: Path) -> Any:
             return _built(tree, tensors)
         except TorchFileError:
             raise
-        # The other process was fed by an untrusted file: what it says may be of any form.
+        # The other process read an untrusted file, so its output can have any form.
         except Exception as error:
             raise TorchFileError(f"cannot be read: {error}") from error
 
 
 def unpack_torch_file(path: str, folder: str) -> Any:
-    """Write the tensors of a file below ``folder``; the containers around them as JSON values.
+    """Write the tensors of a file below ``folder``; return the containers around them as JSON
+    values.
 
     Raises:
         TorchFileError: as :func:`read_torch_file`.
@@ -101,7 +101,7 @@ def unpack_torch_file(path: str, folder: str) -> Any:
 
 
 def _tree(value: Any, tensors: dict[str, Tensor], *, depth: int) -> list[Any]:
-    """A value as JSON: its kind, then what it is made of."""
+    """A value as JSON: its kind, then its contents."""
     if depth > MAX_DEPTH:
         raise TorchFileError(f"no checkpoint of torch: its containers are {depth} deep")
     if isinstance(value, Tensor):
@@ -138,7 +138,7 @@ def _built(tree: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def _numpy_scalars() -> list[Any]:
-    """What the numbers in checkpoints that are not final are made of; harmless to build."""
+    """Types behind the numbers in intermediate checkpoints; harmless to build."""
     scalar = np._core.multiarray.scalar  # type: ignore[attr-defined]
     numbers = [np.dtype, *(type(np.dtype(kind)) for kind in ("f8", "f4", "i8", "i4", "?"))]
     old_name = (scalar, "numpy.core.multiarray.scalar")
@@ -161,23 +161,23 @@ class CheckpointError(ReconstructError):
 
 @dataclass(frozen=True)
 class CheckpointOptions:
-    """What a checkpoint was trained on, as its configuration says.
+    """Training data of a checkpoint, from its configuration.
 
     Attributes:
-        dataset: preprocessed dataset folder it was trained on. Street Gaussians needs it: its
-            checkpoints hold corrections of tracks, not tracks. For drivestudio it gives cameras
-            and the path of the ego, which else stands still.
-        first_frame, last_frame: frames it was trained on, both inclusive (``selected_frames`` of
-            Street Gaussians; ``start_timestep`` of drivestudio is the first). The last one
-            defaults to the end.
-        cameras: cameras it was trained on. Default: 0, 1, 2 for Street Gaussians, as there;
-            those the folder has for drivestudio.
-        tracker: whether Street Gaussians took its tracks from a tracker (``use_tracker``).
+        dataset: preprocessed dataset folder used in training. Street Gaussians requires it: its
+            checkpoints hold corrections of tracks, not tracks. For drivestudio it provides the
+            cameras and the ego path; without it the ego does not move.
+        first_frame, last_frame: training frames, both inclusive (``selected_frames`` of Street
+            Gaussians; ``start_timestep`` of drivestudio is the first). The last one defaults to
+            the end.
+        cameras: training cameras. Default: 0, 1, 2 for Street Gaussians, as in its code; all
+            cameras in the folder for drivestudio.
+        tracker: whether Street Gaussians used tracks from a tracker (``use_tracker``).
         fourier_scale: of Street Gaussians' time-varying colours.
-        frame_rate: of a drivestudio log [Hz]; its checkpoints know no times.
+        frame_rate: of a drivestudio log [Hz]; its checkpoints contain no times.
         world: of a drivestudio checkpoint: axes of its world. ``vehicle`` (x forward, z up) for
             Waymo, Argoverse and KITTI, ``front_camera`` (x right, y down) for nuScenes.
-        name: of the scene; default: that of the dataset folder, else of the file.
+        name: of the scene; default: the name of the dataset folder, otherwise of the file.
     """
 
     dataset: Path | None = None
@@ -207,11 +207,11 @@ class CheckpointOptions:
 
 @dataclass(frozen=True, eq=False)
 class ImportedScene:
-    """A scene, and what of the checkpoint is not in it.
+    """An imported scene, and the parts of the checkpoint that it lacks.
 
     Attributes:
         scene: ready to be saved and rendered.
-        warnings: what was left out or is only approximately the same, one sentence each.
+        warnings: dropped or approximated parts, one sentence each.
     """
 
     scene: Scene
@@ -221,12 +221,12 @@ class ImportedScene:
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """The tensors and numbers of a ``torch.save`` file, on the CPU.
 
-    Only tensors, containers, numbers and NumPy scalars are built; any other object in the file is
-    refused, since reading it would run code from the file. It is read in a process of its own, see
-    :mod:`.torch_file`.
+    Only tensors, containers, numbers and NumPy scalars are built. Any other object in the file is
+    rejected, because reading it would execute code from the file. The file is read in a separate
+    confined process.
 
     Raises:
-        CheckpointError: not there, no checkpoint, damaged, or with other objects inside.
+        CheckpointError: missing, not a checkpoint, damaged, or with other objects inside.
     """
     try:
         state = read_torch_file(path)
@@ -256,12 +256,12 @@ def array(
 
     Args:
         path, what: for messages.
-        part: table that holds it.
+        part: table with the tensor.
         key: its name.
-        shape: expected shape, None where anything goes.
+        shape: expected shape, None for any size.
 
     Raises:
-        CheckpointError: missing, no tensor, of another shape, or with NaN or infinite values.
+        CheckpointError: missing, not a tensor, wrong shape, or with NaN or infinite values.
     """
     value = part.get(key)
     if not isinstance(value, Tensor):
@@ -291,13 +291,13 @@ def cloud_of(
     logits: Float,
     sh: Float,
 ) -> GaussianCloud:
-    """Gaussians of parameters before activation; logits [N, 1], sh [N, K, 3].
+    """Gaussians from parameters before activation; logits [N, 1], sh [N, K, 3].
 
-    The importers give the harmonics as they are in the file, in world directions.
+    The harmonics are passed as stored in the file, in world directions.
 
     Raises:
-        CheckpointError: rotations of length zero, values beyond float32, or a number of
-            harmonics that is of no degree.
+        CheckpointError: rotations of length zero, values beyond float32, or a number of harmonics
+            that matches no degree.
     """
     if sh.shape[1] not in SH_DEGREES:
         raise CheckpointError(
@@ -323,9 +323,9 @@ DIRECTIONS_WARNING = (
 
 
 def tied_to_object(cloud: GaussianCloud, R_world_object: Float) -> GaussianCloud:
-    """The same Gaussians with harmonics of world directions turned to the object's own.
+    """The same Gaussians with harmonics rotated from world directions to the object's frame.
 
-    Both give the same colours while the object stands at ``R_world_object`` [3, 3].
+    The colours are the same at the object rotation ``R_world_object`` [3, 3].
     """
     return replace(cloud, sh=rotate_sh(cloud.sh, R_world_object.T))
 
@@ -360,7 +360,7 @@ def read_pose(path: Path) -> Float:
 
 
 def read_intrinsics(path: Path) -> Float:
-    """Matrix K [3, 3] of a file of fx, fy, cx, cy and distortion, which is left out."""
+    """Matrix K [3, 3] of a file of fx, fy, cx, cy and distortion; the distortion is ignored."""
     numbers = read_numbers(path)
     if numbers.size < 4:
         raise CheckpointError(f"{path}: must hold fx, fy, cx, cy, not {numbers.size} numbers")

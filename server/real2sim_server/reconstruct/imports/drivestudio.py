@@ -42,7 +42,7 @@ R_CUBE_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turn of view directions before its sky is looked up."""
 
 FLAT = 1e-4
-"""Thickness of its flat Gaussians, which have two scales only, as a fraction of the smaller."""
+"""Thickness of flat Gaussians, which have only two scales, as a fraction of the smaller scale."""
 
 LOST_MODELS = {
     "DeformableNodes": "deformable objects (cyclists and the like) are not kept",
@@ -57,7 +57,7 @@ DEFAULT_CAMERA_HEIGHT = 1.6
 
 @dataclass(frozen=True, eq=False)
 class _Drive:
-    """Where the ego went and what it saw with; the world is the scene's."""
+    """Path and cameras of the ego, in the scene's world frame."""
 
     rig: CameraRig
     times_us: NDArray[np.int64]
@@ -70,12 +70,12 @@ def import_drivestudio(
     """Read background, rigid objects and sky.
 
     The checkpoint holds the tracks of its objects; frames get time stamps by ``frame_rate``. With
-    ``dataset`` (layouts with ``ego_pose``: Waymo, Argoverse, KITTI) come the cameras and the path
-    of the ego, else one camera stands where the drive began. The world is that of the checkpoint,
-    with ``world='front_camera'`` turned to x forward, z up.
+    ``dataset`` (layouts with ``ego_pose``: Waymo, Argoverse, KITTI), the scene gets the cameras and
+    the ego path. Otherwise it gets one camera at the origin of the drive. The world is the
+    checkpoint's, with ``world='front_camera'`` rotated to x forward, z up.
 
     Raises:
-        CheckpointError: a part that is missing, damaged or does not fit.
+        CheckpointError: a part is missing, damaged or does not fit.
     """
     file, options = Path(path), options or CheckpointOptions()
     state = load_checkpoint(file)
@@ -101,7 +101,7 @@ def import_drivestudio(
 
 
 def _frame_count(file: Path, models: Mapping[str, Any], options: CheckpointOptions) -> int:
-    """Frames of the clip: as objects have, else as asked for, else two."""
+    """Frames of the clip: from the objects, otherwise from the options, otherwise two."""
     asked = None if options.last_frame is None else options.last_frame - options.first_frame + 1
     if "RigidNodes" not in models:
         return asked or 2
@@ -124,7 +124,7 @@ def _cloud(file: Path, models: Mapping[str, Any], key: str) -> GaussianCloud:
     first = array(file, key, part, "_features_dc", (n, 3))
     rest = array(file, key, part, "_features_rest", (n, None, 3))
     if not rest.shape[1]:
-        # Without harmonics its colours are a sigmoid.
+        # Without harmonics, colours are a sigmoid.
         first = (1 / (1 + np.exp(-np.clip(first, -80, 80))) - 0.5) / SH_C0
     return cloud_of(
         file,
@@ -137,7 +137,7 @@ def _cloud(file: Path, models: Mapping[str, Any], key: str) -> GaussianCloud:
 
 
 def _log_scales(file: Path, key: str, part: Mapping[str, Any], n: int) -> Float:
-    """Three log scales; its balls have one, its discs two."""
+    """Three log scales; balls in the file have one, discs two."""
     given = array(file, key, part, "_scales", (n, None))
     match given.shape[1]:
         case 3:
@@ -154,9 +154,9 @@ def _log_scales(file: Path, key: str, part: Mapping[str, Any], n: int) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class _Instances:
-    """Rigid objects: all their Gaussians [N], whose they are, and poses [F, I] in the file's world.
+    """Rigid objects: all Gaussians [N], their owners, and poses [F, I] in the file's world.
 
-    A pose means nothing where the instance is not visible.
+    A pose is meaningless where the instance is not visible.
     """
 
     cloud: GaussianCloud
@@ -309,7 +309,7 @@ def _rig(folder: Path, options: CheckpointOptions) -> CameraRig:
 
 def _camera(folder: Path, index: int, pose: Float) -> Camera:
     k = read_intrinsics(folder / "intrinsics" / f"{index}.txt")
-    # Without images, the principal point is taken for the middle.
+    # Without images, assume the principal point at the image centre.
     middle = (round(2 * k[0, 2]), round(2 * k[1, 2]))
     width, height = image_size(folder, index) or middle
     return Camera(f"camera_{index}", width, height, k, pose)

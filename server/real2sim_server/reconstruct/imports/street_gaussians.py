@@ -42,10 +42,10 @@ WAYMO_SIZES = ((1920, 1280), (1920, 1280), (1920, 1280), (1920, 886), (1920, 886
 
 @dataclass(frozen=True, eq=False)
 class StreetFolder:
-    """What a dataset folder says of the frames a model was trained on.
+    """Data of a dataset folder for the frames of a model.
 
     Attributes:
-        rig: cameras that were trained on.
+        rig: cameras used in training.
         first_frame: number of the first frame.
         times_us: [F] int64 time stamps of the frames [us].
         ego: [F, 4, 4] float64 ``T_world_vehicle``; the world is Waymo's, shifted by the mean
@@ -82,7 +82,7 @@ def read_street_folder(
 
 
 def _ego_poses(folder: Path) -> Float:
-    """``T_waymo_vehicle`` [all frames, 4, 4]; files of single cameras are not meant."""
+    """``T_waymo_vehicle`` [all frames, 4, 4]; files of single cameras are skipped."""
     place = folder / "ego_pose"
     found = sorted(p for p in place.glob("*.txt") if re.fullmatch(r"\d+", p.stem))
     if not found:
@@ -296,14 +296,14 @@ LOST_PARTS = {
 def import_street_gaussians(
     path: str | PathLike[str], options: CheckpointOptions | None = None
 ) -> ImportedScene:
-    """Read a checkpoint with the dataset folder it was trained on.
+    """Read a checkpoint with its dataset folder.
 
-    Objects keep their own frames; their tracks are those of the folder with the corrections of the
-    checkpoint, composed with the path of the ego, at the frames' time stamps. The world is
-    that of the checkpoint: Waymo's axes, shifted to the mean position of the ego.
+    Objects keep their own frames. Their tracks come from the folder, with the corrections of the
+    checkpoint, composed with the ego path at the frames' time stamps. The world is the
+    checkpoint's: Waymo's axes, shifted to the mean position of the ego.
 
     Raises:
-        CheckpointError: a part that is missing, damaged or does not fit the folder.
+        CheckpointError: a part is missing, damaged or does not fit the folder.
     """
     file, options = Path(path), options or CheckpointOptions()
     if options.dataset is None:
@@ -384,12 +384,13 @@ def _object_poses(
     count, columns = tracks.ids.shape
     positions, yaw = tracks.positions.copy(), tracks.headings.copy()
     actor = state.get("actor_pose") or {}
-    # Without corrections (opt_track off) there is an empty table.
+    # Without corrections (opt_track off) the table is empty.
     if columns and actor:
         params = table(file, actor, "params")
         positions += array(file, "actor_pose", params, "opt_trans", (count, columns, 3))
         theta = array(file, "actor_pose", params, "opt_rots", (count, columns, 1))[..., 0]
-        # Its quaternion is (cos, 0, 0, sin) of theta itself, which turns by twice theta.
+        # The checkpoint's quaternion is (cos, 0, 0, sin) of theta itself, a rotation by twice
+        # theta.
         yaw += 2 * theta
     placed: Float = frames.ego[:, None] @ transform_from(positions, yaw_quaternion(yaw))
     return placed
@@ -434,7 +435,7 @@ def _object_warnings(
 
 
 def _cloud(file: Path, state: Mapping[str, Any], key: str, fourier_scale: float) -> GaussianCloud:
-    """Gaussians of one model; a Fourier series of the first harmonic is taken at half its time."""
+    """Gaussians of one model; a first-harmonic Fourier series is evaluated at half its time."""
     part = table(file, state, key)
     means = array(file, key, part, "xyz", (None, 3))
     n = len(means)

@@ -29,7 +29,7 @@ class PointSet:
     Attributes:
         points: [N, 3] float32 [m].
         intensity: [N] float32 in [0, 1].
-        weight: [N] float32, how many measurements a point stands for.
+        weight: [N] float32, number of measurements that a point represents.
     """
 
     points: NDArray[np.float32]
@@ -45,7 +45,7 @@ class PointSet:
 
     @classmethod
     def measured(cls, points: Float, intensity: NDArray[np.float32]) -> PointSet:
-        """Points that stand for one measurement each."""
+        """Points that represent one measurement each."""
         return cls(
             points.astype(np.float32),
             intensity.astype(np.float32),
@@ -65,7 +65,7 @@ class PointSet:
 
 
 def thin(cloud: PointSet, voxel: float, levels: NDArray[np.int64] | None = None) -> PointSet:
-    """One point for each occupied voxel: the weighted mean of what lies inside.
+    """One point per occupied voxel: the weighted mean of the points inside.
 
     Args:
         cloud: any number of points.
@@ -74,7 +74,7 @@ def thin(cloud: PointSet, voxel: float, levels: NDArray[np.int64] | None = None)
             of different levels are never merged.
 
     Returns:
-        The means in the order of their voxels; total weight is kept.
+        The means in the order of their voxels, with the same total weight.
     """
     if len(cloud) == 0:
         return cloud
@@ -96,7 +96,7 @@ def thin_to(
     """Like :func:`thin`, with voxels as much larger as it takes to stay within ``limit`` points."""
     thinned = thin(cloud, voxel, levels)
     while len(thinned) > limit:
-        # Points lie on surfaces, so their number falls with the square of the edge.
+        # Points are on surfaces, so their number falls with the square of the edge.
         voxel *= max(1.05, (len(thinned) / limit) ** 0.5)
         thinned = thin(cloud, voxel, levels)
     return thinned
@@ -147,7 +147,9 @@ def voxel_levels(distance: NDArray[np.float32], voxel: float, growth: float) -> 
 
 
 def well_supported(points: NDArray[np.float32], reach: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which points [N] have three others within their ``reach`` [N] [m]; loners are noise."""
+    """Mask [N] of points with three others within their ``reach`` [N] [m]; isolated points are
+    noise.
+    """
     from scipy.spatial import cKDTree
 
     if len(points) < 4:
@@ -162,11 +164,11 @@ def well_supported(points: NDArray[np.float32], reach: NDArray[np.float32]) -> N
 # scanner's upper limit is continued straight up; images then decide which part is real.
 
 CELL = 0.25
-"""Edge of the columns into which walls are divided [m]."""
+"""Edge of the columns for the detection of walls [m]."""
 REACH, HEIGHT = 45.0, 14.0
 """Walls up to this far from the drive are continued by this much [m]."""
 MIN_POINTS, MIN_EXTENT = 6, 0.8
-"""A column is a wall when it has so many points over such a height [m]."""
+"""A column is a wall if it has this many points over at least this height [m]."""
 MAX_DEVIATION = 28.0
 """Views of a real wall differ less than this in brightness, standard deviation of 0 to 255."""
 
@@ -187,12 +189,12 @@ class ScanLimit:
 
 
 def continue_walls(structure: Surfels, limit: ScanLimit, *, max_count: int) -> Surfels:
-    """Surfels on walls above what the scanner can see, candidates to be judged by their colours.
+    """Surfels on walls above the scanner's field of view; their colours decide which are real.
 
     Args:
-        structure: what stands on the ground, world frame.
+        structure: objects above the ground, world frame.
         limit: of the scanner.
-        max_count: at most so many; they lie farther apart if need be.
+        max_count: maximum number; the spacing grows if needed.
     """
     columns = _wall_columns(structure, limit)
     step = CELL
@@ -286,10 +288,11 @@ def real_walls(
 
 HALF_SWEEP_US = 50_000
 EGO_MARGIN = 0.45
-"""Returns this close beside the recording vehicle are its own mirrors [m]."""
+"""Returns this close to the sides of the recording vehicle are its own mirrors [m]."""
 SHELL = 0.3
-"""Above the road, what is this close to a box is dropped: boxes are not exact, and what sticks
-out of a moving vehicle would leave a smear [m]."""
+"""Points above the road this close to a box are dropped [m]: boxes are inexact, and parts of a
+moving vehicle outside its box would leave a smear.
+"""
 THIN_EVERY = 6_000_000
 """Points that may pile up before they are thinned, so that memory does not follow the drive."""
 
@@ -312,13 +315,13 @@ class Accumulation:
 def accumulate(
     log: DrivingLog, options: InitialiseOptions, on_frame: Callable[[int], None]
 ) -> Accumulation:
-    """Bring all sweeps of ``log`` together.
+    """Accumulate all sweeps of ``log``.
 
-    A point belongs to a tracked object when, at the moment it was measured, it lay inside the
-    box enlarged by ``box_margin`` and above ``ground_clearance`` over the box bottom. Below that,
-    what is level with the bottom is road; the rest, tyres and underbody, is dropped, and so are
-    other points within SHELL of a box and returns from the recording vehicle itself. Everything
-    else is background.
+    A point belongs to a tracked object if, at its time of measurement, it was inside the box
+    enlarged by ``box_margin`` and more than ``ground_clearance`` above the box bottom. Below that
+    height, points level with the bottom are road. The others (tyres, underbody) are dropped, as are
+    points within SHELL of a box and returns from the recording vehicle itself. Everything else is
+    background.
     """
     path = drive_path(log)
     background: list[PointSet] = []
@@ -395,7 +398,7 @@ def _usable(
 
 
 def on_recording_vehicle(points: Float, size: tuple[float, float, float]) -> NDArray[np.bool_]:
-    """Which points [N, 3] of the vehicle's frame are returns of its own body."""
+    """Mask [N] of points [N, 3] in the vehicle's frame that are returns from its own body."""
     length, width, height = size
     return (
         (points[:, 0] > -0.3 * length)
@@ -458,7 +461,7 @@ def near_box(
 
 
 def pose_around(trajectory: Trajectory, t_us: int) -> Float:
-    """``T_world_object`` [4, 4]; just outside its time range it goes on with constant velocity."""
+    """``T_world_object`` [4, 4]; constant velocity just outside its time range."""
     inside = min(max(t_us, trajectory.start_us), trajectory.end_us)
     pose = trajectory.transform(inside)
     pose[:3, 3] += trajectory.velocity(inside) * (t_us - inside) * 1e-6

@@ -62,15 +62,17 @@ ABOVE_GROUND = 0.1
 LIDAR_REACH = 0.5
 """Points from images are taken where LiDAR has none so close [m]."""
 FEATURE_HEIGHT = 0.3
-"""And from this height over the ground on [m]: road has LiDAR, and reflections lie below it."""
+"""Minimum height of these points above the ground [m]: LiDAR covers the road, and reflections are
+below it.
+"""
 STEREO_VOXEL, STEREO_PER_METRE = 0.15, 0.01
 """Points from images are joined in voxels of this edge, larger with the distance by so much."""
 STEREO_WEIGHT = 3
-"""In a voxel must lie so many of them."""
+"""Minimum number of points per voxel."""
 UNDERSIDE_COLOUR = 0.06
 SKY_FRAMES = 15
 FACED_FRAMES = 20
-"""Of so many frames cameras are asked which sides of a vehicle they faced."""
+"""Number of frames used to find the vehicle sides that cameras faced."""
 WALL_FRAMES = 16
 BACKGROUND_HEIGHTS = (0.3, 1.0, 3.0)
 OBJECT_HEIGHTS = (-0.35, 0.0, 0.3)
@@ -94,7 +96,7 @@ class _SurfelSet:
     bodies: tuple[VehicleBody | None, ...] = ()
 
     def without(self, dropped: NDArray[np.int64]) -> _SurfelSet:
-        """Without the walls at these indices."""
+        """Remove the walls at these indices."""
         kept = np.ones(len(self.surfels), dtype=np.bool_)
         kept[dropped] = False
         return _SurfelSet(
@@ -126,15 +128,15 @@ def initialise_scene(
     """Build a scene from a log in seconds, without training.
 
     LiDAR is accumulated in the world and in each tracked box, thinned, turned into flat Gaussians
-    and coloured from the cameras; where no beam went, points are triangulated from features that
-    images have in common; the road becomes a closed surface, also where cars hide it; pixels that
-    nothing covers become the sky. The same log gives the same bits.
+    and coloured from the cameras. Where LiDAR has no returns, points are triangulated from image
+    features. The road becomes a closed surface, also under cars, and pixels without a surface
+    become the sky. The same log gives the same bits.
 
     Args:
         log: a drive with at least one camera; boxes may be missing. Without LiDAR the scene is
-            made of what is triangulated, the driven path and the boxes.
+            made of triangulated points, the driven path and the boxes.
         options: see InitialiseOptions.
-        on_progress: called with the stage, steps done and steps in all.
+        on_progress: called with the stage, completed and total steps.
         timing_s: filled with the seconds of each stage.
 
     Returns:
@@ -142,9 +144,9 @@ def initialise_scene(
 
     Raises:
         ReconstructError: the log has no camera or no frame, or neither a usable LiDAR point nor
-            features that tell a depth.
+            features with a depth.
         LogError: a file of the log cannot be read.
-        MapError: the map that the log comes with cannot be read.
+        MapError: the log's map cannot be read.
     """
     options = options or InitialiseOptions()
     stages = Stages(on_progress, timing_s)
@@ -181,7 +183,7 @@ def initialise_scene(
 def _fit_ground(
     log: DrivingLog, measured: NDArray[np.float32], features: NDArray[np.float32]
 ) -> GroundFit:
-    """The ground of the points of LiDAR; of those from images where a log has no LiDAR."""
+    """Fit the ground to LiDAR points, or to points from images if a log has no LiDAR."""
     boxes = box_bottoms(log.tracks, log.frame_times_us)
     points = measured if len(measured) else features
     return fit_ground(points.astype(np.float64), DrivenPath.of(log.ego), boxes)
@@ -194,7 +196,7 @@ def _shape(
     fitted: GroundFit,
     options: InitialiseOptions,
 ) -> _SurfelSet:
-    """Gaussians without colour: the ground, what stands on it, and the objects."""
+    """Gaussians without colour: the ground, structure above it, and the objects."""
     path = drive_path(log)
     ground = _ground_surfels(fitted, options)
     above = _above_ground(measured.background, fitted.surface)
@@ -357,7 +359,7 @@ def _inpaint(
     colours: NDArray[np.float32],
     known: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-    """Colours [N, 3] of all Gaussians, and what vehicles share: light, colours of parts."""
+    """Colours [N, 3] of all Gaussians, and shared values of vehicles: light, part colours."""
     points, filled = parts.surfels.points, colours.copy()
     ground = slice(0, parts.ground_count)
     filled[ground] = fill_ground(surface, points[ground], colours[ground], known[ground])
@@ -375,7 +377,10 @@ def _inpaint(
 def _inpaint_objects(
     log: DrivingLog, parts: _SurfelSet, colours: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-    """Fill each object's body from itself, then its underside, in place; what vehicles share."""
+    """Fill the unseen body of each object from its seen part, then its underside, in place.
+
+    Returns the shared values of vehicles.
+    """
     bodies = ~parts.is_underside
     members = [np.flatnonzero((parts.instance == i + 1) & bodies) for i in range(len(log.tracks))]
     if not members:
@@ -395,7 +400,7 @@ def _inpaint_objects(
             closed.append(k)
             places = parts.surfels.points[mine].astype(np.float64)
             nearest = body.nearest(places)
-            # A side seen edge on has the colours of what lies beside its outline.
+            # A side seen edge on has the colours of the background next to its outline.
             seen = known[mine] & faced(log, track, places, body.normals[nearest], frames)
             normals = body.unit_normals()[nearest] @ pose_amid(track.trajectory)[:3, :3].T
             surfaces.append(

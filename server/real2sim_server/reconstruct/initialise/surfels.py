@@ -15,7 +15,7 @@ from ...scene.ground_fit import GroundFit, pull_push
 
 NEIGHBOURS = 20
 CHUNK = 50_000
-"""Points whose neighbourhoods are fitted together; bounds the memory."""
+"""Number of points fitted at a time; limits the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +67,9 @@ def fit_surfels(
 ) -> Surfels:
     """Orient and size a Gaussian on each point by its nearest neighbours.
 
-    Normals are the least principal axes. Along each tangent the scale follows the distance to the
+    Normals are the axes of least variance. Along each tangent the scale follows the distance to the
     neighbours on either side, so that gaps between scan lines close without blurring along them.
-    Where neighbours variances in all directions (leaves) the Gaussian becomes round.
+    Where neighbours vary in all directions (leaves), the Gaussian becomes round.
 
     Args:
         points: [N, 3] float32 [m].
@@ -97,12 +97,12 @@ def fit_surfels(
 def round_surfels(
     points: NDArray[np.float32], distance: NDArray[np.float32], *, spread: float = 0.012
 ) -> Surfels:
-    """Round Gaussians on sparse points that lie on no common surface.
+    """Round Gaussians on sparse points without a common surface.
 
     Args:
         points: [N, 3] float32 [m].
-        distance: [N] float32, from where they were seen [m].
-        spread: bound of the scale, as part of that distance.
+        distance: [N] float32, from the viewpoint [m].
+        spread: upper bound of the scale, as a fraction of that distance.
     """
     largest = np.maximum(spread * distance, 0.02).astype(np.float32)
     if len(points) > 3:
@@ -146,7 +146,7 @@ def _gap(local: Float, axis: int) -> Float:
     in_sector = np.abs(along) >= np.abs(across)
     ahead = np.where(in_sector & (along > 0), length, np.inf).min(axis=1)
     behind = np.where(in_sector & (along < 0), length, np.inf).min(axis=1)
-    # At the rim of a surface one side is empty; there the other side alone counts.
+    # At the rim of a surface one side is empty, so only the other side counts.
     ahead, behind = np.minimum(ahead, 1.5 * behind), np.minimum(behind, 1.5 * ahead)
     mean = (ahead + behind) / 2
     nearest = length[:, : min(4, length.shape[1])].mean(axis=1)
@@ -178,9 +178,9 @@ def spread_ground(fit: GroundFit, spacing: float, limit: int) -> GroundPoints:
     """Cover the ground with a square grid that coarsens with the distance from the drive.
 
     Args:
-        fit: of the ground; points lie on its surface as it was measured.
+        fit: of the ground; points are on its surface as measured.
         spacing: distance between points near the drive [m].
-        limit: at most so many points; the grid is as much coarser as that takes.
+        limit: maximum number of points; the grid coarsens to stay below it.
     """
     while True:
         parts = [
@@ -235,7 +235,7 @@ MIRROR_REACH = 0.15
 TRUST_REACH = 1.0
 """Distance over which the weight of an observed neighbour's colour falls to 1/e [m]."""
 MIN_OBSERVED = 30
-"""Fewer observed points than this say nothing about the colour of a body."""
+"""Minimum number of observed points for the colour of a body."""
 COLOUR_SIGMA = 0.06
 """Standard deviation of colours that count as one."""
 GREY = np.array([0.4, 0.4, 0.4], dtype=np.float32)
@@ -320,16 +320,16 @@ def body_color(
     prior: Colours,
     edges: tuple[float, ...],
 ) -> Colours:
-    """The commonest colour of an object's seen points at about the same height.
+    """The most common colour of an object's seen points at about the same height.
 
-    Lamps, plates and reflections are no guide to the rest of a body, its paint is: hence the mode
-    and not the mean.
+    The mode is used instead of the mean: lamps, plates and reflections do not represent the rest of
+    a body, its paint does.
 
     Args:
         heights: [N] as a fraction of the object's height, 0 at its middle.
         colours: [N, 3] where ``known`` [N].
-        prior: [N, 3] for bands of height of which too little was seen.
-        edges: where bands end.
+        prior: [N, 3], used if too few points were observed.
+        edges: limits of the bands of height.
     """
     if known.sum() < MIN_OBSERVED:
         return prior
@@ -343,7 +343,7 @@ def body_color(
 
 
 def modal_colour(colours: Colours) -> Colours:
-    """The colour [3] around which most of ``colours`` [N, 3] lie."""
+    """The mode [3] of ``colours`` [N, 3]."""
     few = colours[:: -(-len(colours) // 400)]
     distance = np.linalg.norm(few[:, None] - few[None], axis=2)
     votes = np.exp(-0.5 * (distance / COLOUR_SIGMA) ** 2)
@@ -356,8 +356,7 @@ def fill_from_mirror(
 ) -> tuple[Colours, Known]:
     """Colour unobserved points of an object from its other side, across y = 0.
 
-    Vehicles look alike from the left and the right: the observed side is the best prior for the
-    other one.
+    Vehicles are symmetric, so the observed side is the best prior for the other one.
     """
     from scipy.spatial import cKDTree
 

@@ -21,7 +21,7 @@ WIDEST = 1280
 FEATURES = 4000
 """Features of an image at most, the strongest."""
 BASELINES = (0.5, 1.5, 4.0)
-"""Two images of a camera are matched when so far apart [m]; and a step further, each."""
+"""Each image is matched with the next one, and with the first one beyond each baseline [m]."""
 MIN_STEP = 0.2
 """Images of a camera closer to each other than this tell nothing new [m]."""
 MIN_DEPTH, MAX_DEPTH = 1.0, 400.0
@@ -77,18 +77,18 @@ class _Features:
 
 
 def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> TriangulatedPoints:
-    """Points of what stands still, from features that three images or more have in common.
+    """Points of the static scene, from features shared by at least three images.
 
-    SIFT features (Lowe 2004) outside of all boxes and of the sky are matched along epipolar lines,
-    since poses are known, between images of one camera that lie some decimetres to some metres
-    apart. Matches are joined to tracks, and a track becomes a point where it lies within a pixel
-    and a half of all its images and is known to a tenth of its distance. The same log gives the
+    SIFT features (Lowe 2004) outside all boxes and the sky are matched along epipolar lines,
+    because poses are known, between images of one camera taken decimetres to metres apart. Matches
+    are joined to tracks. A track becomes a point if its reprojection error is within a pixel and a
+    half in all images and its uncertainty is below a tenth of its distance. The same log gives the
     same bits.
 
     Args:
         log: with calibrated cameras and poses.
-        max_images: of each camera at most, evenly spread.
-        on_image: called with the images done and all.
+        max_images: maximum number per camera, evenly spread.
+        on_image: called with the number of finished images and of all images.
     """
     sightings: list[tuple[Float, Float, Float]] = []
     labels: list[NDArray[np.int64]] = []
@@ -109,7 +109,7 @@ def triangulate(log: DrivingLog, *, max_images: int, on_image: _Progress) -> Tri
 
 
 def spread_frames(log: DrivingLog, camera: Camera, limit: int) -> list[int]:
-    """Frames between which the camera has moved, at most ``limit``."""
+    """Frames with camera motion in between, at most ``limit``."""
     kept: list[int] = []
     last: Float | None = None
     if limit == 0:
@@ -140,7 +140,8 @@ def _features(log: DrivingLog, camera: Camera, frame: int) -> _Features:
     keypoints, found = detector.detectAndCompute(grey, free.astype(np.uint8))
     pixels = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     descriptors = np.zeros((0, 128), np.float32) if found is None else found.astype(np.float32)
-    # Of roots of histograms the product is Hellinger's kernel (Arandjelovic, Zisserman 2012).
+    # The dot product of square-rooted histograms is Hellinger's kernel (Arandjelovic, Zisserman
+    # 2012).
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
     return _Features(small.K @ viewmat[:3], pose[:3, 3].copy(), pixels, descriptors)
 
@@ -251,8 +252,12 @@ def _points(
 def _intersect(
     track: NDArray[np.int64], image: NDArray[np.int64], pixels: Float, projections: Float
 ) -> tuple[Float, Float, NDArray[np.bool_], Float]:
-    """Points [T, 3] nearest to all their rays in the images; their precision [T, 3, 3] per square
-    pixel; whether they lie before all cameras; and the largest error in an image [T] [px]."""
+    """Triangulate points and their precision.
+
+    Returns:
+        Points [T, 3] nearest to all their rays; their precision [T, 3, 3] per square pixel; whether
+        they are in front of all cameras; and the largest reprojection error [T] [px].
+    """
     count = int(track.max()) + 1
     P = projections[image]
     weight = np.ones(len(track))
@@ -284,26 +289,26 @@ def _intersect(
 # images agree best is accepted if the depths of the neighbours are consistent with it.
 
 WIDTH = 320
-"""Images are compared at this width [px]; depths are some percent right then."""
+"""Images are compared at this width [px]; it gives depths to a few percent."""
 STEREO_BASELINES = (0.8, 1.6)
 """Each image is compared with those taken about so far before and after it [m]."""
 PLANES = 96
 NEAREST, FARTHEST = 4.0, 90.0
 """Depths of the planes, evenly spread by their inverse [m]."""
 WINDOW = 5
-"""Edge of the squares whose likeness counts [px]."""
+"""Edge of the correlation window [px]."""
 MIN_CONTRAST = 2.0
-"""Standard deviation of brightness in a square, 0 to 255, below which nothing can be told."""
+"""Minimum standard deviation of brightness in a window, 0 to 255; flatter windows are ambiguous."""
 MIN_LIKENESS = 0.6
 """Normalised cross-correlation of squares, mean of the two best neighbours."""
 CLEARNESS, APART = 0.05, 3
-"""The best plane is so much better than any more than so many planes away."""
+"""Minimum lead in correlation of the best plane over all planes at least this many planes away."""
 AGREEMENT = 0.03
 """Depths of two images agree to this share."""
 AGREEING = 2
-"""Other images whose depth must agree."""
+"""Minimum number of other images with a consistent depth."""
 MARGIN = 0.03
-"""Of the image's height, which is compared below the highest LiDAR returns."""
+"""Overlap with the region below the highest LiDAR returns, as a fraction of the image height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,12 +331,12 @@ class _View:
 
 
 def sweep_planes(log: DrivingLog, *, max_images: int, on_image: _Progress) -> NDArray[np.float32]:
-    """Points [N, 3] float32 of what stands still above the LiDAR's reach, world frame [m].
+    """Points [N, 3] float32 of the static scene above the LiDAR's field of view, world frame [m].
 
     Args:
-        log: with calibrated cameras and poses; of cameras that are no pinholes nothing is taken.
-        max_images: of each camera at most, evenly spread.
-        on_image: called with the images done and all.
+        log: with calibrated cameras and poses; cameras other than pinholes are skipped.
+        max_images: maximum number per camera, evenly spread.
+        on_image: called with the number of finished images and of all images.
     """
     cameras = [camera for camera in log.rig if camera.is_pinhole]
     chosen = {camera.name: spread_frames(log, camera, max_images) for camera in cameras}
@@ -429,8 +434,9 @@ def _likeness(  # noqa: PLR0917 - what is the same for all planes is given along
     mean: NDArray[np.float32],
     spread: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Correlation [rows, W] of squares, if all that ``view`` shows were at ``depth`` [m]; -1
-    where the other image does not show it."""
+    """Correlation [rows, W] of windows, assuming that ``view`` is at ``depth`` [m]; -1 outside the
+    other image.
+    """
     import cv2
 
     relative = invert_transform(other.pose) @ view.pose
@@ -452,7 +458,7 @@ def _likeness(  # noqa: PLR0917 - what is the same for all planes is given along
 
 
 def _agreed(index: int, views: list[_View], depths: list[NDArray[np.float32]]) -> Float:
-    """World points [N, 3] of an image whose depth other images share."""
+    """World points [N, 3] of an image with depths consistent with other images."""
     view, depth = views[index], depths[index]
     row, column = np.nonzero(depth)
     pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1)
@@ -466,7 +472,7 @@ def _agreed(index: int, views: list[_View], depths: list[NDArray[np.float32]]) -
 
 
 def _agrees(points: Float, view: _View, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which points [N, 3] lie where an image has its depths."""
+    """Mask of the points [N, 3] that are consistent with the depths of an image."""
     local = apply_transform(invert_transform(view.pose), points)
     z = np.maximum(local[:, 2], 1e-3)
     pixels = (local @ view.K.T)[:, :2] / z[:, None]

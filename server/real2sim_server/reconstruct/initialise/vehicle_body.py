@@ -37,18 +37,18 @@ from .vehicle_parts import (
 SPACING = 0.05
 """Distance between points on a body [m]."""
 WIDE_SPACING = 0.12
-"""Distance between those that are drawn where a body is flat and of one part [m]."""
+"""Spacing of rendered points where a body is flat and of a single part [m]."""
 FLAT = 0.95
-"""Cosine between normals of neighbours up to which a body is flat."""
+"""Minimum cosine between normals of neighbours on a flat body."""
 FEW_POINTS = 50
 """Fewer measured points do not tell one shape from another."""
 COMPARED = 1500
 MAX_SCALE = 1.35
 """A body that would have to be stretched or pressed more than this is another kind of vehicle."""
 GRAZING = 0.35
-"""Cosine to a surface's normal up to which a camera hardly sees it: 20 degrees from edge on."""
+"""A camera barely sees a surface below this cosine between ray and normal (20 degrees)."""
 PAINT_REACH = 0.2
-"""Points farther from a body say nothing by its parts [m]."""
+"""Points farther from a body give no evidence of its parts [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +59,9 @@ class VehicleBody:
         points: [N, 3] float64 [m].
         normals: [N, 3] float64, outwards.
         parts: [N] uint8, see :class:`.vehicle_parts.Part`.
-        own_colours: [N, 3] float32, the builder's, of what is ``OTHER``.
-        drawn: [N] float32, distance to the next point where all that need not be drawn are left
-            out [m]; 0 at these.
+        own_colours: [N, 3] float32, the builder's, of points with part ``OTHER``.
+        drawn: [N] float32, distance to the next rendered point if redundant points are omitted
+            [m]; 0 for omitted points.
     """
 
     points: Float
@@ -76,7 +76,7 @@ class VehicleBody:
         return np.asarray(self.parts == Part.PAINT)
 
     def colours(self, palette: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Colours [N, 3] by ``palette`` [10, 3], but for what is ``OTHER``."""
+        """Colours [N, 3] from ``palette`` [10, 3]; ``OTHER`` has its own colours."""
         other = (self.parts == Part.OTHER)[:, None]
         return np.where(other, self.own_colours, palette[self.parts])
 
@@ -97,7 +97,9 @@ class VehicleBody:
     def parts_at(
         self, distance: Float, index: NDArray[np.int64], *, reach: float = PAINT_REACH
     ) -> NDArray[np.uint8]:
-        """Parts [N] at what :meth:`closest` gave; beyond ``reach`` [m] all counts as paint."""
+        """Parts [N] for the result of :meth:`closest`; beyond ``reach`` [m] all points count as
+        paint.
+        """
         return np.where(distance < reach, self.parts[index], np.uint8(Part.PAINT))
 
     def parts_near(
@@ -105,7 +107,7 @@ class VehicleBody:
     ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """Indices [N] of the body's points nearest to ``points`` [N, 3], and parts [N] there.
 
-        What lies farther than ``reach`` [m] from it counts as paint.
+        Points farther than ``reach`` [m] from the body count as paint.
         """
         distance, index = self.closest(points)
         return index, self.parts_at(distance, index, reach=reach)
@@ -159,18 +161,18 @@ def body_colours(
     light: Float,
     palette: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Colours [B, 3] of the points of a body: its paints and parts, in the given light.
+    """Colours [B, 3] of the points of a body: its paints and parts, under the given light.
 
     Args:
-        points: [N, 3] of a vehicle in that box, stage 0's.
-        colours: [N, 3] of these; the commonest where there is paint becomes the paint, the light
-            taken off, and likewise of a truck's cargo.
+        points: [N, 3] of a vehicle in that box, from stage 0.
+        colours: [N, 3] of these. The most common paint colour without the light becomes the paint;
+            a truck's cargo is handled the same.
         light: slopes [3] in the frame of the box, see :func:`.vehicle_parts.fit_light`.
         palette: colours [10, 3] of parts, see :func:`.vehicle_parts.fit_palette`.
     """
     distance, nearest = body.closest(points)
     lit = brightness(light, body.unit_normals())
-    # Far from the body lies the plate under it, in the dark.
+    # Points far from the body belong to the dark plate under it.
     near = distance < PAINT_REACH
     plain = colours / lit[nearest]
     usual = modal_colour(plain) if len(plain) else GREY
@@ -227,7 +229,7 @@ def _body(shape: VehicleShape) -> VehicleBody:
     paints: list[tuple[float, ...]] = []
     mesh = build_vehicle(shape, paints)
     triangle, weights = _spread(mesh.corners)
-    # Wheels first: the shell about them lies in the same cells, just behind their outer faces.
+    # Wheels first: the surrounding shell is in the same cells, just behind their outer faces.
     order = np.argsort(mesh.material[triangle] != WHEEL, kind="stable")
     triangle, weights = triangle[order], weights[order]
     points = np.einsum("nk,nkd->nd", weights, mesh.corners[triangle])
@@ -239,7 +241,7 @@ def _body(shape: VehicleShape) -> VehicleBody:
     inwards = (normals * _outwards(shape, points, material)).sum(1) < 0
     normals[inwards] *= -1
     table = np.array([row[:3] for row in paints])
-    # The builder's colours are linear; images are not.
+    # The builder's colours are linear; images are gamma-encoded.
     colours = np.clip(table[mesh.paint[triangle]], 0, 1) ** (1 / 2.2)
     parts = np.full(len(points), Part.OTHER, dtype=np.uint8)
     is_wheel, on_shell = material == WHEEL, material == BODY
@@ -252,7 +254,7 @@ def _body(shape: VehicleShape) -> VehicleBody:
 
 
 def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """[N]: SPACING where parts meet and where a body bends, WIDE_SPACING or 0 elsewhere."""
+    """[N]: SPACING at borders of parts and at bends of a body, WIDE_SPACING or 0 elsewhere."""
     from scipy.spatial import cKDTree
 
     near = cKDTree(points).query_pairs(0.75 * WIDE_SPACING, output_type="ndarray")
@@ -265,7 +267,7 @@ def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> N
     plain[near[unlike].ravel()] = False
     cells = np.floor(points[plain] / WIDE_SPACING)
     from_centre = np.abs(points[plain] / WIDE_SPACING - cells - 0.5).max(axis=1)
-    # Of each cell the point in its middle, so that they are as far apart everywhere.
+    # Use the point nearest to the middle of each cell, for a uniform spacing.
     order = np.argsort(from_centre, kind="stable")
     kept = order[np.unique(cells[order].astype(np.int64), axis=0, return_index=True)[1]]
     drawn = np.full(len(points), SPACING, dtype=np.float32)
@@ -287,7 +289,7 @@ def _on_cargo(shape: VehicleShape, points: Float) -> NDArray[np.bool_]:
 
 
 def _outwards(shape: VehicleShape, points: Float, material: NDArray[np.int32]) -> Float:
-    """Directions [N, 3] out of the convex piece that each point is on; windings differ by piece."""
+    """Outward directions [N, 3] of the convex piece of each point; windings differ by piece."""
     length, width, height = shape.size
     centres = np.zeros_like(points)
     # The shell is no convex piece, but nearly: from the line through its middle all of it is seen.
@@ -341,8 +343,8 @@ UNDERSIDE_HEIGHT = 0.05
 def underside(size: tuple[float, float, float], *, spacing: float = 0.08) -> Surfels:
     """A flat plate under a vehicle, in the object frame; empty for other objects.
 
-    What cameras see below a car is its dark underside and contact shadow. They belong to the car
-    and leave with it; the road keeps its own colour.
+    Cameras see the dark underside and contact shadow of a car. They belong to the car and move with
+    it; the road keeps its own colour.
 
     Args:
         size: (length, width, height) [m].
@@ -364,18 +366,18 @@ def complete_body(
     body: VehicleBody | None = None,
     spacing: float = 0.06,
 ) -> PointSet:
-    """Measured points together with a generic body where nothing was measured.
+    """Complete measured points with a generic body in unmeasured places.
 
-    LiDAR sees neither the far side of a car, nor its windows, nor the top of a truck. The body is
-    a box with rounded-off corners for most things, and has a bonnet and a cabin for cars and vans.
-    Points of the body nearer than GAP to a measured point, or to its mirror image across y = 0,
-    are left out, and mirrored points of vehicles are used instead.
+    LiDAR does not see the far side of a car, its windows, or the top of a truck. The generic body
+    is a box with rounded corners; cars and vans also have a bonnet and a cabin. Body points nearer
+    than GAP to a measured point, or to its mirror image across y = 0, are omitted. For vehicles,
+    mirrored points replace them.
 
     Args:
         measured: points in the object frame.
         size: (length, width, height) [m].
         category: class of the object.
-        body: of a vehicle, taken instead of the generic one.
+        body: of a vehicle, used instead of the generic one.
         spacing: distance between points of the body [m]; larger for large objects.
     """
     from scipy.spatial import cKDTree
@@ -448,7 +450,9 @@ def _face(half: Float, axis: int, sign: int, spacing: float) -> Float:
 # Shading is removed first and applied again for the side's direction.
 
 ON_PART = 0.06
-"""Points this near to a body show the colour of its part there [m]; others lie behind its glass."""
+"""Points within this distance of a body have the colour of its part [m]; others are behind its
+glass.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -479,7 +483,7 @@ class VehicleSurface:
 
     @cached_property
     def closest(self) -> tuple[Float, NDArray[np.int64]]:
-        """Of the points, see :meth:`.VehicleBody.closest`."""
+        """See :meth:`.VehicleBody.closest`, for the surface's points."""
         return self.body.closest(self.points)
 
 
@@ -488,8 +492,8 @@ def fill_vehicles(
 ) -> tuple[list[NDArray[np.float32]], Float, NDArray[np.float32]]:
     """Colours [N, 3] of all points of each vehicle, the light [3] and the palette [10, 3] of all.
 
-    What was seen stays. The paint of a vehicle of which hardly anything was seen is a grey, as
-    bright as the median of the others': the median of their colours is a colour that none has.
+    Seen colours do not change. A vehicle with almost no seen paint gets a grey with the median
+    brightness of the others: the median of their colours is a colour that no vehicle has.
     """
     painted = [s.seen_paint() for s in surfaces]
     light = fit_light(

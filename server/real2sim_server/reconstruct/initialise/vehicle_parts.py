@@ -20,17 +20,17 @@ from .surfels import MIN_OBSERVED, modal_colour
 # to another.
 
 FROM_ABOVE = (0.0, 0.0, 0.25)
-"""Slopes that hold where vehicles say nothing."""
+"""Slopes without evidence from vehicles."""
 DOUBT = 2.0
 """Weight of these, in vehicles."""
 FEW = 100
-"""Vehicles of which fewer points are seen do not count."""
+"""Minimum number of seen points of a vehicle."""
 ODD = 0.15
 """Logarithms of brightness that differ more are of reflections, cast shadows, or no paint."""
 ROUNDS = 10
 DARKEST = 0.02
 LIGHT = "vehicle_light"
-"""Where a scene's reconstruction keeps the slopes."""
+"""Key of the slopes in a scene's reconstruction provenance."""
 
 
 def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) -> Float:
@@ -49,7 +49,7 @@ def fit_light(normals: Sequence[Float], colours: Sequence[NDArray[np.float32]]) 
     bright = np.concatenate([colours[k].mean(axis=1) for k in members])
     rest = np.log(bright.clip(DARKEST)) - unit @ prior
     share = np.concatenate([np.full(len(normals[k]), 1 / len(normals[k])) for k in members])
-    # Each vehicle has a paint of its own, of which nothing is known.
+    # Each vehicle has its own unknown paint.
     columns = np.concatenate([unit, np.eye(len(members))[owner]], axis=1)
     doubt = np.diag([DOUBT / 30] * 3 + [1e-6] * len(members))
     weight, found = share, np.zeros(columns.shape[1])
@@ -66,10 +66,10 @@ def brightness(light: Float, normals: Float) -> NDArray[np.float32]:
 
 
 def light_on(item: SceneObject, reconstruction: object) -> Float:
-    """The slopes [3] in the frame of an object, as it stands in the middle of its time.
+    """The slopes [3] in the frame of an object, at its pose in the middle of its time.
 
     Args:
-        reconstruction: of the scene's provenance; of one without slopes light comes from above.
+        reconstruction: of the scene's provenance; without slopes, light comes from above.
     """
     known = reconstruction.get(LIGHT) if isinstance(reconstruction, dict) else None
     light = np.array(FROM_ABOVE if known is None else known, dtype=np.float64)
@@ -77,7 +77,7 @@ def light_on(item: SceneObject, reconstruction: object) -> Float:
 
 
 def pose_amid(trajectory: Trajectory) -> Float:
-    """``T_world_object`` [4, 4] in the middle of its time: light is taken as it lies there."""
+    """``T_world_object`` [4, 4] in the middle of its time, the reference pose for the light."""
     return trajectory.transform((trajectory.start_us + trajectory.end_us) // 2)
 
 
@@ -89,7 +89,7 @@ def pose_amid(trajectory: Trajectory) -> Float:
 PALETTE_DOUBT = 2.0
 """Weight of the usual colour of a part, in vehicles that show theirs."""
 PARTS = "vehicle_parts"
-"""Where a scene's reconstruction keeps the colours of parts."""
+"""Key of the colours of parts in a scene's reconstruction provenance."""
 FRAME = 0.035
 """Width of the dark frame about side windows [m]."""
 PILLAR = 0.05
@@ -98,9 +98,10 @@ Colours = NDArray[np.float32]
 
 
 class Part(IntEnum):
-    """What a place of a body is.
+    """Part of a vehicle body.
 
-    Paint and cargo (the box of a truck) are each vehicle's own; ``OTHER`` has the builder's colour.
+    Paint and cargo (the box of a truck) differ between vehicles; ``OTHER`` has the builder's
+    colour.
     """
 
     PAINT = 0
@@ -126,14 +127,15 @@ USUAL: dict[Part, tuple[float, float, float]] = {
 }
 """sRGB of parts in the light of a surface that faces the horizon, before a log is looked at."""
 FITTED = (Part.GLASS, Part.TRIM, Part.TYRE)
-"""Parts that are alike on all vehicles and large enough to be seen; lamps are lit or not, and rims
-are seen together with the dark between their spokes."""
+"""Parts that are similar on all vehicles and large enough to be seen. Lamps can be on or off, and
+rims appear together with the dark gaps between their spokes.
+"""
 PAINTED = (Part.PAINT, Part.CARGO)
 """Parts in a vehicle's own paints."""
 
 
 def usual_palette() -> Colours:
-    """Colours [10, 3] by part before a log is looked at; 0 for what has none."""
+    """Default colours [10, 3] by part; 0 for parts without a default."""
     palette = np.zeros((len(Part), 3), dtype=np.float32)
     for part, colour in USUAL.items():
         palette[part] = colour
@@ -143,11 +145,11 @@ def usual_palette() -> Colours:
 def fit_palette(
     parts: Sequence[NDArray[np.uint8]], colours: Sequence[NDArray[np.float32]]
 ) -> Colours:
-    """Colours [10, 3] by part, those of FITTED as vehicles of a log show them.
+    """Colours [10, 3] by part, with FITTED parts as observed on the vehicles of a log.
 
     Args:
-        parts: by vehicle, [N] what its points are, of points that images show.
-        colours: by vehicle, [N, 3] there, the light taken off.
+        parts: per vehicle, [N] parts of the seen points.
+        colours: per vehicle, [N, 3] of these points, without the light.
     """
     palette = usual_palette()
     for part in FITTED:
@@ -162,11 +164,11 @@ def fit_palette(
 def shown_paints(
     parts: NDArray[np.uint8], colours: NDArray[np.float32]
 ) -> dict[Part, NDArray[np.float32]]:
-    """The commonest colour [3] of each of PAINTED that enough points show.
+    """The most common colour [3] of each PAINTED part with enough points.
 
     Args:
-        parts: [N] what points are.
-        colours: [N, 3] there, the light taken off.
+        parts: [N] of the points.
+        colours: [N, 3] of the points, without the light.
     """
     members = {part: colours[parts == part] for part in PAINTED}
     return {part: modal_colour(c) for part, c in members.items() if len(c) >= MIN_OBSERVED}
@@ -184,7 +186,7 @@ def with_paints(
 
 
 def palette_of(reconstruction: object) -> Colours:
-    """The palette [10, 3] that a scene's provenance keeps; the usual one where it keeps none."""
+    """The palette [10, 3] in a scene's provenance; the default one if it is missing."""
     known = reconstruction.get(PARTS) if isinstance(reconstruction, dict) else None
     palette = usual_palette()
     if known is not None:

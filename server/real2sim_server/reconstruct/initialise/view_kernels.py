@@ -1,8 +1,8 @@
 """Compiled loops over Gaussians in one camera image: projection, depth, visibility, samples.
 
-Loops run over a range of Gaussians and write only to those, so ranges can be spread over threads
-and the result does not depend on how many there are. The kernels release the GIL; Numba's own
-``parallel`` would take several times longer to compile.
+Loops run over a range of Gaussians and write only to that range, so ranges can be distributed over
+threads and the result does not depend on the number of threads. The kernels release the GIL;
+Numba's ``parallel`` would take several times longer to compile.
 """
 # ruff: noqa: PLR0917 - compiled loops take their arrays one by one
 
@@ -18,8 +18,9 @@ NEAR = np.float32(0.3)
 MAX_FOOTPRINT = 24
 """Half-width of the largest footprint in the depth image [px]."""
 GRAZING = 0.15
-"""Objects give no colour to a view that looks along their surface by less than this cosine: a few
-centimetres of error, and what it sees is the side next to it, a lamp on a wing for one."""
+"""Minimum cosine between ray and surface for colours of objects. At smaller angles, a few
+centimetres of error give the colour of the adjacent side, for example a lamp on a wing.
+"""
 
 
 @kernel(nogil=True)
@@ -52,7 +53,7 @@ def splat_depth(in_camera, turned, radii, K, depth):
         in_camera, turned: from :func:`to_camera`.
         radii: [N] float32, of the disks [m].
         K: [4] float32: fx, fy, cx, cy of the depth image [px].
-        depth: written; inf where nothing is.
+        depth: written; inf for empty pixels.
     """
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     height, width = depth.shape
@@ -127,7 +128,7 @@ def gather_samples(
     colours,
     weights,
 ):
-    """Keep the best colours of each Gaussian that this view sees.
+    """Update the best colours of each Gaussian that this view sees.
 
     Args:
         in_camera, turned: from :func:`to_camera`.
@@ -135,10 +136,10 @@ def gather_samples(
         instance: [N] uint16.
         K: [4] float32 of the image; the depth image is ``shrink`` times smaller.
         depth: from :func:`splat_depth`.
-        first, second: [H, W] float32, depths of the nearest two objects, each drawn somewhat
-            larger than it is [m]; inf where there is none.
+        first, second: [H, W] float32, depths of the nearest two objects, each rendered slightly
+            enlarged [m]; inf where there is none.
         first_object: [H, W] int32, instance of the first; -1 where there is none.
-        levels: tuple of [H, W, 3] uint8 images, each half the size of the one before.
+        levels: tuple of [H, W, 3] uint8 images, each half the size of the previous one.
         colours: [N, S, 3] uint8 and weights: [N, S] float32, updated.
     """
     height, width = levels[0].shape[0], levels[0].shape[1]
@@ -183,7 +184,7 @@ def gather_samples(
 
 @func(nogil=True)
 def sample(image, u, v, channel):
-    """Bilinear value of one channel at (u, v) [px], rounded; pixel centres lie at +0.5."""
+    """Bilinear value of one channel at (u, v) [px], rounded; pixel centres are at +0.5."""
     height, width = image.shape[0], image.shape[1]
     u = min(max(u - 0.5, 0.0), width - 1.0)
     v = min(max(v - 0.5, 0.0), height - 1.0)
@@ -225,7 +226,7 @@ def robust_mean(colours, weights, result, known):
 
 @func(nogil=True)
 def weighted_median(values, weights, total):
-    """The value below and above which lies half of the weight."""
+    """Weighted median: half of the weight is below it, half above."""
     best = np.float32(0.0)
     for s in range(len(values)):
         if weights[s] <= 0:

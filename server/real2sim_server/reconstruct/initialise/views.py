@@ -26,7 +26,7 @@ DEPTH_DOWNSCALE = 2
 """The depth image is this much smaller than the camera image."""
 PYRAMID = 4
 OBJECT_MARGIN = 0.12
-"""Objects hide what is behind them with this margin around them [m]."""
+"""Objects occlude the scene behind them with this margin [m]."""
 MAX_REACH = 15
 """Bound of that margin [px of the depth image]."""
 
@@ -35,7 +35,7 @@ _NearestObjects = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float
 
 @dataclass(frozen=True, eq=False)
 class PlacedSurfels:
-    """All Gaussians of a scene in the making.
+    """All Gaussians of a scene under construction.
 
     Attributes:
         surfels: in the frame of their instance.
@@ -111,7 +111,7 @@ class ColourSamples:
         return ProjectedView(camera, frame, T_camera_world, image, depth, np.isfinite(nearest[0]))
 
     def mean(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Colours [N, 3] float32 in [0, 1], and which are known [N] bool; the others are 0."""
+        """Colours [N, 3] float32 in [0, 1], and a mask [N] of the known ones; the others are 0."""
         n = len(self._means)
         colours, known = np.zeros((n, 3), dtype=np.float32), np.zeros(n, dtype=np.bool_)
         kernels.robust_mean(self._colours, self._weights, colours, known)
@@ -217,14 +217,14 @@ def gather_views(
     slots: int,
     on_view: Callable[[ProjectedView], None],
 ) -> ColourSamples:
-    """Sample the colours of all Gaussians from all cameras at ``frames``, occlusion respected.
+    """Sample the colours of all Gaussians from all cameras at ``frames``, with occlusion.
 
-    A view counts for a Gaussian when nothing lies before it in a depth image of all Gaussians,
-    and no other object lies before it that is drawn somewhat larger than it is. Of the ``slots``
-    nearest, most frontal views, those that agree with their median are averaged.
+    A Gaussian is visible in a view if no surface is in front of it in the depth image of all
+    Gaussians, and no other object, rendered slightly enlarged. Of the ``slots`` nearest, most
+    frontal views, those that agree with their median are averaged.
 
     Args:
-        on_view: called with each view after it was sampled.
+        on_view: called after each view.
     """
     samples = ColourSamples(placed, slots)
     for camera, frame, image in _images(log, frames):
@@ -244,7 +244,7 @@ def _images(log: DrivingLog, frames: list[int]) -> Iterator[tuple[Camera, int, N
 
 
 def _instance_poses(log: DrivingLog, t_us: int) -> list[Float | None]:
-    """``T_world_instance``, first the background, then the tracks; None where there is none."""
+    """``T_world_instance``, first the background, then the tracks; None for absent tracks."""
     return [np.eye(4), *(track.transform_near(t_us) for track in log.tracks)]
 
 
@@ -253,7 +253,7 @@ def nearest_objects(
 ) -> _NearestObjects:
     """Depth of the nearest object in each pixel, its instance, and depth of the second nearest.
 
-    Objects are drawn larger by OBJECT_MARGIN, as boxes and poses are not exact.
+    Objects are enlarged by OBJECT_MARGIN, because boxes and poses are inexact.
     """
     import cv2
 
@@ -290,14 +290,14 @@ def _pyramid(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
 Coordinates = NDArray[np.floating[Any]]
 
 SLOTS = 15
-"""Samples of which the median is taken for a direction."""
+"""Number of samples per direction for the median."""
 PANORAMA = (256, 512)
 ZENITH = np.array([0.75, 0.82, 0.9])
 """Colour of a sky that no camera observed."""
 FADE = 1 / 24
 """Fraction of a full turn over which the weight of an observed colour falls to 1/e."""
 GROUND_ELEVATION = -0.03
-"""Below this elevation [rad] directions are given the colour of the ground."""
+"""Directions below this elevation [rad] get the colour of the ground."""
 
 
 class SkySamples:
@@ -312,11 +312,11 @@ class SkySamples:
         self._is_sky = np.zeros(n, dtype=np.bool_)
 
     def add(self, view: ProjectedView, sky: NDArray[np.bool_]) -> None:
-        """Take pixels of the sky, and those that show neither a Gaussian nor a tracked object.
+        """Add sky pixels, and pixels that show neither a Gaussian nor a tracked object.
 
         Args:
-            sky: [H, W] bool, pixels of ``view`` that show the sky. A direction in which any view
-                shows it keeps pixels of the sky alone.
+            sky: [H, W] bool, sky pixels of ``view``. A direction with a sky pixel in any view keeps
+                only sky pixels.
         """
         texels, u, v = self._texels_in(view)
         row, column = (v / DEPTH_DOWNSCALE).astype(np.int64), (u / DEPTH_DOWNSCALE).astype(np.int64)
@@ -369,7 +369,7 @@ class SkySamples:
 
 
 def uncovered_pixels(view: ProjectedView) -> NDArray[np.bool_]:
-    """[H / 2, W / 2] bool: no Gaussian and no object there; pinholes closed."""
+    """[H / 2, W / 2] bool: pixels without a Gaussian or an object, small holes closed."""
     import cv2
 
     covered = (np.isfinite(view.depth) | view.on_object).astype(np.uint8)
@@ -438,7 +438,7 @@ def _softened(panorama: NDArray[np.float64]) -> NDArray[np.float32]:
     import cv2
 
     width = panorama.shape[1]
-    # Three turns side by side, so that there is no seam at the back.
+    # Three copies side by side, so that there is no seam at the back.
     blurred = cv2.GaussianBlur(np.tile(panorama, (1, 3, 1)).astype(np.float32), (0, 0), 2)
     return np.asarray(blurred, dtype=np.float32)[:, width : 2 * width]
 

@@ -21,11 +21,11 @@ from .rays import RecordedRays
 
 # --- Loss of rays ---------------------------------------------------------------------------------
 
-# A ray that stops where the sensor measured something costs nothing. One that stops elsewhere costs
-# by its error, up to REACH; one that does not stop costs in full. So Gaussians in front of a return
-# become transparent (line of sight), those at the return become opaque and move along their
-# normals. Kernels take arrays by position: Numba knows neither dataclasses nor keyword-only
-# arguments.
+# A ray that stops at the measured return costs nothing. One that stops elsewhere costs by its
+# error, up to REACH; one that does not stop costs in full. So Gaussians in front of a return become
+# transparent (line of sight), those at the return become opaque and move along their normals.
+# Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
+#
 # ruff: noqa: PLR0917
 
 
@@ -59,7 +59,7 @@ def ray_gradients(
             light *= 1.0 - alpha[entry]
         cost += light
         costs[ray] = cost
-        # What is left of the cost behind an entry is what its light would have cost instead.
+        # Remaining cost behind an entry: the cost if its light had passed.
         left, light = cost, 1.0
         for entry in range(begins[ray], begins[ray + 1]):
             share, member = alpha[entry], members[entry]
@@ -96,10 +96,10 @@ class SurfaceTable:
 
     Attributes:
         object_ids: of the bodies after the background.
-        firsts: [bodies + 1] int64, where each body begins.
-        means, quats, axes, scales: [N, 3], [N, 4], [N, 3, 3] and [N, 3] float32, as laid out.
-        logit, size, shift: [N] float32, what is learned: logit of the opacity, logarithm of the
-            factor of the scales along the surface, shift along the normal [m].
+        firsts: [bodies + 1] int64, first Gaussian of each body.
+        means, quats, axes, scales: [N, 3], [N, 4], [N, 3, 3] and [N, 3] float32, initial values.
+        logit, size, shift: [N] float32, learnt: logit of the opacity, logarithm of the factor of
+            the scales along the surface, shift along the normal [m].
         attributes: [N, 2] float32, see ``Reflector``.
     """
 
@@ -167,7 +167,7 @@ class SurfaceTable:
         return replace(scene, lidar=LidarSurfaces(parts[0], objects, incidence), content_hash="")
 
     def select(self, kept: NDArray[np.bool_]) -> SurfaceTable:
-        """The Gaussians of a mask, as far as they have been learned."""
+        """The Gaussians of a mask, with their learnt values."""
         counts = np.bincount(self.body_of[kept], minlength=len(self.firsts) - 1)
         laid_out = (
             getattr(self, name)[kept] for name in ("means", "quats", "axes", "scales", "logit")
@@ -207,7 +207,7 @@ def trace(
     lidar: Lidar,
     reach: NDArray[np.float32],
 ) -> SweepHits:
-    """Follow the rays of ``lidar`` about ``frame`` through ``scene``, which holds ``table``.
+    """Trace the rays of ``lidar`` about ``frame`` through ``scene``, which contains ``table``.
 
     Args:
         reach: [R], see ``CpuCaster.trace``.
@@ -216,7 +216,7 @@ def trace(
     targets = recorded_scene(scene, lidar, t_us)
     request = targets.request(lidar, sensor_poses(log.ego, lidar, t_us))
     found = CpuCaster().trace(request, reach)
-    # Ids count from 1 over the scene's objects; the background has 0.
+    # Ids count from 1 over the scene's objects; the background is 0.
     bodies = np.array([instance.instance_id for instance in targets.instances])
     counts = [len(instance.cloud) for instance in targets.instances]
     shift = np.repeat(table.firsts[bodies] - (np.cumsum(counts) - counts), counts)
@@ -234,13 +234,13 @@ def part_of(lidar: Lidar, rays: NDArray[np.int64]) -> Lidar:
 # Optimisation: opacity, size and position from the measuring rays.
 
 RAYS = 30_000
-"""Of one step, evenly spread over a sweep."""
+"""Rays per step, evenly spread over a sweep."""
 BEYOND = 0.5
 """How far behind its return a ray is followed [m]."""
 RATES = {LOGIT: 0.15, SIZE: 0.03, SHIFT: 0.0015}
 BOUNDS = {LOGIT: (-6.0, 4.6), SIZE: (-1.5, 0.5), SHIFT: (-0.05, 0.05)}
 INERTIA, SCATTER = 0.9, 0.99
-"""Of Adam."""
+"""Adam's decay rates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,10 +249,10 @@ class SeenSweep:
 
     Attributes:
         frame: of the log.
-        rays: that returned.
-        ring: [R] int32, of each ray; -1 for those of none.
-        elevations: [B] of the rings [rad]; [0] where the scan is not by rings.
-        missing: rays that were fired and did not return, where rings tell.
+        rays: with a return.
+        ring: [R] int32, of each ray; -1 for rays without a ring.
+        elevations: [B] of the rings [rad]; [0] if the scan has no rings.
+        missing: rays that were fired and did not return, if the scan has rings.
     """
 
     frame: int
@@ -271,9 +271,10 @@ def learn_surfaces(
     steps: int,
     on_step: Callable[[int, int], None],
 ) -> float:
-    """Learn opacity, size and shift of each Gaussian in place; the mean cost of the last rays.
+    """Learn opacity, size and shift of each Gaussian in place; returns the mean cost of the last
+    rays.
 
-    Each step takes a part of the rays of one sweep, in turns. The same input gives the same bits.
+    Each step uses a part of the rays of one sweep, in turn. The same input gives the same bits.
     """
     moments = {column: _Moments.of(len(table)) for column in RATES}
     order = np.random.default_rng(0).permutation(len(sweeps))
@@ -325,7 +326,7 @@ def _gradients(
 
 
 def _directions(table: SurfaceTable, met: SweepHits) -> NDArray[np.float32]:
-    """[bodies, R, 3], unit, of the rays in the frame of each body; zeros of those not there."""
+    """[bodies, R, 3], unit, of the rays in the frame of each body; zeros for absent bodies."""
     request = met.request
     beams = request.lidar.beams
     slots, turns = beams.slots[1], request.T_world_lidar[:, :3, :3]

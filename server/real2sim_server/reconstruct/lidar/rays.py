@@ -18,9 +18,9 @@ from ...scene.range_sensors import wrapped
 # Rays of recorded sweeps: origin, direction and time.
 
 FAR = 250.0
-"""Recorded points beyond this are left out [m]."""
+"""Recorded points beyond this range are dropped [m]."""
 SEES_ALL = Detection(range_m=2000.0, reflectivity=1e-6)
-"""Nobody knows the limit of the sensor; where its beams were lost the scene says."""
+"""The limit of the sensor is unknown; the scene determines where beams are lost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +48,10 @@ class RecordedRays:
 
 
 def recorded_rays(log: DrivingLog, frame: int) -> RecordedRays | None:
-    """The rays of the sweep of ``frame``; None where it is empty.
+    """The rays of the sweep of ``frame``; None if it is empty.
 
-    Sweeps are brought to the frame's time stamp by the vehicle's own motion; here that is undone,
-    so that each ray starts where the sensor was.
+    Logs compensate sweeps for the vehicle's motion to the frame's time stamp. This function undoes
+    the compensation, so that each ray starts at the sensor's position when it was fired.
 
     Raises:
         LogError: the sweep cannot be read.
@@ -102,11 +102,11 @@ FALLS_BACK = np.pi
 MIN_RING = 50
 """Fewer points make no ring."""
 ROUNDS = 5
-"""Times that the farthest points of a ring are left aside and the rest is fitted again."""
+"""Rounds of dropping the farthest points of a ring and fitting again."""
 HEIGHT_STEP = 0.05
-"""Lasers whose heights differ by less leave the sensor together [m]."""
+"""Lasers with a smaller height difference have the same origin [m]."""
 MIN_STEP = 1e-4
-"""Of azimuth, smaller ones are no steps of a turning sensor [rad]."""
+"""Minimum azimuth step of a rotating sensor [rad]."""
 NOT_ONE = np.radians(0.35)
 """Elevations of a ring scatter less than this [rad], or the scan is not by rings."""
 
@@ -116,14 +116,14 @@ class Rings:
     """A fitted beam table.
 
     Attributes:
-        elevation: [B] of each ring, as the scan lists them [rad].
+        elevation: [B] of each ring, in scan order [rad].
         offset: [B] of each ring's origin above the sensor's [m].
-        residual: root mean square of the points' elevations about their rings' as seen from there
-            [rad], the farthest twentieth left aside.
-        ring: [R] int32, of each ray; -1 for those of no ring.
-        columns: azimuth steps of a turn.
-        clockwise: as seen from above.
-        T_vehicle_lidar: [4, 4], turned so that z is the axis.
+        residual: root mean square of the points' elevations about their rings', seen from the
+            ring's origin [rad], without the farthest twentieth.
+        ring: [R] int32, of each ray; -1 for rays without a ring.
+        columns: azimuth steps per turn.
+        clockwise: seen from above.
+        T_vehicle_lidar: [4, 4], rotated so that z is the axis.
         azimuth, height: [R] of each ray about that axis, and of its ring [rad].
     """
 
@@ -138,7 +138,7 @@ class Rings:
     height: Float
 
     def beams(self, rays: RecordedRays) -> Beams:
-        """The grid of rings by columns, each column at the instant at which ``rays`` were there."""
+        """The grid of rings by columns, each column at the time at which ``rays`` were there."""
         slope, start = _turn(self.azimuth, rays.lidar.beams.time_us)
         azimuth = wrapped(-np.pi + 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns)
         order = np.argsort(wrapped(azimuth - start) * np.sign(slope), kind="stable")
@@ -154,8 +154,8 @@ class Rings:
     def missing(self, rays: RecordedRays) -> list[Lidar]:
         """Rays of ``rays``' sweep that were fired and did not return.
 
-        A ring fires at even steps of azimuth, so that gaps between its returns tell how many were
-        lost there. One LiDAR for each height at which lasers leave the sensor.
+        A ring fires at uniform azimuth steps, so gaps between its returns give the number of lost
+        rays. One LiDAR for each height of the lasers' origins.
         """
         heights = np.round(self.offset / HEIGHT_STEP).astype(int)
         slope, start = _turn(self.azimuth, rays.lidar.beams.time_us)
@@ -175,7 +175,7 @@ class Rings:
 
 
 def _gaps(azimuth: Float) -> Float:
-    """Azimuths between those of a ring, in the order in which it fired them, at its even steps."""
+    """Azimuths of the lost rays of a ring, in firing order, at its uniform steps."""
     turned = np.unwrap(azimuth)
     closed = np.append(turned, turned[0] + 2 * np.pi * np.sign(turned[-1] - turned[0]))
     away = np.diff(closed)
@@ -191,8 +191,8 @@ def _gaps(azimuth: Float) -> Float:
 
 
 def fit_rings(rays: RecordedRays) -> Rings | None:
-    """The rings of a sweep whose rays are in the order of the scan; None where it has none."""
-    # Rings run from ahead to ahead: seen from behind there is one fall back for each.
+    """The rings of a sweep with rays in scan order; None if it has none."""
+    # Rings run from front to front: measured from the back, azimuth drops once per ring.
     turned = rays.lidar.beams.azimuth % (2 * np.pi)
     step = np.diff(turned)
     rises = np.median(step) > 0
@@ -245,7 +245,7 @@ def _cones(points: Float, ring: NDArray[np.int32]) -> tuple[Float, Float, Float]
 
 
 def _upright(directions: Float, ring: NDArray[np.int32]) -> Float:
-    """Turn [3, 3] whose columns are the sensor's axes, the last one that of the cones."""
+    """Rotation [3, 3] with the sensor's axes as columns; the last one is the axis of the cones."""
     scatter = np.zeros((3, 3))
     for index in range(int(ring.max()) + 1):
         own = directions[ring == index]
@@ -259,7 +259,7 @@ def _upright(directions: Float, ring: NDArray[np.int32]) -> Float:
 
 
 def _turn(azimuth: Float, time_us: Float) -> tuple[float, float]:
-    """Speed [rad/us] at which a sweep turns, and where it looks at its time stamp [rad]."""
+    """Angular speed [rad/us] of a sweep, and its azimuth at its time stamp [rad]."""
     near = np.abs(time_us) < np.abs(time_us).max() / 4
     start = float(np.angle(np.exp(1j * azimuth[np.abs(time_us) < 2000]).mean()))
     away = wrapped(azimuth[near] - start)

@@ -23,11 +23,11 @@ from .learn import SeenSweep, SurfaceTable, part_of, trace
 # sensor respond differently, depending on range: each ring has its own gain and offset by range.
 
 RAYS = 60_000
-"""Of each sweep, evenly spread."""
+"""Rays per sweep, evenly spread."""
 LITTLE = 0.01
-"""Smaller shares of a ray's light are left out."""
+"""Smaller shares of a ray's light are ignored."""
 INCIDENCES = (1.0, 0.8, 0.6, 0.4, 0.25, 0.15)
-"""Shares of light that does not mind incidence, from which the best is taken."""
+"""Candidate shares of light that is independent of the incidence; the best one is used."""
 PRIOR = 0.5
 """Light that the mean reflectivity of all counts for."""
 TRUST = 20.0
@@ -36,18 +36,18 @@ ROUNDS, INNER = 5, 4
 DARKEST = 1e-3
 """What returned reflects something."""
 UNKNOWN = 0.3
-"""Reflectivity where no sweep met anything in a scene."""
+"""Reflectivity if no sweep hit anything in a scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedReflectivity:
-    """What was found.
+    """Result of the fit.
 
     Attributes:
         incidence: see ``LidarSurfaces``.
-        response: of the rings; None where sweeps are not by rings.
-        known: share of the Gaussians that a ray met.
-        residual: root mean square of recorded less explained intensities.
+        response: of the rings; None if sweeps have no rings.
+        known: share of the Gaussians that a ray hit.
+        residual: root mean square of recorded minus explained intensities.
     """
 
     incidence: float
@@ -58,16 +58,16 @@ class FittedReflectivity:
 
 @dataclass(frozen=True, eq=False)
 class LitRays:
-    """Rays of all sweeps that returned, and what they met.
+    """Rays of all sweeps with a return, and the Gaussians they hit.
 
     Attributes:
-        ray, member: [M] which ray met which Gaussian.
+        ray, member: [M], ray and Gaussian of each hit.
         share: [M] of the light that the ray loses.
         facing: [M] cosine of the incidence.
         intensity: [R] float64, as recorded.
-        cell: [R] int64, ring and step of range of a response.
-        rings: [B] elevations of the rings [rad]; [0] where scans are not by rings.
-        every: [sweeps] of so many rays of each sweep one was taken.
+        cell: [R] int64, ring and range step of a response.
+        rings: [B] elevations of the rings [rad]; [0] if scans have no rings.
+        every: [sweeps], stride of the used rays in each sweep.
     """
 
     ray: NDArray[np.int32]
@@ -109,7 +109,7 @@ def light_of(
             row = RingResponse.rows(rings, sweep.elevations, sweep.ring[chosen])
         ray = np.repeat(np.arange(len(chosen)), np.diff(found.begins))
         share = stopped_shares(found.alpha, found.begins, ray)
-        # The facing of a Gaussian is that of its centre, as in a cast.
+        # The facing of a Gaussian is evaluated at its centre, as in a cast.
         facing = np.concatenate(facing_of_request(met.request))
         kept = share > LITTLE
         columns.append(
@@ -133,7 +133,7 @@ def light_of(
 
 
 def fit_reflectivity(table: SurfaceTable, lit: LitRays) -> FittedReflectivity:
-    """Fit the reflectivity of each Gaussian, in place, and what all have in common."""
+    """Fit the reflectivity of each Gaussian, in place, and the common parameters."""
     cells = max(len(lit.rings), 1) * (len(RANGE_STEPS) - 1)
     gain, offset = np.ones(cells), np.zeros(cells)
     incidence = min(INCIDENCES, key=lambda given: _misfit(lit, given, len(table)))
@@ -176,7 +176,7 @@ def stopped_shares(
 
 
 def _misfit(lit: LitRays, incidence: float, count: int) -> float:
-    """Mean square of what one pass of back-projection leaves unexplained."""
+    """Mean squared residual after one pass of back-projection."""
     lambert = lit.share * (incidence + (1 - incidence) * lit.facing)
     start = np.full(count, lit.intensity.mean() if len(lit.intensity) else UNKNOWN)
     one = np.ones(1)
@@ -196,7 +196,7 @@ def _reflectivities(
     one = len(gain) == 1
     factor = lambert if one else lambert * gain[lit.cell][lit.ray]
     wanted = lit.intensity if one else lit.intensity - offset[lit.cell]
-    # Each meeting counts by its share: of the light on a Gaussian, not of its own part alone.
+    # Each hit is weighted by its share: by the light on the Gaussian, not only by its own part.
     light = np.bincount(lit.member, factor * factor / np.maximum(lit.share, 1e-6), len(values))
     mean = float(np.average(values, weights=light)) if light.sum() > 0 else UNKNOWN
     for _ in range(INNER):
@@ -210,8 +210,9 @@ def _reflectivities(
 def _responses(
     lit: LitRays, explained: NDArray[np.float64], cells: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gain and offset of each cell by least squares, leaning on those of its ring, which lean on
-    1 and 0."""
+    """Gain and offset of each cell by least squares, regularised towards its ring; rings are
+    regularised towards 1 and 0.
+    """
     steps = len(RANGE_STEPS) - 1
     mean_square = float(np.mean(explained**2))
     moments = np.stack(
@@ -238,7 +239,7 @@ def _line(
     offset: NDArray[np.float64],
     mean_square: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lines through rays given by sums of xx, x, 1, xy and y, leaning on others by TRUST."""
+    """Line fits from sums of xx, x, 1, xy and y, regularised towards other lines by TRUST."""
     xx, x, one, xy, y = moments
     xx, xy = xx + TRUST * mean_square, xy + TRUST * mean_square * gain
     one, y = one + TRUST, y + TRUST * offset
@@ -265,10 +266,10 @@ def fit_losses(
     lit: LitRays,
     on_sweep: Callable[[int, int], None],
 ) -> None:
-    """Fit the share of lost rays of each Gaussian, in place; none where no sweep tells.
+    """Fit the share of lost rays of each Gaussian, in place; 0 if no sweep provides evidence.
 
     Args:
-        lit: the rays of ``sweeps`` that returned.
+        lit: the rays of ``sweeps`` with a return.
     """
     returned = len(lit.intensity)
     rays, members, shares = [lit.ray.astype(np.int64)], [lit.member], [lit.share]
@@ -306,7 +307,7 @@ def _solved(
     lost: NDArray[np.float64],
     count: int,
 ) -> NDArray[np.float32]:
-    """Shares of lost rays [N], 0 to 1, that explain which rays were lost, by least squares."""
+    """Shares of lost rays [N], 0 to 1, that explain the lost rays by least squares."""
     light = np.bincount(member, share, count)
     mean = float(lost.mean())
     values = np.full(count, mean)

@@ -39,13 +39,13 @@ MAX_BACKGROUND, MAX_OBJECT = 300_000, 40_000
 MAX_OBJECT_SURFEL = 0.15
 """Scale along surfaces of objects, at most [m]."""
 SMALLEST = 0.004
-"""Scale along normals, at least [m]; beams measure to millimetres."""
+"""Minimum scale along normals [m]; beams measure to millimetres."""
 FLATTER = 0.3
-"""Share of the thickness of neighbourhoods that is left: most of it is noise of single beams."""
+"""Remaining share of the thickness of neighbourhoods; most of it is noise of single beams."""
 ROAD_BAND = 0.05
 """Points in a box at most so high over its bottom are road [m]."""
 MOVES = 0.3
-"""An object whose path is longer moves, and what sticks out of its box moves along [m]."""
+"""An object with a longer path moves, and parts outside its box move with it [m]."""
 BOX_MARGIN = 0.12
 GAP, GAP_PER_METRE = 0.3, 0.01
 """Surfaces of the scene count where nothing was measured so near [m], with distance more."""
@@ -56,7 +56,7 @@ OPACITY = 0.95
 
 
 class MeasuredPoints:
-    """Points of sweeps by what they lie on, thinned as they come."""
+    """Points of sweeps by body, thinned as they are added."""
 
     def __init__(self, log: DrivingLog) -> None:
         self._log = log
@@ -65,8 +65,9 @@ class MeasuredPoints:
         self._pending = 0
 
     def add(self, frame: int, rays: RecordedRays) -> NDArray[np.int64]:
-        """Take the points of the sweep of ``frame`` of the log; what each ray met, as of
-        :func:`bodies_of`."""
+        """Add the points of the sweep of ``frame``; returns the body of each ray, see
+        :func:`bodies_of`.
+        """
         body, places = bodies_of(self._log, frame, rays)
         near = rays.range < FAR
         for number, parts in enumerate(self._parts):
@@ -116,8 +117,10 @@ class MeasuredPoints:
 
 
 def bodies_of(log: DrivingLog, frame: int, rays: RecordedRays) -> tuple[NDArray[np.int64], Float]:
-    """What each ray of a sweep met, 0 for the background, else 1 + the track's index, -1 for the
-    recording vehicle itself; and where, in the frame of that [R, 3]."""
+    """Body of each ray of a sweep, and its points [R, 3] in that body's frame.
+
+    0 is the background, -1 the recording vehicle itself, otherwise 1 + the track's index.
+    """
     t_us, offset_us = int(log.frame_times_us[frame]), rays.lidar.beams.time_us
     world = np.asfortranarray(rays.points)
     body, places = np.zeros(len(world), np.int64), rays.points.copy()
@@ -176,9 +179,9 @@ def _filled(
 # rays. Reflectivity is fitted last.
 
 MAX_SWEEPS = 40
-"""That are learned from; every sweep gives points."""
+"""Maximum number of sweeps for learning; every sweep provides points."""
 STEPS = 60
-"""By default; each takes a part of the rays of one sweep."""
+"""Default number of steps; each uses a part of the rays of one sweep."""
 WITHOUT_LOOKS = InitialiseOptions(
     max_background=120_000,
     max_object=8_000,
@@ -194,21 +197,21 @@ WITHOUT_LOOKS = InitialiseOptions(
 )
 """Shapes alone, for where no beam measured anything: beams see no colours."""
 GONE = 0.02
-"""Gaussians of less opacity are left out in the end."""
+"""Gaussians with less opacity are removed at the end."""
 
 
 @dataclass(frozen=True)
 class SurfacesReport:
-    """What was made.
+    """Result of building surfaces.
 
     Attributes:
-        gaussians: of background and objects.
-        sweeps: learned from.
-        held_out: frames that were left aside.
-        known: share of the Gaussians that a recorded beam met.
-        incidence: share of reflected light that does not mind incidence.
-        cost: of the last rays, 0 where all light stops where the sweep measured, 1 where none.
-        intensity_residual: root mean square, of what the intensities leave unexplained.
+        gaussians: number in background and objects.
+        sweeps: number of sweeps for learning.
+        held_out: frames that were not used.
+        known: share of the Gaussians that a recorded beam hit.
+        incidence: share of reflected light that is independent of the incidence.
+        cost: of the last rays, 0 if all light stops at the measured return, 1 if none does.
+        intensity_residual: root mean square of the unexplained intensities.
         timing_s: seconds by stage.
     """
 
@@ -231,20 +234,20 @@ def fit_lidar_surfaces(
     steps: int = STEPS,
     on_progress: OnProgress | None = None,
 ) -> tuple[Scene, SurfacesReport]:
-    """The scene with a set for LiDARs made of ``log``, frames that it holds out left aside.
+    """Add Gaussians for LiDARs to a scene, fitted to ``log`` without its held-out frames.
 
     Args:
-        scene: made of ``log``.
+        scene: made from ``log``.
         log: with LiDAR sweeps.
-        surfaces: fills up what no beam measured: what ``initialise_scene`` makes of the same
-            frames. Training leaves it as ``initial.r2s`` in its folder. Made anew by default.
+        surfaces: fills the places that no beam measured: the result of ``initialise_scene`` on the
+            same frames. Training saves it as ``initial.r2s`` in its folder. Built by default.
         options: of the surfaces, see ``initialise_scene``; by default shapes alone.
         steps: of learning; each takes about a second of one core.
-        on_progress: called with the stage, steps done and steps in all.
+        on_progress: called with the stage, completed and total steps.
 
     Raises:
-        ReconstructError: the log has no sweeps or other objects, or ``surfaces`` may be of frames
-            held out.
+        ReconstructError: the log has no sweeps or other objects, or ``surfaces`` may come from
+            held-out frames.
         LogError: a file of the log cannot be read.
     """
     timing_s: dict[str, float] = {}
@@ -308,7 +311,7 @@ def held_out_of(scene: Scene) -> set[int]:
 
 
 def _check_objects(scene: Scene, surfaces: Scene) -> None:
-    """Objects are met by their number, so both must have the same."""
+    """Objects are matched by number, so both scenes must have the same."""
     of_scene, of_log = tuple(scene.objects), tuple(surfaces.objects)
     if of_scene != of_log:
         differ = sorted(set(of_scene) ^ set(of_log))[:5]

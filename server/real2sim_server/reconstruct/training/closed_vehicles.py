@@ -1,10 +1,9 @@
-"""Vehicles, closed where no image shows them.
+"""Close vehicles where no image shows them.
 
-The body that fits a vehicle's box stands, in its paint, wherever no image shows what was learnt.
-Where all images look along one direction, none tells how deep what they show lies: the tail of a
-vehicle that was followed is learnt as a cloud metres deep, and falls apart when the vehicle turns.
-Here that cloud is pressed along the viewing rays onto the body that fits the vehicle's box, which
-hardly changes an image.
+The body that fits a vehicle's box fills in, with its paint, where no image shows trained Gaussians.
+If all images look along one direction, they do not determine depth: the tail of a followed vehicle
+is learnt as a cloud metres deep and falls apart when the vehicle turns. This module projects that
+cloud along the viewing rays onto the body, with almost no change to the images.
 """
 
 from __future__ import annotations
@@ -35,19 +34,21 @@ from .visibility import (
 )
 
 ONE_DIRECTION = float(np.radians(5))
-"""Root mean square angle between viewing directions up to which they count as one."""
+"""Root mean square angle up to which viewing directions count as one direction."""
 KEPT_DEPTH = 0.05
-"""Of the depth about a surface so much stays, so that what lay in front still does."""
+"""Remaining fraction of the depth about a surface, so that the order in depth is preserved."""
 HIT = 0.07
 """A ray that passes a point of a surface this close hits it [m]."""
 LAYER = 0.15
 """Points of a surface at most so much deeper than the first one hit belong to it [m]."""
 EDGE_ON = 0.2
-"""Surfaces are followed up to this cosine between normal and ray, beyond it Gaussians stand up."""
+"""Gaussians follow the surface up to this cosine between normal and ray; beyond it they face the
+ray.
+"""
 THINNEST = 2e-3
-"""Least standard deviation of what was pressed [m]."""
+"""Minimum standard deviation of projected Gaussians [m]."""
 SHADOW = 0.3
-"""The ground plate on which shadows lie reaches so far beyond the box [m]."""
+"""The ground plate that carries shadows extends this far beyond the box [m]."""
 INSETS = (1.0, 0.96, 0.92, 0.87, 0.82)
 """A body may be this much narrower and lower, where images show it beyond a vehicle's outline."""
 DISC = (0.7, 0.7, 0.15)
@@ -62,13 +63,13 @@ def close_followed(
     viewpoints: Sequence[Viewpoint],
     bodies: Sequence[VehicleBody | None],
 ) -> list[bool]:
-    """Press what was followed onto its body, in place.
+    """Project followed vehicles onto their bodies, in place.
 
     Args:
-        bodies: of the objects; None where there is none.
+        bodies: of the objects; None for objects without a body.
 
     Returns:
-        Of which objects that was done.
+        Whether each object was projected.
     """
     seen = viewing_directions(model, viewpoints, objects_only=True)
     followed = []
@@ -83,11 +84,12 @@ def close_followed(
 def offer_bodies(
     model: SceneModel, followed: Sequence[bool], bodies: Sequence[VehicleBody | None]
 ) -> OfferedPriors:
-    """Bodies as the priors of all vehicles that have one, in the paint of stage 0.
+    """Bodies with the paint of stage 0, as priors for all vehicles that have a body.
 
     Args:
-        followed: by object, whether its outline alone says how wide it is: bodies come in INSETS.
-        bodies: of the objects; None where there is none.
+        followed: per object, whether only its outline determines its width; such bodies are offered
+            in several INSETS.
+        bodies: of the objects; None for objects without a body.
     """
     scene = model.scene
     reconstruction = scene.provenance.get("reconstruction")
@@ -102,7 +104,7 @@ def offer_bodies(
             alternatives.append(torch.arange(len(cloud) // len(insets)).repeat(len(insets)))
         else:
             alternatives.append(_no_choice(len(item.cloud)))
-    # Of a body's point one inset is taken; numbers tell the points of all objects apart.
+    # One inset is inserted per body point; the numbers are unique across objects.
     numbered = [a + (a >= 0) * (i << 32) for i, a in enumerate(alternatives)]
     return OfferedPriors(replace(scene, objects=objects), torch.cat(numbered))
 
@@ -163,7 +165,7 @@ def _followed_rows(model: SceneModel, seen: ViewingDirections, index: int) -> Te
 
 
 def _surface(body: VehicleBody, size: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-    """Points and normals [P, 3] of a body and of the ground on which it stands."""
+    """Points and normals [P, 3] of a body and of the ground under it."""
     length, width, height = size
     x, y = (
         np.arange(-0.5 * side - SHADOW, 0.5 * side + SHADOW, SPACING) for side in (length, width)
@@ -184,8 +186,8 @@ def _press(
 ) -> None:
     """Move Gaussians ``rows`` [M] along ``directions`` [M, 3] onto a surface, in place.
 
-    A shear along the rays brings what lies about the surface down to KEPT_DEPTH of its depth: seen
-    along the rays, centres and outlines stay where they are.
+    A shear along the rays reduces the depth about the surface to KEPT_DEPTH of its value. Seen
+    along the rays, centres and outlines stay in place.
     """
     gaussians = model.gaussians
     rays = normalize(directions, dim=-1).cpu()
@@ -214,11 +216,12 @@ def _press(
 
 
 def _hits(origins: Tensor, rays: Tensor, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Where lines through ``origins`` [M, 3] along unit ``rays`` first meet a surface of points.
+    """First intersection of lines through ``origins`` [M, 3] along unit ``rays`` with a point
+    surface.
 
     Returns:
         Distances [M] along the rays [m] and normals [M, 3] there, against the rays. Lines that miss
-        get the distance to where they pass closest, and the ray itself as normal.
+        get the distance of closest approach, and the ray itself as normal.
     """
     parts = [
         _hits_of(o, r, points, normals)
@@ -242,7 +245,7 @@ def _hits_of(
     normal, place = normalize(weight @ normals, dim=-1), weight @ points
     cosine = (normal * rays).sum(-1)
     on_plane = ((place - origins) * normal).sum(-1) / cosine.clamp(max=-EDGE_ON / 2)
-    # The plane through the points of a bend may lie far from them along a grazing ray.
+    # At a bend, the plane through the points can be far from them along a grazing ray.
     on_plane = torch.minimum(torch.maximum(on_plane, first - 2 * LAYER), first + 2 * LAYER)
     closest = torch.where(cosines > -EDGE_ON, aside, torch.inf).argmin(1, keepdim=True)
     meets = torch.isfinite(first)

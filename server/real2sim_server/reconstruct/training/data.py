@@ -1,4 +1,4 @@
-"""The images of a log as training sees them: split, shrunk, kept in memory, in a fixed order."""
+"""Training images of a log: split, downscaled, cached, in a fixed order."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from .schedule import TrainOptions
 NEAR, FAR = 0.5, 80.0
 """LiDAR depths outside are not compared [m]."""
 SKY_BORDER = 3.0
-"""Width of the edge of the sky in which it counts less [px]."""
+"""Width of the border of the sky mask with reduced weight [px]."""
 PREFETCH = 4
 """Images that are decoded ahead of the step that takes them."""
 
 
 def held_out_frames(frame_count: int, every: int) -> list[int]:
-    """Frames that training never sees: the third of every ``every``; none for ``every`` = 0.
+    """Frames excluded from training: the third of every ``every``; none for ``every`` = 0.
 
-    Neither the first nor the last frame of a drive is among them when ``every`` is 4 or more, so
-    that every one lies between two frames that are seen.
+    If ``every`` is 4 or more, neither the first nor the last frame of a drive is held out, so every
+    held-out frame is between two training frames.
     """
     if every == 0:
         return []
@@ -49,13 +49,13 @@ class TrainingView:
 
     Attributes:
         camera: at the size of ``image``.
-        frame: of the log.
-        t_us: when the image was taken [us].
+        frame: index in the log.
+        t_us: time of the image [us].
         image: [H, W, 3] float32 in [0, 1].
-        pixels: [M] int64, row-major pixels that LiDAR hit.
+        pixels: [M] int64, row-major pixels with a LiDAR return.
         depths: [M] float32 along the camera's z [m].
-        sky: [H, W] float32, 1 where the sky is seen, less near its edge and 0 elsewhere; None
-            without a loss that uses it.
+        sky: [H, W] float32, 1 in the sky, less near its border and 0 elsewhere; None if no loss
+            uses it.
     """
 
     camera: Camera
@@ -82,17 +82,17 @@ class _CachedImage:
 class TrainingViews:
     """The views of some frames of a log.
 
-    Decoded images are kept up to ``options.image_bytes``, the least recently used leave first.
+    Decoded images are cached up to ``options.image_bytes``; the least recently used are evicted.
 
     Args:
         log: with cameras.
         frames: indices into ``log``.
-        options: of training.
-        device: where views are given. On another device than the CPU they stay there, as bytes and
-            within ``options.image_bytes`` too, so that later epochs copy nothing.
+        options: training options.
+        device: of the returned views. A device other than the CPU caches the views as bytes, also
+            up to ``options.image_bytes``, so that later epochs copy nothing.
 
     Raises:
-        ReconstructError: nothing to see.
+        ReconstructError: no view is available.
     """
 
     def __init__(
@@ -133,9 +133,11 @@ class TrainingViews:
         return found
 
     def sample_viewpoints(self, count: int) -> list[tuple[Camera, int]]:
-        """At most ``count`` of :meth:`viewpoints`: of each camera its share, evenly over time.
+        """At most ``count`` of :meth:`viewpoints`, split among the cameras and evenly spread over
+        time.
 
-        What none of them shows counts as hidden, so gaps are kept as short as they can be.
+        Gaussians that none of them shows count as hidden, so the gaps in time are as short as
+        possible.
         """
         viewpoints, count = self.viewpoints(), min(count, len(self))
         by_camera = sorted(range(len(self)), key=lambda k: self._keys[k][0])
@@ -149,7 +151,7 @@ class TrainingViews:
         return int(rng.permutation(len(self))[place])
 
     def prefetch(self, iteration: int) -> None:
-        """Begin to read what the next iterations will ask for."""
+        """Start reading the images of the next iterations."""
         for ahead in range(1, PREFETCH + 1):
             index = self.index_at(iteration + ahead)
             if index not in self._cache and index not in self._pending:
@@ -166,7 +168,7 @@ class TrainingViews:
         return self._as_floats(self._bytes(index, divisor))
 
     def _on_device(self, index: int, divisor: int) -> TrainingView:
-        """The view on its device, copied there when it is first asked for."""
+        """The view on its device, copied there on first use."""
         key = (index, divisor)
         kept = self._resident.pop(key, None)
         if kept is None:
@@ -238,7 +240,7 @@ class TrainingViews:
         inside = (z > NEAR) & (z < FAR) & (u >= 0) & (u < camera.width)
         inside &= (v >= 0) & (v < camera.height)
         chosen = np.flatnonzero(inside)
-        # Points come sorted by angle; a stride that is prime to the beams spreads what is kept.
+        # Points are sorted by angle; a stride coprime to the number of beams spreads the selection.
         step = max(1, len(chosen) // self._options.depth_points) | 1
         return points[chosen[::step]].astype(np.float32)
 

@@ -21,10 +21,10 @@ EPSILON = 1e-15
 
 
 class SelectiveAdam:
-    """Adam (Kingma and Ba 2015) over named tensors whose first axis are rows.
+    """Adam (Kingma and Ba 2015) over named tensors with one row per Gaussian.
 
-    Rows that were not seen keep value and moments, so that a Gaussian does not drift while it is
-    out of view; the bias of young moments is corrected by the number of steps of all.
+    Unseen rows keep their value and moments, so a Gaussian does not drift while it is out of view.
+    The bias correction uses the global step count.
 
     Args:
         parameters: by name, float32, updated in place.
@@ -42,12 +42,12 @@ class SelectiveAdam:
         rates: Mapping[str, float | Tensor],
         seen: Mapping[str, Tensor],
     ) -> None:
-        """One step along the gradients held by ``parameters``.
+        """One step along the gradients of ``parameters``.
 
         Args:
-            parameters: those without a gradient are left alone.
-            rates: learning rate by name, one number or one for each column of a row.
-            seen: [rows] bool by name; all rows where a name is missing.
+            parameters: those without a gradient do not change.
+            rates: learning rate by name, one number or one per column.
+            seen: [rows] bool by name; all rows if a name is missing.
         """
         self.steps += 1
         for name, parameter in parameters.items():
@@ -88,7 +88,8 @@ class SelectiveAdam:
         )
 
     def gather(self, name: str, source: Tensor, fresh: Tensor) -> None:
-        """Follow a change of rows: new row i was row ``source[i]``; ``fresh`` rows start anew.
+        """Follow a change of rows: new row i was row ``source[i]``; ``fresh`` rows get zero
+        moments.
 
         Args:
             source: [M] int64.
@@ -105,13 +106,13 @@ class SelectiveAdam:
             moments[name][slice(None) if rows is None else rows] = 0
 
     def state(self) -> dict[str, Tensor]:
-        """Moments by ``first.<name>`` and ``second.<name>``; the tensors themselves."""
+        """Moments as ``first.<name>`` and ``second.<name>``, without copies."""
         return {f"first.{k}": v for k, v in self.first.items()} | {
             f"second.{k}": v for k, v in self.second.items()
         }
 
     def restore(self, state: Mapping[str, Tensor], steps: int) -> None:
-        """Take over what :meth:`state` gave after ``steps`` steps; what it lacks begins."""
+        """Restore the result of :meth:`state` after ``steps`` steps; missing moments are 0."""
         self.steps = steps
         self.first = {k: state.get(f"first.{k}", held) for k, held in self.first.items()}
         self.second = {k: state.get(f"second.{k}", held) for k, held in self.second.items()}
@@ -134,10 +135,10 @@ def _update_plain(views: list[Tensor], seen: Tensor, columns: Tensor, correction
 # by owner.
 
 SPLIT_SHRINK = 1.6
-"""By which the halves of a split Gaussian are smaller (Kerbl et al. 2023)."""
+"""Factor by which the halves of a split Gaussian are smaller (Kerbl et al. 2023)."""
 RESET_OPACITY = 0.01
 MAX_COPIES = 51
-"""More copies of one Gaussian are shared out as if there were so many."""
+"""Cap on the number of copies of one Gaussian when opacity is divided among them."""
 
 
 def step_generator(seed: int, iteration: int) -> np.random.Generator:
@@ -155,12 +156,12 @@ def refine(
     prune: Tensor,
     rng: np.random.Generator,
 ) -> Gaussians:
-    """Duplicate, split and prune at once (Kerbl et al. 2023); every tensor is gathered once.
+    """Duplicate, split and prune in one pass (Kerbl et al. 2023); every tensor is gathered once.
 
     Args:
-        duplicate: [N] bool, get a copy with moments of zero.
-        split: [N] bool, become two smaller ones, placed at random within the one.
-        prune: [N] bool, removed; none of them is in the others.
+        duplicate: [N] bool, get a copy with zero moments.
+        split: [N] bool, are replaced by two smaller ones at random positions within the original.
+        prune: [N] bool, are removed; disjoint from the other masks.
         rng: places the halves.
     """
     kept = (~prune & ~split).nonzero()[:, 0]
@@ -186,7 +187,7 @@ def _scatter(gaussians: Gaussians, halves: Tensor, rng: np.random.Generator) -> 
 
 @torch.no_grad()
 def prune(gaussians: Gaussians, optimizer: SelectiveAdam, mask: Tensor) -> Gaussians:
-    """Without the Gaussians of ``mask`` [N] bool."""
+    """Remove the Gaussians of ``mask`` [N] bool."""
     kept = (~mask).nonzero()[:, 0]
     return select_rows(gaussians, optimizer, kept, torch.zeros_like(kept, dtype=torch.bool))
 
@@ -201,15 +202,15 @@ def relocate(
     min_opacity: float,
     rng: np.random.Generator,
 ) -> Gaussians:
-    """Replace dead Gaussians by copies of live ones, drawn by opacity (Kheradmand et al. 2024).
+    """Replace dead Gaussians by copies of live ones, sampled by opacity (Kheradmand et al. 2024).
 
-    Copies look together like the one they were made from.
+    The copies of a Gaussian together look like the original.
 
     Args:
         dead: [N] bool.
-        count: of Gaussians afterwards; never fewer than live ones.
+        count: number of Gaussians afterwards; at least the number of live ones.
         min_opacity: of copies.
-        rng: draws which ones are copied.
+        rng: samples the Gaussians to copy.
     """
     live = (~dead).nonzero()[:, 0]
     if len(live) == 0:
@@ -230,7 +231,7 @@ def relocate(
 
 
 def sample_by_weight(weights: Tensor, count: int, rng: np.random.Generator) -> Tensor:
-    """``count`` indices [count] int64 drawn with probability proportional to ``weights`` [N]."""
+    """``count`` indices [count] int64, sampled with probability proportional to ``weights`` [N]."""
     sums = np.cumsum(weights.double().cpu().numpy())
     chosen = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
     return torch.from_numpy(np.minimum(chosen, len(sums) - 1)).to(weights.device)
@@ -265,14 +266,14 @@ def inject_noise(
     min_opacity: float,
     rng: np.random.Generator,
 ) -> None:
-    """Move the means by noise along each Gaussian's own shape, in place.
+    """Add noise along each Gaussian's shape to the means, in place.
 
     Kheradmand et al. 2024, eq. 8: the more transparent a Gaussian, the more it moves.
 
     Args:
         rate: learning rate of the means [m].
-        strength: of the noise, relative to that.
-        min_opacity: about which the noise ceases.
+        strength: of the noise, relative to the rate.
+        min_opacity: opacity around which the noise fades out.
     """
     drawn = rng.standard_normal((len(gaussians), 3), dtype=np.float32)
     noise = torch.from_numpy(drawn).to(gaussians.means.device)
@@ -286,7 +287,7 @@ def inject_noise(
 
 @torch.no_grad()
 def reset_opacity(gaussians: Gaussians, optimizer: SelectiveAdam) -> None:
-    """Lower all opacities to RESET_OPACITY in place, so that only what is needed comes back."""
+    """Lower all opacities to RESET_OPACITY in place, so that only the Gaussians in use recover."""
     limit = float(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     gaussians.logits.clamp_(max=limit)
     optimizer.reset_moments("logits")
@@ -324,17 +325,17 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 # the render and :meth:`Strategy.step_post_backward` after the optimiser's step.
 
 BOX_MARGIN = 1.15
-"""Objects' Gaussians may stick out of their boxes by this factor: mirrors, antennas, bad boxes."""
+"""Gaussians of objects may exceed their boxes by this factor: mirrors, antennas, inexact boxes."""
 
 
 @dataclass(frozen=True)
 class VisibilityLimits:
-    """Which Gaussians count as hidden: see :mod:`.visibility`.
+    """Limits of hidden Gaussians, see :mod:`.visibility`.
 
     Attributes:
-        fraction: visible fraction up to which all are.
-        occluded_fraction: visible fraction up to which those are that lie deep behind a surface.
-        occluded_depth: how deep that is [m].
+        fraction: all Gaussians up to this visible fraction are hidden.
+        occluded_fraction: visible fraction up to which Gaussians deep behind a surface are hidden.
+        occluded_depth: minimum depth behind the surface [m].
     """
 
     fraction: float = 0.005
@@ -344,31 +345,31 @@ class VisibilityLimits:
 
 @dataclass(frozen=True)
 class DensifyOptions:
-    """When and how Gaussians are added and removed.
+    """Schedule and limits for adding and removing Gaussians.
 
     Attributes:
         method: name of a strategy, see STRATEGIES.
-        start, stop: fraction of all iterations between which it happens.
-        every: iterations from one round to the next.
-        max_gaussians: never more than so many.
+        start, stop: range of the rounds, as fractions of all iterations.
+        every: iterations between rounds.
+        max_gaussians: maximum number.
         background_gradient: absgrad on the image above which background grows.
         object_gradient: plain gradient above which objects grow.
         split_scale: Gaussians larger than this are split, smaller ones duplicated [m].
-        min_opacity: below it Gaussians are removed, or moved by ``mcmc``.
+        min_opacity: Gaussians below it are removed, or moved by ``mcmc``.
         max_scale: larger ones near the drive are removed [m].
         reset_every: iterations between resets of opacity; 0 for never.
         noise: of ``mcmc``: factor on the learning rate of means.
-        growth: of ``mcmc``: fraction by which the number grows in a round.
+        growth: of ``mcmc``: relative growth of the number per round.
         hidden_rounds: fractions of all iterations at which hidden Gaussians are pruned.
-        prior_round: fraction of all iterations at which they are pruned once more, and priors of
-            stage 0 take their places; what stands before these closes up in the rest.
-        background_limits: of what counts as hidden in the background.
-        object_limits: likewise in objects.
-        last_background_limits: when priors take their places, besides, of what is no higher than
-            the objects: what lies metres behind all that images show of it was learnt through gaps
-            in them, and shows when one is deleted.
-        last_object_limits: likewise in objects; what a window shows of an object's inside is
-            hardly ever learnt well, and is better drawn as the window's colour.
+        prior_round: fraction of all iterations at which they are pruned again and replaced by
+            priors of stage 0; the surfaces in front close up in the remaining iterations.
+        background_limits: of hidden Gaussians in the background.
+        object_limits: of hidden Gaussians in objects.
+        last_background_limits: additional limits in the prior round, for background no higher than
+            the objects: Gaussians metres behind the visible surfaces were learnt through gaps in
+            them, and become visible when an object is deleted.
+        last_object_limits: the same in objects: an interior seen through a window is rarely learnt
+            well, and looks better in the window's colour.
     """
 
     method: str = "gradient"
@@ -400,11 +401,11 @@ class DensifyOptions:
 
 @dataclass(frozen=True, eq=False)
 class ScreenSums:
-    """What was visible on images since the last round.
+    """Visibility on images since the last round.
 
     Attributes:
         gradients: [N, 2] float32 sums, see ScreenStatistics.
-        views: [N] float32, in how many images each Gaussian was drawn.
+        views: [N] float32, number of images that each Gaussian was rendered in.
     """
 
     gradients: Tensor
@@ -416,7 +417,7 @@ class ScreenSums:
         return cls(torch.zeros(count, 2, device=device), torch.zeros(count, device=device))
 
     def add(self, rows: list[slice], screen: ScreenStatistics) -> None:
-        """Add one image; ``rows`` are those of each drawn instance."""
+        """Add one image; ``rows`` are those of each rendered instance."""
         for part, radii, gradients in zip(rows, screen.radii, screen.gradients, strict=True):
             self.gradients[part] += gradients
             self.views[part] += (radii > 0).any(0)
@@ -424,12 +425,12 @@ class ScreenSums:
 
 @dataclass(frozen=True, eq=False)
 class TrainingStep:
-    """A step that was taken.
+    """A finished step.
 
     Attributes:
         iteration: counted from 0.
-        rows: of the Gaussians of each drawn instance.
-        screen: where these were on the image, with gradients.
+        rows: of the Gaussians of each rendered instance.
+        screen: their positions on the image, with gradients.
         means_rate: learning rate of the means in this step [m].
     """
 
@@ -440,14 +441,14 @@ class TrainingStep:
 
 
 class Strategy:
-    """Leaves the set of Gaussians as it is; others add and remove.
+    """Base strategy: does not change the set of Gaussians; subclasses add and remove.
 
     Attributes:
-        state: what was visible since the last round; a part of checkpoints.
+        state: visibility since the last round; a part of checkpoints.
 
     Args:
-        options: see there.
-        half_sizes: [I, 3] half the sizes of the objects' boxes [m], where the Gaussians are.
+        options: see :class:`DensifyOptions`.
+        half_sizes: [I, 3] half the sizes of the objects' boxes [m], on the Gaussians' device.
         seed: of all noise, together with the iteration.
         iterations: of the whole training.
     """
@@ -467,10 +468,10 @@ class Strategy:
         self.state = ScreenSums.zeros(count, self._half_sizes.device)
 
     def step_pre_backward(self, output: RenderOutput) -> None:
-        """After the image of a step is drawn, before the loss is differentiated.
+        """Called after the image of a step is rendered, before the backward pass.
 
         Raises:
-            ReconstructError: the renderer keeps no screen statistics.
+            ReconstructError: the renderer has no screen statistics.
         """
         if output.screen is None:
             raise ReconstructError(
@@ -480,12 +481,14 @@ class Strategy:
     def step_post_backward(
         self, gaussians: Gaussians, optimizer: SelectiveAdam, step: TrainingStep
     ) -> Gaussians:
-        """The Gaussians after the optimiser's step; the moments in ``optimizer`` follow."""
+        """The Gaussians after the optimiser's step; the moments in ``optimizer`` are updated to
+        match.
+        """
         self.state.add(step.rows, step.screen)
         return gaussians
 
     def step_end(self, gaussians: Gaussians, optimizer: SelectiveAdam, iteration: int) -> None:
-        """Last in a step, in place, after hidden Gaussians were pruned; nothing by default."""
+        """Last call in a step, in place, after hidden Gaussians were pruned; nothing by default."""
 
     def _is_due(self, iteration: int) -> bool:
         """Whether a round of adding and removing follows the step ``iteration``."""

@@ -23,7 +23,7 @@ from . import kernels
 
 
 class Activated(NamedTuple):
-    """What is drawn of N Gaussians, by owner: background first, then object by object.
+    """Activated parameters of N Gaussians by owner: background first, then object by object.
 
     Attributes:
         scales: [n, 3] float32 [m].
@@ -46,17 +46,17 @@ def activated(
     counts: Sequence[int],
     functions: int,
 ) -> Activated:
-    """Scales, opacities and colours of all owners; they carry gradients.
+    """Scales, opacities and colours of all owners, with gradients.
 
     Args:
         log_scales: [N, 3] float32.
         logits: [N] float32 of opacities.
         sh: [N, J, 3] float32.
         fourier: [N - counts[0], F, 3] float32, time-varying part of the objects' constant colour.
-        tones: [M, F] float32, by which each object's Fourier part counts, without gradient; F of 0
-            leaves it out.
-        counts: Gaussians of each owner.
-        functions: K <= J, spherical harmonics that are kept.
+        tones: [M, F] float32, weights of each object's Fourier part, without gradient; F of 0
+            omits it.
+        counts: number of Gaussians of each owner.
+        functions: K <= J, number of spherical harmonics to use.
     """
     parts = (log_scales, logits, sh, fourier)
     if any(part.device.type != "cpu" for part in parts):
@@ -208,7 +208,7 @@ class Gaussians:
         return {name: getattr(self, name) for name in FIELDS}
 
     def rows(self, name: str, index: Tensor) -> Tensor:
-        """From rows [M] of Gaussians (sorted by owner) to rows of the tensor ``name``."""
+        """Map rows [M] of Gaussians (sorted by owner) to rows of the tensor ``name``."""
         return index[index >= self.counts[0]] - self.counts[0] if name in OBJECT_FIELDS else index
 
     def select(self, source: Tensor) -> Gaussians:
@@ -222,8 +222,9 @@ class Gaussians:
 
     @torch.no_grad()
     def normalise(self) -> None:
-        """Give all quaternions the length 1, which changes no rotation; those that have it keep
-        their bits."""
+        """Normalise all quaternions, which changes no rotation; unit quaternions stay
+        bit-identical.
+        """
         length = self.quats.norm(dim=-1, keepdim=True)
         unit = (length - 1).abs() < 1e-6
         self.quats.copy_(torch.where(unit, self.quats, self.quats / length))
@@ -231,14 +232,14 @@ class Gaussians:
     def clouds(
         self, *, degree: int, tones: Tensor | None = None, mirrored: tuple[bool, ...] = ()
     ) -> list[GaussianCloud]:
-        """Activated clouds of background and objects; they carry gradients.
+        """Activated clouds of background and objects, with gradients.
 
-        Their quaternions are of any length: every renderer normalises them.
+        Their quaternions are not normalised: every renderer normalises them.
 
         Args:
             degree: of the spherical harmonics.
-            tones: [M, F] basis values by which each object's Fourier part counts; None for none.
-            mirrored: objects to be reflected at their x z plane.
+            tones: [M, F] basis values, weights of each object's Fourier part; None for none.
+            mirrored: objects to reflect at their x z plane.
         """
         if tones is None:
             tones = self.fourier.new_zeros(len(self.counts) - 1, 0)
@@ -260,7 +261,7 @@ class Gaussians:
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> tuple[Gaussians, Tensor]:
-    """Both together, sorted by owner, and [N] bool: which of them are ``second``'s."""
+    """Both together, sorted by owner, and [N] bool: the Gaussians of ``second``."""
     fields = {}
     for name in FIELDS:
         start = 1 if name in OBJECT_FIELDS else 0
@@ -304,9 +305,9 @@ def from_scene(
 
     Args:
         sh_degree: of the spherical harmonics.
-        harmonics: F, basis functions of time-varying colours.
+        harmonics: F, number of basis functions of time-varying colours.
         initial_opacity: upper bound, so that all opacities can still learn.
-        device: where they are kept.
+        device: of the parameters.
     """
     clouds = [scene.background, *(o.cloud for o in scene.objects.values())]
     clouds = [c.with_sh_degree(sh_degree) for c in clouds]

@@ -13,9 +13,9 @@ from torch import Tensor
 from . import kernels
 
 FRAME_STEP = 0.1
-"""Second differences are given as for frames so far apart [s]."""
+"""Second differences are scaled to this frame interval [s]."""
 KEPT_QUANTILE = 0.95
-"""Fraction of LiDAR points that count; the rest are edges, reflections and moving things."""
+"""Fraction of LiDAR points in the loss; the rest are edges, reflections and moving objects."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,12 @@ class LossWeights:
     Attributes:
         ssim: fraction of 1 - SSIM in the photometric loss, the rest is L1 (Kerbl et al. 2023).
         depth: mean distance from LiDAR along the view [m] (drivestudio: 0.01).
-        sky: cross-entropy of accumulated opacity where the sky is seen (Street Gaussians: 0.05).
-        object_entropy: entropy of the objects' opacity inside their projected boxes, and what of
-            it lies outside (Street Gaussians: 0.1).
-        box: distance by which object Gaussians stick out of their box [m].
-        needle: excess of a Gaussian's longest over its second axis above ``needle_ratio``.
+        sky: cross-entropy of accumulated opacity in the sky (Street Gaussians: 0.05).
+        object_entropy: entropy of the objects' opacity inside their projected boxes, and their
+            opacity outside (Street Gaussians: 0.1).
+        box: distance of object Gaussians outside their box [m].
+        needle: excess of the ratio of a Gaussian's longest to its second axis over
+            ``needle_ratio``.
         needle_ratio: that ratio (drivestudio: 10).
         smooth: squared second differences of refined object poses [m, rad] (drivestudio: 0.01).
         opacity, scale: mean opacity and mean size [m] (MCMC, Kheradmand et al. 2024: 0.01).
@@ -103,7 +104,7 @@ def ssim(image: Tensor, truth: Tensor) -> float:
 
 
 def ssim_plain(image: Tensor, truth: Tensor) -> Tensor:
-    """The same in plain torch, on any device, differentiable by torch; [H, W, 3]."""
+    """Mean SSIM in plain torch, on any device, differentiable; images are [H, W, 3]."""
     window = torch.from_numpy(kernels.gaussian_window()).to(image)
     kernel = (window[:, None] * window)[None, None]
     x, y = (t.movedim(-1, 0)[:, None] for t in (image, truth))
@@ -182,14 +183,14 @@ def object_accumulation(alpha: Tensor, inside: Tensor) -> Tensor:
 
 
 def outside_box(means: Tensor, half_sizes: Tensor) -> Tensor:
-    """Mean over Gaussians of the distance [m] by which centres [N, 3] leave boxes [N, 3]."""
+    """Mean distance [m] of centres [N, 3] outside their boxes, half sizes [N, 3]."""
     if len(means) == 0:
         return means.sum()
     return (means.abs() - half_sizes).clamp(min=0).sum(-1).mean()
 
 
 def needles(log_scales: Tensor, ratio: float) -> Tensor:
-    """Mean excess of longest / second longest axis over ``ratio``; flat discs are welcome."""
+    """Mean excess of longest / second longest axis over ``ratio``; flat discs have none."""
     if len(log_scales) == 0:
         return log_scales.sum()
     low, high = log_scales.amin(-1), log_scales.amax(-1)
@@ -212,7 +213,7 @@ def second_differences(values: Tensor, times_s: NDArray[np.float64]) -> Tensor:
 
 
 def psnr_of(squared_error: float) -> float:
-    """[dB] of a mean squared error of values in [0, 1]; at most 100."""
+    """PSNR [dB] of a mean squared error of values in [0, 1]; at most 100."""
     return float(-10 * np.log10(max(squared_error, 1e-10)))
 
 

@@ -31,16 +31,16 @@ from .schedule import TrainOptions
 
 
 class ImageGains:
-    """Gains of the colours of every training image.
+    """Colour gains of every training image.
 
     Attributes:
-        logarithms: [cameras * K, 3] natural logarithms of the gains of red, green and blue, 0 at
-            first; by camera, in the order of the times.
+        logarithms: [cameras * K, 3] natural logarithms of the gains of red, green and blue,
+            initially 0; camera by camera, in time order.
 
     Args:
-        cameras: how many there are.
-        times_us: [K] int64 times of training images, in order.
-        device: where they lie.
+        cameras: number of cameras.
+        times_us: [K] int64 times of training images, increasing.
+        device: of the gains.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class ImageGains:
         self.logarithms = torch.zeros(rows, 3, device=device, requires_grad=True)
 
     def at(self, camera: int, t_us: int) -> Tensor:
-        """Gains [3] of a camera at a time, between images in between; they carry gradients."""
+        """Gains [3] of a camera at a time, interpolated between images, with gradients."""
         times, count = self._times_us, len(self._times_us)
         after = min(int(np.searchsorted(times, t_us)), count - 1)
         before = after if times[after] <= t_us else max(after - 1, 0)
@@ -74,7 +74,7 @@ class KeyPoses:
 
     Attributes:
         times_us: [T] int64 key times [us].
-        positions, quaternions: [T, 3] and [T, 4] float64 of the boxes as given.
+        positions, quaternions: [T, 3] and [T, 4] float64 of the input boxes.
         first_row: of this object in the packed corrections.
     """
 
@@ -93,7 +93,7 @@ class KeyPoses:
         return bool(self.times_us[0] <= t_us <= self.times_us[-1])
 
     def bracket(self, t_us: int) -> tuple[int, int, float]:
-        """Keys before and after ``t_us`` and the fraction of the way between them."""
+        """Keys before and after ``t_us`` and the interpolation fraction between them."""
         after = int(np.searchsorted(self.times_us, t_us, side="left"))
         if self.times_us[after] == t_us:
             return after, after, 0.0
@@ -105,16 +105,17 @@ class KeyPoses:
 class ObjectPoses:
     """Poses of all objects with their corrections.
 
-    At a key time ``T_world_object = T_given [Rz(yaw) Ry(pitch) Rx(roll) | shift]``; in between
-    positions and corrections are linear and rotations slerped, as in Trajectory. Boxes are mostly
-    labelled upright, while roads are steep and vehicles pitch when they brake.
+    At a key time ``T_world_object = T_given [Rz(yaw) Ry(pitch) Rx(roll) | shift]``. In between,
+    positions and corrections are linear and rotations slerped, as in Trajectory. Roll and pitch are
+    needed because boxes are mostly labelled upright, while roads are steep and vehicles pitch when
+    they brake.
 
     Args:
-        scene: its trajectories are where refinement starts.
-        key_times_us: [K] times of training frames: only there do images correct a pose, so
-            other times between the first and last pose of a track lean on their neighbours.
-            None keeps every pose of the trajectories as it is.
-        device: where corrections lie, and poses with them.
+        scene: its trajectories are the initial poses.
+        key_times_us: [K] times of training frames. Images correct a pose only at these times;
+            other times between the first and last pose of a track are interpolated from their
+            neighbours. None keeps every pose of the trajectories.
+        device: of corrections and poses.
     """
 
     def __init__(
@@ -139,8 +140,9 @@ class ObjectPoses:
         self.tilts = torch.zeros(row, 2, device=device, requires_grad=True)
 
     def at(self, t_us: int) -> tuple[list[int], Tensor]:
-        """Indices of the objects that exist at ``t_us``, K of them, and their ``T_world_object``
-        [K, 4, 4] float64, which carry gradients."""
+        """Indices of the K objects that exist at ``t_us``, and their ``T_world_object`` [K, 4, 4]
+        float64, with gradients.
+        """
         present = [index for index, key in enumerate(self.keys) if key.covers(t_us)]
         if not present:
             return [], torch.zeros(0, 4, 4, dtype=torch.float64, device=self.shifts.device)
@@ -236,13 +238,13 @@ SYMMETRIC_CATEGORIES = ("car", "truck", "van", "bus")
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """A view drawn from the model.
+    """A rendered view of the model.
 
     Attributes:
-        output: images of one camera; carries gradients.
-        rgb: [H, W, 3], as the camera exposes it.
-        drawn: indices of the trained instances drawn: 0 for the background, then 1 + object;
-            those of priors come behind them.
+        output: images of one camera, with gradients.
+        rgb: [H, W, 3], with the camera's exposure.
+        drawn: indices of the rendered trained instances: 0 for the background, then 1 + object;
+            instances of priors follow.
     """
 
     output: RenderOutput
@@ -254,14 +256,14 @@ class SceneModel:
     """Trainable parameters of a scene.
 
     Attributes:
-        device: where parameters lie: that of the renderer, so that no step moves them.
-        mirrored: by object, whether training shows its other side now and then.
-        priors: Gaussians that are drawn too but do not learn; None for none.
+        device: of the parameters and the renderer, so that no step moves them.
+        mirrored: per object, whether training sometimes shows its mirrored side.
+        priors: Gaussians that are rendered but not trained; None for none.
 
     Args:
-        scene: of stage 0; its cameras, ego path, boxes and times stay as they are.
-        options: of training.
-        key_times_us: [K] int64, times of training images, at which boxes may be refined.
+        scene: of stage 0; its cameras, ego path, boxes and times do not change.
+        options: training options.
+        key_times_us: [K] int64, times of training images, at which boxes can be refined.
         backend: of the renderer.
     """
 
@@ -298,7 +300,7 @@ class SceneModel:
         self.half_sizes = torch.from_numpy(np.array(half).reshape(-1, 3)).float().to(self.device)
 
     def stop_mirroring(self) -> None:
-        """From now on no image of a vehicle's other side counts as seen or teaches anything."""
+        """Stop using images of a vehicle as evidence for its mirrored side."""
         self.mirrored = tuple(False for _ in self.mirrored)
 
     def parameters(self) -> dict[str, Tensor]:
@@ -336,12 +338,12 @@ class SceneModel:
         mirrored: tuple[bool, ...] = (),
         depth: bool = False,
     ) -> RenderedView:
-        """Draw ``camera``, of the rig at any size, on the recording vehicle at ``t_us``.
+        """Render ``camera``, of the rig at any size, on the recording vehicle at ``t_us``.
 
         Args:
             degree: of the spherical harmonics; the highest by default.
-            mirrored: by object, whether its other side is shown.
-            depth: whether depth is drawn.
+            mirrored: per object, whether to show its mirrored side.
+            depth: whether to render depth.
         """
         degree = self.options.sh_degree if degree is None else degree
         clouds = self.gaussians.clouds(degree=degree, tones=self._tones(t_us), mirrored=mirrored)
@@ -365,7 +367,7 @@ class SceneModel:
         return RenderedView(output, self.exposed(output.rgb[0], camera, t_us), tuple(drawn))
 
     def exposed(self, rgb: Tensor, camera: Camera, t_us: int) -> Tensor:
-        """Colours as a camera records them at a time, as far as that is learnt."""
+        """Apply the learnt exposure of a camera at a time to colours."""
         index, rates = self.scene.rig.names.index(camera.name), self.options.learning_rates
         if rates.exposure > 0:
             affine = self.exposure[index]
@@ -373,7 +375,7 @@ class SceneModel:
         return rgb * self.gains.at(index, t_us) if rates.image_exposure > 0 else rgb
 
     def objects_alpha(self, camera: Camera, t_us: int) -> Tensor:
-        """[H, W] accumulated opacity of the objects alone; carries gradients."""
+        """[H, W] accumulated opacity of the objects alone, with gradients."""
         clouds = self.gaussians.clouds(degree=0)
         instances, _ = self.instances(clouds, t_us)
         output = rasterize(
@@ -389,7 +391,7 @@ class SceneModel:
         return output.alpha[0]
 
     def instances(self, clouds: list[GaussianCloud], t_us: int) -> tuple[list[Instance], list[int]]:
-        """Clouds of background and objects where they are at ``t_us``, and which are there."""
+        """Clouds of background and objects at their poses at ``t_us``, and their indices."""
         instances, drawn = [Instance(clouds[0])], [0]
         there, poses = self.poses.at(t_us)
         for index, pose in zip(there, poses.unbind(), strict=True):
@@ -420,10 +422,10 @@ class SceneModel:
         return _small_motion(change) @ viewmat.to(self.device)
 
     def export(self, **provenance: Any) -> Scene:
-        """The scene as it is now with its priors, immutable, on its own memory.
+        """The current scene with its priors, immutable, in separate memory.
 
-        It shows what the model shows, to the last bit where boxes are as they were given, else to
-        the rounding of their poses. For that the model's own quaternions are made unit ones.
+        It renders like the model: bit for bit where boxes are unchanged, otherwise up to the
+        rounding of their poses. For this, the model's own quaternions are normalised.
         """
         self.gaussians.normalise()
         gaussians = self.gaussians

@@ -36,15 +36,15 @@ PRIORS_OF_VERSION_3 = "guesses."
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Everything that a run needs to go on as if it had never stopped.
+    """Everything needed to resume a run without a difference in the result.
 
     Attributes:
-        iteration: steps done.
+        iteration: completed steps.
         counts: Gaussians of the background and of each object.
-        prior_counts: likewise of the priors; empty as long as there are none.
+        prior_counts: the same for priors; empty before they are inserted.
         optimizer_steps: of the optimiser.
         options: of training, JSON values.
-        log_name: of the log it learns from.
+        log_name: of the training log.
         running: smoothed figures for progress.
         tensors: parameters and moments by name.
     """
@@ -60,7 +60,7 @@ class Checkpoint:
 
 
 def write_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
-    """Write ``checkpoint``; ``folder`` is replaced whole or not at all.
+    """Write ``checkpoint`` to ``folder``, which is replaced atomically.
 
     Raises:
         OSError: it cannot be written.
@@ -126,7 +126,7 @@ def _upgraded_name(tensor: str) -> str:
 
 
 class MetricsFile:
-    """Appends to ``path``; lines are whole, so that others may read along.
+    """Appends whole lines to ``path``, so that other programs can read it at any time.
 
     Raises:
         OSError: the file cannot be written.
@@ -142,14 +142,14 @@ class MetricsFile:
             file.write(json.dumps(figures) + "\n")
 
     def read(self) -> list[dict[str, Any]]:
-        """All whole lines; what a kill cut off is left out."""
+        """All complete lines; a line truncated by a kill is dropped."""
         if not self.path.exists():
             return []
         lines = self.path.read_text(encoding="ascii").split("\n")[:-1]
         return [json.loads(line) for line in lines]
 
     def cut(self, iteration: int) -> None:
-        """Drop what came after ``iteration``, as a resumed run writes it again."""
+        """Drop lines after ``iteration``; a resumed run writes them again."""
         kept = [line for line in self.read() if line["iteration"] <= iteration]
         temporary = self.path.with_name(f".{self.path.name}.tmp")
         temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="ascii")
@@ -164,14 +164,14 @@ SMOOTHING = 0.98
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """How far a training run is.
+    """Progress of a training run.
 
     Attributes:
-        iteration, iterations: steps done and in all.
-        rate: steps per second of late.
+        iteration, iterations: completed and total steps.
+        rate: recent steps per second.
         loss, psnr: smoothed over training images; PSNR in [dB].
-        gaussians: at the moment.
-        eta_s: seconds that are left at this rate.
+        gaussians: current number.
+        eta_s: remaining seconds at this rate.
     """
 
     iteration: int
@@ -208,7 +208,7 @@ class RunningMeans:
 
     @property
     def psnr(self) -> float:
-        """Of the smoothed squared error [dB]."""
+        """PSNR of the smoothed squared error [dB]."""
         return psnr_of(self.squared / max(self.weight, 1e-9))
 
 
@@ -219,7 +219,7 @@ class RateMeter:
         self._iteration, self._time = iteration, time.perf_counter()
 
     def rate(self, iteration: int) -> float:
-        """Of the steps up to ``iteration``."""
+        """Recent steps per second, up to ``iteration``."""
         now = time.perf_counter()
         rate = max(iteration - self._iteration, 1) / max(now - self._time, 1e-6)
         self._iteration, self._time = iteration, now

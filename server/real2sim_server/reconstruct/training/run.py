@@ -42,11 +42,11 @@ from .trainer import CHECKPOINT, Trainer
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Run small torch operations on the calling thread; compiled loops keep all cores.
+    """Run small torch operations on the calling thread; compiled loops still use all cores.
 
-    A step has hundreds of operations of some microseconds each. Where another program wants the
-    cores as well, torch's threads wait for each other at every one of them: six times slower,
-    measured with two cores and three busy programs.
+    A step has hundreds of operations of a few microseconds each. If other programs compete for the
+    cores, torch's threads wait for each other at every operation: six times slower, measured with
+    two cores and three busy programs.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -61,7 +61,7 @@ def one_torch_thread() -> Iterator[None]:
 ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
 """What vehicles usually do: standard deviations [m/s^2] and [rad/s^2]."""
 MIN_NOISE, MIN_YAW_NOISE = 0.02, 0.005
-"""Boxes that scatter less are left as they are [m], [rad]."""
+"""Boxes with less noise do not change [m], [rad]."""
 MIN_POSES = 5
 
 
@@ -90,11 +90,11 @@ def with_box_noise(log: DrivingLog, fraction: float, *, seed: int = 0) -> Drivin
 
 
 def smoothed_boxes(log: DrivingLog) -> DrivingLog:
-    """``log`` with the scatter of its boxes taken out, as far as vehicles cannot move like that.
+    """``log`` without the noise in its boxes that vehicles cannot follow.
 
-    The variance of second differences shows how much boxes scatter; where that is more than
-    driving explains, positions and headings are smoothed with the weight that follows from both
-    (Whittaker 1923). Boxes that do not scatter stay as they are, to the bit.
+    The variance of second differences measures the noise. If it exceeds normal driving, positions
+    and headings are smoothed with the weight that follows from both (Whittaker 1923). Boxes without
+    noise stay bit-identical.
     """
     return replace(log, tracks=tuple(_smoothed(track) for track in log.tracks))
 
@@ -113,13 +113,13 @@ def _smoothed(track: ObjectTrack) -> ObjectTrack:
 
 
 def _whittaker(values: Float, driving: float, least: float) -> Float:
-    """``values`` [T, D] smoothed; themselves where they scatter by less than ``least``.
+    """``values`` [T, D] smoothed; unchanged if their noise is below ``least``.
 
     Args:
-        driving: standard deviation of second differences without any scatter.
+        driving: standard deviation of second differences without noise.
     """
     second = np.diff(values, n=2, axis=0)
-    # Robust against the few steps at which a driver brakes hard.
+    # Robust to the few steps with hard braking.
     deviation = 1.4826 * np.median(np.abs(second), axis=0)
     variance = max(0.0, float((deviation**2).mean()) - driving**2) / 6
     if variance < least**2:
@@ -139,18 +139,18 @@ def _with_poses(track: ObjectTrack, positions: Float, yaws: Float) -> ObjectTrac
 # Held-out score.
 
 MIN_PIXELS = 50
-"""Views in which moving objects cover fewer pixels do not count for them."""
+"""Views in which moving objects cover fewer pixels are not scored for objects."""
 
 
 @dataclass(frozen=True)
 class HeldOutScore:
-    """Means over held-out views; nan where there are none.
+    """Means over held-out views; nan if there are none.
 
     Attributes:
         psnr: over all pixels [dB].
         ssim: mean structural similarity.
         psnr_objects: over the projected boxes of moving objects [dB].
-        views: how many.
+        views: number of views.
     """
 
     psnr: float
@@ -163,10 +163,10 @@ class HeldOutScore:
 def score_held_out(
     model: SceneModel, log: DrivingLog, options: TrainOptions, *, limit: int | None = None
 ) -> HeldOutScore:
-    """Compare the held-out images of ``log`` with what ``model`` shows.
+    """Compare the held-out images of ``log`` with renderings of ``model``.
 
     Args:
-        limit: at most so many frames, evenly spread; all by default.
+        limit: maximum number of frames, evenly spread; all by default.
 
     Raises:
         LogError: an image cannot be read.
@@ -212,13 +212,13 @@ PREVIEWS = "previews"
 
 @dataclass(frozen=True, eq=False)
 class TrainResult:
-    """What training made.
+    """Result of training.
 
     Attributes:
-        scene: trained, not written anywhere yet.
+        scene: trained, not yet saved.
         score: over the held-out frames.
-        seconds: of the steps taken in this run.
-        steps: taken in this run; fewer than all where it was resumed.
+        seconds: duration of the steps in this run.
+        steps: number of steps in this run; fewer than in total if it was resumed.
         stage_s: seconds of these by stage.
     """
 
@@ -242,22 +242,22 @@ def train(
 ) -> TrainResult:
     """Train a scene on ``log``.
 
-    Held-out frames are kept from stage 0 as well: neither their images nor their sweeps are read
+    Stage 0 does not use the held-out frames either: neither their images nor their sweeps are read
     before the end.
 
     Args:
         options: of stage 0 and of training.
         folder: for the first scene, checkpoints, metrics and preview pictures.
-        resume: go on from the checkpoint in ``folder``; the result is the same, bit for bit on
-            the CPU, as without a break.
+        resume: continue from the checkpoint in ``folder``. On the CPU the result is bit for bit
+            the same as without an interruption.
         backend: of the renderer.
-        on_progress: called with the stage, steps done and steps in all.
+        on_progress: called with the stage, completed and total steps.
         on_training: called with figures every ``options.log_every`` steps.
         timing_s: filled with the seconds of each stage.
 
     Raises:
         ReconstructError: the log has nothing to train on, or there is nothing to resume.
-        LogError: a file of the log is missing or broken; said before anything is built.
+        LogError: a file of the log is missing or broken; raised before anything is built.
     """
     timing_s = {} if timing_s is None else timing_s
     stages = Stages(on_progress, timing_s)
@@ -317,7 +317,7 @@ def _first_scene(
     scene = initialise_scene(
         seen, options=options.initialise, on_progress=on_progress, timing_s=timing_s
     )
-    # Whoever takes these surfaces can tell what they did not see.
+    # Users of these surfaces can look up the frames that were held out.
     made = {**scene.provenance["reconstruction"]}
     made["held_out_frames"] = held_out_frames(log.frame_count, options.hold_out)
     provenance = {**scene.provenance, "reconstruction": made}
@@ -348,7 +348,7 @@ def _combined(
 def _previewer(
     log: DrivingLog, options: TrainOptions, folder: Path
 ) -> Callable[[SceneModel, int], None]:
-    """Writes the image of a held-out frame above what the model shows, camera beside camera."""
+    """Writes the image of a held-out frame above the rendering of the model, camera by camera."""
     frames = held_out_frames(log.frame_count, options.hold_out) or [log.frame_count // 2]
     views = TrainingViews(log, [frames[len(frames) // 2]], options)
 

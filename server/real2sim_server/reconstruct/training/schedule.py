@@ -17,18 +17,18 @@ from .losses import LossWeights
 
 @dataclass(frozen=True)
 class DirectionOptions:
-    """What becomes of objects where training images look from one side alone.
+    """Treatment of objects that training images show from one side only.
 
     Attributes:
-        lobe_prior: variance of the directions at which objects keep half of a colour that depends
-            on the direction; 0 leaves colours as they were learnt.
-        paint: whether sides of vehicles that images show only edge on have the colours of
-            initialisation from ahead; what images show of them stays.
-        sides: whether sides of vehicles that images show only edge on are taken from
-            initialisation: right for edits, but recorded views lose by it.
-        close: whether vehicles that images show from one direction alone become closed bodies:
-            what was learnt is laid on the body's surface, the body stands behind it.
-        views: that are asked.
+        lobe_prior: variance of the directions at which objects keep half of a direction-dependent
+            colour; 0 keeps the learnt colours.
+        paint: whether vehicle sides that images show only edge on get the frontal colours of
+            initialisation; the colours visible in the images stay.
+        sides: whether vehicle sides that images show only edge on come from initialisation. This
+            improves edits and degrades recorded views.
+        close: whether vehicles that images show from one direction only are closed: the learnt
+            Gaussians are projected onto the body's surface, with the body behind them.
+        views: number of views to examine.
     """
 
     lobe_prior: float = 0.03
@@ -43,25 +43,27 @@ class DirectionOptions:
 COLOUR_BASES = ("cosine", "real_dft")
 HIGHER_HARMONICS_RATE = 1 / 20
 FINE_START = 0.55
-"""Fraction of the iterations from which images wider than a preset's own are shown whole."""
+"""Fraction of the iterations after which images wider than the preset's width are used at full
+size.
+"""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes; pairs decay exponentially from the first to the second value.
+    """Adam's learning rates; pairs decay exponentially from the first to the second value.
 
     Attributes:
-        means: [m] a step.
-        scales, quats, opacities: of logarithms, raw quaternions and logits.
-        colour: of the constant part; the rest of the spherical harmonics takes 1/20 of it.
+        means: [m] per step.
+        scales, quats, opacities: for logarithms, raw quaternions and logits.
+        colour: of the constant part; the rest of the spherical harmonics gets 1/20 of it.
         fourier: of the time-varying colour.
         sky: of the cube map.
         pose_translation: of object boxes [m].
         pose_yaw: of object boxes [rad].
         pose_tilt: of their roll and pitch [rad].
-        camera: of camera poses [m, rad]; 0 leaves them as calibrated.
-        exposure: of each camera's affine colour; 0 leaves colours as they are.
-        image_exposure: of the gains of each image; 0 leaves them at 1.
+        camera: of camera poses [m, rad]; 0 keeps the calibration.
+        exposure: of each camera's affine colour; 0 disables it.
+        image_exposure: of the gains of each image; 0 keeps them at 1.
 
     Sources: Kerbl et al. 2023; Street Gaussians (poses, sky); drivestudio (cameras).
     """
@@ -83,36 +85,36 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Everything a training run depends on besides the log; the same values give the same scene.
+    """All settings of a training run; the same log and values give the same scene.
 
     Attributes:
         iterations: steps, one image each.
-        seed: of the order of images and all noise.
+        seed: for the order of images and all noise.
         width: of the training images [px]; None for the logged width. Never above ``max_width``.
         max_width: largest width of training images [px].
         coarse: (fraction of iterations, divisor of the width) stages before full size.
-        scales: divisors of the width that take turns after them; (1, 2, 2) keeps a scene sharp at
-            full size and true at half of it.
+        scales: divisors of the width to cycle through after these stages; (1, 2, 2) keeps a scene
+            sharp at full size and accurate at half of it.
         sh_degree: highest degree of the spherical harmonics.
-        sh_every: fraction of the iterations after which the degree grows by one.
-        harmonics: time-varying colours of objects, number of basis functions; 0 for none.
+        sh_every: fraction of the iterations after which the degree increases by one.
+        harmonics: number of basis functions of objects' time-varying colours; 0 for none.
         harmonics_basis: ``cosine`` (half periods) or ``real_dft``.
-        hold_out: every so many frames one is kept back for evaluation; 0 trains on all.
-        refine_poses: whether object boxes are refined.
-        pose_start: fraction of the iterations before which boxes stay.
-        mirror: fraction of steps at which vehicles are shown mirrored about their long axis.
+        hold_out: hold out every Nth frame for evaluation; 0 trains on all.
+        refine_poses: whether to refine object boxes.
+        pose_start: fraction of the iterations before which boxes are fixed.
+        mirror: fraction of steps that show vehicles mirrored about their long axis.
         initial_opacity: of Gaussians from LiDAR.
-        sky_resolution: edge of a face of the sky [px].
-        depth_points: LiDAR points that count in one step, at most.
-        regularise_every: steps between those with the costly object terms.
+        sky_resolution: edge length of a face of the sky [px].
+        depth_points: maximum number of LiDAR points per step.
+        regularise_every: interval of the steps with the costly object terms.
         image_bytes: memory for decoded images.
         log_every, preview_every, checkpoint_every: iterations between lines of metrics, preview
             pictures and checkpoints; 0 for none but the last.
-        initialise: of stage 0.
-        learning_rates, losses, densify, directions: see there.
+        initialise: options of stage 0.
+        learning_rates, losses, densify, directions: see their classes.
 
     Raises:
-        ReconstructError: for a value out of range.
+        ReconstructError: a value is out of range.
     """
 
     iterations: int = 30_000
@@ -167,7 +169,7 @@ class TrainOptions:
         return min(self.sh_degree, iteration // step)
 
     def divisor(self, iteration: int) -> int:
-        """By which the image width is divided at ``iteration``."""
+        """Divisor of the image width at ``iteration``."""
         fraction = iteration / self.iterations
         for until, divisor in self.coarse:
             if fraction < until:
@@ -227,11 +229,11 @@ PRESETS: dict[str, TrainOptions] = {
 
 
 def at_width(options: TrainOptions, width: int) -> TrainOptions:
-    """``options`` for images of ``width`` [px], coarse to fine where these are wider than its own.
+    """``options`` for images of ``width`` [px], coarse to fine if they are wider than the preset's.
 
-    Stages before the last are then at the widths that they had, so that most steps cost what they
-    did; in the last, one image at full size takes turns with two at a part of it, or what was
-    trained would be too sharp for smaller images.
+    Earlier stages keep their image widths, so most steps cost the same. In the last stage, one
+    image at full size alternates with two downscaled images; otherwise the scene would be too sharp
+    for smaller images.
     """
     part = -(-width // options.max_width)
     if part > 1:
@@ -252,7 +254,7 @@ def preset(name: str, **changes: Any) -> TrainOptions:
 
 
 def exponential_decay(span: tuple[float, float], fraction: float) -> float:
-    """From the first to the second value of ``span`` as ``fraction`` goes from 0 to 1."""
+    """Interpolate between the values of ``span`` as ``fraction`` goes from 0 to 1."""
     first, last = span
     return float(first * (last / first) ** min(max(fraction, 0.0), 1.0)) if first > 0 else 0.0
 
@@ -260,10 +262,10 @@ def exponential_decay(span: tuple[float, float], fraction: float) -> float:
 def learning_rates_at(
     options: TrainOptions, fraction: float, *, functions: int
 ) -> dict[str, float | Tensor]:
-    """Step sizes by name of parameter after ``fraction`` of the iterations.
+    """Learning rates by parameter name after ``fraction`` of the iterations.
 
     Args:
-        functions: number of spherical harmonics, whose rates differ.
+        functions: number of spherical harmonics, which have different rates.
     """
     rates = options.learning_rates
     columns = torch.full((functions, 3), rates.colour * HIGHER_HARMONICS_RATE)
@@ -292,7 +294,7 @@ def from_values(kind: type, values: dict[str, Any]) -> Any:
     for item in fields(kind):
         default = getattr(kind(), item.name)
         if item.name not in values:
-            # A run of a release before did not know of it.
+            # Absent in runs of earlier releases.
             continue
         value = values[item.name]
         if is_dataclass(default):

@@ -55,9 +55,9 @@ class Trainer:
 
     Args:
         log: the drive, all frames.
-        scene: of stage 0, made without the held-out frames.
+        scene: of stage 0, built without the held-out frames.
         options: of training.
-        folder: for checkpoints and metrics; None keeps nothing.
+        folder: for checkpoints and metrics; None writes nothing.
         backend: of the renderer.
     """
 
@@ -125,7 +125,7 @@ class Trainer:
                 self.save()
 
     def step(self) -> dict[str, float]:
-        """One iteration; the terms of its loss."""
+        """Run one iteration; returns the terms of its loss."""
         i = self.iteration
         timed = StepTimer(self.running.stages)
         with timed("data"):
@@ -245,7 +245,8 @@ class Trainer:
         fraction = self.iteration / self.options.iterations
         rates = learning_rates_at(self.options, fraction, functions=int(gaussians.sh.shape[1]))
         self.optimizer.step(parameters, rates, masks)
-        # A colour no surface has would make up for another one before it, and show when that goes.
+        # A colour outside the gamut would compensate for a Gaussian in front of it, and show once
+        # that Gaussian is gone.
         gaussians.sh[:, 0].clamp_(*CONSTANT_SH)
         # A sky beyond white could be trained, but neither written nor seen.
         self.model.sky.clamp_(0, 1)
@@ -267,7 +268,7 @@ class Trainer:
         self._settle_colours(step.iteration + 1)
 
     def _settle_colours(self, done: int) -> None:
-        """After the last step: objects' colours in directions from which none shows them."""
+        """After the last step: fix objects' colours in directions without views."""
         options = self.options.directions
         if done != self.options.iterations or not self.model.scene.objects:
             return
@@ -297,7 +298,7 @@ class Trainer:
             on_progress(progress)
 
     def save(self) -> None:
-        """Write a checkpoint, when there is a folder for it."""
+        """Write a checkpoint if there is a folder."""
         if self.folder is None:
             return
         tensors = {f"model.{k}": v for k, v in self.model.parameters().items()}
@@ -321,10 +322,10 @@ class Trainer:
         write_checkpoint(checkpoint, self.folder / CHECKPOINT)
 
     def resume(self) -> None:
-        """Go back to the last checkpoint in the folder.
+        """Restore the last checkpoint in the folder.
 
         Raises:
-            ReconstructError: there is none, or it is of another log or other options.
+            ReconstructError: there is none, or it belongs to another log or other options.
         """
         if self.folder is None:
             raise ReconstructError("a run without a folder leaves no checkpoint to resume")

@@ -23,30 +23,31 @@ from .model import SceneModel
 #
 # A Gaussian behind a surface gets gradients only through thin gaps in that surface, and Adam takes
 # full steps along them: the Gaussian becomes a floater that a turned or moved object reveals.
-# Floaters are barely visible and lie deep behind the surface; the layers of a surface are each
-# barely visible as well, but close together. Floaters are pruned, and the priors of stage 0 for
-# unobserved places (mirrored sides, body colours, ground under cars) replace them while the
-# surfaces in front finish learning and close up.
+# Floaters are barely visible and far behind the surface. The layers of a surface are also barely
+# visible, but close together. Floaters are pruned. The priors of stage 0 for unobserved places
+# (mirrored sides, body colours, ground under cars) replace them while the surfaces in front finish
+# learning and close up.
 
 NEAR = 0.2
 """Gaussians nearer to the camera are not counted [m]."""
 FAINT_LOGIT = -3.0
-"""Logit of an opacity that occludes next to nothing and is well above what blending skips."""
+"""Logit of an opacity that occludes almost nothing but is well above the blending cutoff."""
 PRIOR_FRACTION = 0.01
-"""Visible fraction behind what was trained up to which a prior is drawn: more costs logged views,
-less leaves holes in sides that only a turned object shows."""
+"""Priors are inserted up to this visible fraction behind the trained scene. A higher value degrades
+the logged views, a lower one leaves holes in sides that only a turned object shows.
+"""
 SKY_FRACTION = 0.1
-"""Visible fraction up to which a texel of the sky counts as hidden."""
+"""A texel of the sky counts as hidden up to this visible fraction."""
 ON_GROUND = 0.05
-"""Gaussians of stage 0 this close to the ground's surface make it up [m]."""
+"""Gaussians of stage 0 within this distance of the ground surface are ground [m]."""
 SHOWN_FRACTION = 0.05
-"""Trained Gaussians of which more is visible than this say what the ground is like."""
+"""Trained Gaussians with a larger visible fraction are evidence of the ground's appearance."""
 BARE_REACH = 2.5
-"""They say so up to so many standard deviations of a Gaussian of the ground from its centre."""
+"""Reach of this evidence around a ground Gaussian, in its standard deviations."""
 HARDLY_SEEN = 25.0
-"""Vehicles of which an image shows less on average are not learnt from images [px]."""
+"""Vehicles with fewer visible pixels per image on average are not learnt from images [px]."""
 VISIBILITY_VIEWS = 64
-"""Views that decide which Gaussians are hidden."""
+"""Number of views that decide which Gaussians are hidden."""
 EPS2D = RasterOptions().eps2d
 
 Viewpoint = tuple[Camera, int]
@@ -55,15 +56,14 @@ Viewpoint = tuple[Camera, int]
 
 @dataclass(frozen=True, eq=False)
 class GaussianVisibility:
-    """How much of N Gaussians some views show, and how deep behind what they show these lie.
+    """Visibility of N Gaussians in a set of views, and their depth behind the visible surface.
 
     Attributes:
-        fractions: [N] float32, the sum of a Gaussian's blending weights over all pixels, by what it
-            would be over the whole image plane if nothing stood before it; 0 for what is never
-            before a camera.
-        depths: [N] float32, from the surface in the pixels that show it back to its centre, mean
-            by blending weight [m]; negative before the surface, 0 for what no pixel shows.
-        pixels: [N] float32, sums of blending weights over all pixels, by view [px].
+        fractions: [N] float32, the sum of a Gaussian's blending weights over all pixels, divided by
+            its unoccluded sum over the whole image plane; 0 if it is never in front of a camera.
+        depths: [N] float32, mean distance from the visible surface back to the Gaussian's centre,
+            weighted by blending weight [m]; negative in front of it, 0 if no pixel shows it.
+        pixels: [N] float32, sum of blending weights over all pixels, per view [px].
     """
 
     fractions: Tensor
@@ -80,10 +80,10 @@ class GaussianVisibility:
 
 @torch.no_grad()
 def visibility(model: SceneModel, viewpoints: Sequence[Viewpoint]) -> GaussianVisibility:
-    """What ``viewpoints`` show of each Gaussian of ``model``.
+    """Visibility of each Gaussian of ``model`` in ``viewpoints``.
 
-    Where training shows vehicles mirrored, both sides count: what is hidden on one is learnt on
-    the other.
+    Where training mirrors vehicles, both sides count: the part hidden on one side is learnt on the
+    other.
     """
     gaussians = model.gaussians
     starts = gaussians.starts
@@ -114,10 +114,12 @@ def visibility(model: SceneModel, viewpoints: Sequence[Viewpoint]) -> GaussianVi
 def blending_weights(
     instances: list[Instance], viewmat: Tensor, camera: Camera, model: SceneModel
 ) -> list[tuple[Tensor, Tensor]]:
-    """By instance: sums [N] over pixels of each Gaussian's blending weight, and of weight by depth.
+    """Per instance: sums [N] over pixels of each Gaussian's blending weight, and of weight by
+    depth.
 
-    In [px] and [px/m]; a pixel's depth is that of the surface it shows. An image is linear in the
-    constant colours, so that the gradients of two channels' sums by them are these sums.
+    Units are [px] and [px/m]. A pixel's depth is the depth of its visible surface. An image is
+    linear in the constant colours, so the sums are the gradients of two channels' sums with respect
+    to these colours.
     """
     colours, coloured = [], []
     for item in instances:
@@ -143,9 +145,9 @@ def blending_weights(
 
 
 def unoccluded_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> Tensor:
-    """[N] integral over the image plane of each Gaussian's opacity [px].
+    """Integral of each Gaussian's opacity over the image plane, [N] [px].
 
-    0 for Gaussians whose centre is not on the image.
+    0 for Gaussians with their centre outside the image.
     """
     to_camera = camera_from_object(instance, viewmat)
     rotation, cloud = to_camera[:3, :3], instance.cloud
@@ -166,7 +168,7 @@ def unoccluded_weights(instance: Instance, viewmat: Tensor, camera: Camera) -> T
 
 @torch.no_grad()
 def hidden_sky(model: SceneModel, viewpoints: Iterable[Viewpoint]) -> Tensor:
-    """[6, R, R] bool, texels of the sky that are hardly visible in any view."""
+    """Texels of the sky that are almost invisible in every view, [6, R, R] bool."""
     visible, unoccluded = (torch.zeros_like(model.sky) for _ in range(2))
     clouds = model.gaussians.clouds(degree=0)
     for camera, t_us in viewpoints:
@@ -215,10 +217,10 @@ def prune_hidden(
     object_limits: VisibilityLimits,
     besides: Tensor | None = None,
 ) -> Gaussians:
-    """Without those hardly visible, or little visible and occluded deep behind the rest.
+    """Remove Gaussians that are almost invisible, or barely visible and deep behind the surface.
 
     Args:
-        besides: [N] bool, more that go.
+        besides: [N] bool, further Gaussians to remove.
     """
     hidden = torch.where(
         gaussians.owners > 0, seen.hidden(object_limits), seen.hidden(background_limits)
@@ -241,9 +243,9 @@ def behind_objects(model: SceneModel, seen: GaussianVisibility, limits: Visibili
 
 
 def hardly_seen(model: SceneModel, seen: GaussianVisibility, offered: OfferedPriors) -> Tensor:
-    """[1 + objects] bool: those offered as bodies of which images show next to nothing.
+    """[1 + objects] bool: objects with a body on offer that images barely show.
 
-    From a few pixels anything is learnt but a vehicle.
+    A few pixels are too little evidence to learn a vehicle.
     """
     owners = torch.arange(len(model.gaussians.counts), device=seen.pixels.device)
     shown = torch.zeros(len(owners), device=seen.pixels.device)
@@ -262,13 +264,14 @@ def hardly_seen(model: SceneModel, seen: GaussianVisibility, offered: OfferedPri
 
 @dataclass(frozen=True, eq=False)
 class OfferedPriors:
-    """What may take the places that no image shows.
+    """Priors that can fill places that no image shows.
 
     Attributes:
-        scene: of stage 0, or with other clouds of its objects.
-        alternatives: [N] int64 by Gaussian of ``scene``: of those of one number only the first
-            that fits is taken; negative for any that fits. None: all are of the latter kind.
-        whole: [1 + objects] bool, of whom all are taken, visible or not; None: of nobody.
+        scene: from stage 0, or with other clouds for its objects.
+        alternatives: [N] int64 per Gaussian of ``scene``: of the Gaussians with the same number,
+            only the first that fits is inserted. A negative number marks a Gaussian without
+            alternatives. None: no Gaussian has alternatives.
+        whole: [1 + objects] bool, objects that get all their priors, visible or not; None: none.
     """
 
     scene: Scene
@@ -286,19 +289,19 @@ def occluded_priors(
     alternatives: Tensor | None = None,
     bare: Tensor | None = None,
 ) -> Gaussians:
-    """Gaussians of stage 0 that ``model`` occludes; they are drawn and do not learn.
+    """Gaussians of stage 0 that ``model`` occludes. They are rendered but not trained.
 
-    A prior of the background must have been hidden in stage 0 too: where it was visible, training
-    had its reasons to prune it. Bare ground needs no reasons. Objects can be moved, and are given
-    every prior that their trained Gaussians occlude.
+    A background prior must also have been hidden in stage 0: if it was visible, training pruned it
+    for a reason. Bare ground is exempt. Objects can be moved, so they get every prior that their
+    trained Gaussians occlude.
 
     Args:
         model: trained.
-        first: of stage 0, with the same objects.
+        first: model of stage 0, with the same objects.
         viewpoints: training views.
-        limit: visible fraction up to which a Gaussian of the background was hidden in stage 0.
-        wanted: [N] bool, Gaussians of ``first`` that are taken even where they are visible.
-        alternatives: of the Gaussians of ``first``, see OfferedPriors.
+        limit: a background Gaussian counts as hidden in stage 0 up to this visible fraction.
+        wanted: [N] bool, Gaussians of ``first`` to insert even where they are visible.
+        alternatives: of the Gaussians of ``first``, see :class:`OfferedPriors`.
         bare: [N] bool, Gaussians of ``first`` that count as hidden in stage 0.
     """
     hidden = visibility(first, viewpoints).fractions <= limit
@@ -306,7 +309,7 @@ def occluded_priors(
         hidden |= bare
     offered = (hidden | (first.gaussians.owners > 0)).nonzero()[:, 0]
     priors, trained = first.gaussians.select(offered), model.gaussians
-    # Faint, so that no prior occludes another: several may stand behind one gap of the surface.
+    # Faint, so that no prior occludes another: several can be behind one gap in the surface.
     faint = replace(priors, logits=torch.full_like(priors.logits, FAINT_LOGIT))
     model.gaussians, is_prior = concatenate(trained, faint)
     behind = visibility(model, viewpoints).fractions[is_prior] <= PRIOR_FRACTION
@@ -321,10 +324,10 @@ def occluded_priors(
 
 @torch.no_grad()
 def bare_ground(model: SceneModel, first: SceneModel, seen: GaussianVisibility) -> Tensor:
-    """[N] bool, Gaussians of ``first`` on the ground near which images show none of ``model``.
+    """[N] bool, ground Gaussians of ``first`` near which images show no Gaussian of ``model``.
 
     Args:
-        seen: of ``model``.
+        seen: visibility of ``model``.
     """
     from scipy.spatial import cKDTree
 
@@ -354,18 +357,18 @@ def _first_of_each(numbers: Tensor) -> Tensor:
 
 
 class OcclusionPruning:
-    """Prunes hidden Gaussians in a few rounds, and inserts the priors of stage 0 in the last one.
+    """Prunes hidden Gaussians in a few rounds and inserts the priors of stage 0 in the last round.
 
     Args:
-        options: when that is and what counts as hidden.
+        options: schedule of the rounds and limits for hidden Gaussians.
         iterations: of the whole training.
-        sample: draws so many training views.
-        unseen: of a model, which Gaussians lie on sides that no view shows, see
-            :func:`unseen_sides`; None knows of no such sides.
-        close: changes a model before its priors are chosen and says of which objects, see
-            :func:`.closed_vehicles.close_followed`; None changes nothing.
-        offer: says, given these, which priors there are, see
-            :func:`.closed_vehicles.offer_bodies`; None offers stage 0.
+        sample: returns the given number of random training views.
+        unseen: returns the Gaussians of a model on sides that no view shows, see
+            :func:`unseen_sides`; None: no such sides.
+        close: changes a model before its priors are selected and returns the changed objects, see
+            :func:`.closed_vehicles.close_followed`; None: no change.
+        offer: returns the available priors for these objects, see
+            :func:`.closed_vehicles.offer_bodies`; None: the priors of stage 0.
     """
 
     def __init__(
@@ -384,13 +387,14 @@ class OcclusionPruning:
         self._prior_round = round(options.prior_round * iterations)
 
     def step(self, model: SceneModel, optimizer: SelectiveAdam, iteration: int) -> bool:
-        """Change ``model`` after the step ``iteration`` if a round is due; whether one was."""
+        """Change ``model`` after step ``iteration`` if a round is due; returns whether it was."""
         hidden_round = iteration + 1 in self._hidden_rounds
         prior_round = iteration + 1 == self._prior_round
         if hidden_round:
             viewpoints = self._sample(VISIBILITY_VIEWS)
             if self._close is not None and iteration + 1 == max(self._hidden_rounds):
-                # Early enough that what is pressed is learnt anew, and the next time moves little.
+                # Early enough to relearn the projected Gaussians, so that the next round moves
+                # little.
                 self._close(model, optimizer, viewpoints)
             model.gaussians = prune_hidden(
                 model.gaussians,
@@ -409,7 +413,7 @@ class OcclusionPruning:
                 offered = self._offer(model, self._close(model, optimizer, viewpoints))
                 model.stop_mirroring()
             seen = visibility(model, viewpoints)
-            # Priors first: they are to stand behind what is pruned then, too.
+            # Priors first: they also belong behind the Gaussians that are pruned next.
             scarce = hardly_seen(model, seen, offered)
             offered = replace(offered, whole=scarce)
             self._insert_priors(model, optimizer, viewpoints, offered, seen)
@@ -462,21 +466,21 @@ class OcclusionPruning:
 # car.
 
 SH_C1 = 0.4886025119029199
-"""Of the basis functions of degree 1: -C1 y, C1 z, -C1 x."""
+"""Factor of the basis functions of degree 1: -C1 y, C1 z, -C1 x."""
 LOBE_PRIOR = 0.03
-"""Variance of viewing directions at which a lobe keeps half of what was learnt."""
+"""Variance of viewing directions at which a lobe keeps half of its learnt value."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewingDirections:
-    """Moments of the unit directions from cameras to N Gaussians, in the frames of their owners.
+    """Moments of the unit directions from N Gaussians to the cameras, in their owners' frames.
 
     Attributes:
-        views: [N] float32, in how many images a Gaussian's centre is.
-        means: [N, 3] float32; 0 without any.
+        views: [N] float32, number of images that contain a Gaussian's centre.
+        means: [N, 3] float32; 0 without such images.
         seconds: [N, 3, 3] float32, means of outer products.
-        facing: [N] float32, greatest cosine between a normal and the way back to a camera; -1
-            where none was asked for.
+        facing: [N] float32, largest cosine between a normal and the direction to a camera; -1
+            without normals.
     """
 
     views: Tensor
@@ -493,10 +497,10 @@ def viewing_directions(
     normals: Tensor | None = None,
     objects_only: bool = False,
 ) -> ViewingDirections:
-    """Over all images that hold a Gaussian's centre, whatever stands before it.
+    """Moments over all images that contain a Gaussian's centre, occluded or not.
 
     Args:
-        normals: [N, 3] of the surfaces on which Gaussians lie, in the frames of their owners.
+        normals: [N, 3] of the surfaces under the Gaussians, in their owners' frames.
         objects_only: leaves the background out.
     """
     gaussians, starts = model.gaussians, model.gaussians.starts
@@ -543,12 +547,14 @@ def viewing_directions(
 def unseen_sides(
     model: SceneModel, viewpoints: Iterable[Viewpoint], bodies: Sequence[VehicleBody | None]
 ) -> Tensor:
-    """[N] bool: on a side of a vehicle's body that no image shows but at grazing angles.
+    """[N] bool: on a side of a vehicle's body that images show only at grazing angles or not at
+    all.
 
-    What lies there was learnt from the outline of other sides, and shows when the vehicle turns.
+    Gaussians there were learnt from the outline of other sides and become visible when the vehicle
+    turns.
 
     Args:
-        bodies: of the objects; None where there is none to tell by.
+        bodies: of the objects; None where the body is unknown.
     """
     normals, known = _body_normals(model, bodies)
     facing = viewing_directions(model, viewpoints, normals=normals, objects_only=True).facing
@@ -556,8 +562,9 @@ def unseen_sides(
 
 
 def _body_normals(model: SceneModel, bodies: Sequence[VehicleBody | None]) -> tuple[Tensor, Tensor]:
-    """Outward normals [N, 3] of the bodies where Gaussians are nearest to them, and [N] bool:
-    where there is one."""
+    """Outward normals [N, 3] of the bodies at their points nearest to the Gaussians, and [N] bool:
+    whether there is a body.
+    """
     gaussians, starts = model.gaussians, model.gaussians.starts
     normals = torch.zeros_like(gaussians.means)
     known = torch.zeros(len(gaussians), dtype=torch.bool, device=model.device)
@@ -575,10 +582,11 @@ def _body_normals(model: SceneModel, bodies: Sequence[VehicleBody | None]) -> tu
 def paint_unseen_sides(
     model: SceneModel, viewpoints: Sequence[Viewpoint], bodies: Sequence[VehicleBody | None]
 ) -> None:
-    """Give sides of vehicles that images show only edge on the colours of stage 0 from ahead.
+    """Give sides of vehicles that images show only edge on the frontal colours of stage 0.
 
-    The colour of a Gaussian there goes linearly from what was learnt, in the mean direction of the
-    images, to what initialisation has at its place, against the normal. What images show stays.
+    The colour of such a Gaussian changes linearly from its learnt value, in the mean direction of
+    the images, to the initial colour at its position, against the normal. The colour visible in the
+    images stays.
     """
     normals, known = _body_normals(model, bodies)
     seen = viewing_directions(model, viewpoints, normals=normals, objects_only=True)
@@ -623,10 +631,10 @@ def constant_colours(cloud: GaussianCloud) -> Tensor:
 
 @torch.no_grad()
 def plain_lobes(model: SceneModel, seen: ViewingDirections, *, prior: float = LOBE_PRIOR) -> None:
-    """Move objects' colours that depend on the direction into constant ones, where views were few.
+    """Move direction-dependent colours of objects into constant ones where views were few.
 
-    A ridge regression of the linear lobes on the colours that were seen: what they say across the
-    directions of training goes, what the mean direction showed stays to the bit of rounding.
+    A ridge regression of the linear lobes on the observed colours. The variation across the
+    training directions shrinks; the colour in the mean direction stays, up to rounding.
     """
     objects = slice(model.gaussians.counts[0], None)
     sh, means = model.gaussians.sh[objects], seen.means[objects]

@@ -1,7 +1,7 @@
-"""OpenSCENARIO XML, in and out.
+"""OpenSCENARIO XML, import and export.
 
 ``read`` turns a file with its catalogs into a storyboard, by ``read_actions``, ``read_conditions``
-and ``read_positions``; ``elements`` refuses what none of them has asked for.
+and ``read_positions``; ``elements`` rejects everything that none of them has read.
 """
 
 from .read import ReadOptions, ScenarioFile, read_openscenario, read_openscenario_text

@@ -1,7 +1,7 @@
-"""Elements of an OpenSCENARIO file, with their lines, and what has been read of them.
+"""Elements of an OpenSCENARIO file with their lines, and a record of the parts that were read.
 
-Every element and attribute has to be read: what nobody asked for is not supported, and is refused
-by name with its line.
+Every element and attribute must be read. Unread ones are unsupported, and are rejected by name and
+line.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ PRUNED = frozenset(
         "Private", "InfrastructureAction", *_NEEDED,
     }
 )  # fmt: skip
-"""Elements that go with the last of their children that is left out."""
+"""Elements that are dropped together with the last of their omitted children."""
 
 
 @dataclass(eq=False)
 class RawElement:
-    """An element as it stands in the file."""
+    """An element as in the file."""
 
     tag: str
     line: int
@@ -50,18 +50,18 @@ class RawElement:
 
 
 class Scope:
-    """Parameters by name, and what stands for each in an expression.
+    """Parameters by name, and their replacements in expressions.
 
     Args:
-        texts: by name: ``$name`` of one that stays a parameter, a plain text, or ``(expression)``.
-        values: what they evaluate to now.
+        texts: by name: ``$name`` of a remaining parameter, a plain text, or ``(expression)``.
+        values: their current values.
     """
 
     def __init__(self, texts: Mapping[str, str], values: Mapping[str, Any]) -> None:
         self.texts, self.values = dict(texts), dict(values)
 
     def expression(self, text: str) -> str:
-        """A text with the parameters of this scope replaced by what stands for them."""
+        """A text with the parameters of this scope replaced."""
         if not text.startswith("$"):
             return text
         if not text.startswith("${"):
@@ -119,7 +119,7 @@ class Part:
         return f"{value:.17g}" if isinstance(value, float) else str(value)
 
     def optional(self, name: str) -> str | None:
-        """An attribute as it evaluates now; None where it is absent."""
+        """The current value of an attribute; None if it is missing."""
         return self.text(name) if name in self.raw.attributes else None
 
     def number(self, name: str, default: float | None = None) -> float | str:
@@ -138,7 +138,7 @@ class Part:
         return self.number(name) if name in self.raw.attributes else None
 
     def magnitude(self, name: str, default: float | None = None) -> float | str:
-        """A time or distance, which is 0 or more; or the expression of parameters that it is."""
+        """A time or distance, which is 0 or more; or its parameter expression."""
         found = self.number(name, default)
         value = float(self._evaluated(name, self._given(name, repr(default))))
         if value < 0:
@@ -169,7 +169,7 @@ class Part:
         return value in {"true", "1"}
 
     def choice(self, name: str, allowed: Mapping[str, Any], default: str | None = None) -> Any:
-        """What an attribute stands for."""
+        """The value of ``allowed`` for an attribute."""
         given = self.text(name, default)
         if given not in allowed:
             raise self.error(
@@ -194,12 +194,12 @@ class Part:
     # --- children -------------------------------------------------------------------------------
 
     def children(self, *tags: str) -> list[Part]:
-        """Children of these names in their order; without names all."""
+        """Children with these names in order; without names all."""
         found = [c for c in self.raw.children if not tags or c.tag in tags]
         return [self._of(c) for c in found]
 
     def find(self, tag: str) -> Part | None:
-        """The child of a name; None where there is none."""
+        """The child with a name; None if there is none."""
         found = self.children(tag)
         if len(found) > 1:
             raise self.error(f"<{self.tag}> has {len(found)} elements <{tag}>; one is allowed")
@@ -213,7 +213,7 @@ class Part:
         return found
 
     def only(self, tags: Any = None) -> Part:
-        """The one child that an element which is a choice has; of these names."""
+        """The single child of a choice element, with one of these names."""
         here = [c for c in self.raw.children if c.tag not in WITHOUT_EFFECT]
         if len(here) != 1:
             raise self.error(f"<{self.tag}> has {len(here)} elements; it needs one")
@@ -235,7 +235,7 @@ class Part:
 
 
 def unread(raw: RawElement, file: str) -> Iterator[ScenarioError]:
-    """Errors of what nobody has asked for, in the order of the file."""
+    """Errors for unread parts, in file order."""
     for name in raw.attributes:
         if name not in raw.read and ":" not in name and name != "xmlns":
             yield ScenarioError(
@@ -256,10 +256,10 @@ def read_elements(data: bytes, file: str, leave_out: frozenset[str] = frozenset(
     Args:
         data: content.
         file: name in messages.
-        leave_out: names of elements that are taken out before anything is read.
+        leave_out: names of elements to remove before anything is read.
 
     Raises:
-        ScenarioError: too large, too deep, no XML, or with a document type of its own.
+        ScenarioError: too large, too deep, not XML, or with a document type.
     """
     if len(data) > MAX_BYTES:
         raise ScenarioError(f"{file}: is larger than {MAX_BYTES >> 20} MiB, the most that is read")
@@ -269,7 +269,7 @@ def read_elements(data: bytes, file: str, leave_out: frozenset[str] = frozenset(
     except ScenarioError:
         raise
     except (xml.parsers.expat.ExpatError, LookupError, ValueError) as error:
-        # Of the last two kind are encodings that Python does not know, or has no table of.
+        # The last two exceptions come from encodings that Python does not support.
         raise ScenarioError(f"{file}: is no XML file ({error})") from error
     if builder.root is None:
         raise ScenarioError(f"{file}: is empty")
@@ -292,7 +292,7 @@ def _take_out(raw: RawElement, names: frozenset[str]) -> None:
 
 
 def _acts(raw: RawElement) -> bool:
-    """Whether something is left for which an element that may be pruned is there."""
+    """Whether an element that may be pruned still has content."""
     needed = _NEEDED.get(raw.tag)
     return any(needed is None or c.tag in needed for c in raw.children)
 
@@ -419,8 +419,9 @@ def scoped(part: Part) -> Part:
 
 
 def declared(part: Part | None, texts: Mapping[str, str], values: Mapping[str, Any]) -> Scope:
-    """The scope of declarations below the top level, in the scope in which they stand: a parameter
-    stands for what is assigned to it, or for its default."""
+    """The scope of declarations below the top level, within the outer scope: a parameter has its
+    assigned value, or its default.
+    """
     scope = Scope({}, {}) if part is None else Scope(part.scope.texts, part.scope.values)
     for each in part.children("ParameterDeclaration") if part is not None else []:
         name, kind = each.text("name"), each.choice("parameterType", KINDS)
@@ -437,15 +438,16 @@ def declared(part: Part | None, texts: Mapping[str, str], values: Mapping[str, A
 
 
 def top_level(part: Part | None, given: Mapping[str, Any]) -> tuple[Scope, dict[str, Any]]:
-    """The scope of a scenario's declarations, and the parameters of the storyboard: those whose
-    value is a plain one. Others are expressions of them.
+    """The scope of a scenario's declarations, and the parameters of the storyboard.
+
+    Parameters with plain values become storyboard parameters; others are expressions of them.
 
     Args:
         part: ``ParameterDeclarations``.
-        given: values instead of those of the file.
+        given: values that override the file's.
 
     Raises:
-        ScenarioError: a value that breaks a constraint, or a name that is not declared.
+        ScenarioError: a value that violates a constraint, or an undeclared name.
     """
     scope, parameters = Scope({}, {}), dict[str, Any]()
     declarations = part.children("ParameterDeclaration") if part is not None else []
@@ -474,7 +476,7 @@ def top_level(part: Part | None, given: Mapping[str, Any]) -> tuple[Scope, dict[
 
 
 def typed(part: Part, value: Any, kind: str) -> Any:
-    """A value as its declaration says."""
+    """A value converted to its declared type."""
     if kind == "boolean":
         return value if isinstance(value, bool) else str(value).lower() in {"true", "1", "1.0"}
     if kind not in NUMBERS:
@@ -486,7 +488,7 @@ def typed(part: Part, value: Any, kind: str) -> Any:
 
 
 def check_constraints(part: Part, name: str, value: Any) -> None:
-    """Raises ScenarioError: none of the groups of constraints of a parameter holds."""
+    """Raises ScenarioError if a parameter satisfies none of its constraint groups."""
     groups = part.children("ConstraintGroup")
     if not groups:
         return

@@ -23,14 +23,14 @@ from .elements import (
 # --- Positions -----------------------------------------------------------------------------------
 
 Fields = dict[str, Any]
-"""Of a model of the storyboard."""
+"""Fields of a storyboard model."""
 
 Resolve = Callable[[Part, str], Part]
 """The entry of a catalog that an element refers to, of a type."""
 
 
 class Positions:
-    """Reads positions; ``entry`` finds entries of catalogs."""
+    """Reads positions; ``entry`` looks up catalog entries."""
 
     def __init__(self, entry: Resolve) -> None:
         self._entry = entry
@@ -42,7 +42,7 @@ class Positions:
         return fields
 
     def route(self, part: Part) -> Fields:
-        """Of ``RouteRef`` or ``AssignRouteAction``: a route here, or of a catalog."""
+        """Fields of ``RouteRef`` or ``AssignRouteAction``: an inline route, or one of a catalog."""
         found = part.only({"Route", "CatalogReference"})
         is_named = found.tag == "CatalogReference"
         found = self._entry(found, "Route") if is_named else scoped(found)
@@ -56,7 +56,7 @@ class Positions:
         }
 
     def trajectory(self, part: Part) -> Fields:
-        """Of ``TrajectoryRef``: name, closed and curve."""
+        """Fields of ``TrajectoryRef``: name, closed and curve."""
         found = part.only({"Trajectory", "CatalogReference"})
         is_named = found.tag == "CatalogReference"
         found = self._entry(found, "Trajectory") if is_named else scoped(found)
@@ -202,7 +202,7 @@ def _with(fields: Fields, orientation: Fields | None) -> Fields:
 
 
 def _level(part: Part) -> None:
-    """Objects stand level: other angles are refused."""
+    """Objects are level: other angles are rejected."""
     for name in ("p", "r"):
         _flat(part, name)
 
@@ -253,13 +253,13 @@ def plain_value(text: str) -> bool | float | str:
 
 
 class Conditions:
-    """Reads triggers; ``positions`` reads what is in them."""
+    """Reads triggers; ``positions`` reads their positions."""
 
     def __init__(self, positions: Positions) -> None:
         self._positions = positions
 
     def trigger(self, part: Part | None) -> Fields | None:
-        """A trigger; None where there is none."""
+        """A trigger; None if there is none."""
         if part is None:
             return None
         groups = []
@@ -386,7 +386,7 @@ def _ruled(part: Part) -> Fields:
 
 
 def _measured(part: Part) -> Fields:
-    """How a distance is measured; ``alongRoute`` is the word of version 1.0."""
+    """Distance measure; ``alongRoute`` is the attribute of version 1.0."""
     along = part.flag("alongRoute", False)
     measure = part.choice("relativeDistanceType", MEASURES, "euclidianDistance")
     frame = part.choice("coordinateSystem", FRAMES, "entity")
@@ -437,7 +437,7 @@ MODES = {"position": "position", "follow": "follow"}
 
 
 class Actions:
-    """Reads actions; ``positions`` reads what is in them."""
+    """Reads actions; ``positions`` reads their positions."""
 
     def __init__(self, positions: Positions) -> None:
         self._positions = positions
@@ -644,7 +644,7 @@ def _dynamics(part: Part) -> Fields:
     part.choice("followingMode", MODES, "position")
     shape = part.choice("dynamicsShape", SHAPES)
     dimension = part.choice("dynamicsDimension", DIMENSIONS)
-    # Some write braking as a negative rate, whose magnitude counts.
+    # Some files give braking as a negative rate; its magnitude is used.
     signed = shape == "step" or dimension == "rate"
     value = part.number("value") if signed else part.magnitude("value")
     return {"shape": shape, "dimension": dimension, "value": value}

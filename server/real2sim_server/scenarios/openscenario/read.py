@@ -121,11 +121,11 @@ MAX_CASES = 1_000_000
 
 
 def read_distributions(part: Part) -> tuple[list[dict[str, Any]], Fields]:
-    """Values of parameters of each case of the deterministic distributions, their product; and the
-    stochastic ones by parameter.
+    """Parameter values of each case of the deterministic distributions, their product; and the
+    stochastic distributions by parameter.
 
     Raises:
-        ScenarioError: a distribution that is not supported, or more than a million cases.
+        ScenarioError: an unsupported distribution, or more than a million cases.
     """
     deterministic, stochastic = part.find("Deterministic"), part.find("Stochastic")
     if deterministic is not None:
@@ -212,18 +212,18 @@ def _range(part: Part) -> Fields:
 
 
 EGO_NAMES = frozenset({"ego", "hero", "egovehicle", "ego_vehicle", "vut", "sut"})
-"""Names of entities that are the ego, in lower case, where nobody says which it is."""
+"""Default names of the ego, in lower case."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScenarioFile:
-    """What a file holds.
+    """Contents of a file.
 
     Attributes:
         board: the storyboard.
-        road_file: the road network that it names, as an absolute path where it is known.
-        notes: what of the file has no effect, in sentences for people.
-        cases: values of parameters of each case of a deterministic distribution.
+        road_file: its road network, as an absolute path if known.
+        notes: parts of the file without effect, one sentence each.
+        cases: parameter values of each case of a deterministic distribution.
     """
 
     board: Storyboard
@@ -234,12 +234,12 @@ class ScenarioFile:
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How a file is read.
+    """Options for reading a file.
 
     Attributes:
-        parameters: values instead of those of the file.
-        leave_out: names of elements to leave out that are not supported.
-        ego: name of the entity that is the ego; None: the one that is called so.
+        parameters: values that override the file's.
+        leave_out: names of unsupported elements to ignore.
+        ego: name of the ego entity; None: the one with an ego's name.
     """
 
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -248,14 +248,13 @@ class ReadOptions:
 
 
 def read_openscenario(path: Path, options: ReadOptions | None = None) -> ScenarioFile:
-    """The storyboard of a file, with the catalogs that it names.
+    """The storyboard of a file, with its catalogs.
 
-    A file of a ``ParameterValueDistribution`` gives its scenario with the distribution's first
+    A file with a ``ParameterValueDistribution`` gives its scenario with the distribution's first
     case, and all cases.
 
     Raises:
-        ScenarioError: no such file, no scenario, or something in it that is not supported, with its
-            line.
+        ScenarioError: no such file, not a scenario, or unsupported content, with its line.
     """
     options = options or ReadOptions()
     try:
@@ -335,7 +334,7 @@ def _header(whole: Part) -> Fields:
 
 
 class _Reader:
-    """Reads a scenario whose parameters are known."""
+    """Reads a scenario with known parameters."""
 
     def __init__(self, whole: Part, folder: Path | None, options: ReadOptions) -> None:
         self._whole, self._folder, self._options = whole, folder, options
@@ -348,7 +347,7 @@ class _Reader:
     road_file: Path | None
 
     def fields(self) -> Fields:
-        """Of the storyboard, but its header and parameters."""
+        """Fields of the storyboard, except its header and parameters."""
         whole = self._whole
         if (locations := whole.find("CatalogLocations")) is not None:
             self.catalogs.read(locations)
@@ -357,7 +356,7 @@ class _Reader:
         board = whole.child("Storyboard")
         init, global_init = self._init(board.child("Init"))
         stop = self._conditions.trigger(board.find("StopTrigger"))
-        # The element has to be there; without a condition it says nothing.
+        # The element is required; without a condition it has no effect.
         stop = stop if stop is not None and stop["groups"] else None
         stories = [self._story(s) for s in board.children("Story")]
         if self._at_once:
@@ -525,7 +524,7 @@ class _Reader:
         return init, global_init
 
     def _environment(self, part: Part) -> None:
-        """Weather has no effect but friction, which is refused where it is not 1."""
+        """Weather has no effect except friction, which is rejected if it is not 1."""
         found = part.only({"Environment", "CatalogReference"})
         is_named = found.tag == "CatalogReference"
         found = self.catalogs.entry(found, "Environment") if is_named else scoped(found)
@@ -551,7 +550,7 @@ class _Reader:
         }
 
     def _start(self, part: Part) -> Fields | None:
-        """When an act or event begins; None: with what it is part of."""
+        """Start of an act or event; None: together with its parent."""
         start = self._conditions.trigger(part.find("StartTrigger"))
         if start is None or start["groups"]:
             return start
@@ -604,7 +603,7 @@ def _box(part: Part) -> tuple[list[Any], list[Any]]:
 
 
 def _read_all(raw: RawElement) -> None:
-    """Mark an element as read that has no effect, or one of which a note is made."""
+    """Mark an element without effect, or with a note, as read."""
     raw.is_read = True
     raw.read.update(raw.attributes)
     for child in raw.children:

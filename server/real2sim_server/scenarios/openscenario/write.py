@@ -29,12 +29,12 @@ Element = ET.Element
 
 
 def write_openscenario(board: Storyboard) -> bytes:
-    """The storyboard as a file that reads back as the same one.
+    """The storyboard as a file that reads back identically.
 
-    Roads along a route have no words there: lanes are then those of the scene that it is run on.
+    OpenSCENARIO cannot express roads along a route: lanes are then those of the scene.
 
     Raises:
-        ScenarioError: it holds what OpenSCENARIO has no words for: the form 'quintic', limits of a
+        ScenarioError: content that OpenSCENARIO cannot express: the form 'quintic', limits of a
             synchronised arrival, a controller's parameters, objects of a scene, distributions.
     """
     _check(board)

@@ -82,7 +82,7 @@ def save_scene(scene: Scene, path: str | PathLike[str], *, overwrite: bool = Fal
 
     Args:
         scene: on any device.
-        path: folder to write, by custom ``<name>.r2s``.
+        path: folder to write, by convention ``<name>.r2s``.
         overwrite: replace an existing bundle.
 
     Raises:
@@ -187,14 +187,14 @@ def load_ground(path: str | PathLike[str], content_hash: str) -> Ground:
 
 
 def load_lanes(path: str | PathLike[str], content_hash: str) -> LaneGraph | None:
-    """The lanes of a scene bundle, without its scene; None where it has none.
+    """The lanes of a scene bundle, without its scene; None if it has none.
 
     Args:
         path: folder of the bundle.
-        content_hash: that the bundle must have.
+        content_hash: expected hash of the bundle.
 
     Raises:
-        BundleError: as :func:`load_scene`, or it is another bundle by now.
+        BundleError: as :func:`load_scene`, or the hash has changed.
     """
     folder = Path(path)
     document = _document_of(folder, content_hash)
@@ -565,7 +565,7 @@ class StagingLimits:
 
 
 class StagingError(SceneError):
-    """The bundle cannot be written; the message is the system's reason."""
+    """The bundle cannot be written; the message is the operating system's error."""
 
 
 def stage_scene(source: Path, folder: Path, *, name: str, limits: StagingLimits) -> None:
@@ -588,8 +588,8 @@ def stage_asset(
         source: the splat file.
         folder: of the bundle; its parent exists.
         asset_id: name of the asset.
-        options: ``category``, ``up_axis`` and ``yaw`` as :func:`~.splats.import_splats` takes them,
-            and ``length`` [m], None for that of the file.
+        options: ``category``, ``up_axis`` and ``yaw`` as for :func:`~.splats.import_splats`, and
+            ``length`` [m], None for the length in the file.
         limits: of the import.
 
     Raises:

@@ -33,7 +33,7 @@ def cloud_tensors(cloud: GaussianCloud) -> dict[str, Tensor]:
 def cloud_shapes(
     gaussians: int, sh_degree: int, *, known: Container[str] = ()
 ) -> dict[str, tuple[int, ...]]:
-    """Shapes of a cloud's tensors by field name; of those that may be missing if ``known``."""
+    """Shapes of a cloud's tensors by field name; with uncertainties only if ``known``."""
     n = gaussians
     shapes: dict[str, tuple[int, ...]] = {
         "means": (n, 3),
@@ -84,9 +84,9 @@ def tensor_hashes(tensors: Mapping[str, Tensor]) -> dict[str, str]:
 
 
 def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> int:
-    """Write a new safetensors file; its length in bytes."""
+    """Write a new safetensors file; returns its size in bytes."""
     save_file({name: tensor.numpy() for name, tensor in tensors.items()}, path)
-    # The library writes for the owner alone; a service often runs as somebody else.
+    # The library makes the file readable only for its owner; a service often runs as another user.
     path.chmod(path.parent.stat().st_mode & 0o666)
     return path.stat().st_size
 
@@ -122,12 +122,13 @@ class TensorFile:
         hashes: Mapping[str, str],
         dtypes: Mapping[str, torch.dtype] = MappingProxyType({}),
     ) -> dict[str, Tensor]:
-        """The tensors stored under ``prefix`` + name for each name in ``shapes``; float32 where
-        ``dtypes`` names no other type.
+        """The tensors stored under ``prefix`` + name for each name in ``shapes``; float32 unless
+        ``dtypes`` names another type.
 
         Raises:
-            BundleError: one is missing, has another shape or type or, when verifying, another
-                hash than in ``hashes``.
+            BundleError: a tensor is missing, has a wrong shape or type or, with verification, a
+                hash
+                other than in ``hashes``.
         """
         if set(hashes) != set(shapes):
             raise BundleError(
@@ -236,7 +237,7 @@ def content_hash(kind: str, content: Mapping[str, Any]) -> str:
     """SHA-256 over kind and content as canonical JSON; content holds the hashes of all tensors.
 
     Canonical: keys sorted, no spaces, ASCII, floats as the shortest text that reads back exactly.
-    Name, provenance and folder do not count: they change nothing of what is simulated.
+    Name, provenance and folder are excluded: they do not affect the simulation.
     """
     canonical = json.dumps(
         {"kind": kind, "content": content}, sort_keys=True, separators=(",", ":"), allow_nan=False

@@ -41,7 +41,7 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class _Part(BaseModel):
-    """A part of ``scene.json``. Optional parts are left out of the JSON where there are none."""
+    """A part of ``scene.json``. Absent optional parts are omitted from the JSON."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -116,7 +116,7 @@ class CameraPart(_Part):
 
     Attributes:
         lens, shutter: None for a pinhole with a global shutter.
-        recorded: optics of the recorded images, None where they are those of the camera.
+        recorded: optics of the recorded images, None if identical to the camera's.
     """
 
     name: str
@@ -159,7 +159,7 @@ class CameraPart(_Part):
 
 
 class CloudPart(_Part):
-    """Size and hashes of a cloud; the numbers themselves lie in a tensor file."""
+    """Size and hashes of a cloud; its values are in a tensor file."""
 
     gaussians: Count
     sh_degree: Annotated[int, Field(ge=0, le=3)]
@@ -256,8 +256,8 @@ class LidarPart(_Part):
 
 
 class LanesPart(_Part):
-    """Lanes of a scene; ``document`` is that of ``lanes.json`` with lengths in the place of its
-    arrays, which lie in the tensor file one after the other.
+    """Lanes of a scene. ``document`` is the content of ``lanes.json`` with lengths in place of
+    arrays, which are concatenated in the tensor file.
     """
 
     points: Count
@@ -352,7 +352,7 @@ def lane_document(graph: LaneGraph, *, with_roads: bool = True) -> SceneLanes:
     """
     tables = [name for name in _TABLES if with_roads or name != "roads"]
     parts = {name: [_values(p) for p in getattr(graph, name).values()] for name in tables}
-    # Values come out of a checked graph; what they are for is known to the models alone.
+    # Values come from a validated graph; only the models define their meaning.
     return SceneLanes.model_validate({key: getattr(graph, key) for key in _HEAD} | parts)
 
 
@@ -360,7 +360,7 @@ def graph_of(document: SceneLanes) -> LaneGraph:
     """The graph of a document.
 
     Raises:
-        SceneError: it is well-formed but makes no graph; the message names the part.
+        SceneError: well-formed but not a valid graph; the message names the part.
     """
     tables = {
         name: [_part(kind, entry.model_dump()) for entry in getattr(document, name)]
@@ -391,7 +391,7 @@ def read_lanes(path: Path) -> LaneGraph:
     """The graph in a file ``lanes.json``.
 
     Raises:
-        BundleError: naming the file: missing, too large, no such document, or no graph.
+        BundleError: missing, too large, not such a document, or not a graph; names the file.
     """
     try:
         if path.stat().st_size > MAX_LANES_BYTES:

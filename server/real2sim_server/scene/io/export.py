@@ -52,8 +52,8 @@ class GlbWriter:
         """Append an array [N] or [N, 3 or 4], N >= 1, float32 or (normalised) uint8.
 
         Args:
-            array: the values; kept, not copied.
-            bounds: also state lowest and highest, which positions and key times must have.
+            array: the values; referenced, not copied.
+            bounds: also write minimum and maximum, required for positions and key times.
             vertices: whether it belongs to vertices or to an animation.
 
         Returns:
@@ -113,7 +113,7 @@ class GlbWriter:
             if self._parts:
                 file.write(struct.pack("<I4s", self._nbytes, b"BIN\0"))
             for part in self._parts:
-                # As vertices lie in memory: little-endian, row by row.
+                # In the memory layout of vertices: little-endian, row by row.
                 file.write(np.ascontiguousarray(part, dtype=part.dtype.newbyteorder("<")).data)
                 file.write(b"\0" * (-part.nbytes % 4))
 
@@ -135,19 +135,19 @@ def write_gltf(
 ) -> None:
     """Write ``scene`` with ``objects`` as one ``.glb``, atomically.
 
-    The root node turns the scene (z up) to glTF's y up and z forward; below it are the
+    The root node rotates the scene (z up) to glTF's y up and z forward. Below it are the
     ``background``, one node per object named by its id, and ``ego`` with the cameras. Gaussians of
-    an object are in its own frame. Without ``t_us`` nodes move by an animation in seconds since
+    an object are in its own frame. Without ``t_us``, nodes are animated in seconds since
     ``extras.start_us``: translation and rotation LINEAR, as trajectories interpolate, and a STEP
-    scale of zero while an object does not exist, which is how glTF hides a node. With ``t_us``
-    everything stands as it was at that time, and all of ``objects`` must exist then.
+    scale of zero while an object does not exist, because glTF hides nodes by scale. With ``t_us``,
+    everything has its pose at that time, and all of ``objects`` must exist then.
 
-    Scales and opacities are linear, as the extension has it; ``COLOR_0`` lets viewers without
-    it show points. The sky and a camera's principal point are not in the file (the latter is in the
-    node's ``extras``).
+    Scales and opacities are linear, as in the extension; ``COLOR_0`` lets viewers without it show
+    points. The sky and a camera's principal point are not in the file (the latter is in the node's
+    ``extras``).
 
     Raises:
-        SceneError: for values that are not finite or out of range, or more than 4 GiB.
+        SceneError: values that are not finite or out of range, or more than 4 GiB.
         OSError: the file cannot be written.
     """
     scene.background.check_values(f"background for {path}")
@@ -260,7 +260,7 @@ class _Builder:
         self._hide_outside(index, trajectory)
 
     def _hide_outside(self, index: int, trajectory: Trajectory) -> None:
-        """A scale of zero before and after the trajectory, where the drive goes on longer."""
+        """Scale of zero before and after the trajectory, if the drive is longer."""
         first, last = self._seconds(np.array([trajectory.start_us, trajectory.end_us]))
         times, scales = [first], [1.0]
         if first > 0:
@@ -284,7 +284,7 @@ class _Builder:
 
     def _seconds(self, times_us: NDArray[np.int64]) -> NDArray[np.float32]:
         seconds = ((times_us - self.start_us) / 1e6).astype(np.float32)
-        # Key times increase strictly; float32 cannot tell apart what is closer than it resolves.
+        # Key times must increase strictly; float32 cannot resolve closer times.
         for i in np.flatnonzero(np.diff(seconds) <= 0) + 1:
             seconds[i] = np.nextafter(seconds[i - 1], np.float32(np.inf))
         return seconds
@@ -300,7 +300,7 @@ def _pose(transform: Float) -> dict[str, Any]:
 
 
 def _continuous(quaternions: Float) -> Float:
-    """The same rotations with signs such that neighbours are less than half a turn apart."""
+    """The same rotations with signs such that adjacent ones are less than half a turn apart."""
     dots = np.sum(quaternions[1:] * quaternions[:-1], axis=1)
     signs = np.cumprod(np.concatenate([[1.0], np.where(dots < 0, -1.0, 1.0)]))
     return quaternions * signs[:, None]
@@ -314,7 +314,7 @@ def _primitive(writer: GlbWriter, cloud: GaussianCloud) -> dict[str, Any]:
 
     rgb = 0.5 + SH_C0 * host_array(cloud.sh[:, 0])
     rgba = np.concatenate([rgb, host_array(cloud.opacities)[:, None]], axis=1)
-    # Clouds may be off by a thousandth; glTF asks for unit length.
+    # Clouds allow an error of 0.001; glTF requires unit length.
     quats = torch.nn.functional.normalize(cloud.quats.double(), dim=1)
     attributes = {
         "POSITION": writer.add(host(cloud.means), bounds=True),
@@ -347,30 +347,30 @@ def export_scene(
     objects: Iterable[str] | None = None,
     up_axis: UpAxis | None = None,
 ) -> tuple[Path, ...]:
-    """Write a scene for other programs, atomically; what is there under ``out`` is replaced.
+    """Write a scene for other programs, atomically; existing content of ``out`` is replaced.
 
-    ``gltf`` gives one ``.glb`` with a node per object: with its track as an animation, or with
-    ``t_us`` standing still as it was then (see :func:`.export_gltf.write_gltf`). The splat formats
-    give with ``t_us`` one file of all Gaussians in the world as they were then, and without it a
-    folder: the background, each object in its own frame (origin at the box centre), and
-    ``objects.json`` with file, category, size and track of each. The sky is in none of them.
+    ``gltf`` gives one ``.glb`` with a node per object: animated along its track, or with ``t_us``
+    at its pose at that time (see :func:`.export_gltf.write_gltf`). The splat formats give, with
+    ``t_us``, one file of all Gaussians in the world at that time. Without it they give a folder:
+    the background, each object in its own frame (origin at the box centre), and ``objects.json``
+    with file, category, size and track of each. None of them contains the sky.
 
     Args:
-        scene: what to write.
-        out: file to write, or folder where objects become files of their own.
+        scene: to write.
+        out: file to write, or folder for separate object files.
         format: ``gltf``, or the suffix of a splat format without its dot.
-        t_us: instant to bake [us]; objects that do not exist then are left out.
+        t_us: time to bake [us]; objects that do not exist then are omitted.
         objects: ids of objects to write besides the background; default all.
         up_axis: axis of the files that points up, ``z``, ``y`` or ``-y``, as in
-            ``import_splats``; default is the format's: ``y`` for spz, else ``z``. glTF is
+            ``import_splats``; the default depends on the format: ``y`` for spz, else ``z``. glTF is
             always y up.
 
     Returns:
         The files written.
 
     Raises:
-        SceneError: an unknown format, object or axis, a time outside the scene, an ``out`` that
-            does not fit, or values that are not finite or that the format cannot hold.
+        SceneError: an unknown format, object or axis, a time outside the scene, an unsuitable
+            ``out``, or values that are not finite or not representable in the format.
         OSError: a file cannot be written.
     """
     splat_formats = {known.suffix[1:]: known for known in FORMATS}
@@ -402,9 +402,9 @@ def export_scene(
 def bake(
     scene: Scene, t_us: int, *, objects: Mapping[str, SceneObject] | None = None
 ) -> GaussianCloud:
-    """All Gaussians in the world as they are at ``t_us``: the background first, then objects.
+    """All Gaussians in the world at ``t_us``: the background first, then objects.
 
-    Objects (default: all of the scene) that do not exist at that time are left out.
+    Objects (default: all of the scene) that do not exist at that time are omitted.
     """
     placed = [
         o.cloud.moved(o.trajectory.transform(t_us))
@@ -460,7 +460,7 @@ def _write_folder(
 
 
 def _is_replaceable(out: Path) -> bool:
-    """Whether a folder is empty or an export of this kind, so that nothing else is lost."""
+    """Whether a folder is empty or an export of this kind, so that no other data is lost."""
     if not out.is_dir():
         return False
     if not any(out.iterdir()):
@@ -474,7 +474,7 @@ def _is_replaceable(out: Path) -> bool:
 
 
 def _file_name(index: int, object_id: str) -> str:
-    """A safe file name; the number distinguishes ids that look alike in it."""
+    """A safe file name; the number distinguishes similar ids."""
     return f"{index:03d}_{re.sub(r'[^A-Za-z0-9_-]', '_', object_id)[:60]}"
 
 

@@ -40,14 +40,14 @@ from .document import UNCERTAINTIES, CameraPart, GaitPart, TrajectoryPart
 FORMAT, VERSION = "real2sim-packed", 1
 DOCUMENT = "scene.json"
 MAX_BYTES = 1 << 32
-"""Of all arrays when unpacked; a small file cannot ask for more memory than this."""
+"""Maximum total size of the unpacked arrays; protects from small files with huge contents."""
 MEAN_STEPS, QUAT_STEPS, OPACITY_STEPS, SH_STEPS = 65535, 127, 255, 127
 UNCERTAINTY_STEPS = 255
-"""Of their square roots."""
+"""Quantisation steps of the square roots of uncertainties."""
 HEIGHT_STEP = 0.001
-"""Of the ground [m]."""
+"""Quantisation of the ground [m]."""
 LOG_SCALE_STEPS, LOWEST_LOG_SCALE = 3276, -13.0
-"""Of an axis: 16 bits from 2 micrometres to a kilometre."""
+"""Quantisation of an axis: 16 bits from 2 micrometres to a kilometre."""
 
 SKY_UNCERTAINTIES = f"sky.{UNCERTAINTIES}"
 
@@ -108,7 +108,7 @@ class _PackedDocument(_Part):
 
 
 def write_packed(scene: Scene, path: str | PathLike[str]) -> None:
-    """Write ``scene`` to the file ``path``, by custom ``<name>.r2s.zip``; whole or not at all.
+    """Write ``scene`` to the file ``path`` atomically, by convention ``<name>.r2s.zip``.
 
     Raises:
         SceneError: values that are not finite or out of range.
@@ -190,7 +190,7 @@ def _document(data: bytes, file: Path) -> _PackedDocument:
 
 
 def _pack_ground(ground: Ground, arrays: Arrays) -> _PackedGround:
-    """Heights become differences along both axes, which are mostly zero and compress well."""
+    """Store heights as differences along both axes, which are mostly zero and compress well."""
     steps = np.round(ground.heights.astype(np.float64) / HEIGHT_STEP).astype(np.int32)
     along = np.diff(steps, axis=0, prepend=np.int32(0))
     arrays["ground.heights"] = np.diff(along, axis=1, prepend=np.int32(0))
@@ -237,7 +237,7 @@ def _pack_object(item: SceneObject, key: str, arrays: Arrays) -> _PackedObject:
 
 
 def _pack_cloud(cloud: GaussianCloud, key: str, arrays: Arrays) -> _PackedCloud:
-    """Quantise; Gaussians go along a space-filling curve, so that neighbours compress well."""
+    """Quantise, and sort Gaussians along a space-filling curve, so that they compress well."""
     cloud.check_values(key)
     cloud = cloud.to("cpu")
     low, extent = np.zeros(3), np.ones(3)
@@ -380,7 +380,7 @@ def _vector(values: NDArray[np.float64]) -> Vector3:
 # The shipped street: the demo shows it, and a worker without scenes serves it.
 
 SHIPPED_STREET = Path(__file__).parents[2] / "demo" / "street.r2s.zip"
-"""A packed scene; ``python -m real2sim_server.demo.street`` makes it anew."""
+"""A packed scene; rebuilt by ``python -m real2sim_server.demo.street``."""
 
 DEMO_SCENE = "demo_street"
 """Its name where it is served."""

@@ -32,10 +32,10 @@ from .splat_format import (
 )
 
 MAX_HEADER_BYTES = 1 << 20
-"""Longer headers are refused: none of the known writers comes near."""
+"""Longer headers are rejected; known writers stay far below."""
 
 MAX_HEADER_LINES = 1024
-"""Elements and properties together; a splat with all its harmonics has 62 properties."""
+"""Maximum number of elements and properties; a splat with all its harmonics has 62 properties."""
 
 _TYPES = {
     "char": "i1",
@@ -85,11 +85,11 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says it holds.
+    """Header of a PLY file.
 
     Attributes:
         elements: by name, in file order.
-        nbytes: length of the header, that is where the data starts.
+        nbytes: length of the header, the offset of the data.
     """
 
     elements: Mapping[str, PlyElement]
@@ -200,7 +200,7 @@ def _element(name: str, count: str, path: Path) -> PlyElement:
 def _add_property(element: PlyElement, definition: list[str], order: str, path: Path) -> None:
     match definition:
         case ["list", *_]:
-            # Mesh tools declare an empty face element; it takes no room in the file.
+            # Mesh tools declare an empty face element; it has no data in the file.
             if element.count:
                 raise BundleError(
                     f"{path}: ply element {element.name!r} has list properties, a splat file none"
@@ -238,7 +238,7 @@ SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 MAX_LOGIT = 40.0
-"""Opacities of 0 and 1 have no finite logit; in float32 this one stands for them."""
+"""Logit for opacities of 0 and 1, which have no finite logit."""
 
 
 class InriaPly:
@@ -253,7 +253,7 @@ class InriaPly:
     up_axis: UpAxis = "z"
 
     def recognises(self, head: bytes) -> bool:
-        """Whether ``head`` is that of a PLY file; the compressed kind is asked before."""
+        """Whether ``head`` belongs to a PLY file; the compressed variant is checked first."""
         return head.startswith((b"ply\n", b"ply\r\n"))
 
     def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
@@ -337,7 +337,7 @@ def _rest_properties(path: Path, vertex: NDArray[np.void]) -> tuple[str, ...]:
 def _spherical_harmonics(
     path: Path, vertex: NDArray[np.void], rest: tuple[str, ...]
 ) -> NDArray[np.float32]:
-    """Coefficients [N, K, 3]; the file holds those past the first channel by channel."""
+    """Coefficients [N, K, 3]; the file stores those past the first channel by channel."""
     per_channel = len(rest) // 3
     sh = np.empty((len(vertex), 1 + per_channel, 3), dtype=np.float32)
     sh[:, 0] = columns(path, vertex, DC, np.float32)
@@ -401,12 +401,12 @@ MAX_LOG_SCALE = 20.0
 class PlayCanvasPly:
     """Elements ``chunk`` (12 or 18 floats), ``vertex`` (4 uint32) and, for degree > 0, ``sh``.
 
-    Axes: those of the splats it was made of, mostly y down. Both ways keep the coordinates.
+    Axes: those of the source splats, mostly y down. Reading and writing preserve the coordinates.
 
-    Quantisation: within a chunk of 256, positions and log scales are cut into 2047 (x, z) and
+    Quantisation: within a chunk of 256, positions and log scales are divided into 2047 (x, z) and
     1023 (y) steps of the chunk's extent, colours of the first harmonic into 255; opacities are
-    multiples of 1/255; the three small parts of a quaternion are multiples of sqrt(2)/1023;
-    further harmonics are clamped to [-4, 4] and cut into 256 bins.
+    multiples of 1/255; the three small components of a quaternion are multiples of sqrt(2)/1023;
+    further harmonics are clamped to [-4, 4] and divided into 256 bins.
     """
 
     name = "PlayCanvas compressed ply"
@@ -415,7 +415,7 @@ class PlayCanvasPly:
     up_axis: UpAxis = "z"
 
     def recognises(self, head: bytes) -> bool:
-        """Whether ``head`` is that of a PLY file with packed positions."""
+        """Whether ``head`` belongs to a PLY file with packed positions."""
         header = head.split(b"end_header", 1)[0]
         return header.startswith((b"ply\n", b"ply\r\n")) and b" packed_position" in header
 
@@ -446,7 +446,7 @@ class PlayCanvasPly:
         )
 
     def write(self, cloud: GaussianCloud, path: Path, *, comment: str = "") -> None:
-        """Write ``cloud`` in Z-curve order, so that chunks are small; the order is not kept.
+        """Write ``cloud`` in Z-curve order, so that chunks are small; the original order is lost.
 
         Raises:
             OSError: the file cannot be written.
@@ -506,8 +506,8 @@ def _unpack_8888(words: Words) -> Float:
 def _unpack_rotation(words: Words) -> Float:
     """Quaternions [N, 4] wxyz.
 
-    The highest two bits say which component is largest and left out; the other three follow in
-    the order w, x, y, z with 10 bits each over [-1/sqrt(2), 1/sqrt(2)].
+    The highest two bits give the index of the largest component, which is omitted; the other three
+    follow in the order w, x, y, z with 10 bits each over [-1/sqrt(2), 1/sqrt(2)].
     """
     w = np.asarray(words, dtype=np.uint32)
     small = (np.stack([w >> s & 1023 for s in (20, 10, 0)], axis=-1) / 1023 - 0.5) * np.sqrt(2)
@@ -536,7 +536,8 @@ def _rest(path: Path, sh: NDArray[np.void] | None, count: int) -> NDArray[np.flo
     rest = np.empty((count, per_channel, 3), dtype=np.float32)
     for index, name in enumerate(names):
         codes = column(path, sh, name)
-        # The writer cuts 256 equal bins; their middles come back, and the ends where it clamped.
+        # The writer uses 256 equal bins; reading returns their centres, and the limits for clamped
+        # values.
         fraction = np.where(codes == 0, 0.0, np.where(codes == 255, 1.0, (codes + 0.5) / 256))
         rest[:, index % per_channel, index // per_channel] = (fraction - 0.5) * 8
     return rest
@@ -564,7 +565,7 @@ def _fractions(values: Float) -> tuple[Float, Float, Float]:
     starts = np.arange(0, len(values), CHUNK_SIZE)
     if not len(starts):
         return values, np.empty((0, 3)), np.empty((0, 3))
-    # The file holds bounds as float32, so fractions refer to what will be read back.
+    # The file stores bounds as float32, so fractions refer to the rounded bounds.
     low = np.minimum.reduceat(values, starts).astype(np.float32).astype(np.float64)
     high = np.maximum.reduceat(values, starts).astype(np.float32).astype(np.float64)
     chunk_of = np.arange(len(values)) // CHUNK_SIZE
@@ -574,7 +575,7 @@ def _fractions(values: Float) -> tuple[Float, Float, Float]:
 
 
 def _pack(fractions: Float, bits: tuple[int, ...]) -> Words:
-    """One word of each row of fractions; the first component goes to the highest bits."""
+    """Pack each row of fractions into one word; the first component is in the highest bits."""
     words = np.zeros(len(fractions), dtype=np.uint32)
     for axis, width in enumerate(bits):
         codes = np.rint(fractions[:, axis] * (2**width - 1)).astype(np.uint32)

@@ -22,7 +22,7 @@ UpAxis = Literal["z", "y", "-y"]
 """Axis of a file that points up: ``y`` as in glTF (z forward), ``-y`` as in OpenCV and COLMAP."""
 
 MIN_SCALE = 1e-20
-"""Scales whose exponential underflows are lifted to this [m], since a scale is positive."""
+"""Minimum scale [m], for scales whose exponential underflows: scales must be positive."""
 
 
 class SplatFormat(Protocol):
@@ -42,12 +42,12 @@ class SplatFormat(Protocol):
 
     @property
     def up_axis(self) -> UpAxis:
-        """Up axis by convention of the format; else the scene's own, ``z``."""
+        """Up axis by convention of the format; ``z`` if it has none."""
 
     def recognises(self, head: bytes) -> bool:
-        """Whether a file that starts with ``head`` (up to 64 KiB) is of this format.
+        """Whether a file that starts with ``head`` (up to 64 KiB) has this format.
 
-        Always false where there is no signature.
+        Always false for formats without a signature.
         """
 
     def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
@@ -55,12 +55,11 @@ class SplatFormat(Protocol):
 
         Args:
             path: the file.
-            max_bytes: what they may take in memory; compared before anything is unpacked. None for
-                any amount.
+            max_bytes: memory limit, checked before anything is unpacked. None for no limit.
 
         Raises:
-            BundleTooLargeError: they take more.
-            BundleError: naming the file and the reason.
+            BundleTooLargeError: the limit is exceeded.
+            BundleError: names the file and the reason.
         """
 
     def write(self, cloud: GaussianCloud, path: Path) -> None:
@@ -73,15 +72,15 @@ class SplatFormat(Protocol):
 
 
 def check_memory(path: Path, count: int, harmonics: int, max_bytes: int | None) -> None:
-    """Refuse a file by its unpacked size, whatever its compressed size.
+    """Reject a file by its unpacked size, independent of its compressed size.
 
     Args:
         path: for the message.
-        count, harmonics: of Gaussians, and of each one's spherical harmonics.
-        max_bytes: what they may take in memory; None for any amount.
+        count, harmonics: number of Gaussians, and of spherical harmonics of each.
+        max_bytes: memory limit; None for no limit.
 
     Raises:
-        BundleTooLargeError: they take more.
+        BundleTooLargeError: the limit is exceeded.
     """
     needed = 4 * count * (11 + 3 * harmonics)
     if max_bytes is not None and needed > max_bytes:
@@ -127,7 +126,7 @@ def columns(
     names: tuple[str, ...],
     dtype: type[np.floating[Any]] = np.float64,
 ) -> NDArray[Any]:
-    """Properties [N, len(names)] of records, finite; float64 where ``dtype`` names no other type.
+    """Properties [N, len(names)] of records, finite; float64 unless ``dtype`` names another type.
 
     Raises like :func:`column`.
     """
@@ -152,12 +151,12 @@ def build_cloud(
     opacities: NDArray[np.floating[Any]],
     sh: NDArray[np.floating[Any]],
 ) -> GaussianCloud:
-    """A cloud of parameters as files hold them: quats [N, 4] wxyz of any length, log scales.
+    """A cloud from parameters as stored in files: quats [N, 4] wxyz of any length, log scales.
 
-    Arrays of float32 are not copied; whoever has many values hands them over so.
+    Arrays of float32 are not copied, to save memory.
 
     Raises:
-        BundleError: for quaternions of length zero and values beyond the range of float32.
+        BundleError: quaternions of length zero, or values beyond the range of float32.
     """
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     zero = norms[:, 0] < 1e-12
@@ -193,11 +192,11 @@ SPLAT_RECORD = np.dtype(
 class AntimatterSplat:
     """Records of position, linear scale (float32), RGBA and rotation wxyz (bytes).
 
-    Axes: none are prescribed; files made of trained splats have y down like those. Both ways keep
-    the coordinates as they are.
+    Axes: not prescribed; files from trained splats are y down like their source. Reading and
+    writing preserve the coordinates.
 
     Quantisation: positions and scales keep their bits; colours and opacities are multiples of
-    1/255, colours clamped to [0, 1]; parts of the quaternion are multiples of 1/128. Spherical
+    1/255, colours clamped to [0, 1]; quaternion components are multiples of 1/128. Spherical
     harmonics past the first are lost.
     """
 
@@ -207,7 +206,7 @@ class AntimatterSplat:
     up_axis: UpAxis = "z"
 
     def recognises(self, head: bytes) -> bool:
-        """Never: there is no header."""
+        """Always false: there is no header."""
         return False
 
     def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:

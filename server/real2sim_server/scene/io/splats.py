@@ -31,18 +31,19 @@ _ROTATIONS: dict[str, list[list[float]]] = {
     "y": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
     "-y": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
 }
-"""Rotations from the file's axes to x forward, y left, z up. ``y`` is that of glTF (z forward),
-``-y`` that of OpenCV and COLMAP (z forward, x right)."""
+"""Rotations from the file's axes to x forward, y left, z up. ``y`` follows glTF (z forward), ``-y``
+OpenCV and COLMAP (z forward, x right).
+"""
 
 VIEW_DURATION_US = 10_000_000
-"""Duration of the ego's stand in an imported scene: long enough to drive through it."""
+"""Duration of the stationary ego in an imported scene, enough for a drive through it."""
 
 
 def register_format(splat_format: SplatFormat) -> None:
     """Add a format from outside the package; it takes precedence over the existing ones.
 
     Raises:
-        ValueError: another format has that name or that suffix.
+        ValueError: another format has that name or suffix.
     """
     for known in FORMATS:
         if splat_format.name == known.name or splat_format.suffix == known.suffix:
@@ -60,12 +61,12 @@ def read_splats(path: str | PathLike[str], *, max_bytes: int | None = None) -> G
 
     Args:
         path: the file.
-        max_bytes: what its Gaussians may take in memory; None for any amount.
+        max_bytes: memory limit of its Gaussians; None for no limit.
 
     Raises:
-        BundleTooLargeError: they take more.
-        BundleError: naming the file and the reason: not there, of no known format, cut short,
-            wrong counts, values that are not finite, rotations of length zero.
+        BundleTooLargeError: the limit is exceeded.
+        BundleError: names the file and the reason: missing, unknown format, truncated, wrong
+            counts, values that are not finite, rotations of length zero.
     """
     file = Path(path)
     head = _head(file)
@@ -82,19 +83,19 @@ def read_splats(path: str | PathLike[str], *, max_bytes: int | None = None) -> G
 def write_splats(
     cloud: GaussianCloud, path: str | PathLike[str], *, up_axis: UpAxis | None = None
 ) -> None:
-    """Write ``cloud`` in the format that the name ends with, atomically, in its own frame.
+    """Write ``cloud`` in the format of the file name suffix, atomically, in its own frame.
 
-    ``.compressed.ply``, ``.ply``, ``.spz`` (version 3) or ``.splat``; each format's class
-    documents what it rounds.
+    ``.compressed.ply``, ``.ply``, ``.spz`` (version 3) or ``.splat``; the class of each format
+    documents its rounding.
 
     Args:
         cloud: the Gaussians.
         path: file to write.
-        up_axis: which axis points up; the header of a ply says so. None: unknown.
+        up_axis: axis that points up, written to the header of a ply. None: unknown.
 
     Raises:
-        SceneError: another ending, values that are not finite or out of range, or values the
-            format cannot hold.
+        SceneError: another suffix, values that are not finite or out of range, or not
+            representable in the format.
         OSError: the file cannot be written.
     """
     file = Path(path)
@@ -107,7 +108,7 @@ def write_splats(
 
 
 def up_axis_of(path: str | PathLike[str]) -> UpAxis | None:
-    """The axis of a splat file that points up, where its format (spz) or its header says so.
+    """The up axis of a splat file, if its format (spz) or its header defines it.
 
     Raises:
         BundleError: it cannot be read.
@@ -117,7 +118,7 @@ def up_axis_of(path: str | PathLike[str]) -> UpAxis | None:
         said = re.search(rb"^comment up_axis (z|y|-y)\r?$", head.split(b"end_header")[0], re.M)
         return cast("UpAxis", said[1].decode()) if said else None
     known = (f.up_axis for f in FORMATS if f.recognises(head))
-    # A format whose users agree on nothing has the scene's own axis.
+    # A format without a convention has the scene's own axis.
     return next((axis for axis in known if axis != "z"), None)
 
 
@@ -178,16 +179,16 @@ def import_splats(
         name: name of the scene, or id of the asset.
         as_asset: make an asset instead of a scene.
         category: class of the asset.
-        up_axis: which axis of the file points up; trained splats mostly have ``-y``. None: what
-            its format or header says (:func:`up_axis_of`), else ``z``.
-        yaw: turn about z after that [rad], to bring the front of a thing to x.
+        up_axis: axis of the file that points up; trained splats mostly have ``-y``. None: from its
+            format or header (:func:`up_axis_of`), else ``z``.
+        yaw: rotation about z after that [rad], to align the front of an object with x.
         scale: metres per unit of the file.
-        max_bytes: what its Gaussians may take in memory; None for any amount.
+        max_bytes: memory limit of its Gaussians; None for no limit.
 
     Raises:
-        BundleTooLargeError: they take more.
+        BundleTooLargeError: the limit is exceeded.
         BundleError: like :func:`read_splats`, and for a file without splats.
-        SceneError: for an unknown ``up_axis`` or a scale that is not positive.
+        SceneError: an unknown ``up_axis`` or a scale that is not positive.
     """
     file = Path(path)
     cloud = read_splats(file, max_bytes=max_bytes)
@@ -220,7 +221,7 @@ def asset_from_cloud(
 
 
 def scene_from_cloud(cloud: GaussianCloud, *, name: str, provenance: dict[str, Any]) -> Scene:
-    """A scene with ``cloud`` as background, seen along x by one camera that holds its robust box.
+    """A scene with ``cloud`` as background, seen along x by one camera that covers its robust box.
 
     The ego stands behind the box for ten seconds; its camera ``front`` looks at the box's centre.
     """
@@ -245,10 +246,10 @@ def scene_from_cloud(cloud: GaussianCloud, *, name: str, provenance: dict[str, A
 
 
 def robust_bounds(cloud: GaussianCloud, *, opacity: float = 0.1) -> tuple[Float, Float]:
-    """Lowest and highest corner [3] [m] of what one sees, without the floaters.
+    """Lowest and highest corner [3] [m] of the visible part, without floaters.
 
     Between the 0.5 and 99.5 percentiles of the centres of Gaussians above ``opacity``; of all
-    where none is.
+    Gaussians if none is.
     """
     visible = cloud.means[cloud.opacities >= opacity]
     means = (visible if len(visible) else cloud.means).detach().cpu().numpy().astype(np.float64)
@@ -265,10 +266,10 @@ def _head(file: Path) -> bytes:
 
 
 def upright(up_axis: str, yaw: float) -> Float:
-    """Turn ``T_scene_file`` [4, 4] for files whose ``up_axis`` points up, then by ``yaw`` [rad].
+    """Rotation ``T_scene_file`` [4, 4] for files with ``up_axis`` up, followed by ``yaw`` [rad].
 
     Raises:
-        SceneError: for an unknown axis or a yaw that is not finite.
+        SceneError: an unknown axis or a yaw that is not finite.
     """
     if up_axis not in _ROTATIONS:
         raise SceneError(f"up_axis {up_axis!r}; allowed are {list(_ROTATIONS)}")

@@ -34,10 +34,10 @@ HAS_EXTENSIONS = 2
 MAX_EXTENSION_BYTES = 1 << 20
 
 MAX_REST = 15
-"""Harmonics past the first that a cloud can hold; those of degree 4 are cut."""
+"""Maximum number of harmonics past the first in a cloud; those of degree 4 are dropped."""
 
 MAX_SPLATS = 20_000_000
-"""More are refused; the largest street scenes have a few million."""
+"""Larger files are rejected; the largest street scenes have a few million."""
 
 ZSTD_LEVEL = 12
 GZIP_LEVEL = 6
@@ -48,7 +48,7 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Header:
-    """What all versions say: version, number of splats, degree 0 to 4, bits, flags."""
+    """Fields common to all versions: version, number of splats, degree 0 to 4, bits, flags."""
 
     version: int
     count: int
@@ -100,16 +100,16 @@ def is_spz(head: bytes) -> bool:
 def read_streams(path: Path, *, max_bytes: int | None = None) -> tuple[Header, Streams]:
     """Header and decompressed streams of a file of any version.
 
-    No more is inflated than the header asks for, and the header is checked before.
+    The header is checked first, and limits the number of inflated bytes.
 
     Args:
         path: the file.
-        max_bytes: what its Gaussians may take in memory.
+        max_bytes: memory limit of its Gaussians.
 
     Raises:
-        BundleTooLargeError: they take more.
-        BundleError: naming the file and the reason: not there, an unknown version, counts out of
-            range or not fitting, cut short, broken compression.
+        BundleTooLargeError: the limit is exceeded.
+        BundleError: names the file and the reason: missing, unknown version, counts out of range
+            or mismatched, truncated, broken compression.
     """
     try:
         data = path.read_bytes()
@@ -211,7 +211,7 @@ def _unpack(path: Path, header: Header, data: bytes) -> Streams:
 
 
 def _inflate_gzip(path: Path, data: bytes, limit: int) -> bytes:
-    """At most ``limit`` bytes of what is packed in ``data``."""
+    """At most ``limit`` decompressed bytes of ``data``."""
     machine = zlib.decompressobj(31)
     position = 0
 
@@ -242,7 +242,7 @@ def _collect(step: Callable[[int], bytes], exhausted: Callable[[], bool], limit:
 
 
 def _inflate_zstd(path: Path, name: str, frame: bytes, size: int) -> bytes:
-    """Exactly ``size`` bytes of a frame; memory grows with what it really holds."""
+    """Exactly ``size`` bytes of a frame; memory grows with its actual content."""
     try:
         with zstandard.ZstdDecompressor().stream_reader(frame) as reader:
             parts: list[bytes] = []
@@ -268,24 +268,24 @@ FRACTIONAL_BITS = 12
 """Positions are multiples of 2^-12 (a quarter of a millimetre) unless they reach too far."""
 
 SH_BITS = (5, 4, 4)
-"""Bits kept of harmonics of degree 1, 2, 3; the other bits are zero and compress away."""
+"""Significant bits of harmonics of degree 1, 2, 3; the other bits are zero and compress away."""
 
 
 class Spz:
     """Gaussians with 19 to 65 bytes each before compression.
 
     Axes: by definition right, up, back (y up, as glTF), unlike trained PLY files. Reading and
-    writing keep the coordinates: whoever imports such a file says ``up_axis="y"``, and
-    ``export_scene`` turns the scene before it writes one.
+    writing preserve the coordinates: pass ``up_axis="y"`` to import such a file. ``export_scene``
+    rotates the scene before writing.
 
-    Quantisation: positions are multiples of 2^-12 within 2048 units, coarser only where the
-    cloud reaches farther; log scales multiples of 1/16 in [-10, 5.94]; opacities multiples of
-    1/255; coefficients of the first harmonic multiples of 1/38.25 in [-3.33, 3.33]; the three small
-    parts of a quaternion multiples of sqrt(1/2)/511; further harmonics multiples of 1/16 (degree 1)
-    and 1/8 in [-1, 0.992]. Harmonics of degree 4 are cut when read; extensions are skipped.
+    Quantisation: positions are multiples of 2^-12 within 2048 units, coarser only for larger
+    clouds; log scales multiples of 1/16 in [-10, 5.94]; opacities multiples of 1/255; coefficients
+    of the first harmonic multiples of 1/38.25 in [-3.33, 3.33]; the three small components of a
+    quaternion multiples of sqrt(1/2)/511; further harmonics multiples of 1/16 (degree 1) and 1/8 in
+    [-1, 0.992]. Harmonics of degree 4 are dropped when read; extensions are skipped.
 
     Args:
-        version: of the files to write: 3 (gzip, what most viewers read) or 4 (zstd, smaller).
+        version: of the files to write: 3 (gzip, supported by most viewers) or 4 (zstd, smaller).
         gzip_level: 1 (fast) to 9 (small), of version 3.
     """
 
@@ -303,7 +303,7 @@ class Spz:
         self.gzip_level = gzip_level
 
     def recognises(self, head: bytes) -> bool:
-        """Whether ``head`` is that of a plain or gzipped spz file."""
+        """Whether ``head`` belongs to a plain or gzipped spz file."""
         return is_spz(head)
 
     def read(self, path: Path, *, max_bytes: int | None = None) -> GaussianCloud:
@@ -322,7 +322,7 @@ class Spz:
         """Write ``cloud`` in its order.
 
         Raises:
-            SceneError: for positions beyond what 24 bits of whole units hold (8 million).
+            SceneError: positions beyond the range of 24 bits of whole units (8 million).
             OSError: the file cannot be written.
         """
         content = self.encode(cloud)
@@ -381,7 +381,7 @@ def _rotations(header: Header, streams: Streams) -> Float:
 
 
 def _other_places(place: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The three places [N, 3] in a quaternion besides ``place`` [N], in order."""
+    """The three components [N, 3] of a quaternion other than ``place`` [N], in order."""
     return np.array([[k for k in range(4) if k != p] for p in range(4)])[place]
 
 

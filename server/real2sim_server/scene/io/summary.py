@@ -50,8 +50,8 @@ class SceneSummary:
         background_gaussians: number of Gaussians of the background.
         sky_resolution: edge length of the sky's faces [px], 0 without sky.
         bounds: lowest and highest Gaussian centre of the background [m], None without any.
-        nbytes: bytes of the tensor files, nearly what the scene takes in memory.
-        has_uncertainties: as of Scene.
+        nbytes: size of the tensor files, about the memory of the scene [bytes].
+        has_uncertainties: as in Scene.
         lane_count: lanes of its graph; 0 without one.
     """
 
@@ -82,7 +82,7 @@ class SceneSummary:
 
     @cached_property
     def lanes(self) -> LaneGraph | None:
-        """The lanes of the scene, read on first access; None where it has none.
+        """The lanes of the scene, read on first access; None if it has none.
 
         Raises:
             BundleError: the bundle is damaged, or another one has replaced it.
@@ -96,20 +96,20 @@ class SceneSummary:
 
     @property
     def start_us(self) -> int:
-        """First time the ego path knows [us]."""
+        """Start of the ego path [us]."""
         return self.ego.start_us
 
     @property
     def end_us(self) -> int:
-        """Last time the ego path knows [us]."""
+        """End of the ego path [us]."""
         return self.ego.end_us
 
 
 def read_scene_summary(path: str | PathLike[str]) -> SceneSummary:
-    """Read ``scene.json`` of a bundle and nothing else; hashes are not compared.
+    """Read only ``scene.json`` of a bundle; hashes are not compared.
 
     Raises:
-        BundleError: no scene bundle, a newer version, or not as the format asks.
+        BundleError: not a scene bundle, a newer version, or an invalid document.
     """
     folder = Path(path)
     document = read_container(folder, SceneDocument, verify=False)
@@ -139,10 +139,10 @@ class AssetSummary:
 
 
 def read_asset_summary(path: str | PathLike[str]) -> AssetSummary:
-    """Read the document of an asset bundle and the size of its file, and nothing else.
+    """Read only the document of an asset bundle and the size of its file.
 
     Raises:
-        BundleError: no asset bundle, a newer version, cut short, or not as the format asks.
+        BundleError: not an asset bundle, a newer version, truncated, or an invalid document.
     """
     folder = Path(path)
     document = read_container(folder, AssetDocument, verify=False)

@@ -1,2 +1,3 @@
-"""A search for the avoidable failures of a planner: where it is at fault, and a driver who knows
-what comes could have done otherwise."""
+"""Search for avoidable failures of a planner: it is at fault, and a driver who knows the future
+could have avoided the collision.
+"""

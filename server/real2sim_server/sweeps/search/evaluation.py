@@ -21,30 +21,31 @@ from ..spec import Space
 
 # --- Reference driver ----------------------------------------------------------------------------
 
-# It knows the future and tries manoeuvres in copies of the world, in which everybody else acts as
-# they will. What it avoids was avoidable.
+# The reference driver knows the future. It tries manoeuvres in copies of the world, in which all
+# others act as they will. A collision that it avoids was avoidable.
 
 CRUISE = 8.0
 """Speed that it drives at where nothing hinders it, unless it begins faster [m/s]."""
 HORIZON, SPACING = 4.0, 0.2
-"""Of a manoeuvre that is tried, and between poses of its plan [s]."""
+"""Horizon of a tried manoeuvre, and spacing of the poses of its plan [s]."""
 DECIDES_EVERY = 0.3
-"""Seconds after which it looks for another manoeuvre."""
+"""Interval of its decisions [s]."""
 SIDEWAYS = 5.0
-"""Acceleration of a swerve [m/s^2]; with the hardest braking beside it 7.1 of the 8.8 that tyres on
-dry asphalt give."""
+"""Acceleration of a swerve [m/s^2]. Combined with the hardest braking it is 7.1, below the limit of
+8.8 of tyres on dry asphalt.
+"""
 KEEPS_FREE = 0.2
-"""To everybody, or what there was at the start where that was less [m]."""
+"""Minimum distance to all others, or the initial distance if that is smaller [m]."""
 MIN_TIME = 1.0
-"""To a collision at constant velocities when a manoeuvre ends [s]."""
+"""Minimum time to collision at constant velocities at the end of a manoeuvre [s]."""
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """Something to try.
+    """A candidate manoeuvre.
 
     Attributes:
-        aside: where beside the route it ends, positive on the left [m].
+        aside: final lateral offset from the route, positive on the left [m].
         acceleration: along the route until standstill or ``most`` [m/s^2].
         most: speed [m/s].
     """
@@ -55,19 +56,19 @@ class Manoeuvre:
 
     @property
     def effort(self) -> float:
-        """By which the milder of two is taken."""
+        """Ranks manoeuvres: the mildest is preferred."""
         return abs(self.acceleration) + abs(self.aside)
 
 
 @dataclass(frozen=True)
 class Drove:
-    """How the reference drove.
+    """Outcome of the reference driver.
 
     Attributes:
-        survived: without contact, on the road, with room to spare.
-        gap: smallest to anybody [m].
-        effort: hardest acceleration that it asked for [m/s^2].
-        steps: that it took.
+        survived: no contact, on the road, with the minimum distance to others.
+        gap: minimum distance to others [m].
+        effort: maximum requested acceleration [m/s^2].
+        steps: number of steps.
         world: at the end.
     """
 
@@ -93,10 +94,10 @@ def manoeuvres(most: float) -> list[Manoeuvre]:
 
 
 def drive_reference(world: World) -> Drove:
-    """Drive a world to its end; it is changed.
+    """Drive a world to its end; the world is changed.
 
     Args:
-        world: of plans as trajectories, at any instant.
+        world: with trajectories as plans, at any time.
     """
     start, free = world.steps, gap_now(world)
     most = max(CRUISE, world.motion.speed)
@@ -120,7 +121,7 @@ def drive_reference(world: World) -> Drove:
 
 
 def plan_of(world: World, manoeuvre: Manoeuvre) -> TrajectoryPlan:
-    """Poses of a manoeuvre from here on, along the route and beside it."""
+    """Poses of a manoeuvre from the current time, along the route and next to it."""
     route, motion, point = world.route, world.motion, world.path_point
     shift = manoeuvre.aside - point.offset
     # A quintic change of lanes has 5.77 d / T^2 at most.
@@ -135,7 +136,7 @@ def plan_of(world: World, manoeuvre: Manoeuvre) -> TrajectoryPlan:
             after = min(max(speed + manoeuvre.acceleration * dt, 0.0), max(limit, speed - 2.0 * dt))
             s, speed = s + 0.5 * (speed + after) * dt, after
         u = min(k * SPACING / change, 1.0)
-        # One that hardly moves cannot move aside.
+        # A vehicle that barely moves cannot move sideways.
         offset = point.offset + shift * (u * u * u * (10 - 15 * u + 6 * u * u))
         x, y, _, heading = route.at(s)
         x, y = x - offset * math.sin(heading), y + offset * math.cos(heading)
@@ -150,7 +151,7 @@ def plan_of(world: World, manoeuvre: Manoeuvre) -> TrajectoryPlan:
 
 
 def gap_now(world: World) -> float:
-    """Smallest from the ego's box to another's [m]; infinite where there is nobody."""
+    """Minimum distance from the ego's box to another's [m]; infinite without others."""
     instant, context = world.instant, world.context
     ego, others = instant.ego, instant.others
     if not others.ids:
@@ -165,10 +166,12 @@ def gap_now(world: World) -> float:
 def _chosen(
     world: World, tried: Sequence[Manoeuvre], before: Manoeuvre, wanted: float
 ) -> Manoeuvre:
-    """The mildest that ends well, the one under way before others; else the one that goes well for
-    longest."""
+    """The mildest successful manoeuvre, or the one that succeeds longest.
+
+    The current manoeuvre is preferred.
+    """
     best, best_end = tried[0], (-math.inf, -math.inf)
-    # From the mild one at first, then what is under way, so that it does not dither.
+    # The mild one first, then the current one, to avoid oscillation.
     for manoeuvre in dict.fromkeys([tried[0], before, *tried]):
         end = _end(world, manoeuvre, wanted)
         if end[0] == math.inf:
@@ -179,8 +182,7 @@ def _chosen(
 
 
 def _end(world: World, manoeuvre: Manoeuvre, wanted: float) -> tuple[float, float]:
-    """How long a manoeuvre goes well [s], infinite where that is to its end; and its smallest
-    gap."""
+    """Time until a manoeuvre fails [s], infinite if it succeeds; and its minimum distance."""
     copy, plan = world.fork(), plan_of(world, manoeuvre)
     was_off, smallest = copy.accumulator.off_road, math.inf
     for step in range(round(HORIZON / copy.context.dt)):
@@ -197,30 +199,30 @@ def _end(world: World, manoeuvre: Manoeuvre, wanted: float) -> tuple[float, floa
 
 # --- Realism -------------------------------------------------------------------------------------
 
-# Subtracted from the criticality of cases that people hardly drive.
+# Subtracted from the criticality of cases that are implausible in human driving.
 
 Array = NDArray[np.float64]
 
 HARDEST, SIDEWAYS_LIMIT, JERK = 8.0, 4.0, 20.0
 """Accelerations [m/s^2] along and across, and jerk [m/s^3], that people reach in emergencies."""
 TIGHTEST = 0.2
-"""Curvature of the way of a vehicle, whatever its speed [1/m]: none turns within 5 m."""
+"""Maximum curvature of a vehicle's path at any speed [1/m]: no vehicle turns within 5 m."""
 START_GAP = 1.0
 """Free around the ego when the episode begins [m]."""
 MIN_DRIVERS = 5
-"""A log with fewer that move says nothing about how people drive there."""
+"""Minimum number of moving vehicles for driving statistics of a log."""
 MIN_SPREAD = np.array([1.0, 0.5, 0.5])
 """Standard deviations are at least these: speed [m/s], accelerations [m/s^2]."""
 ORDINARY = 3.0
-"""Standard deviations within which nothing is subtracted."""
+"""No penalty within this many standard deviations."""
 
 
 @dataclass(frozen=True)
 class Manners:
-    """How those who moved in the log did: mean and spread of speed and accelerations.
+    """Driving statistics of the log: mean and spread of speed and accelerations.
 
     Attributes:
-        mean, spread: [3] each; None where too few moved.
+        mean, spread: [3] each; None if too few vehicles moved.
     """
 
     mean: Array | None
@@ -247,7 +249,7 @@ class Manners:
         return cls(found.mean(axis=0), np.maximum(found.std(axis=0), MIN_SPREAD))
 
     def distance(self, features: Array) -> float:
-        """Mahalanobis distance beyond what is ordinary; 0 where the log says nothing."""
+        """Mahalanobis distance beyond the ordinary; 0 without statistics."""
         if self.mean is None or self.spread is None:
             return 0.0
         z = (features - self.mean) / self.spread
@@ -256,7 +258,7 @@ class Manners:
 
 @dataclass
 class Watch:
-    """Follows those who make it hard, over an episode.
+    """Monitors the adversaries over an episode.
 
     Attributes:
         names: their objects.
@@ -280,8 +282,9 @@ class Watch:
                 self._tracks.setdefault(name, []).append((x, y))
 
     def implausibility(self) -> float:
-        """0 for what people do, about 1 for what nobody does; none of it is forbidden, but nobody
-        learns from it."""
+        """0 for normal human driving, about 1 for implausible driving. Implausible cases are
+        allowed, but not instructive.
+        """
         found = max(START_GAP - self._start_gap, 0.0) / START_GAP
         for track in self._tracks.values():
             motion = _motion(np.array(track), self._dt)
@@ -326,37 +329,37 @@ def _features(motion: Array) -> Array:
 
 
 def _beyond(values: Array, most: float) -> float:
-    """By how much the nearly largest of values is beyond what people reach, as a share of it."""
+    """Relative excess of the 98th percentile of the values over a human limit."""
     if not len(values):
         return 0.0
     return max(float(np.percentile(values, 98)) / most - 1.0, 0.0)
 
 
 UNAVOIDABLE, REFUSED = -1.0, -200.0
-"""Scores of a failure that the reference does not avoid, and of what cannot begin."""
+"""Scores of a failure that the reference does not avoid, and of a case that cannot start."""
 MAX_STRANGE = 0.5
 """A collision in a case that is less plausible than this is no finding."""
 SPEED_BIN = 2.0
 """Width of the archive's cells [m/s]."""
 
 Cell = tuple[str, str, str]
-"""Where on the ego, speed of the impact, kind of the other."""
+"""Contact position on the ego, speed of the impact, kind of the other."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A point that was driven.
+    """An evaluated point.
 
     Attributes:
-        space: number of its space.
+        space: index of its space.
         point: coordinates from 0 to 1.
         values: of the parameters.
         drive: the episode.
-        score: higher is nearer to an avoidable failure; above 0 for one.
+        score: higher is nearer to an avoidable failure; positive for one.
         criticality: of the tested planner.
         implausibility: subtracted from it.
         at_fault: whether the planner caused a collision.
-        avoided: whether the reference survived the same; None where it was not asked.
+        avoided: whether the reference survived the same case; None if it did not drive.
         cell: of the archive; None unless at fault.
         impact: columns of the collision.
     """
@@ -375,7 +378,7 @@ class Evaluation:
 
     @property
     def is_failure(self) -> bool:
-        """Whether the planner was at fault for what could be avoided, in a plausible case."""
+        """Whether the planner was at fault for an avoidable collision, in a plausible case."""
         return self.at_fault and bool(self.avoided) and self.implausibility <= MAX_STRANGE
 
 
@@ -401,7 +404,7 @@ class Evaluator:
         return len(drawn_parameters(self.spaces[space].parameters))
 
     def __call__(self, space: int, point: Sequence[float] | NDArray[np.float64]) -> Evaluation:
-        """Drive a point; one more evaluation is counted."""
+        """Drive a point; increments the number of evaluations."""
         self.done += 1
         asked = self.spaces[space]
         inside = tuple(float(min(max(u, 0.0), 1.0)) for u in point)
@@ -417,7 +420,7 @@ class Evaluator:
         score, avoided = driven.criticality - strange, None
         if driven.at_fault:
             avoided = self.reference(drive).survived
-            # A finding is above 0; what nobody avoids, or nobody does, is not sought.
+            # A finding has a positive score; unavoidable and implausible collisions do not count.
             if not avoided:
                 score = UNAVOIDABLE - strange
             elif strange > MAX_STRANGE:
@@ -444,7 +447,7 @@ class Evaluator:
 
 
 def cell_of(driven: Driven) -> Cell:
-    """Of an at-fault collision."""
+    """Cell of an at-fault collision."""
     impact = impact_of(driven)
     low = SPEED_BIN * math.floor((impact["speed"] or 0.0) / SPEED_BIN)
     return impact["where"], f"{low:g} to {low + SPEED_BIN:g} m/s", impact["kind"]
@@ -473,7 +476,7 @@ def impact_of(driven: Driven) -> dict[str, Any]:
 
 
 def _where(world: World, name: str | None, side: str) -> str:
-    """Third of the front, or side of the ego, on which another touches it."""
+    """Third of the front, or side of the ego, at the contact."""
     others, ego, context = world.instant.others, world.instant.ego, world.context
     if name is None or name not in others.ids:
         return side

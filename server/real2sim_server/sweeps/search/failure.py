@@ -29,18 +29,18 @@ from .evaluation import Evaluation, Evaluator, impact_of
 # Bisects each parameter between the failure and a safe end.
 
 HALVINGS = 5
-"""A boundary is known to 1/32 of the way from the failure to the end that is safe."""
+"""Number of bisections: a boundary is accurate to 1/32 of the distance from failure to safe end."""
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """Where a failure ends along one parameter.
+    """Boundary of a failure along one parameter.
 
     Attributes:
         parameter: name.
         failing: the value of the failure.
-        last_fail, first_pass: the two that the boundary is between.
-        share: way to ``first_pass``, as a share of the range.
+        last_fail, first_pass: the values on either side of the boundary.
+        share: distance to ``first_pass``, as a share of the range.
     """
 
     parameter: str
@@ -51,9 +51,9 @@ class Boundary:
 
 
 def boundaries(evaluate: Evaluator, failure: Evaluation) -> list[Boundary]:
-    """The nearest boundary of each parameter that leads to safety alone, the nearest first.
+    """The nearest boundary of each parameter that alone leads to safety, sorted by distance.
 
-    Both ends of a parameter are tried; where one goes well, the way to it is halved.
+    Both ends of a parameter are tried; if one is safe, the interval is bisected.
     """
     names = list(drawn_parameters(evaluate.spaces[failure.space].parameters))
     found = []
@@ -68,7 +68,7 @@ def boundaries(evaluate: Evaluator, failure: Evaluation) -> list[Boundary]:
 def _towards(
     evaluate: Evaluator, failure: Evaluation, parameter: tuple[int, str], end: float
 ) -> Boundary | None:
-    """The boundary on the way to an end; None where that fails as well."""
+    """The boundary towards an end; None if the end fails as well."""
     k, name = parameter
 
     def fails(u: float) -> bool:
@@ -102,7 +102,7 @@ def _moved(failure: Evaluation, k: int, u: float) -> list[float]:
 # --- Scenario files ------------------------------------------------------------------------------
 
 NAMING = ("name", "author", "date")
-"""Of a storyboard: says nothing about what happens."""
+"""Keys of a storyboard without effect on the episode."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,10 @@ class WrittenScenario:
     """The file of a failure.
 
     Attributes:
-        file: relative to the folder of the search; OpenSCENARIO, or a storyboard in JSON where that
-            has no words for it.
+        file: relative to the folder of the search; OpenSCENARIO, or a storyboard in JSON if
+            OpenSCENARIO cannot express it.
         command: drives it.
-        same: whether what it drives ends in the same collision, bit for bit.
+        same: whether it ends in the same collision, bit for bit.
     """
 
     file: str
@@ -124,18 +124,17 @@ class WrittenScenario:
 def write_scenario(
     path: Path, evaluate: Evaluator, found: Evaluation, driven: Driven, *, scene: str
 ) -> WrittenScenario | None:
-    """Write a failure's storyboard, with the road network that it names, read it, and drive it.
+    """Write a failure's storyboard and its road network, read it, and drive it.
 
     Args:
         path: in the folder of the search, without a suffix.
         evaluate: of the search.
         found: the failure.
         driven: its episode.
-        scene: name or path of the scene, for people.
+        scene: name or path of the scene, for display.
 
     Returns:
-        None where the case is no storyboard, or has options beside it that ``real2sim run`` has
-        not.
+        None if the case is not a storyboard, or has options that ``real2sim run`` lacks.
     """
     space = evaluate.spaces[found.space].storyboard
     if space is None:
@@ -170,7 +169,7 @@ def _plain(options: Mapping[str, Any]) -> str:
     board = fields["storyboard"] or {}
     for key in NAMING:
         board.pop(key, None)
-    # A road network's file is called otherwise beside the scenario.
+    # The road network file has another name next to the scenario.
     if (board.get("roads") or {}).get("kind") == "map":
         board["roads"].pop("file", None)
     return json.dumps(fields, sort_keys=True)
@@ -199,12 +198,12 @@ class Failure:
         name: of its files.
         found: the evaluation.
         recording: of the planner's episode.
-        replays: whether the recording comes out the same, bit for bit.
-        avoidable_until: seconds before the impact from which on the reference, taking over from the
-            planner, still avoids it; None where it cannot, or plans are not trajectories.
+        replays: whether the recording replays bit for bit.
+        avoidable_until: latest take-over by the reference that avoids the impact, in seconds before
+            it; None if there is none, or plans are not trajectories.
         boundaries: nearest first.
         film: file, or None.
-        scenario: its file; None where the case is no storyboard.
+        scenario: its file; None if the case is not a storyboard.
     """
 
     name: str
@@ -253,7 +252,7 @@ video{width:100%;border-radius:4px;margin-top:.4rem}
 
 
 def render_page(report: Mapping[str, Any], failures: Sequence[Failure]) -> str:
-    """The page of what failures.json holds."""
+    """The HTML page of failures.json."""
     title = f"Failures of {report['planner']}"
     cards = "".join(_card(f) for f in failures)
     body = "\n".join(
@@ -332,7 +331,7 @@ def _number(value: Any) -> str:
 
 
 def _top_view(failure: Failure) -> str:
-    """The last seconds from above, the ego's way upwards."""
+    """Top view of the last seconds, with the ego's direction upwards."""
     instants = failure.recording.instants
     last, context = instants[-1], failure.recording.context
     cos, sin = math.cos(last.ego.yaw), math.sin(last.ego.yaw)

@@ -1,7 +1,7 @@
-"""The search itself: spread points, then those that a surrogate expects to be more critical; once
-something is found, CMA-ES and variations of it for other kinds.
+"""The search: spread points, then points that a surrogate expects to be more critical. After the
+first finding, also CMA-ES and variations of it for other kinds of failures.
 
-Everything random is drawn from the seed, so that the same search finds the same.
+All random numbers come from the seed, so the search is reproducible.
 """
 
 from __future__ import annotations
@@ -28,14 +28,16 @@ class Archive:
 
     Attributes:
         elites: avoidable failures with the highest score, by cell.
-        first: number of the evaluation that found the first one, from 1; None while there is none.
+        first: number of the first evaluation with a failure, from 1; None without one.
     """
 
     elites: dict[Cell, Evaluation] = field(default_factory=dict)
     first: int | None = None
 
     def add(self, found: Evaluation, number: int) -> bool:
-        """Whether it is kept: a failure in a new cell, or worse than the one there."""
+        """Whether it is added: a failure in a new cell, or with a higher score than the cell's
+        elite.
+        """
         if not found.is_failure or found.cell is None:
             return False
         self.first = number if self.first is None else self.first
@@ -85,11 +87,11 @@ class GaussianProcess:
     def fitted(
         cls, points: Array, values: Array, *, scales: Array | None = None
     ) -> GaussianProcess:
-        """Through points [N, D] in the unit cube and values [N].
+        """Fit to points [N, D] in the unit cube and values [N].
 
         Args:
-            points, values: seen; at least two.
-            scales: length scales; None finds the likeliest.
+            points, values: observations; at least two.
+            scales: length scales; None uses the most likely ones.
         """
         mean, spread = float(values.mean()), max(float(values.std()), 1e-9)
         unit = (values - mean) / spread
@@ -154,21 +156,21 @@ POPULATION = 8
 STEP = 0.25
 """Standard deviation that CMA-ES begins with, of a range."""
 STALE = 3
-"""Generations without anything better after which it begins elsewhere."""
+"""Generations without improvement before a restart elsewhere."""
 START, MIN_START = 8, 4
 """Spread points in all, and of each space."""
 BATCH = 8
 """Points by the surrogate before spaces are weighed again."""
 OPTIMISM = (2.0, 0.5, 1.0)
-"""Standard deviations that are added to what the surrogate expects, by turns."""
+"""Standard deviations added to the surrogate's mean, in turn."""
 REFIT = 4
-"""Points after which the surrogate's length scales are fitted anew."""
+"""Points between fits of the surrogate's length scales."""
 MAX_SEEN = 160
-"""Points that it goes through: the most critical ones, and the latest."""
+"""Maximum number of points for the surrogate: the most critical ones, and the latest."""
 UNIFORM, NEAR, AROUND = 600, 60, 6
-"""Places that are looked at: anywhere, and around each of so many of the most critical points."""
+"""Candidates: anywhere, number of most critical points, and candidates around each of these."""
 ISO, LINE = 0.05, 0.3
-"""Of a variation: isotropic, and along the line to another (Vassiliades and Mouret 2018)."""
+"""Size of a variation: isotropic, and along the line to another (Vassiliades and Mouret 2018)."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,7 @@ class SearchState:
     archive: Archive = field(default_factory=Archive)
 
     def add(self, found: Evaluation) -> bool:
-        """Keep an evaluation; whether the archive gained."""
+        """Add an evaluation; returns whether the archive improved."""
         self.evaluations.append(found)
         return self.archive.add(found, len(self.evaluations))
 
@@ -226,7 +228,7 @@ def search(
 def random_search(
     evaluate: Evaluator, budget: SearchBudget, *, on_progress: Report = lambda _d, _t: None
 ) -> SearchState:
-    """The same budget spent on independent points, spaces by turns: what a search is held to."""
+    """The same budget spent on independent points, spaces in turn: the baseline of a search."""
     state, rng = SearchState(), np.random.default_rng(budget.seed)
     for k in range(budget.episodes):
         space = k % len(evaluate.spaces)
@@ -240,7 +242,7 @@ def random_search(
 def _points(
     evaluate: Evaluator, state: SearchState, budget: SearchBudget, rng: np.random.Generator
 ) -> Iterator[tuple[int, Point]]:
-    """Points to drive next, each asked for once the one before is in the state."""
+    """Points to drive, each requested after the previous one is in the state."""
     yield from _start(evaluate, budget)
     spent = np.zeros((len(evaluate.spaces), 2))
     while True:
@@ -270,12 +272,12 @@ def _start(evaluate: Evaluator, budget: SearchBudget) -> Iterator[tuple[int, Poi
 
 
 def _space(spent: NDArray[np.float64], rng: np.random.Generator) -> int:
-    """Where to go on: more likely where more kinds of failures came of what was driven (Thompson
-    sampling of rates).
+    """Select a space: more likely with more kinds of failures per batch (Thompson sampling of
+    rates).
 
     Args:
-        spent: [S, 2] kinds found and batches driven, of each space.
-        rng: draws.
+        spent: [S, 2] kinds of failures and batches, per space.
+        rng: random generator.
     """
     return int(np.argmax(rng.gamma(spent[:, 0] + 1.0) / (spent[:, 1] + 1.0)))
 
@@ -283,7 +285,7 @@ def _space(spent: NDArray[np.float64], rng: np.random.Generator) -> int:
 def _guided(
     evaluate: Evaluator, state: SearchState, rng: np.random.Generator, space: int
 ) -> Iterator[tuple[int, Point]]:
-    """Points at which a Gaussian process through all episodes of a space hopes for most."""
+    """Points with the best expected score in a Gaussian process of all episodes of a space."""
     scales = None
     for k in range(BATCH):
         mine = _telling([e for e in state.evaluations if e.space == space])
@@ -308,7 +310,7 @@ def _telling(seen: Sequence[Evaluation]) -> list[Evaluation]:
 
 
 def _compressed(scores: Point) -> Point:
-    """Scores so that a second near a collision is worth as much as half of the way to it."""
+    """Compressed scores: a second near a collision counts as much as half of the distance to it."""
     found: Point = np.where(scores < 0.0, -np.log1p(np.maximum(-scores, 0.0)), scores)
     return found
 

@@ -1,4 +1,4 @@
-"""A search from the question to files: failures that replay, what they are, and a page."""
+"""A complete search: failures that replay, their descriptions, and a page."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ NORMAL_95 = 1.959964
 
 @dataclass(frozen=True)
 class Probability:
-    """How often drawn points fail, with an interval of 95 %.
+    """Failure probability of sampled points, with a 95 % interval.
 
     Attributes:
         value, low, high: estimate and interval.
-        how: in words.
-        episodes: that it took.
+        how: method in words.
+        episodes: number of episodes.
     """
 
     value: float
@@ -78,18 +78,18 @@ def splitting(
     most_episodes: int = 2000,
     moves: int = 3,
 ) -> Probability:
-    """Adaptive multilevel splitting (Cerou and Guyader 2007): for what is too rare to be drawn.
+    """Adaptive multilevel splitting (Cerou and Guyader 2007), for events too rare to sample.
 
-    The lowest tenth of the particles is replaced by others that go on from there at random above
-    its level, until all are above ``level``. Moves keep the uniform distribution of the space.
+    The lowest tenth of the particles is replaced by random continuations of others above its level,
+    until all are above ``level``. Moves preserve the uniform distribution of the space.
 
     Args:
         score: of a point from 0 to 1; higher is nearer to failing.
         dimensions: of points.
-        level: from which on a point fails.
+        level: minimum score of a failure.
         particles: at least 10.
-        seed: of all that is random.
-        most_episodes: after which the estimate is an upper bound.
+        seed: of all random numbers.
+        most_episodes: limit; beyond it the estimate is an upper bound.
         moves: tries for each new particle.
     """
     from scipy.special import ndtr, ndtri
@@ -115,7 +115,7 @@ def splitting(
             source = int(rng.choice(alive))
             z, value, accepted = places[source], values[source], 0
             for _ in range(moves):
-                # A Crank-Nicolson step leaves the normal distribution as it is.
+                # A Crank-Nicolson step preserves the normal distribution.
                 tried = math.sqrt(1 - step * step) * z + step * rng.standard_normal(dimensions)
                 if (found := scored(tried)) > threshold:
                     z, value, accepted = tried, found, accepted + 1
@@ -141,8 +141,8 @@ def sobol_indices(
 ) -> dict[str, tuple[float, float]]:
     """First-order and total Sobol indices of a surrogate through episodes, by parameter.
 
-    The surrogate is a smoothed thin-plate spline through what was driven; where that lies unevenly,
-    as after a search, indices are of what it knows. Empty where too few were driven.
+    The surrogate is a smoothed thin-plate spline through the driven points. If these are uneven, as
+    after a search, the indices describe the surrogate. Empty if there are too few episodes.
     """
     from scipy import stats
     from scipy.interpolate import RBFInterpolator
@@ -167,19 +167,19 @@ def sobol_indices(
 
 FAILURES, PAGE = "failures.json", "failures.html"
 TAKE_OVERS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
-"""Seconds before an impact at which the reference tries to take over."""
+"""Take-over times of the reference before an impact [s]."""
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """What a search does beside searching.
+    """Options beyond the search itself.
 
     Attributes:
         budget: of the search itself.
-        shrink: failures whose boundaries are looked for, from the worst on.
+        shrink: number of failures, worst first, to find boundaries for.
         probability: episodes for the probability of an at-fault collision in each space; 0: none.
-        films: failures that are filmed, from the worst on.
+        films: number of failures, worst first, to film.
         film_width: [px].
         scenes: folder of bundles.
     """
@@ -200,10 +200,10 @@ def run_search(
     *,
     on_progress: Report = lambda _stage, _done, _total: None,
 ) -> dict[str, Any]:
-    """Search spaces of one scene for a planner's avoidable failures; write what was found.
+    """Search spaces of one scene for a planner's avoidable failures, and write the findings.
 
     Returns:
-        What ``failures.json`` holds.
+        Contents of ``failures.json``.
 
     Raises:
         CommandError: spaces of several scenes, a planner that cannot drive there, no such scene.
@@ -282,8 +282,10 @@ def _scene_path(name: str, folder: Path | None) -> str:
 
 
 def _avoidable_until(driven: Driven) -> float | None:
-    """How long before the impact the reference, taking over from the planner, still avoids it [s];
-    None where it does not at any instant tried, or plans are not trajectories."""
+    """Latest take-over by the reference that avoids the impact, in seconds before it.
+
+    None if there is none among the tried times, or plans are not trajectories.
+    """
     for before in TAKE_OVERS:
         assert driven.world is not None
         step = len(driven.worlds) - round(before / driven.world.context.dt)
@@ -297,8 +299,10 @@ def _avoidable_until(driven: Driven) -> float | None:
 def _probabilities(
     evaluate: Evaluator, options: SearchOptions, on_progress: Report
 ) -> list[Probability | None]:
-    """Of at-fault collisions in each space, as its parameters are distributed: independent
-    episodes, and splitting where none of them fails."""
+    """Probability of at-fault collisions in each space under its distributions.
+
+    Estimated from independent episodes, and by splitting if none of them fails.
+    """
     if not options.probability:
         return [None] * len(evaluate.spaces)
     found: list[Probability | None] = []
