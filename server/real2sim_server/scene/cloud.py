@@ -136,7 +136,7 @@ class GaussianCloud:
         opacities: [N] float32 in [0, 1].
         sh: [N, K, 3] float32, spherical harmonics, K = (degree + 1)^2, degree 0 to 3; RGB is
             ``clamp(sum_k sh_k Y_k(direction) + 0.5, min=0)`` with the direction in the cloud's
-            own frame, the basis of :func:`~.spherical_harmonics.sh_basis`.
+            own frame, the basis of :func:`.sh_basis`.
         uncertainties: [N] float32 in [0, 1], expected absolute error of the colour, UNSEEN for
             Gaussians without training rays; None if unknown.
 

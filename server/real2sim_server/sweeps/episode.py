@@ -367,7 +367,7 @@ class Driven:
 
     @property
     def criticality(self) -> float:
-        """See :meth:`.criticality.Danger.criticality`; NaN if it could not start."""
+        """See :meth:`Danger.criticality`; NaN if it could not start."""
         return math.nan if self.world is None else self.danger.criticality(self.world)
 
 

@@ -185,7 +185,7 @@ COLUMNS: Mapping[str, type] = {
 
 
 def recipe_of(scene: str, scenes: Path | None, metrics: Sequence[str] = ()) -> Recipe:
-    """Makes workers for a scene; see :func:`~.storyboard_space.open_scene`."""
+    """Makes workers for a scene; see :func:`.spec.open_scene`."""
     return partial(EpisodeWorker, scene, scenes, tuple(metrics))
 
 
@@ -193,7 +193,7 @@ class EpisodeWorker:
     """Holds a scene.
 
     Args:
-        scene, scenes: as :func:`~.storyboard_space.open_scene` takes them.
+        scene, scenes: as :func:`.spec.open_scene` takes them.
         metrics: scores that get columns.
         threads: that it computes with.
     """

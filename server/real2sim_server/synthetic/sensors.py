@@ -97,7 +97,7 @@ class RaycastWorld(NamedTuple):
     One flat tuple, because parallel kernels do not support nested ones.
 
     Attributes:
-        bounds, children, counts, edges, uv, normals, material, paint: as in :class:`.bvh.Geometry`;
+        bounds, children, counts, edges, uv, normals, material, paint: see :class:`.Geometry`;
             the surroundings have root 0.
         paints: [P, 8] paint table.
         shapes: [S, 16] measures of vehicle shapes.

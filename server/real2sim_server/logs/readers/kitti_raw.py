@@ -1,7 +1,7 @@
 """KITTI raw data: one folder per drive, below one folder per recording day.
 
 Source: Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, and the raw data's
-development kit. World, vehicle frame and motion compensation are as in :mod:`.kitti`.
+development kit. World, vehicle frame and motion compensation are as in :mod:`.kitti_tracking`.
 """
 
 from __future__ import annotations

@@ -275,7 +275,7 @@ class WaymoV1Reader:
         """The file ``<sequence>.tfrecord``; the only one by default.
 
         Images are undistorted when they are read, all lasers and both returns are merged. Every
-        record is read once to check it and to list poses and boxes. See :mod:`.waymo` for times.
+        record is read once to check it and to list poses and boxes. Times: :mod:`.waymo_common`.
 
         Raises:
             LogError: see :class:`LogReader`.

@@ -68,7 +68,7 @@ class WaymoV2Reader:
 
         Images are undistorted when they are read, all lasers and both returns are merged, and the
         pixels of the TOP laser are moved by their own poses if ``lidar_pose`` exists. See
-        :mod:`.waymo` for times.
+        :mod:`.waymo_common` for times.
 
         Raises:
             LogError: see :class:`LogReader`.

@@ -350,7 +350,7 @@ def export_scene(
     """Write a scene for other programs, atomically; existing content of ``out`` is replaced.
 
     ``gltf`` gives one ``.glb`` with a node per object: animated along its track, or with ``t_us``
-    at its pose at that time (see :func:`.export_gltf.write_gltf`). The splat formats give, with
+    at its pose at that time (see :func:`write_gltf`). The splat formats give, with
     ``t_us``, one file of all Gaussians in the world at that time. Without it they give a folder:
     the background, each object in its own frame (origin at the box centre), and ``objects.json``
     with file, category, size and track of each. None of them contains the sky.
