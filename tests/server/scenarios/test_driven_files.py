@@ -243,7 +243,9 @@ def test_entities_placed_relative_to_each_other_are_refused(run):
     found = run(scenario(init=init))
 
     assert found.exit_code != 0
-    assert "'Ego' and 'Target' are placed relative to each other" in " ".join(found.output.split())
+    assert "'Ego' and 'Target' have initial positions relative to each other" in " ".join(
+        found.output.split()
+    )
 
 
 EMPTY = "<ParameterDeclarations/>"
