@@ -69,8 +69,10 @@ Slot = Annotated[
     Field(
         ge=0,
         lt=MAX_SHM_SLOTS,
-        description="slot of the shared memory that raw images of the answer may be written to; "
-        "None, or without shared memory: they come with the answer",
+        description=(
+            "slot of the shared memory for raw images of the answer; None, or without "
+            "shared memory: images are part of the answer"
+        ),
     ),
 ]
 
@@ -119,10 +121,12 @@ class EgoState(ServerModel):
     position: Vector3
     quaternion: Quaternion
     yaw: float = Field(description="heading in the world [rad]")
-    speed: float = Field(description="along vehicle x, below 0 backwards [m/s]")
+    speed: float = Field(description="speed along vehicle x, negative in reverse [m/s]")
     gear: Gear = "drive"
-    lateral_speed: float = Field(default=0.0, description="of the rear axle along vehicle y [m/s]")
-    acceleration: float = Field(description="along vehicle x [m/s^2]")
+    lateral_speed: float = Field(
+        default=0.0, description="speed of the rear axle along vehicle y [m/s]"
+    )
+    acceleration: float = Field(description="acceleration along vehicle x [m/s^2]")
     steering: float = Field(description="road-wheel angle [rad]")
     yaw_rate: float = Field(description="[rad/s]")
     size: Vector3 = Field(description="box length, width, height [m]")
@@ -170,26 +174,32 @@ class Event(ServerModel):
     type: str = one_of(EventType)
     t_us: Microseconds
     object_id: str | None = None
-    other_id: str | None = Field(default=None, description="second object, without the ego")
+    other_id: str | None = Field(
+        default=None, description="the second object of a contact without the ego"
+    )
     data: dict[str, float] = Field(default_factory=dict)
     element: str | None = Field(
         default=None,
-        description="of 'storyboard': names from the story down to what has changed, joined by "
-        "'::'; t_us is when, within 10 ms",
+        description=(
+            "for 'storyboard': names from the story down to the changed element, joined by "
+            "'::'; t_us is the time of the change, within 10 ms"
+        ),
     )
     element_type: str | None = Field(
         default=None, description="story, act, maneuver_group, maneuver, event or action"
     )
-    change: str | None = Field(default=None, description="of it: start, end, stop or skip")
+    change: str | None = Field(default=None, description="its transition: start, end, stop or skip")
 
 
 class SignalShown(ServerModel):
     """State of a traffic signal of the storyboard."""
 
     signal_id: str
-    state: str = Field(description="in the words of the storyboard, such as 'red' or 'off;off;on'")
+    state: str = Field(
+        description="as written in the storyboard, for example 'red' or 'off;off;on'"
+    )
     stop_line: Vector3 | None = Field(
-        default=None, description="x, y [m], heading [rad] where vehicles are to stop, world"
+        default=None, description="x, y [m], heading [rad] of the stop line, world"
     )
 
 
@@ -199,14 +209,16 @@ class LaneShown(ServerModel):
     lane_id: str
     kind: LaneKind
     places: Array = Field(
-        description="[K, 4] float64: x, y [m], heading [rad] of the centre line as its traffic "
-        "drives, world; width [m]"
+        description=(
+            "[K, 4] float64: x, y [m], heading [rad] of the centre line in driving "
+            "direction, world; width [m]"
+        )
     )
-    speed_limit: float | None = Field(default=None, description="[m/s]; None: not known")
+    speed_limit: float | None = Field(default=None, description="[m/s]; None: unknown")
     successors: list[str] = Field(default_factory=list)
-    left: str | None = Field(default=None, description="neighbour of the same direction")
+    left: str | None = Field(default=None, description="neighbour in the same direction")
     right: str | None = None
-    opposite: str | None = Field(default=None, description="neighbour that runs the other way")
+    opposite: str | None = Field(default=None, description="neighbour in the opposite direction")
     may_change_left: bool = True
     may_change_right: bool = True
     junction: str | None = None
@@ -220,15 +232,17 @@ class Score(ServerModel):
 
     name: str
     version: str
-    value: float | None = Field(description="None where it is not defined, see `missing`")
-    terms: dict[str, float] = Field(default_factory=dict, description="what it is made of")
+    value: float | None = Field(description="None if undefined, see `missing`")
+    terms: dict[str, float] = Field(default_factory=dict, description="its components")
     assumed: list[str] = Field(
-        default_factory=list, description="what is taken for granted for want of inputs"
+        default_factory=list, description="assumptions made because inputs are missing"
     )
-    missing: list[str] = Field(default_factory=list, description="inputs it cannot do without")
+    missing: list[str] = Field(default_factory=list, description="required inputs that are missing")
     cannot_see: str = Field(
         default="",
-        description="one sentence: what it does not see in this episode, and what of that happened",
+        description=(
+            "one sentence: what it cannot detect in this episode, and what of that occurred"
+        ),
     )
 
 
@@ -239,7 +253,9 @@ class Resume(Model):
     """Continues a session whose connection was lost."""
 
     token: str = Field(max_length=500, description="`resume_token` of the welcome")
-    last_step: int | None = Field(default=None, ge=0, description="newest observation received")
+    last_step: int | None = Field(
+        default=None, ge=0, description="step of the newest observation received"
+    )
 
 
 class Hello(Envelope):
@@ -252,7 +268,7 @@ class Hello(Envelope):
         default="controller", description="'agent' drives objects whose driver is 'external'"
     )
     token: str | None = Field(default=None, max_length=500)
-    resume: Resume | None = Field(default=None, description="of a controller")
+    resume: Resume | None = Field(default=None, description="for a controller")
 
 
 class Attach(Envelope):
@@ -263,7 +279,9 @@ class Attach(Envelope):
 
     type: Literal["attach"] = "attach"
     secret: bytes = Field(
-        min_length=SHM_SECRET_BYTES, max_length=SHM_SECRET_BYTES, description="read from the memory"
+        min_length=SHM_SECRET_BYTES,
+        max_length=SHM_SECRET_BYTES,
+        description="secret read from the shared memory, which proves access to it",
     )
 
 
@@ -288,7 +306,9 @@ class Edit(Envelope):
     """Edits the session's world before the next step."""
 
     type: Literal["edit"] = "edit"
-    base_rev: int | None = Field(default=None, description="refused when the session is elsewhere")
+    base_rev: int | None = Field(
+        default=None, description="refused if the session is at another revision"
+    )
     operations: list[Operation] = Field(min_length=1, max_length=MAX_OPERATIONS_PER_REQUEST)
 
 
@@ -368,17 +388,19 @@ class Frame(ServerModel):
     codec: Codec
     dtype: Literal["uint8", "uint16", "float32"]
     shape: list[int] = Field(description="[H, W, 3] or [H, W]")
-    lens: str | None = Field(default=None, description="its model; None: a pinhole")
-    shutter: str | None = Field(default=None, description="its direction; None: global")
+    lens: str | None = Field(default=None, description="lens model; None: pinhole")
+    shutter: str | None = Field(
+        default=None, description="readout direction of the shutter; None: global"
+    )
     effects: list[str] | None = Field(
-        default=None, description="of the sensor's, those that are on; None: none"
+        default=None, description="effects of the sensor that are on; None: none"
     )
     offset: int | None = Field(
         default=None,
         ge=0,
-        description="of a raw image that lies in the shared memory, from its beginning [bytes]",
+        description="offset of a raw image in the shared memory [bytes]",
     )
-    data: bytes = Field(description="empty where the image lies in the shared memory")
+    data: bytes = Field(description="empty if the image is in the shared memory")
 
 
 class PointCloud(ServerModel):
@@ -386,29 +408,37 @@ class PointCloud(ServerModel):
 
     sensor: str
     modality: str = one_of(CloudModality)
-    t_us: Microseconds = Field(description="its instant; a sweep's last ray is fired then")
-    duration_us: int = Field(description="from the first ray to the last; 0 of radars")
+    t_us: Microseconds = Field(description="time stamp; a sweep fires its last ray then")
+    duration_us: int = Field(description="time from the first ray to the last; 0 for radars")
     frame: str = one_of(CloudFrame)
     compensated: bool = Field(
-        description="points are as seen from the pose at `t_us`; false: at each ray's own instant"
+        description=(
+            "points are compensated to the pose at `t_us`; false: each point is relative to "
+            "the pose at its own ray's time"
+        )
     )
-    T_world_sensor: Array = Field(description="[4, 4] float64, at `t_us`")
+    T_world_sensor: Array = Field(description="[4, 4] float64, sensor to world at `t_us`")
     T_vehicle_sensor: Array = Field(description="[4, 4] float64")
     count: int = Field(ge=0, description="number of points, N")
-    fields: list[CloudField] = Field(description="columns in their order; each [N, width]")
+    fields: list[CloudField] = Field(description="columns in order; each [N, width]")
     codec: str = one_of(CloudCodec)
     data: bytes = Field(
-        description="'raw': the columns, little-endian; 'deflate': zlib of them, the first bytes "
-        "of all numbers of a column before the second ones, and so on"
+        description=(
+            "'raw': the columns, little-endian; 'deflate': the same compressed by zlib, "
+            "with the bytes of each column shuffled: all first bytes, then all second "
+            "bytes, and so on"
+        )
     )
 
 
 class SharedMemory(ServerModel):
     """Shared memory for raw images, for a controller on the worker's machine."""
 
-    name: str = Field(pattern=SHM_NAME, description="of a file in /dev/shm")
+    name: str = Field(pattern=SHM_NAME, description="name of a file in /dev/shm")
     slots: int = Field(ge=1, le=MAX_SHM_SLOTS)
-    slot_bytes: int = Field(ge=1, le=2**40, description="of each; the first begins at byte 4096")
+    slot_bytes: int = Field(
+        ge=1, le=2**40, description="size of each slot; the first slot begins at byte 4096"
+    )
 
 
 class Welcome(ServerEnvelope):
@@ -424,18 +454,21 @@ class Welcome(ServerEnvelope):
     objects: Named[ObjectInfo]
     route: Array | None = Field(
         default=None,
-        description="[R, 4] float64 x, y, z [m], heading [rad] along the recorded drive, world, a "
-        "point every metre (4096 at most); None: of a worker that does not say",
+        description=(
+            "[R, 4] float64 x, y, z [m], heading [rad] along the recorded drive, world, a "
+            "point every metre (at most 4096); None: an older worker"
+        ),
     )
     start_us: Microseconds
     end_us: Microseconds
-    step: int | None = Field(description="of the running episode; None before reset")
-    revision: int = Field(default=0, description="of the session's edits")
+    step: int | None = Field(description="step of the running episode; None before reset")
+    revision: int = Field(default=0, description="revision of the session's edits")
     resume_token: str | None = Field(
-        default=None, description="of a controller: lets it come back after a lost connection"
+        default=None, description="for a controller: resumes after a lost connection"
     )
     shared_memory: SharedMemory | None = Field(
-        default=None, description="of a controller that may be on this machine, for `attach`"
+        default=None,
+        description="for a controller on the same machine: shared memory to `attach`",
     )
 
 
@@ -451,13 +484,15 @@ class Obs(ServerEnvelope):
     type: Literal["obs"] = "obs"
     step: int
     t_us: Microseconds
-    revision: int = Field(description="of the session's edits")
+    revision: int = Field(description="revision of the session's edits")
     ego: EgoState
-    command: Literal["straight", "left", "right"] = Field(description="from the route ahead")
+    command: Literal["straight", "left", "right"] = Field(
+        description="command derived from the route ahead"
+    )
     route: Array = Field(description="[R, 2] float64 x, y of the route ahead, vehicle frame [m]")
     frames: list[Frame]
     clouds: list[PointCloud] = Field(
-        default_factory=list, description="of LiDARs and radars that are due"
+        default_factory=list, description="clouds of LiDARs and radars that are due"
     )
     agents: list[AgentState] = Field(default_factory=list)
     events: list[Event] = Field(default_factory=list)
@@ -466,24 +501,28 @@ class Obs(ServerEnvelope):
     )
     lanes: list[LaneShown] = Field(
         default_factory=list,
-        description="of privileged episodes on a scene with a map: within 60 m, the nearest first, "
-        "at most 32",
+        description=(
+            "in privileged episodes on a scene with a map: lanes within 60 m, nearest "
+            "first, at most 32"
+        ),
     )
     metrics: dict[str, float] = Field(default_factory=dict)
     terminated: bool = False
     truncated: bool = False
     reason: str | None = None
     warming_up: bool = Field(default=False, description="the ego still moves as recorded")
-    lap: int = Field(default=0, description="times the ego has been put back to the route's start")
+    lap: int = Field(
+        default=0, description="number of times the ego returned to the start of the route"
+    )
     drawn: dict[str, float] = Field(
         default_factory=dict,
-        description="what the seed has drawn for this episode in the step that led here, by name",
+        description="values that the seed drew for this episode in the last step, by name",
     )
     ego_truth: EgoState | None = Field(
         default=None,
-        description="of a privileged episode whose `ego` is an estimate with errors",
+        description="true state, in a privileged episode whose `ego` is an estimate with errors",
     )
-    timing: dict[str, float] = Field(default_factory=dict, description="milliseconds by stage")
+    timing: dict[str, float] = Field(default_factory=dict, description="time by stage [ms]")
 
 
 class Edited(ServerEnvelope):
@@ -511,7 +550,7 @@ class Driven(ServerEnvelope):
 
     type: Literal["driven"] = "driven"
     object_id: str
-    step: int = Field(description="the plan holds from this step on")
+    step: int = Field(description="step from which the plan is followed")
 
 
 class Kept(ServerEnvelope):
@@ -549,10 +588,10 @@ class Error(ServerEnvelope):
     detail: str
     hint: str | None = None
     retryable: bool = False
-    fatal: bool = Field(default=False, description="the socket is closed after this")
-    step: int | None = Field(default=None, description="step the session is at")
+    fatal: bool = Field(default=False, description="the socket closes after this message")
+    step: int | None = Field(default=None, description="current step of the session")
     retry_after_s: int | None = Field(
-        default=None, description="of `retryable` ones: when it may be sent again"
+        default=None, description="if `retryable`: wait before sending it again"
     )
 
 

@@ -25,26 +25,33 @@ class SensorSpec(Model):
     camera: Identifier
     modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=6)
     width: int | None = Field(default=None, ge=16, le=8192, description="[px]; default: recorded")
-    codec: Codec = Field(default="raw", description="of rgb; all else is raw or png")
-    quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
+    codec: Codec = Field(
+        default="raw", description="encoding of rgb; other modalities are raw or png"
+    )
+    quality: int = Field(default=90, ge=1, le=100, description="JPEG quality")
     period_us: int | None = Field(
         default=None, gt=0, description="time between frames; a multiple of dt_us; default: dt_us"
     )
 
     detail: Literal["auto", "full"] = Field(
         default="auto",
-        description="'auto': images of at most 16,384 pixels are drawn from merged Gaussians, "
-        "antialiased, in a fraction of the time; 'full': from all of them, as larger ones always",
+        description=(
+            "'auto': images of at most 16,384 pixels are rendered from merged Gaussians, "
+            "antialiased, in a fraction of the time; 'full': from all Gaussians, as larger "
+            "images always are"
+        ),
     )
 
     optics: Optics = Field(
         default="pinhole",
-        description="'pinhole': free of distortion, as scenes are trained; 'recorded': through the "
-        "lens and shutter that the log's camera really had, where its scene knows them; or a lens "
-        "and shutter given here",
+        description=(
+            "'pinhole': without distortion, as scenes are trained; 'recorded': lens and "
+            "shutter of the log's camera, if the scene has them; or a lens and shutter "
+            "given here"
+        ),
     )
     effects: CameraEffects | None = Field(
-        default=None, description="what a real camera does to its colour images; default: nothing"
+        default=None, description="camera effects on colour images; default: none"
     )
 
     @model_validator(mode="after")
@@ -70,10 +77,10 @@ class VehicleSpec(Model):
         default=0.56, description="fraction of the weight on the front axle at rest"
     )
     centre_height: Annotated[float, Field(ge=0, le=4)] = Field(
-        default=0.55, description="of the centre of mass above the ground [m]"
+        default=0.55, description="height of the centre of mass above the ground [m]"
     )
     friction: Annotated[float, Field(gt=0, le=2)] = Field(
-        default=0.9, description="tyre on road; 0.9 is dry asphalt, 0.5 wet, 0.2 snow"
+        default=0.9, description="friction of tyre on road: 0.9 dry asphalt, 0.5 wet, 0.2 snow"
     )
     front_cornering: Annotated[float, Field(gt=1, le=100)] = Field(
         default=11.5, description="cornering coefficient of the front axle [1/rad]"
@@ -91,16 +98,15 @@ class ActuatorSpec(Model):
 
     steering_delay_us: int = Field(default=0, ge=0, le=1_000_000, description="dead time")
     steering_lag: Annotated[float, Field(ge=0, le=2)] = Field(
-        default=0.05, description="time constant of the first order [s]"
+        default=0.05, description="time constant of the first-order lag [s]"
     )
     drive_delay_us: int = Field(default=0, ge=0, le=1_000_000, description="dead time")
     drive_lag: Annotated[float, Field(ge=0, le=2)] = Field(
-        default=0.2, description="time constant of the first order [s]"
+        default=0.2, description="time constant of the first-order lag [s]"
     )
     foreseen: bool = Field(
         default=True,
-        description="trackers of trajectories know these figures and act in time; false: they "
-        "steer as if there were neither lag nor dead time",
+        description="trajectory trackers compensate lag and dead time; false: they ignore both",
     )
 
 
@@ -119,16 +125,16 @@ class SuspensionSpec(Model):
         default=1.5, description="ride frequency of the rear axle [Hz]"
     )
     damping: Annotated[float, Field(ge=0.05, le=0.95)] = Field(
-        default=0.3, description="of the critical one"
+        default=0.3, description="fraction of critical damping"
     )
     track: Annotated[float, Field(ge=0.3, le=5)] = Field(
-        default=1.58, description="between left and right wheels [m]"
+        default=1.58, description="track width, left to right wheels [m]"
     )
     pitch_resistance: Annotated[float, Field(ge=0, le=0.95)] = Field(
-        default=0.3, description="share of the load transfer that links carry past the springs"
+        default=0.3, description="share of the load transfer carried by links instead of springs"
     )
     roll_resistance: Annotated[float, Field(ge=0, le=0.95)] = Field(
-        default=0.4, description="share of the load transfer that anti-roll bars carry"
+        default=0.4, description="share of the load transfer carried by anti-roll bars"
     )
 
 
@@ -137,13 +143,16 @@ class EgoSpec(Model):
 
     dynamics: Literal["kinematic_bicycle", "dynamic_bicycle"] = "kinematic_bicycle"
     tracker: Literal["pursuit", "lqr", "ilqr", "perfect"] = Field(
-        default="pursuit", description="controller of trajectories; 'perfect' is put on the plan"
+        default="pursuit",
+        description="trajectory controller; 'perfect' places the ego on the plan",
     )
     tracker_version: Literal[1, 2] = Field(
         default=2,
-        description="2: trackers know a plan's acceleration and direction before its first pose, "
-        "and plans of a single pose by the one before; 1: they do not, as in episodes recorded "
-        "before this option was there",
+        description=(
+            "2: trackers extrapolate acceleration and direction before a plan's first pose, "
+            "and use the previous plan if a plan has a single pose; 1: they do neither, for "
+            "recordings without this option"
+        ),
     )
     wheelbase: Annotated[float, Field(ge=0.5, le=20)] = Field(default=2.8, description="[m]")
     max_steer: Annotated[float, Field(gt=0, le=1.4)] = Field(default=0.6, description="[rad]")
@@ -155,14 +164,18 @@ class EgoSpec(Model):
     max_speed: Annotated[float, Field(gt=0, le=150)] = Field(default=60.0, description="[m/s]")
     max_reverse_speed: Annotated[float, Field(ge=0, le=20)] = Field(
         default=5.0,
-        description="in reverse gear, which commands engage and plans that lead backwards; 0: it "
-        "has none [m/s]",
+        description=(
+            "top speed in reverse gear, engaged by commands and by plans that lead "
+            "backwards; 0: no reverse gear [m/s]"
+        ),
     )
     vehicle: VehicleSpec = VehicleSpec()
     actuators: ActuatorSpec = ActuatorSpec()
     suspension: SuspensionSpec | None = Field(
         default=SuspensionSpec(),
-        description="body and cameras pitch under drive and brakes and roll in bends; None: rigid",
+        description=(
+            "body and cameras pitch when accelerating and braking and roll in bends; None: rigid"
+        ),
     )
 
 
@@ -187,14 +200,14 @@ class IdmParameters(Model):
     desired_speed: Speed | None = Field(
         default=None, description="[m/s]; default: its highest recorded speed"
     )
-    headway: Seconds = Field(default=1.5, description="T [s]")
-    gap: Metre = Field(default=2.0, description="s0, bumper to bumper at rest [m]")
+    headway: Seconds = Field(default=1.5, description="desired time headway T [s]")
+    gap: Metre = Field(default=2.0, description="gap s0 at rest, bumper to bumper [m]")
     acceleration: Annotated[float, Field(gt=0, le=10)] = Field(default=1.5, description="[m/s^2]")
     braking: Annotated[float, Field(gt=0, le=10)] = Field(
-        default=2.0, description="comfortable [m/s^2]"
+        default=2.0, description="comfortable deceleration [m/s^2]"
     )
     lateral: Annotated[float, Field(gt=0, le=10)] = Field(
-        default=2.5, description="acceleration sideways that sets the speed in bends [m/s^2]"
+        default=2.5, description="lateral acceleration that limits the speed in bends [m/s^2]"
     )
 
 
@@ -204,8 +217,10 @@ class IdmDriver(IdmParameters):
     kind: Literal["idm"] = "idm"
     path: Literal["recorded", "route"] = Field(
         default="recorded",
-        description="'recorded': its own, as recorded or edited; 'route': the lane beside the "
-        "ego's route in which it is, the way it faces",
+        description=(
+            "'recorded': its own path, recorded or edited; 'route': its lane along the "
+            "ego's route, in the direction it faces"
+        ),
     )
 
 
@@ -216,22 +231,24 @@ class LaneDriver(IdmParameters):
     kind: Literal["lanes"] = "lanes"
     desired_speed: Speed | None = Field(
         default=None,
-        description="[m/s]; default: the lane's limit, or its highest recorded speed where the map "
-        "states none",
+        description=(
+            "[m/s]; default: the lane's limit, or its highest recorded speed if the map has none"
+        ),
     )
     politeness: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.2, description="how much others' gains and losses count beside its own, p"
+        default=0.2, description="politeness p: weight of others' gains and losses"
     )
     threshold: Annotated[float, Field(ge=0, le=5)] = Field(
-        default=0.1, description="gain from which on it changes lanes [m/s^2]"
+        default=0.1, description="smallest gain for a lane change [m/s^2]"
     )
     safe_braking: Annotated[float, Field(gt=0, le=9)] = Field(
-        default=4.0, description="hardest that a change may make the one behind brake [m/s^2]"
+        default=4.0,
+        description="hardest braking that a lane change may impose on the vehicle behind [m/s^2]",
     )
     change_time: Annotated[float, Field(ge=0.5, le=20)] = Field(
-        default=4.0, description="of a change of lanes [s]"
+        default=4.0, description="duration of a lane change [s]"
     )
-    changes: bool = Field(default=True, description="False: it keeps to its lane")
+    changes: bool = Field(default=True, description="False: it never changes lanes")
 
 
 class CutInDriver(Model):
@@ -239,15 +256,19 @@ class CutInDriver(Model):
 
     kind: Literal["cut_in"] = "cut_in"
     offset: Annotated[float, Field(ge=-20, le=20)] = Field(
-        default=3.5, description="of its lane from the route, positive on the left [m]"
+        default=3.5,
+        description="lateral offset of its lane from the route, positive to the left [m]",
     )
-    gap: Metre = Field(default=6.0, description="ego's front to its rear when it moves in [m]")
+    gap: Metre = Field(
+        default=6.0, description="distance from the ego's front to its rear when it cuts in [m]"
+    )
     delay: Annotated[float, Field(ge=0, le=3600)] = Field(
-        default=1.0, description="earliest time after the start to move in [s]"
+        default=1.0, description="earliest time after the start to cut in [s]"
     )
-    duration: Seconds = Field(default=1.5, description="of the change of lanes [s]")
+    duration: Seconds = Field(default=1.5, description="duration of the lane change [s]")
     speed_change: Annotated[float, Field(ge=-50, le=50)] = Field(
-        default=-2.0, description="its speed afterwards, relative to the ego's at that time [m/s]"
+        default=-2.0,
+        description="its speed after the lane change, relative to the ego's at that time [m/s]",
     )
 
 
@@ -258,7 +279,7 @@ class HardBrakeDriver(Model):
     delay: Annotated[float, Field(ge=0, le=3600)] = Field(
         default=1.0, description="earliest time after the start to brake [s]"
     )
-    gap: Metre = Field(default=15.0, description="brakes once the ego is this near [m]")
+    gap: Metre = Field(default=15.0, description="brakes once the ego is within this distance [m]")
     braking: Annotated[float, Field(gt=0, le=12)] = Field(default=7.0, description="[m/s^2]")
 
 
@@ -270,17 +291,18 @@ class JunctionCrossingDriver(Model):
         default=30.0, description="crossing point along the route from the start [m]"
     )
     angle: Annotated[float, Field(ge=-3.2, le=3.2)] = Field(
-        default=1.57, description="its heading against the route's there [rad]"
+        default=1.57, description="its heading relative to the route at the crossing point [rad]"
     )
     speed: Annotated[float, Field(gt=0, le=50)] = Field(
-        default=8.0, description="at the start [m/s]"
+        default=8.0, description="speed at the start [m/s]"
     )
     max_speed: Annotated[float, Field(gt=0, le=60)] = Field(default=15.0, description="[m/s]")
     acceleration: Annotated[float, Field(gt=0, le=10)] = Field(
-        default=3.0, description="to arrive with the ego; either way [m/s^2]"
+        default=3.0,
+        description="largest acceleration or braking to arrive together with the ego [m/s^2]",
     )
     commit: Seconds = Field(
-        default=1.0, description="before the crossing it no longer reacts to the ego [s]"
+        default=1.0, description="time before the crossing when it stops reacting to the ego [s]"
     )
 
 
@@ -307,7 +329,8 @@ class LaneSpec(Model):
     """A lane along the ego's route in which road users appear and disappear."""
 
     offset: Annotated[float, Field(ge=-20, le=20)] = Field(
-        default=0.0, description="of its middle from the route, positive on the left [m]"
+        default=0.0,
+        description="lateral offset of its centre from the route, positive to the left [m]",
     )
     oncoming: bool = Field(default=False, description="against the direction of the route")
 
@@ -320,33 +343,36 @@ class SpawnSpec(Model):
     """
 
     density: Annotated[float, Field(gt=0, le=200)] = Field(
-        default=20.0, description="of each lane [vehicles per km]"
+        default=20.0, description="density of each lane [vehicles per km]"
     )
     lanes: list[LaneSpec] = Field(default=[LaneSpec()], min_length=1, max_length=8)
     ahead: Annotated[float, Field(ge=20, le=500)] = Field(
-        default=60.0, description="where the stretch ends, from the ego along the route [m]"
+        default=60.0,
+        description="distance ahead of the ego to the end of the stretch, along the route [m]",
     )
     behind: Annotated[float, Field(ge=10, le=500)] = Field(
-        default=40.0, description="where the stretch begins, behind the ego [m]"
+        default=40.0, description="distance behind the ego to the start of the stretch [m]"
     )
     margin: Annotated[float, Field(ge=5, le=200)] = Field(
-        default=15.0, description="beyond either edge, after which one leaves [m]"
+        default=15.0, description="distance beyond either end at which a road user is removed [m]"
     )
     gap: Annotated[float, Field(ge=2, le=200)] = Field(
-        default=12.0, description="free way before and behind where one appears [m]"
+        default=12.0,
+        description="free distance ahead and behind required to spawn a road user [m]",
     )
-    most: int = Field(default=16, ge=1, le=64, description="at a time")
+    most: int = Field(default=16, ge=1, le=64, description="largest number at the same time")
     speed_spread: Annotated[float, Field(ge=0, le=0.9)] = Field(
-        default=0.15, description="desired speeds are drawn within this fraction of the driver's"
+        default=0.15,
+        description="desired speeds are drawn within this fraction of the driver's desired speed",
     )
     looks: list[Identifier] = Field(
         default_factory=list,
         max_length=64,
-        description="objects of the scene whose look they have; default: all its vehicles",
+        description="objects of the scene to copy the appearance of; default: all its vehicles",
     )
     driver: IdmDriver = Field(
         default=IdmDriver(),
-        description="its desired speed defaults to the highest one of the recorded drive",
+        description="driver; its desired speed defaults to the highest of the recorded drive",
     )
 
 
@@ -355,17 +381,20 @@ class AgentsSpec(Model):
 
     default: Literal["log", "constant_velocity", "idm", "lanes"] = Field(
         default="log",
-        description="of objects that move and are not named in `drivers`; 'lanes' needs a map",
+        description="driver of moving objects that `drivers` does not name; 'lanes' needs a map",
     )
     drivers: dict[Identifier, AgentDriver] = Field(default_factory=dict, max_length=MAX_DRIVERS)
     ego_off_log: Literal["replay", "idm"] = Field(
         default="replay",
-        description="objects that repeat the log keep to it, or drive by IDM from the moment "
-        "that the ego is `off_log_distance` from where it was recorded at that time",
+        description=(
+            "objects that replay the log keep replaying it, or switch to IDM once the ego "
+            "is `off_log_distance` from its recorded position"
+        ),
     )
     off_log_distance: Metre = Field(default=3.0, description="[m]")
     spawn: SpawnSpec | None = Field(
-        default=None, description="road users that come and go along the route; None: nobody does"
+        default=None,
+        description="road users that appear and leave along the route; None: no such traffic",
     )
 
 
@@ -382,7 +411,7 @@ class StartRandomization(Model):
     lateral: Annotated[float, Field(ge=0, le=3)] = Field(default=0.0, description="[m]")
     heading: Annotated[float, Field(ge=0, le=0.5)] = Field(default=0.0, description="[rad]")
     speed: Annotated[float, Field(ge=0, le=20)] = Field(
-        default=0.0, description="never below standstill [m/s]"
+        default=0.0, description="clipped at standstill [m/s]"
     )
 
 
@@ -409,13 +438,15 @@ class EstimateRandomization(Model):
     """
 
     position: Annotated[float, Field(ge=0, le=5)] = Field(
-        default=0.0, description="along x and y of the world each [m]"
+        default=0.0, description="along each of world x and y [m]"
     )
     heading: Annotated[float, Field(ge=0, le=0.5)] = Field(default=0.0, description="[rad]")
     speed: Annotated[float, Field(ge=0, le=5)] = Field(default=0.0, description="[m/s]")
     correlation: Annotated[float, Field(ge=0, le=600)] = Field(
         default=0.0,
-        description="time in which errors change (Gauss-Markov) [s]; 0: anew at every step",
+        description=(
+            "correlation time of the errors (Gauss-Markov) [s]; 0: independent at every step"
+        ),
     )
 
 
@@ -429,7 +460,7 @@ class Randomization(Model):
         default=0,
         ge=0,
         le=5_000_000,
-        description="a wait, uniform from 0 to this, is added to the latency of every plan",
+        description="upper limit of a uniform random delay added to the latency of every plan",
     )
 
 
@@ -440,77 +471,94 @@ class LatencySpec(Model):
     """Delay before a plan takes effect; the previous plan applies meanwhile."""
 
     model: Literal["zero", "fixed", "measured"] = Field(
-        default="zero", description="'measured': from sending obs to receiving the action"
+        default="zero",
+        description="'measured': the time from sending obs to receiving the action",
     )
-    fixed_us: int = Field(default=0, ge=0, le=5_000_000, description="of 'fixed'")
-    longest_us: int = Field(default=5_000_000, ge=0, le=60_000_000, description="of 'measured'")
+    fixed_us: int = Field(default=0, ge=0, le=5_000_000, description="latency for 'fixed'")
+    longest_us: int = Field(
+        default=5_000_000, ge=0, le=60_000_000, description="upper limit for 'measured'"
+    )
 
 
 class ContactSpec(Model):
     """Definition of contact, and its consequences if `on_collision` is 'continue'."""
 
     restitution: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.1, description="separation speed per approach speed along the normal"
+        default=0.1, description="ratio of separation speed to approach speed along the normal"
     )
     friction: Annotated[float, Field(ge=0, le=2)] = Field(
-        default=0.5, description="tangential per normal impulse at most"
+        default=0.5, description="largest ratio of tangential to normal impulse"
     )
     background: bool = Field(
-        default=False, description="walls, poles and other parts of the background are hit too"
+        default=False, description="include walls, poles and other background geometry"
     )
     swept: bool = Field(
         default=True,
-        description="contact between two instants of the clock counts too; false: only what "
-        "overlaps at an instant, as in episodes recorded before this option was there",
+        description=(
+            "detect contact between two clock steps; false: only overlap at a clock step, "
+            "for recordings without this option"
+        ),
     )
     masses: dict[Identifier, Annotated[float, Field(gt=0, le=1e6)]] = Field(
         default_factory=dict, description="[kg] by object; default: by category and box"
     )
     weighed_by_height: bool = Field(
         default=True,
-        description="people weigh by their height, where `masses` names no mass; false: by the "
-        "volume of their box, three to five times too much, as in episodes recorded before this "
-        "option was there",
+        description=(
+            "derive the mass of people from their height unless `masses` has it; false: "
+            "from the volume of their box, three to five times too much, for recordings "
+            "without this option"
+        ),
     )
     pulse: bool = Field(
         default=True,
-        description="impacts take the time that masses and structures need, about a tenth of a "
-        "second; false: all at once, as in episodes recorded before this option was there",
+        description=(
+            "impacts last as long as masses and stiffness determine, about a tenth of a "
+            "second; false: instantaneous, for recordings without this option"
+        ),
     )
     residual_crush: bool = Field(
         default=True,
-        description="what an impact has crushed pushes no more until it is crushed further, force "
-        "acts in the middle of what yields, and vehicles turn by published inertias; false: as in "
-        "episodes recorded before this option was there",
+        description=(
+            "crushed structure does not push back until it is crushed further, force acts "
+            "at the centre of the yielding area, and vehicles have published moments of "
+            "inertia; false: none of this, for recordings without this option"
+        ),
     )
     distributed: bool = Field(
         default=True,
-        description="force between two bodies acts wherever along their faces they still come "
-        "nearer to each other, and its normal turns with the body whose face was struck; false: "
-        "all of it at one place, as in episodes recorded before this option was there",
+        description=(
+            "distribute the contact force along the faces that still approach each other, "
+            "with a normal that turns with the struck face; false: apply it at one point, "
+            "for recordings without this option"
+        ),
     )
     progressive: bool = Field(
         default=True,
-        description="force between two vehicles grows with the speed at which they come nearer and "
-        "progressively with depth, as that of their matter does, so that slow impacts last longer; "
-        "needs `distributed`; false: by depth alone, as in episodes recorded before this option "
-        "was there",
+        description=(
+            "force between two vehicles grows with approach speed and progressively with "
+            "depth, so slow impacts last longer; needs `distributed`; false: depth alone, "
+            "for recordings without this option"
+        ),
     )
     dents: bool = Field(
         default=True,
-        description="images show struck objects deformed, by the material point method",
+        description="images show struck objects deformed by the material point method",
     )
     breakage: bool = Field(
         default=True,
-        description="sheet of struck vehicles folds, their lamps and glass break, and fragments "
-        "stay on the road; false: dents only, as in episodes recorded before this option was there",
+        description=(
+            "sheet metal of struck vehicles folds, their lamps and glass break, and "
+            "fragments stay on the road; false: dents only, for recordings without this "
+            "option"
+        ),
     )
 
 
 class ScoringSpec(Model):
     """Inputs of the scores in addition to the log."""
 
-    speed_limit: Speed | None = Field(default=None, description="[m/s]; None: no limit is known")
+    speed_limit: Speed | None = Field(default=None, description="[m/s]; None: unknown")
     corridor: Annotated[float, Field(gt=0.5, le=50)] = Field(
         default=3.5, description="half width of the drivable corridor along the route [m]"
     )
@@ -542,8 +590,9 @@ class ResetSpec(Model):
         default=0,
         ge=0,
         lt=2**63,
-        description="of what `randomization` and `agents.spawn` draw; without them episodes of all "
-        "seeds are the same",
+        description=(
+            "seed of the draws of `randomization` and `agents.spawn`; has no effect without them"
+        ),
     )
     randomization: Randomization = Randomization()
     start_us: Microseconds | None = Field(default=None, description="default: start of the log")
@@ -552,17 +601,24 @@ class ResetSpec(Model):
         default=None,
         ge=1,
         le=MAX_HORIZON,
-        description="steps; default, and most where `beyond_log` is 'end': to the end of the log; "
-        "default where the episode goes on: an hour, at most 1,000,000 steps",
+        description=(
+            "number of steps, at most 1,000,000. Default: to the end of the log, which is "
+            "also the limit if `beyond_log` is 'end'; an hour otherwise"
+        ),
     )
     beyond_log: Literal["end", "loop", "extend"] = Field(
         default="end",
-        description="what a horizon beyond the recording leads to: 'end' refuses it; 'loop' puts "
-        "the ego back to the start of the recorded drive whenever it has reached its end, with an "
-        "event `looped`; 'extend' lets the route go on, its last bend fading into a straight line",
+        description=(
+            "behaviour for a horizon beyond the recording: 'end' refuses it; 'loop' returns "
+            "the ego to the start of the recorded drive each time it reaches the end, with "
+            "an event `looped`; 'extend' continues the route, its last bend fading into a "
+            "straight line"
+        ),
     )
     warmup_us: int = Field(
-        default=0, ge=0, description="the ego moves as recorded for so long; plans wait"
+        default=0,
+        ge=0,
+        description="the ego replays the recording for this long and ignores plans",
     )
     sensors: list[SensorSpec] = Field(
         default_factory=list, max_length=MAX_SENSORS, description="cameras"
@@ -574,25 +630,30 @@ class ResetSpec(Model):
     agents: AgentsSpec = AgentsSpec()
     storyboard: Storyboard | None = Field(
         default=None,
-        description="what entities do, and when; they are moved by it and by no driver of "
-        "`agents`. Default: that of the scenario; one without entities runs none",
+        description=(
+            "storyboard that moves its entities, which then have no driver of `agents`. "
+            "Default: the scenario's; a storyboard without entities runs none"
+        ),
     )
     privileged: bool = Field(
         default=False,
-        description="fill `agents` of every observation, and `lanes` where the scene has a map",
+        description="fill `agents` of every observation, and `lanes` if the scene has a map",
     )
     deadline_ms: int | None = Field(
-        default=None, ge=1, le=3_600_000, description="wall-clock time for a plan; None: any"
+        default=None,
+        ge=1,
+        le=3_600_000,
+        description="wall-clock time limit of a plan; None: no limit",
     )
     on_timeout: Literal["hold_plan", "brake", "pause", "fail"] = Field(
-        default="hold_plan", description="what happens when a plan misses its deadline"
+        default="hold_plan", description="behaviour if a plan misses its deadline"
     )
     wall_clock_s: Annotated[float, Field(gt=0, le=86_400)] | None = Field(
-        default=None, description="wall-clock time after which the episode is cut off [s]"
+        default=None, description="wall-clock time limit of the episode [s]"
     )
     latency: LatencySpec = LatencySpec()
     on_collision: Literal["terminate", "continue"] = Field(
-        default="terminate", description="'continue' exchanges momentum and goes on"
+        default="terminate", description="'continue' exchanges momentum and continues"
     )
     contact: ContactSpec = ContactSpec()
     scoring: ScoringSpec = ScoringSpec()

@@ -167,10 +167,10 @@ class Problem(BaseModel):
     title: str = Field(description="short sentence, the same for every problem of this code")
     status: int
     code: ErrorCode | str = Field(
-        union_mode="left_to_right", description="newer workers may have others"
+        union_mode="left_to_right", description="error code; newer workers may add codes"
     )
-    detail: str = Field(description="what was given, what is allowed")
-    hint: str | None = Field(default=None, description="what to do next")
+    detail: str = Field(description="the given value and what is allowed")
+    hint: str | None = Field(default=None, description="how to fix it")
     instance: str | None = Field(default=None, description="path of the request")
     request_id: str | None = None
     retryable: bool = False

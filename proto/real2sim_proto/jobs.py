@@ -49,21 +49,21 @@ class JobInfo(Reply):
 
     job_id: str
     kind: str = one_of(JobKind)
-    subject: str = Field(description="scene or scenario it works on")
+    subject: str = Field(description="scene or scenario of the job")
     state: JobState
     progress: float = Field(default=0.0, ge=0, le=1)
-    stage: str = Field(default="", description="what it is doing")
+    stage: str = Field(default="", description="current activity")
     event: int = Field(default=0, description="number of its newest event")
-    who: str = Field(default="", description="who asked for it")
-    owner: str = Field(default="default", description="name of the token it was asked for with")
-    worker: str = Field(default="", description="that has it, and its files")
-    attempt: int = Field(
-        default=1, ge=1, description="which one: a job is begun anew where its worker died"
-    )
+    who: str = Field(default="", description="client that requested it")
+    owner: str = Field(default="default", description="name of the token of the request")
+    worker: str = Field(default="", description="worker that runs it and has its files")
+    attempt: int = Field(default=1, ge=1, description="attempt; a job restarts if its worker dies")
     request: dict[str, Any] = Field(default_factory=dict)
-    result: dict[str, Any] | None = Field(default=None, description="once it has succeeded")
+    result: dict[str, Any] | None = Field(
+        default=None, description="set once the job has succeeded"
+    )
     files: list[JobFile] = Field(default_factory=list)
-    error: Problem | None = Field(default=None, description="why it failed")
+    error: Problem | None = Field(default=None, description="reason of the failure")
     created_at: str = Field(description="UTC, ISO 8601")
     started_at: str | None = None
     finished_at: str | None = None
@@ -85,59 +85,79 @@ class DriveRequest(Model):
 
     planner: PlannerName | None = Field(
         default="follow_route",
-        description="of the SDK, run in a process of its own: it resets the session as it was made "
-        "and drives from there; null waits for a planner of yours, on the drive socket "
-        "(`real2sim drive --session`) or by `POST .../step`, and goes on from where the session is",
+        description=(
+            "planner of the SDK, run in a separate process: it resets the session to its "
+            "initial options and drives from there. null waits for your planner, on the "
+            "drive socket (`real2sim drive --session`) or by `POST .../step`, and continues "
+            "from the current step"
+        ),
     )
     steps: int | None = Field(
-        default=None, ge=1, le=100_000, description="of the episode; default: to its end"
+        default=None,
+        ge=1,
+        le=100_000,
+        description="number of steps; default: to the end of the episode",
     )
 
 
 class SimulateRequest(Model):
     """Body of `POST /v1/scenarios/{id}/simulate`: a physics rollout."""
 
-    start_us: Microseconds | None = Field(default=None, description="default: of the scenario")
-    end_us: Microseconds | None = Field(default=None, description="default: of the scenario")
+    start_us: Microseconds | None = Field(default=None, description="default: the scenario's")
+    end_us: Microseconds | None = Field(default=None, description="default: the scenario's")
     frame_us: int = Field(
-        default=50_000, ge=5_000, le=1_000_000, description="time from one kept frame to the next"
+        default=50_000, ge=5_000, le=1_000_000, description="time between kept frames"
     )
     objects: list[Identifier] | None = Field(
         default=None,
         max_length=64,
-        description="what the physics moves; default: what has a velocity or physics of its own, "
-        "and whatever that touches; 'ego': the recording vehicle, with a body of its size",
+        description=(
+            "objects to simulate; default: those with a velocity or physics properties, and "
+            "all that they touch; 'ego': the recording vehicle, with a body of its size"
+        ),
     )
     background: bool | None = Field(
         default=None,
-        description="whether walls, poles, trees and all else that stands in the background "
-        "stops what hits it; default: true. figures.background of the result says what was taken",
+        description=(
+            "whether walls, poles, trees and other background geometry act as obstacles; "
+            "default: true. figures.background of the result lists them"
+        ),
     )
     preset: Literal["vehicle", "paper"] | None = Field(
         default=None,
-        description="how objects become bodies: crumpling cars (default), or soft ones (default "
-        "of the paper's experiments)",
+        description=(
+            "body model: crumpling cars (default), or soft bodies (default for the paper's "
+            "experiments)"
+        ),
     )
     physics: dict[Identifier | Literal["*"], PhysicsValues] = Field(
         default_factory=dict,
         max_length=64,
-        description="by object, for this rollout alone: what is given goes before set_physics; "
-        "'*' stands for all that take part",
+        description=(
+            "physics properties by object for this rollout, overriding set_physics; '*' "
+            "means all simulated objects"
+        ),
     )
     gravity: Vector3 | None = Field(
-        default=None, description="[m/s^2]; default: (0, 0, -9.81), none in the experiment pair"
+        default=None,
+        description="[m/s^2]; default: (0, 0, -9.81), or zero in the experiment pair",
     )
     max_particles: int | None = Field(
-        default=None, ge=100, le=4_000_000, description="of all bodies together; default: 400,000"
+        default=None,
+        ge=100,
+        le=4_000_000,
+        description="largest number of particles of all bodies; default: 400,000",
     )
     experiment: Literal["wall", "pair", "drop", "frontal", "t_bone", "pole", "roof"] | None = Field(
         default=None,
-        description="of the paper: one of objects against a wall, the first half of objects into "
-        "the others, or objects raised and let fall; or a crash test. It brings its own colliders "
-        "and duration",
+        description=(
+            "experiment of the paper (an object against a wall, the first half of the "
+            "objects into the others, or objects dropped) or crash test; sets its own "
+            "colliders and duration"
+        ),
     )
     speed: Annotated[float, Field(gt=0, le=100)] | None = Field(
-        default=None, description="of an experiment [m/s]; default: the paper's"
+        default=None, description="speed of an experiment [m/s]; default: the paper's"
     )
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
 
@@ -155,10 +175,10 @@ class ObservedBox(Model):
     """Position of an object from a tracker."""
 
     t_us: Microseconds
-    position: Vector3 = Field(description="of the box centre, world [m]")
-    quaternion: Quaternion | None = Field(default=None, description="default: not known")
+    position: Vector3 = Field(description="box centre, world [m]")
+    quaternion: Quaternion | None = Field(default=None, description="default: unknown")
     size: Size3 | None = Field(
-        default=None, description="of the box as it was seen then [m]; default: not known"
+        default=None, description="size of the observed box [m]; default: unknown"
     )
 
 
@@ -172,7 +192,7 @@ class SeenPoint(Model):
 class ObservedPoint(Model):
     """A tracked point of an object; omit times at which it was not visible."""
 
-    place: Vector3 = Field(description="on the object before anything happens, object frame [m]")
+    place: Vector3 = Field(description="point on the undeformed object, object frame [m]")
     seen: list[SeenPoint] = Field(min_length=1, max_length=1000)
 
 
@@ -188,16 +208,22 @@ class Observations(Model):
     """Observations of an object; all of them are used together."""
 
     recorded: bool = Field(
-        default=False, description="the boxes of its own recorded track, in the simulated span"
+        default=False, description="use the boxes of its recorded track within the simulated span"
     )
     boxes: list[ObservedBox] = Field(default_factory=list, max_length=2000)
     points: list[ObservedPoint] = Field(default_factory=list, max_length=256)
     images: list[ObservedImage] = Field(default_factory=list, max_length=64)
-    position_sigma: Sigma = Field(default=0.05, description="of boxes [m]")
-    heading_sigma: Sigma = Field(default=0.02, description="of boxes [rad]")
-    size_sigma: Sigma = Field(default=0.05, description="of boxes [m]")
-    point_sigma: Sigma = Field(default=0.02, description="of points [m]")
-    image_sigma: Sigma = Field(default=0.05, description="of pixels, as a fraction of white")
+    position_sigma: Sigma = Field(
+        default=0.05, description="standard deviation of box positions [m]"
+    )
+    heading_sigma: Sigma = Field(
+        default=0.02, description="standard deviation of box headings [rad]"
+    )
+    size_sigma: Sigma = Field(default=0.05, description="standard deviation of box sizes [m]")
+    point_sigma: Sigma = Field(default=0.02, description="standard deviation of points [m]")
+    image_sigma: Sigma = Field(
+        default=0.05, description="standard deviation of pixel values, as a fraction of white"
+    )
 
     @model_validator(mode="after")
     def _saw_something(self) -> Observations:
@@ -214,15 +240,19 @@ class CalibrateRequest(Model):
 
     object_id: Identifier
     parameters: list[CalibratedName] = Field(
-        min_length=1, max_length=5, description="to be found, as factors on what is given"
+        min_length=1,
+        max_length=5,
+        description="parameters to fit, as factors on the initial values",
     )
     observations: Observations
     simulate: SimulateRequest = Field(
         default_factory=SimulateRequest,
-        description="what is simulated, with initial values; `objects` is the object alone unless "
-        "given, and the end follows from the observations",
+        description=(
+            "simulation with initial values; `objects` defaults to this object alone, and "
+            "the end follows from the observations"
+        ),
     )
-    steps: int = Field(default=12, ge=1, le=60, description="of the search at most")
+    steps: int = Field(default=12, ge=1, le=60, description="largest number of iterations")
 
 
 class ExportRequest(Model):
@@ -232,12 +262,12 @@ class ExportRequest(Model):
     scenario: Identifier | None = None
     scene: Identifier | None = None
     simulation: Identifier | None = Field(
-        default=None, description="id of a finished simulate job, instead of both"
+        default=None, description="id of a finished simulate job, instead of scene and scenario"
     )
     camera: Identifier
     width: int | None = Field(default=None, ge=16, le=4096, description="[px]; default: recorded")
-    start_us: Microseconds | None = Field(default=None, description="default: of the scenario")
-    end_us: Microseconds | None = Field(default=None, description="default: of the scenario")
+    start_us: Microseconds | None = Field(default=None, description="default: the scenario's")
+    end_us: Microseconds | None = Field(default=None, description="default: the scenario's")
     fps: float = Field(default=10.0, gt=0, le=60)
 
     @model_validator(mode="after")
@@ -257,11 +287,13 @@ class SweptValues(Model):
 
     values: list[SweptValue] | None = Field(default=None, min_length=1, max_length=1000)
     range: tuple[float, float, Annotated[int, Field(ge=1, le=1000)]] | None = Field(
-        default=None, description="first, last, and how many, evenly spread"
+        default=None, description="first, last and number of evenly spaced values"
     )
-    uniform: Pair | None = Field(default=None, description="drawn between these")
+    uniform: Pair | None = Field(
+        default=None, description="lower and upper limit of a uniform draw"
+    )
     normal: tuple[float, Annotated[float, Field(ge=0)]] | None = Field(
-        default=None, description="drawn with this mean and standard deviation"
+        default=None, description="mean and standard deviation of a normal draw"
     )
 
     @model_validator(mode="after")
@@ -284,32 +316,42 @@ class DatasetSweep(Model):
 
     parameters: dict[Identifier, SweptValues] = Field(min_length=1, max_length=16)
     draws: int = Field(
-        default=1, ge=1, le=1000, description="of distributions, for each of the combinations"
+        default=1, ge=1, le=1000, description="draws from distributions for each combination"
     )
     operations: list[dict[str, Any]] = Field(
         min_length=1,
         max_length=64,
-        description='edits after those of the scenario; "$name" stands for a parameter\'s value',
+        description=(
+            'edits applied after those of the scenario; "$name" inserts a parameter\'s value'
+        ),
     )
 
 
 class DatasetPerturbation(Model):
     """Clips whose ego starts off its path and returns to it in its future trajectory."""
 
-    lateral_sigma: float = Field(default=0.5, ge=0, le=5, description="beside the path [m]")
-    heading_sigma: float = Field(default=0.07, ge=0, le=0.6, description="against it [rad]")
-    recover_s: float = Field(default=3.0, ge=0.5, le=30, description="until it is on its path [s]")
-    copies: int = Field(default=1, ge=1, le=100, description="of each clip")
+    lateral_sigma: float = Field(
+        default=0.5, ge=0, le=5, description="lateral offset from the path [m]"
+    )
+    heading_sigma: float = Field(
+        default=0.07, ge=0, le=0.6, description="heading relative to the path [rad]"
+    )
+    recover_s: float = Field(
+        default=3.0, ge=0.5, le=30, description="time to return to the path [s]"
+    )
+    copies: int = Field(default=1, ge=1, le=100, description="number of copies of each clip")
 
 
 class DatasetNoise(Model):
     """Simulated detections, in addition to the true boxes."""
 
     position: float = Field(default=0.0, ge=0, le=10, description="standard deviation [m]")
-    size: float = Field(default=0.0, ge=0, le=1, description="of each edge, as a share of it")
+    size: float = Field(
+        default=0.0, ge=0, le=1, description="relative standard deviation of each edge"
+    )
     heading: float = Field(default=0.0, ge=0, le=3.2, description="[rad]")
-    missed: float = Field(default=0.0, ge=0, le=1, description="share that is not found")
-    false: float = Field(default=0.0, ge=0, le=100, description="found where nothing is, a frame")
+    missed: float = Field(default=0.0, ge=0, le=1, description="share of missed objects")
+    false: float = Field(default=0.0, ge=0, le=100, description="false detections per frame")
 
 
 DatasetFormat = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
@@ -326,14 +368,15 @@ class DatasetRequest(Model):
 
     kind: Literal["dataset"]
     scenario: Identifier | None = Field(
-        default=None, description="as it is now, driven as it was recorded"
+        default=None, description="scenario in its present revision, driven as recorded"
     )
     scene: Identifier | None = Field(
-        default=None, description="as it was recorded; with `recording` what that ran on"
+        default=None,
+        description="scene as recorded; with `recording`, the scene of the recording",
     )
     session: Identifier | None = Field(
         default=None,
-        description="its episode so far; wants the session's token, or one of the worker",
+        description="the session's episode so far; needs the session's token or one of the worker",
     )
     recording: str | None = Field(
         default=None,
@@ -343,20 +386,22 @@ class DatasetRequest(Model):
     formats: list[DatasetFormat] = Field(
         min_length=1,
         max_length=16,
-        description="labels, kitti, coco, nuscenes, argoverse2, webdataset, pictures ...; "
-        "docs/datasets.md has all",
+        description=(
+            "labels, kitti, coco, nuscenes, argoverse2, webdataset, pictures ...; see "
+            "docs/datasets.md"
+        ),
     )
     cameras: list[Identifier] = Field(
-        default_factory=list, max_length=64, description="default: all of the scene"
+        default_factory=list, max_length=64, description="default: all cameras of the scene"
     )
     width: int | None = Field(default=None, ge=16, le=8192, description="[px]; default: recorded")
     period_us: int = Field(
-        default=100_000, ge=1_000, le=60_000_000, description="from one frame to the next"
+        default=100_000, ge=1_000, le=60_000_000, description="time between frames"
     )
-    start_us: Microseconds | None = Field(default=None, description="default: of the source")
-    end_us: Microseconds | None = Field(default=None, description="default: of the source")
+    start_us: Microseconds | None = Field(default=None, description="default: the source's")
+    end_us: Microseconds | None = Field(default=None, description="default: the source's")
     clip_s: float = Field(
-        default=20.0, gt=0, le=3600, description="length of a clip, which is in one split [s]"
+        default=20.0, gt=0, le=3600, description="length of a clip; each clip is in one split [s]"
     )
     splits: dict[SplitName, Share] = Field(
         default_factory=lambda: {"train": 1.0},
@@ -364,21 +409,26 @@ class DatasetRequest(Model):
         max_length=16,
         description="share of the clips by name",
     )
-    seed: int = Field(default=0, ge=0, le=2**53, description="draws which clip is in which split")
-    flow: bool = Field(default=True, description="whether optical flow is made")
+    seed: int = Field(
+        default=0, ge=0, le=2**53, description="seed of the assignment of clips to splits"
+    )
+    flow: bool = Field(default=True, description="export optical flow")
     lidar: Identifier | None = Field(
         default=None,
-        description="name in the catalogue (docs/lidar.md): its returns are the labelled points; "
-        "default: points of what the cameras see",
+        description=(
+            "name in the catalogue (docs/lidar.md) of the LiDAR whose returns are labelled; "
+            "default: points on the surfaces that the cameras see"
+        ),
     )
     rig: dict[str, Any] | None = Field(
-        default=None, description="cameras and LiDAR of one's own, instead: docs/datasets.md"
+        default=None, description="your own cameras and LiDAR, instead; see docs/datasets.md"
     )
     sweep: DatasetSweep | None = None
     perturb: DatasetPerturbation | None = None
     noise: DatasetNoise | None = None
     dry_run: bool = Field(
-        default=False, description="only tell frames, images, bytes and minutes in the result"
+        default=False,
+        description="return the number of frames, images, bytes and minutes without exporting",
     )
 
     @model_validator(mode="after")

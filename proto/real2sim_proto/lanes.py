@@ -24,13 +24,13 @@ class LaneInfo(_Part):
 
     lane_id: str
     kind: LaneKind
-    centre: list[Place] = Field(min_length=2, description="centre line, as its traffic drives [m]")
-    widths: list[float] = Field(description="across the centre line at its points [m]")
-    speed_limit: float | None = Field(default=None, description="[m/s]; null: not known")
+    centre: list[Place] = Field(min_length=2, description="centre line in driving direction [m]")
+    widths: list[float] = Field(description="width at each point of the centre line [m]")
+    speed_limit: float | None = Field(default=None, description="[m/s]; null: unknown")
     successors: list[str] = Field(default_factory=list)
-    left: str | None = Field(default=None, description="neighbour of the same direction")
+    left: str | None = Field(default=None, description="neighbour in the same direction")
     right: str | None = None
-    opposite: str | None = Field(default=None, description="neighbour that runs the other way")
+    opposite: str | None = Field(default=None, description="neighbour in the opposite direction")
     may_change_left: bool = True
     may_change_right: bool = True
     junction: str | None = None
@@ -58,10 +58,10 @@ class SignalInfo(_Part):
     signal_id: str
     kind: SignalKind
     position: Place
-    heading: float = Field(default=0.0, description="where its face looks [rad]")
+    heading: float = Field(default=0.0, description="heading of its face [rad]")
     lanes: list[str] = Field(default_factory=list)
     stop_line: str | None = Field(default=None, description="null: at the lanes' ends")
-    value: float | None = Field(default=None, description="of a speed limit [m/s]")
+    value: float | None = Field(default=None, description="speed limit [m/s]")
 
 
 class RoadLaneInfo(_Part):
@@ -69,7 +69,7 @@ class RoadLaneInfo(_Part):
 
     number: int = Field(description="negative to the right of the reference line")
     lane_id: str
-    s: list[float] = Field(description="places along the road [m]")
+    s: list[float] = Field(description="positions along the road [m]")
     inner: list[float] = Field(description="t of the rim towards the reference line [m]")
     outer: list[float]
 
@@ -94,7 +94,7 @@ class SceneLanes(_Part):
     version: Literal[1] = 1
     source: str = Field(default="", description="format and file it was read from, or `log`")
     accuracy: float | None = Field(
-        default=None, description="estimated median error of centre lines [m]; null: not known"
+        default=None, description="estimated median error of centre lines [m]; null: unknown"
     )
     geo_reference: str = ""
     lanes: list[LaneInfo] = Field(default_factory=list)

@@ -48,7 +48,7 @@ Vector3Speed = tuple[Speed, Speed, Speed]
 
 Snap = Annotated[
     bool,
-    Field(description="put the bottom of the box onto the ground, at every pose"),
+    Field(description="put the bottom of the box on the ground at every pose"),
 ]
 
 
@@ -77,7 +77,9 @@ class Translate(Model):
     x: Metres = 0.0
     y: Metres = 0.0
     z: Metres = 0.0
-    frame: Frame = Field(default="world", description="axes of x, y, z; 'object' turns with it")
+    frame: Frame = Field(
+        default="world", description="frame of x, y, z; 'object' turns with the object"
+    )
     time_range: TimeRange | None = Field(default=None, description="default: at all times")
     snap: Snap = False
 
@@ -89,13 +91,15 @@ class Rotate(Model):
     op: Literal["rotate"] = "rotate"
     object_id: ObjectId
     angle: Annotated[float, Field(ge=-1e4, le=1e4)] = Field(description="[rad]")
-    axis: Vector3 = Field(default=(0.0, 0.0, 1.0), description="of any length above 0")
+    axis: Vector3 = Field(default=(0.0, 0.0, 1.0), description="axis of any length above 0")
     frame: Frame = Field(default="world", description="frame of the axis")
     time_range: TimeRange | None = Field(default=None, description="default: at all times")
     about_us: Microseconds | None = Field(
         default=None,
-        description="turns its path with it, about where it is at this instant; a time range "
-        "should then begin or end there",
+        description=(
+            "also rotates its path, about its position at this time; a time range should "
+            "begin or end there"
+        ),
     )
     snap: Snap = False
 
@@ -115,7 +119,7 @@ class Scale(Model):
     z: Annotated[float, Field(ge=0.01, le=100.0)] = 1.0
     anchor: Literal["bottom", "centre"] = Field(
         default="bottom",
-        description="what stays: the centre of the box's bottom, or of the box",
+        description="fixed point: the centre of the box's bottom, or of the box",
     )
 
 
@@ -142,9 +146,9 @@ class Retime(Model):
 
     op: Literal["retime"] = "retime"
     object_id: ObjectId
-    delay_us: Microseconds = Field(default=0, description="later by this; negative: earlier")
+    delay_us: Microseconds = Field(default=0, description="delay; negative: earlier")
     speed: Annotated[float, Field(ge=0.01, le=100.0)] = Field(
-        default=1.0, description="2 takes half the time, from its first pose on"
+        default=1.0, description="2 halves the time, from its first pose on"
     )
 
 
@@ -183,7 +187,9 @@ class Insert(Model):
     object_id: Identifier | None = Field(
         default=None, description="id of the new object; default: <asset_id>_<n>"
     )
-    pose: Pose | None = Field(default=None, description="of the box centre; or `trajectory`")
+    pose: Pose | None = Field(
+        default=None, description="pose of the box centre; or give `trajectory`"
+    )
     trajectory: Track | None = None
     size: Size3 | None = Field(default=None, description="box to fit [m]; default: its own size")
     snap: Snap = True
@@ -199,12 +205,12 @@ class RoutePlace(Model):
     """A position relative to the ego's route, in a running session."""
 
     ahead: Annotated[float, Field(ge=-500, le=500)] = Field(
-        description="of the ego's rear axle along the route [m]"
+        description="distance ahead of the ego's rear axle along the route [m]"
     )
     offset: Annotated[float, Field(ge=-50, le=50)] = Field(
-        default=0.0, description="from the route, positive on its left [m]"
+        default=0.0, description="lateral offset from the route, positive to the left [m]"
     )
-    oncoming: bool = Field(default=False, description="heading against the route")
+    oncoming: bool = Field(default=False, description="faces against the route")
 
 
 class Spawn(Model):
@@ -217,22 +223,26 @@ class Spawn(Model):
     object_id: Identifier | None = Field(default=None, description="default: spawned_<n>")
     asset_id: Identifier | None = Field(default=None, description="from the asset library")
     recorded_id: Identifier | None = Field(
-        default=None, description="instead of an asset: the look of this object of the scene"
+        default=None,
+        description="instead of an asset: copy the appearance of this object of the scene",
     )
-    pose: Pose | None = Field(default=None, description="of the box centre, world; or `place`")
+    pose: Pose | None = Field(
+        default=None, description="pose of the box centre, world; or give `place`"
+    )
     place: RoutePlace | None = Field(
-        default=None, description="beside the ego's route instead; in sessions only"
+        default=None,
+        description="position relative to the ego's route, instead of `pose`; in sessions only",
     )
     speed: Annotated[float, Field(ge=0, le=100)] = Field(
-        default=0.0, description="along its heading when it appears [m/s]"
+        default=0.0, description="initial speed along its heading [m/s]"
     )
     start_us: Microseconds | None = Field(
         default=None,
-        description="when it appears; default: now in a session, else at the beginning",
+        description="time of appearance; default: now in a session, otherwise the start",
     )
     driver: AgentDriver = Field(
         default=IdmDriver(path="route"),
-        description="in sessions; `agents.drivers` of a reset goes first",
+        description="driver in sessions; `agents.drivers` of a reset overrides it",
     )
     snap: Snap = True
 
@@ -252,13 +262,19 @@ class Replace(Model):
     object_id: ObjectId
     asset_id: Identifier | None = Field(default=None, description="from the asset library")
     recorded_id: Identifier | None = Field(
-        default=None, description="instead of an asset: the look of this object of the scene"
+        default=None,
+        description="instead of an asset: copy the appearance of this object of the scene",
     )
     fit: Literal["box", "length"] = Field(
         default="box",
-        description="'box' fills the box along each axis; 'length' keeps the look's proportions",
+        description=(
+            "'box' fills the box along each axis; 'length' keeps the proportions of the new "
+            "appearance"
+        ),
     )
-    size: Size3 | None = Field(default=None, description="box to fill [m]; default: the present")
+    size: Size3 | None = Field(
+        default=None, description="box to fill [m]; default: the present size"
+    )
 
     @model_validator(mode="after")
     def _names_one_look(self) -> Replace:
@@ -272,7 +288,7 @@ class EraseRegion(Model):
 
     op: Literal["erase_region"] = "erase_region"
     region_id: Identifier | None = Field(default=None, description="default: region_<n>")
-    pose: Pose = Field(description="of the box centre")
+    pose: Pose = Field(description="pose of the box centre")
     size: Size3 = Field(description="[m]")
 
 
@@ -292,8 +308,10 @@ class PhysicsValues(Model):
     )
     material: MaterialName | None = Field(
         default=None,
-        description="default: by category; jelly where values of a material are given, metal where "
-        "a yield stress is among them",
+        description=(
+            "default: by category; jelly if material values are given, metal if they "
+            "include a yield stress"
+        ),
     )
     young: Annotated[float, Field(gt=0, le=1e12)] | None = Field(
         default=None, description="Young's modulus E [Pa]"
@@ -302,19 +320,21 @@ class PhysicsValues(Model):
         default=None, description="Poisson's ratio nu; 0.5 would be incompressible, take 0.45"
     )
     density: Annotated[float, Field(ge=1, le=3e4)] | None = Field(
-        default=None, description="rho [kg/m^3] of what it is filled with; instead of mass"
+        default=None, description="density rho of its filling [kg/m^3]; instead of mass"
     )
     yield_stress: Annotated[float, Field(gt=0, le=1e12)] | None = Field(
-        default=None, description="[Pa]; of metal and foam"
+        default=None, description="[Pa]; for metal and foam"
     )
     friction: Friction | None = Field(default=None, description="Coulomb coefficient")
     restitution: Annotated[float, Field(ge=0, le=1)] | None = Field(
-        default=None, description="fraction of the approach speed that is left after a bounce"
+        default=None, description="fraction of the approach speed that remains after a bounce"
     )
     grid: Annotated[int, Field(ge=16, le=1000)] | None = Field(
         default=None,
-        description="cells along twice its longest edge, as the paper counts them (50, 200); all "
-        "that a simulation moves share the finest cells asked for; default: cells of 0.2 m",
+        description=(
+            "cells along twice its longest edge, as in the paper (50, 200); all simulated "
+            "objects share the finest grid requested; default: cells of 0.2 m"
+        ),
     )
 
     @model_validator(mode="after")
@@ -340,9 +360,11 @@ class SetVelocity(Model):
 
     op: Literal["set_velocity"] = "set_velocity"
     object_id: ObjectId
-    linear: Vector3Speed | None = Field(default=None, description="of the box centre [m/s]")
+    linear: Vector3Speed | None = Field(
+        default=None, description="velocity of the box centre [m/s]"
+    )
     angular: Vector3Speed | None = Field(default=None, description="[rad/s]")
-    frame: Frame = Field(default="world", description="axes of both; 'object' counts x forward")
+    frame: Frame = Field(default="world", description="frame of both; 'object' has x forward")
 
 
 class SetGait(Model):
@@ -350,22 +372,27 @@ class SetGait(Model):
 
     op: Literal["set_gait"] = "set_gait"
     object_id: ObjectId
-    stride: float | None = Field(default=None, ge=0.5, le=1.6, description="factor on strides")
-    arms: float | None = Field(default=None, ge=0, le=3, description="factor on the arms' swing")
+    stride: float | None = Field(
+        default=None, ge=0.5, le=1.6, description="factor on the stride length"
+    )
+    arms: float | None = Field(default=None, ge=0, le=3, description="factor on the arm swing")
     lean: float | None = Field(
-        default=None, ge=-0.3, le=0.6, description="further lean forward [rad]"
+        default=None, ge=-0.3, le=0.6, description="additional forward lean [rad]"
     )
-    width: float | None = Field(
-        default=None, ge=0.2, le=3, description="factor on the distance of the feet's tracks"
+    width: float | None = Field(default=None, ge=0.2, le=3, description="factor on the step width")
+    phase: int | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="phase of the gait cycle; 1 starts with the other foot",
     )
-    phase: int | None = Field(default=None, ge=0, le=1, description="1 starts with the other foot")
 
 
 class PlaneShape(Model):
     """A half-space; objects stay on the side of its normal."""
 
     kind: Literal["plane"] = "plane"
-    point: Vector3 = Field(description="on the plane [m]")
+    point: Vector3 = Field(description="point on the plane [m]")
     normal: Vector3 = (0.0, 0.0, 1.0)
 
     @field_validator("normal")
@@ -390,7 +417,7 @@ class CylinderShape(Model):
     position: Vector3 = Field(description="centre [m]")
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     radius: Length = Field(description="[m]")
-    height: Length = Field(description="along its axis [m]")
+    height: Length = Field(description="length along its axis [m]")
 
 
 class CapsuleShape(Model):
@@ -398,11 +425,11 @@ class CapsuleShape(Model):
     ball."""
 
     kind: Literal["capsule"] = "capsule"
-    position: Vector3 = Field(description="middle of the line [m]")
+    position: Vector3 = Field(description="centre of the line [m]")
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     radius: Length = Field(description="[m]")
     length: Annotated[float, Field(ge=0, le=1000.0)] = Field(
-        default=0.0, description="of the line, without the round ends [m]"
+        default=0.0, description="length of the line, without the round ends [m]"
     )
 
 
@@ -413,16 +440,18 @@ class MeshShape(Model):
     """A closed triangle mesh, or a sheet of triangles with a thickness."""
 
     kind: Literal["mesh"] = "mesh"
-    position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="of its origin [m]")
+    position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="position of its origin [m]")
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    vertices: list[Vector3] = Field(min_length=3, max_length=4096, description="in its frame [m]")
+    vertices: list[Vector3] = Field(
+        min_length=3, max_length=4096, description="vertices in its frame [m]"
+    )
     triangles: list[tuple[VertexIndex, VertexIndex, VertexIndex]] = Field(
         min_length=1,
         max_length=8192,
         description="indices of vertices, counter-clockwise seen from outside",
     )
     thickness: Length | None = Field(
-        default=None, description="of a sheet that is not closed [m]; closed without it"
+        default=None, description="thickness of an open sheet [m]; leave out for a closed mesh"
     )
 
 
@@ -445,15 +474,17 @@ class AddCollider(Model):
     op: Literal["add_collider"] = "add_collider"
     collider_id: Identifier | None = Field(default=None, description="default: collider_<n>")
     shape: ColliderShape
-    friction: Friction | None = Field(default=None, description="default: that of what touches it")
+    friction: Friction | None = Field(
+        default=None, description="default: the value of the touching body"
+    )
 
 
 class SetTime(Model):
     """Time span of the scenario: of previews, physics and exports."""
 
     op: Literal["set_time"] = "set_time"
-    start_us: Microseconds | None = Field(default=None, description="default: of the recording")
-    end_us: Microseconds | None = Field(default=None, description="default: of the recording")
+    start_us: Microseconds | None = Field(default=None, description="default: the recording's")
+    end_us: Microseconds | None = Field(default=None, description="default: the recording's")
 
     @model_validator(mode="after")
     def _starts_before_it_ends(self) -> SetTime:

@@ -44,7 +44,8 @@ class TrajectoryPlan(Model):
     times_us: PlanTimes = Field(description="[N] int64 absolute simulation time")
     poses: PlanPoses = Field(description="[N, 3] x [m], y [m], yaw [rad]")
     frame: Literal["vehicle", "world"] = Field(
-        default="vehicle", description="'vehicle': the ego frame of the observation answered"
+        default="vehicle",
+        description="'vehicle': the ego frame of the observation that the plan answers",
     )
 
     @model_validator(mode="after")
@@ -61,15 +62,20 @@ class Control(Model):
 
     kind: Literal["control"] = "control"
     acceleration: Annotated[float, Field(ge=-100, le=100)] = Field(
-        description="in the direction of the gear; below 0 it brakes, to a stop at most [m/s^2]"
+        description=(
+            "acceleration in the direction of the gear; negative values brake, at most to a "
+            "stop [m/s^2]"
+        )
     )
     steering: Annotated[float, Field(ge=-1.6, le=1.6)] = Field(
         description="road-wheel angle [rad], positive to the left in either gear"
     )
     gear: Gear = Field(
         default="drive",
-        description="it is engaged at rest; a vehicle that still rolls the other way brakes by "
-        "`acceleration`, whatever its sign",
+        description=(
+            "gear, engaged at rest; a vehicle still rolling the other way brakes by the "
+            "magnitude of `acceleration`"
+        ),
     )
 
 

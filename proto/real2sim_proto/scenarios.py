@@ -35,18 +35,20 @@ class ScenarioInfo(Reply):
     name: str
     scene: str
     scene_hash: str
-    revision: int = Field(description="grows by one with every batch, undo and redo")
+    revision: int = Field(description="increases by one with every batch, undo and redo")
     etag: str = Field(description='value for If-Match, e.g. "r41" with its quotes')
     created_at: str = Field(description="UTC, ISO 8601")
     can_undo: bool
     can_redo: bool
-    start_us: int | None = Field(default=None, description="when it begins; single views only")
-    end_us: int | None = Field(default=None, description="when it ends; single views only")
+    start_us: int | None = Field(default=None, description="start time; single views only")
+    end_us: int | None = Field(default=None, description="end time; single views only")
     objects: Named[ObjectInfo] = Field(default_factory=Named)
-    erased: list[EraseRegion] = Field(default_factory=list, description="of the background")
+    erased: list[EraseRegion] = Field(
+        default_factory=list, description="erased regions of the background"
+    )
     colliders: list[AddCollider] = Field(default_factory=list)
     storyboard: Storyboard | None = Field(
-        default=None, description="that its sessions run; single views only"
+        default=None, description="storyboard of its sessions; single views only"
     )
 
 
@@ -54,7 +56,9 @@ class ScenarioFork(Model):
     """Body of `POST /v1/scenarios/{id}/fork`: create a scenario with the same history."""
 
     name: str | None = Field(default=None, max_length=200, description="default: the same")
-    revision: int | None = Field(default=None, ge=0, description="up to this one; default: all")
+    revision: int | None = Field(
+        default=None, ge=0, description="last revision to copy; default: the newest"
+    )
 
 
 class ScenarioList(Reply):
@@ -67,7 +71,7 @@ class OperationBatch(Model):
     """Body of `POST /v1/scenarios/{id}/operations`; all operations apply, or none."""
 
     operations: list[Operation] = Field(min_length=1, max_length=MAX_OPERATIONS_PER_REQUEST)
-    dry_run: bool = Field(default=False, description="check and answer, change nothing")
+    dry_run: bool = Field(default=False, description="validate without applying")
 
 
 class EditWarning(Reply):
@@ -84,7 +88,7 @@ class OperationResult(Reply):
     revision: int
     etag: str
     created: list[str] = Field(default_factory=list, description="ids of new objects")
-    inverse: list[Operation] = Field(default_factory=list, description="what takes it back")
+    inverse: list[Operation] = Field(default_factory=list, description="operations that reverse it")
     warnings: list[EditWarning] = Field(default_factory=list)
     dry_run: bool = False
 
@@ -93,7 +97,7 @@ class StoryboardResult(OperationResult):
     """Answer to an OpenSCENARIO file."""
 
     notes: list[str] = Field(
-        default_factory=list, description="what of the file has no effect, in sentences"
+        default_factory=list, description="parts of the file without effect, one sentence each"
     )
 
 
@@ -101,11 +105,11 @@ class CornerCaseInfo(Reply):
     """A predefined corner case of the gallery."""
 
     name: str
-    title: str = Field(description="what happens, in a sentence")
+    title: str = Field(description="description in one sentence")
     family: str
     parameters: dict[str, float] = Field(description="default values; [m], [m/s], [s]")
     picture: str = Field(
-        default="", description="path of a picture from above: an SVG document, 3 by 1"
+        default="", description="path of a top-down picture: an SVG document, 3 by 1"
     )
 
 
@@ -118,9 +122,9 @@ class Gallery(Reply):
 class CornerCaseChoice(Model):
     """Body of `POST /v1/scenarios/{id}/corner-case`."""
 
-    name: Name = Field(description="of the gallery, such as cut_in")
+    name: Name = Field(description="name in the gallery, for example cut_in")
     parameters: dict[Name, float] = Field(
-        default_factory=dict, max_length=100, description="other values than the default ones"
+        default_factory=dict, max_length=100, description="values that replace the defaults"
     )
 
 
@@ -130,10 +134,11 @@ class HistoryEntry(Reply):
     revision: int
     kind: Literal["edit", "undo", "redo"]
     operations: list[Operation] = Field(
-        default_factory=list, description="of an edit; an undo or redo names `target` instead"
+        default_factory=list,
+        description="operations of an edit; an undo or redo has `target` instead",
     )
     target: int | None = Field(default=None, description="revision of the edit undone or redone")
-    who: str = Field(default="", description="as the client named itself")
+    who: str = Field(default="", description="name given by the client")
     created_at: str
 
 
@@ -155,7 +160,7 @@ class ScenarioDocument(Reply):
     format: Literal["real2sim.scenario"] = "real2sim.scenario"
     version: Literal[1] = 1
     name: str = Field(default="", max_length=200)
-    scene: str = Field(description="name of the scene where it was written")
+    scene: str = Field(description="name of its scene on the worker that exported it")
     scene_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
     assets: dict[str, str] = Field(default_factory=dict, description="content hash by asset id")
     entries: list[HistoryEntry] = Field(default_factory=list, max_length=100_000)

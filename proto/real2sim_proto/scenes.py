@@ -48,8 +48,7 @@ class CameraInfo(Reply):
     T_vehicle_camera: list[list[float]] = Field(description="4x4")
     recorded: OpticsSpec | None = Field(
         default=None,
-        description="lens and shutter that the log's camera really had, for `optics` of sensors; "
-        "null: not known",
+        description="lens and shutter of the log's camera, for `optics` of sensors; null: unknown",
     )
 
 
@@ -67,16 +66,20 @@ class ObjectInfo(Reply):
     object_id: str
     category: str
     size: tuple[float, float, float] = Field(description="length, width, height [m]")
-    instance_id: int = Field(description="value of its pixels in instance images")
+    instance_id: int = Field(description="its pixel value in instance images")
     gaussians: int
     start_us: int
     end_us: int
     trajectory: Track | None = Field(default=None, description="T_world_object; single views only")
-    recorded_id: str | None = Field(default=None, description="object of the scene that it shows")
-    asset_id: str | None = Field(default=None, description="asset that it shows instead")
-    physics: SetPhysics | None = Field(default=None, description="what an edit said of it")
-    velocity: SetVelocity | None = Field(default=None, description="with which it enters physics")
-    gait: SetGait | None = Field(default=None, description="how an edit lets a person walk")
+    recorded_id: str | None = Field(
+        default=None, description="object of the scene whose appearance it has"
+    )
+    asset_id: str | None = Field(default=None, description="asset whose appearance it has instead")
+    physics: SetPhysics | None = Field(default=None, description="physics properties set by edits")
+    velocity: SetVelocity | None = Field(
+        default=None, description="velocity at the start of a simulation"
+    )
+    gait: SetGait | None = Field(default=None, description="gait of a person set by an edit")
 
 
 class SceneInfo(Reply):
@@ -97,10 +100,10 @@ class SceneInfo(Reply):
 
     scene: str = Field(description="name to use in paths")
     state: SceneState
-    reason: str | None = Field(default=None, description="why it is broken")
+    reason: str | None = Field(default=None, description="reason if the scene is broken")
     content_hash: str = ""
     gaussians: int = 0
-    bytes: int = Field(default=0, description="memory it takes when resident")
+    bytes: int = Field(default=0, description="memory use when resident")
     start_us: int = 0
     end_us: int = 0
     frame_times_us: list[int] = Field(default_factory=list)
@@ -111,9 +114,11 @@ class SceneInfo(Reply):
     ego: Track | None = Field(default=None, description="T_world_vehicle of the recording")
     provenance: dict[str, Any] = Field(default_factory=dict)
     has_uncertainties: bool = Field(
-        default=False, description="whether it has images of modality `uncertainty`"
+        default=False, description="whether the modality `uncertainty` is available"
     )
-    lane_count: int = Field(default=0, description="lanes of `GET /v1/scenes/{scene}/lanes`")
+    lane_count: int = Field(
+        default=0, description="number of lanes, see `GET /v1/scenes/{scene}/lanes`"
+    )
 
 
 class SceneList(Reply):
@@ -152,7 +157,7 @@ class Limits(Reply):
     max_operations_per_request: int
     max_cameras_per_step: int
     max_pixels_per_step: int
-    max_rays_per_step: int = Field(default=0, description="0: of a worker without LiDARs")
+    max_rays_per_step: int = Field(default=0, description="0: a worker without LiDARs")
     max_steps_per_request: int
     scene_memory_bytes: int
     queue_length: int
@@ -162,7 +167,7 @@ class DeviceInfo(Reply):
     """Device that stores and renders scenes."""
 
     backend: str
-    reason: str = Field(description="why this backend was chosen")
+    reason: str = Field(description="reason for this backend")
     device: str
     threads: int
 
@@ -179,10 +184,10 @@ class ServerInfo(Reply):
     codecs: list[str]
     modalities: list[str]
     lidar_models: list[str] = Field(
-        default_factory=list, description="that `lidars` of a session may name"
+        default_factory=list, description="LiDAR models available for `lidars` of a session"
     )
     radar_models: list[str] = Field(
-        default_factory=list, description="that `radars` of a session may name"
+        default_factory=list, description="radar models available for `radars` of a session"
     )
     conventions: dict[str, str]
 
@@ -191,21 +196,25 @@ class FleetMember(Reply):
     """A worker of a fleet with a shared store, with its last reported status."""
 
     worker_id: str
-    alive: bool = Field(description="whether its lease runs; if not, others may have its sessions")
+    alive: bool = Field(
+        description="whether its lease is valid; if not, other workers may take its sessions"
+    )
     ready: bool = False
     draining: bool = False
     version: str = ""
     backend: str = ""
-    sessions: int = Field(default=0, description="open in its memory")
+    sessions: int = Field(default=0, description="open sessions in its memory")
     max_sessions: int = 0
-    scenes: list[str] = Field(default_factory=list, description="in its memory")
+    scenes: list[str] = Field(default_factory=list, description="scenes in its memory")
     scene_sessions: dict[str, int] = Field(
-        default_factory=dict, description="open in its memory, by scene"
+        default_factory=dict, description="open sessions in its memory, by scene"
     )
     load: float = Field(
-        default=0.0, ge=0, description="share of the time since it last told that its engine worked"
+        default=0.0,
+        ge=0,
+        description="fraction of time that its engine was busy since its last report",
     )
-    queue: int = Field(default=0, description="that wait for its engine")
+    queue: int = Field(default=0, description="calls waiting for its engine")
 
 
 class Fleet(Reply):
@@ -260,12 +269,15 @@ class AssetPerson(Model):
     asset_id: Identifier
     build: Build
     height: float | None = Field(
-        default=None, gt=0.4, lt=2.6, description="of the person; default: of the build [m]"
+        default=None,
+        gt=0.4,
+        lt=2.6,
+        description="height of the person [m]; default: from the build",
     )
     clothes: dict[
         Literal["skin", "hair", "top", "trousers", "shoes"],
         Colour,
-    ] = Field(default_factory=dict, description="colours, RGB in [0, 1], where they matter")
+    ] = Field(default_factory=dict, description="colours by garment, RGB in [0, 1]")
     worn: list[Literal["long_hair", "skirt"]] = Field(default_factory=list, max_length=2)
 
 
@@ -276,14 +288,19 @@ class AssetUpload(Model):
     category: Category = "car"
     up_axis: UpAxis | None = Field(
         default=None,
-        description="which axis of the file points up; default: what the file says (y for spz; an "
-        "exported ply has it in its header), else -y",
+        description=(
+            "up axis of the file; default: as stated by the file (y for spz; the header of "
+            "an exported ply), otherwise -y"
+        ),
     )
     yaw: float = Field(
-        default=0.0, ge=-6.3, le=6.3, description="turn about z after that [rad]: front to x"
+        default=0.0,
+        ge=-6.3,
+        le=6.3,
+        description="rotation about z after that [rad], to point the front along x",
     )
     length: float | None = Field(
-        default=None, gt=0, le=100, description="real length along x [m]; default: by category"
+        default=None, gt=0, le=100, description="length along x [m]; default: by category"
     )
 
 
@@ -297,7 +314,7 @@ class AssetInfo(Reply):
     bytes: int
     content_hash: str
     ambient: Triple | None = Field(
-        default=None, description="mean colour of where it was seen; None where that is unknown"
+        default=None, description="mean ambient colour of its source; None: unknown"
     )
     provenance: dict[str, Any] = Field(default_factory=dict)
 

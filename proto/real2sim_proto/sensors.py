@@ -44,7 +44,9 @@ class FisheyeLens(Model):
     k: tuple[Number, Number, Number, Number] = Field(default=(0.0,) * 4, description="k1 to k4")
     max_angle: Angle | None = Field(
         default=None,
-        description="from the axis, beyond which nothing is seen [rad]; null: as far as it maps",
+        description=(
+            "largest angle from the optical axis that is imaged [rad]; null: the limit of the model"
+        ),
     )
 
 
@@ -63,10 +65,13 @@ class FThetaLens(Model):
 
     model: Literal["f_theta"] = "f_theta"
     polynomial: list[Number] = Field(
-        default=[0.0, 1.0], min_length=2, max_length=6, description="from the constant (0) on"
+        default=[0.0, 1.0],
+        min_length=2,
+        max_length=6,
+        description="coefficients, starting with the constant (0)",
     )
     reference: Literal["angle", "radius"] = Field(
-        default="angle", description="what the polynomial takes"
+        default="angle", description="argument of the polynomial"
     )
     linear: tuple[Number, Number, Number] = Field(default=(1.0, 0.0, 0.0), description="c, d, e")
     max_angle: Angle = Field(default=math.pi, description="[rad]")
@@ -83,7 +88,10 @@ class ShutterSpec(Model):
 
     direction: ShutterDirection = "global"
     readout_us: int = Field(
-        default=0, ge=0, le=200_000, description="first to last line; 0 where global"
+        default=0,
+        ge=0,
+        le=200_000,
+        description="time from the first to the last line; 0 for a global shutter",
     )
 
 
@@ -129,22 +137,24 @@ class CameraEffects(Model):
     motion_blur: MotionBlurSpec | None = None
     vignetting: tuple[float, float, float] | None = Field(
         default=None,
-        description="a, b, c: light falls by 1 + a r^2 + b r^4 + c r^6, at least 0, r from the "
-        "middle of the image over half its diagonal",
+        description=(
+            "a, b, c: light is multiplied by 1 + a r^2 + b r^4 + c r^6, at least 0; r is "
+            "the distance from the image centre over half the diagonal"
+        ),
     )
-    exposure_ev: float = Field(default=0.0, ge=-10, le=10, description="light times 2^ev")
+    exposure_ev: float = Field(default=0.0, ge=-10, le=10, description="multiplies light by 2^ev")
     white_balance: tuple[Gain, Gain, Gain] | None = Field(
-        default=None, description="gains of red, green and blue light"
+        default=None, description="gains of linear red, green and blue"
     )
     noise: NoiseSpec | None = None
     tone_curve: list[Annotated[float, Field(ge=0, le=1)]] | None = Field(
         default=None,
         min_length=2,
         max_length=64,
-        description="display values for evenly spaced ones from 0 to 1; never falling",
+        description="output values for evenly spaced inputs from 0 to 1; non-decreasing",
     )
     jpeg_quality: int | None = Field(
-        default=None, ge=1, le=100, description="of the camera's own compression"
+        default=None, ge=1, le=100, description="quality of the camera's own compression"
     )
 
     @model_validator(mode="after")
@@ -193,15 +203,17 @@ class SpinningBeams(Model):
     """Rows that rotate about the sensor's z axis; angles in degrees."""
 
     kind: Literal["spinning"]
-    elevation_deg: Numbers = Field(description="of each row")
+    elevation_deg: Numbers = Field(description="elevation of each row")
     azimuth_offset_deg: Numbers | None = Field(
-        default=None, description="of each row against its column; default: 0"
+        default=None, description="azimuth offset of each row from its column; default: 0"
     )
-    columns: int = Field(description="azimuth steps of a turn")
-    rate_hz: float = Field(default=10.0, description="turns a second")
-    clockwise: bool = Field(default=True, description="seen from above")
-    start_deg: float = Field(default=180.0, description="azimuth at which a turn begins")
-    field_of_view_deg: float = Field(default=360.0, description="covered about the turn's middle")
+    columns: int = Field(description="azimuth steps per turn")
+    rate_hz: float = Field(default=10.0, description="turns per second")
+    clockwise: bool = Field(default=True, description="rotates clockwise, seen from above")
+    start_deg: float = Field(default=180.0, description="azimuth at the start of a turn")
+    field_of_view_deg: float = Field(
+        default=360.0, description="azimuth range covered, about the middle of the turn"
+    )
 
 
 class TableBeams(Model):
@@ -229,7 +241,7 @@ class RosetteBeams(Model):
 
     kind: Literal["rosette"]
     radius_deg: Annotated[float, Field(gt=0, lt=90)]
-    turns_per_minute: Span = Field(description="of the two prisms")
+    turns_per_minute: Span = Field(description="rotation rates of the two prisms")
     rays: Annotated[int, Field(ge=1, le=MAX_RAYS)]
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
 
@@ -237,11 +249,14 @@ class RosetteBeams(Model):
 class DetectionSpec(Model):
     """Detection model of a LiDAR."""
 
-    range_m: float = Field(default=120.0, description="where `reflectivity` is just seen")
+    range_m: float = Field(
+        default=120.0, description="range at which `reflectivity` is just detected"
+    )
     reflectivity: float = Field(default=0.1, description="0 to 1")
-    loss: float = Field(default=0.0, description="share of rays lost whatever they meet")
+    loss: float = Field(default=0.0, description="share of rays lost independent of the target")
     softness: float = Field(
-        default=0.25, description="width of the passage from seen to lost, of the limiting power"
+        default=0.25,
+        description="width of the transition from detected to lost, relative to the limiting power",
     )
 
 
@@ -249,19 +264,21 @@ class LidarModel(Model):
     """A custom LiDAR."""
 
     name: Annotated[str, Field(min_length=1, max_length=64)]
-    source: str = Field(default="", description="where the numbers come from")
+    source: str = Field(default="", description="source of the figures")
     beams: Annotated[
         SpinningBeams | TableBeams | GridBeams | RosetteBeams, Field(discriminator="kind")
     ]
     T_vehicle_lidar: list[list[float]] | None = Field(
         default=None, description="4x4; default: 0.9 m before and 1.73 m above the rear axle"
     )
-    range_m: Span = Field(default=(0.5, 120.0), description="nearest and farthest return")
+    range_m: Span = Field(
+        default=(0.5, 120.0), description="smallest and largest range of a return"
+    )
     divergence_mrad: Span = Field(
         default=(0.0, 0.0), description="full angle at 1/e^2 of the power, horizontal, vertical"
     )
     returns: int = Field(default=1, description="1, 2 (first, last) or 3 (and the strongest)")
-    pulse_m: float = Field(default=0.4, description="echoes nearer to each other are one")
+    pulse_m: float = Field(default=0.4, description="echoes closer than this merge")
     range_noise_m: float = Field(default=0.0, description="standard deviation")
     detection: DetectionSpec = DetectionSpec()
 
@@ -276,29 +293,30 @@ class RadarModel(Model):
     """A radar that resolves range, azimuth, elevation and radial velocity. The defaults are those
     of a 77 GHz mid-range front radar."""
 
-    range_m: tuple[float, float] = Field(default=(0.5, 160.0), description="nearest, farthest")
+    range_m: tuple[float, float] = Field(default=(0.5, 160.0), description="smallest, largest")
     field_of_view_deg: tuple[Degrees, Degrees] = Field(
         default=(120.0, 20.0), description="horizontal, vertical"
     )
     range_resolution_m: Annotated[float, Field(ge=0.02, le=50)] = Field(
-        default=0.4, description="of a cell"
+        default=0.4, description="size of a resolution cell"
     )
     azimuth_resolution_deg: Annotated[float, Field(ge=0.1, le=90)] = 1.5
     elevation_resolution_deg: Annotated[float, Field(ge=0.1, le=180)] = Field(
-        default=20.0, description="as large as the field of view: elevation is not resolved"
+        default=20.0,
+        description="as large as the field of view if elevation is not resolved",
     )
     velocity_resolution_mps: Annotated[float, Field(ge=0.01, le=50)] = 0.1
     max_velocity_mps: Annotated[float, Field(gt=0, le=500)] | None = Field(
-        default=None, description="velocities beyond fold back into -this to this; null: none do"
+        default=None, description="velocities beyond this wrap around; null: no ambiguity"
     )
     detection_range_m: Metres = Field(
-        default=140.0, description="where a target of 10 m^2 is just detected"
+        default=140.0, description="range at which a target of 10 m^2 is just detected"
     )
     min_rcs_dbsm: Annotated[float, Field(ge=-100, le=60)] = Field(
-        default=-20.0, description="weaker targets are not reported, however near"
+        default=-20.0, description="weaker targets are never reported"
     )
     ray_spacing_deg: Annotated[float, Field(ge=0.05, le=10)] = Field(
-        default=0.4, description="of the rays that look for targets"
+        default=0.4, description="spacing of the rays that search for targets"
     )
     range_noise_m: Annotated[float, Field(ge=0, le=10)] = Field(
         default=0.05, description="standard deviation"
@@ -306,10 +324,11 @@ class RadarModel(Model):
     azimuth_noise_deg: Annotated[float, Field(ge=0, le=10)] = 0.15
     velocity_noise_mps: Annotated[float, Field(ge=0, le=10)] = 0.03
     clutter_rate: Annotated[float, Field(ge=0, le=10_000)] = Field(
-        default=2.0, description="mean number of detections of nothing in a scan"
+        default=2.0, description="mean number of false detections per scan"
     )
     ghost_rate: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.0, description="share of objects' detections seen again at twice their range"
+        default=0.0,
+        description="share of detections of objects that also appear at twice their range",
     )
 
     @model_validator(mode="after")
@@ -341,25 +360,31 @@ PERIOD = "time between clouds; a multiple of dt_us; default: the least such that
 class LidarSpec(Model):
     """One LiDAR of an observation."""
 
-    lidar: Identifier = Field(description="its name; of its clouds, too")
+    lidar: Identifier = Field(description="sensor name, also of its clouds")
     model: Identifier | LidarModel | None = Field(
-        default=None, description="name in the catalogue, or a model; default: called as `lidar`"
+        default=None,
+        description="name in the catalogue, or a model; default: the value of `lidar`",
     )
     pose: Pose | None = Field(
-        default=None, description="T_vehicle_lidar, x forward; default: the model's"
+        default=None, description="T_vehicle_lidar, x forward; default: the model's pose"
     )
     rate_hz: Hertz | None = Field(
-        default=None, description="sweeps a second, the rays' times scaled; default: the model's"
+        default=None,
+        description="sweeps per second; ray times scale with it; default: the model's rate",
     )
     period_us: int | None = Field(default=None, gt=0, le=2**40, description=PERIOD)
-    frame: CloudFrame = Field(default="sensor", description="of the points")
+    frame: CloudFrame = Field(default="sensor", description="frame of the points")
     compensated: bool = Field(
         default=True,
-        description="points are where they would be seen from the pose at the cloud's instant; "
-        "false: from where the sensor was when each ray was fired",
+        description=(
+            "points are relative to the sensor pose at the cloud's time; false: to the "
+            "sensor pose when each ray was fired"
+        ),
     )
     fields: list[LidarField] = Field(
-        default=list(LIDAR_FIELDS), max_length=len(LIDAR_FIELDS), description="beside `points`"
+        default=list(LIDAR_FIELDS),
+        max_length=len(LIDAR_FIELDS),
+        description="columns in addition to `points`",
     )
     codec: CloudCodec = "raw"
 
@@ -374,9 +399,10 @@ class LidarSpec(Model):
 class RadarSpec(Model):
     """One radar of an observation."""
 
-    radar: Identifier = Field(description="its name; of its clouds, too")
+    radar: Identifier = Field(description="sensor name, also of its clouds")
     model: Identifier | RadarModel | None = Field(
-        default=None, description="name in the catalogue, or a model; default: called as `radar`"
+        default=None,
+        description="name in the catalogue, or a model; default: the value of `radar`",
     )
     pose: Pose | None = Field(
         default=None,
@@ -389,7 +415,7 @@ class RadarSpec(Model):
         le=2**40,
         description="time between scans; a multiple of dt_us, and dt_us by default",
     )
-    frame: CloudFrame = Field(default="sensor", description="of the points")
+    frame: CloudFrame = Field(default="sensor", description="frame of the points")
     codec: CloudCodec = "raw"
 
 
@@ -401,7 +427,7 @@ class CloudField(Model):
 
     name: str
     dtype: Literal["float32", "uint8", "uint16", "int32"]
-    width: int = Field(default=1, ge=1, le=16, description="numbers of each point")
+    width: int = Field(default=1, ge=1, le=16, description="values per point")
 
 
 __all__ = [

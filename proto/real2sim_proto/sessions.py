@@ -35,17 +35,17 @@ class SessionCreate(Model):
 class SessionInfo(Reply):
     """A session."""
 
-    session_id: str = Field(description="names its worker: <worker>.<random>")
+    session_id: str = Field(description="<worker>.<random>; the first part is its worker")
     scene: str
     scenario_id: str | None = None
-    ws_url: str = Field(description="drive socket")
+    ws_url: str = Field(description="address of the drive socket")
     token: str = Field(description="authorises the drive socket and this session's REST calls")
-    owner: str = Field(default="default", description="name of the token it was made with")
+    owner: str = Field(default="default", description="name of the token that created it")
     created_at: str
     step: int | None = None
     t_us: Microseconds | None = None
     controller: bool = Field(default=False, description="whether a controller is connected")
-    held: bool = Field(default=False, description="whether its clock is held, see `.../clock`")
+    held: bool = Field(default=False, description="whether its clock is paused, see `.../clock`")
     reset: ResetSpec
 
 
@@ -63,20 +63,21 @@ class SessionClock(Model):
     """
 
     state: Literal["running", "held", "ended"] = Field(
-        description="`ended` ends the episode where it is, with the reason `stopped`"
+        description="`ended` ends the episode at the current step, with the reason `stopped`"
     )
     steps: int | None = Field(
         default=None,
         ge=1,
         le=MAX_STEPS_PER_REQUEST,
-        description="of `held`: that many more steps before it holds",
+        description="for `held`: number of steps to run before the clock pauses",
     )
     pace: float | None = Field(
         default=None,
         ge=0.01,
         le=100.0,
-        description="of `running`: simulated seconds in a second, at most; default: as fast as "
-        "the controller and the worker can",
+        description=(
+            "for `running`: largest ratio of simulated time to wall-clock time; default: no limit"
+        ),
     )
 
 
@@ -86,7 +87,8 @@ class StepRequest(Model):
     n: int = Field(default=1, ge=1, le=MAX_STEPS_PER_REQUEST)
     dt_us: int | None = Field(default=None, description="must equal the session's dt_us")
     plan: Plan | None = Field(
-        default=None, description="default: the last one, else follow the log"
+        default=None,
+        description="default: the previous plan; before the first plan, the ego follows the log",
     )
 
 
@@ -96,7 +98,7 @@ class SessionEdit(Model):
 
     operations: list[Operation] = Field(min_length=1, max_length=MAX_OPERATIONS_PER_REQUEST)
     base_rev: int | None = Field(
-        default=None, description="`revision` they were made for; refused when it is another now"
+        default=None, description="`revision` that they are based on; refused if it has changed"
     )
 
 
@@ -104,7 +106,7 @@ class SessionEdited(Reply):
     """Answer to edits of a running world."""
 
     session_id: str
-    step: int = Field(description="they take effect before the step that follows it")
+    step: int = Field(description="the edits take effect before the step after this one")
     revision: int
     created: list[str] = Field(default_factory=list, description="ids of new objects")
     warnings: list[EditWarning] = Field(default_factory=list)
@@ -117,27 +119,34 @@ class SessionState(Reply):
     step: int
     t_us: Microseconds
     revision: int
-    ego: EgoState = Field(description="where it is, whatever its own estimate")
+    ego: EgoState = Field(description="true state, independent of its own estimate")
     agents: list[AgentState]
-    events: list[Event] = Field(default_factory=list, description="since the previous step answer")
+    events: list[Event] = Field(
+        default_factory=list, description="events since the previous step answer"
+    )
     metrics: dict[str, float]
     terminated: bool
     truncated: bool
     reason: str | None = None
-    lap: int = Field(default=0, description="times the ego has been put back to the route's start")
+    lap: int = Field(
+        default=0, description="number of times the ego returned to the start of the route"
+    )
     drawn: dict[str, float] = Field(
-        default_factory=dict, description="what the seed drew for the start and for objects so far"
+        default_factory=dict,
+        description="values that the seed drew for the start and for objects so far",
     )
     timing: dict[str, float] = Field(default_factory=dict)
-    held: bool = Field(default=False, description="whether the clock is held")
+    held: bool = Field(default=False, description="whether the clock is paused")
     plan: list[tuple[float, float, float]] = Field(
         default_factory=list,
         description="poses of the newest plan: x [m], y [m], yaw [rad] in the world; `GET` only",
     )
     planning_ms: float | None = Field(
         default=None,
-        description="from an observation to the newest plan, where somebody drives on a socket of "
-        "the session's own; `GET` only",
+        description=(
+            "time from an observation to the newest plan, if a controller drives on the "
+            "session's own socket; `GET` only"
+        ),
     )
 
 
@@ -178,19 +187,21 @@ def _intrinsics(K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
 class FreeCamera(Model):
     """A camera with an arbitrary pose in the world."""
 
-    name: Identifier = Field(description="of its frames")
+    name: Identifier = Field(description="name of its frames")
     width: int = Field(ge=16, le=8192, description="[px]")
     height: int = Field(ge=16, le=8192, description="[px]")
     K: Annotated[tuple[Row, Row, Row], AfterValidator(_intrinsics)] = Field(
-        description="3x3 intrinsics [px]; pixel centres lie at +0.5"
+        description="3x3 intrinsics [px]; pixel centres are at +0.5"
     )
     lens: LensSpec = PinholeLens()
     pose: Pose = Field(description="T_world_camera; x right, y down, z forward")
     modalities: list[Modality] = Field(default=["rgb"], min_length=1, max_length=6)
-    codec: Codec = Field(default="raw", description="of rgb; all else is raw or png")
-    quality: int = Field(default=90, ge=1, le=100, description="of jpeg")
+    codec: Codec = Field(
+        default="raw", description="encoding of rgb; other modalities are raw or png"
+    )
+    quality: int = Field(default=90, ge=1, le=100, description="JPEG quality")
     effects: CameraEffects | None = Field(
-        default=None, description="what a real camera does to its colour images; default: nothing"
+        default=None, description="camera effects on colour images; default: none"
     )
 
 
@@ -205,14 +216,13 @@ class SceneView(Model):
     """Body of `POST /v1/scenes/{scene}/render`: one instant, from any cameras."""
 
     t_us: Microseconds | None = Field(
-        default=None, description="where objects are that are not posed; default: the start"
+        default=None, description="time of objects without a pose here; default: the start"
     )
     cameras: list[FreeCamera] = Field(min_length=1, max_length=MAX_SENSORS)
     objects: list[PosedObject] = Field(default_factory=list, max_length=MAX_POSED)
     others: Literal["recorded", "parked", "none"] = Field(
         default="recorded",
-        description="objects that are not posed: as recorded at `t_us`; of these, only those whose "
-        "recording leads nowhere; or none",
+        description="objects without a pose here: as recorded at `t_us`; only parked ones; or none",
     )
 
     @model_validator(mode="after")

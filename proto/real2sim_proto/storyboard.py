@@ -63,11 +63,13 @@ class Entity(Model):
     name: Reference
     kind: Literal["ego", "object", "new"] = "new"
     category: str = Field(default="car", max_length=80)
-    object_id: Identifier | None = Field(default=None, description="of the scene, for 'object'")
+    object_id: Identifier | None = Field(
+        default=None, description="object of the scene, for 'object'"
+    )
     asset_id: Identifier | None = None
     look: Identifier | None = Field(default=None, description="an object of the scene")
     box: BoundingBox | None = Field(
-        default=None, description="default: of the object, or by category"
+        default=None, description="default: the object's, or by category"
     )
     model: str = Field(default="", max_length=200, description="name in the file's catalog")
     mass: Value | None = Field(default=None, description="[kg]")
@@ -95,16 +97,20 @@ class RouteLanes(Model):
     kind: Literal["route"] = "route"
     lane_width: Annotated[float, Field(ge=1.5, le=10)] = 3.5
     ego_lane: int = Field(default=-1, ge=-20, le=-1, description="id of the lane of the route")
-    s: float = Field(default=0.0, description="of the reference line where the route begins [m]")
-    left: int = Field(default=4, ge=0, le=20, description="lanes on the left")
-    right: int = Field(default=4, ge=1, le=20, description="lanes on the right")
+    s: float = Field(
+        default=0.0, description="s of the reference line at the start of the route [m]"
+    )
+    left: int = Field(default=4, ge=0, le=20, description="number of lanes on the left")
+    right: int = Field(default=4, ge=1, le=20, description="number of lanes on the right")
 
 
 class MapRoads(Model):
     """Roads of the scene's map, or of a map included in the file."""
 
     kind: Literal["map"] = "map"
-    file: str = Field(default="", max_length=1000, description="as the file names it")
+    file: str = Field(
+        default="", max_length=1000, description="path of the map as written in the scenario file"
+    )
 
 
 Roads = Annotated[RouteLanes | MapRoads, Field(discriminator="kind")]
@@ -117,8 +123,10 @@ class SignalHead(Model):
     """A traffic signal, with its stop position."""
 
     signal_id: Reference
-    stop_line: WorldPosition | None = Field(default=None, description="None: not known")
-    state: str = Field(default="off", max_length=200, description="until something changes it")
+    stop_line: WorldPosition | None = Field(default=None, description="None: unknown")
+    state: str = Field(
+        default="off", max_length=200, description="initial state, until an action changes it"
+    )
 
 
 class Phase(Model):
@@ -126,16 +134,19 @@ class Phase(Model):
 
     name: ElementName
     duration: Value = Field(description="[s]")
-    states: dict[Reference, str] = Field(max_length=200, description="by id of the signal")
+    states: dict[Reference, str] = Field(max_length=200, description="states by signal id")
 
 
 class SignalController(Model):
     """Cycles signals through phases."""
 
     name: ElementName
-    delay: Value = Field(default=0.0, description="before its first phase, after `reference` [s]")
+    delay: Value = Field(
+        default=0.0, description="delay of its first phase after that of `reference` [s]"
+    )
     reference: Reference | None = Field(
-        default=None, description="controller whose cycle it follows; None: simulation time"
+        default=None,
+        description="controller that its cycle is relative to; None: simulation time",
     )
     phases: list[Phase] = Field(min_length=1, max_length=200)
 
@@ -162,11 +173,11 @@ class Event(Model):
 
     name: ElementName
     priority: Literal["override", "skip", "parallel"] = Field(
-        default="override", description="what becomes of other events of the maneuver that run"
+        default="override", description="effect on other running events of the maneuver"
     )
-    times: int = Field(default=1, ge=1, le=1_000_000, description="that it may happen, at most")
+    times: int = Field(default=1, ge=1, le=1_000_000, description="largest number of executions")
     actions: list[Action] = Field(min_length=1, max_length=100)
-    start: Trigger | None = Field(default=None, description="None: with its maneuver")
+    start: Trigger | None = Field(default=None, description="None: starts with its maneuver")
 
 
 class Maneuver(Model):
@@ -190,7 +201,7 @@ class Act(Model):
 
     name: ElementName
     groups: list[ManeuverGroup] = Field(min_length=1, max_length=100)
-    start: Trigger | None = Field(default=None, description="None: with its story")
+    start: Trigger | None = Field(default=None, description="None: starts with its story")
     stop: Trigger | None = None
 
 
@@ -294,8 +305,7 @@ class Storyboard(Model):
 
     version: Literal[1, 2] = Field(
         default=2,
-        description="of the rules it runs by; 1 keeps the bits of recordings from before there "
-        "were versions",
+        description="version of the execution rules; 1 reproduces recordings without a version",
     )
     name: str = Field(default="", max_length=200)
     author: str = Field(default="", max_length=200)
@@ -303,13 +313,15 @@ class Storyboard(Model):
     parameters: dict[Name, Plain] = Field(default_factory=dict, max_length=1000)
     variables: dict[Name, Plain] = Field(default_factory=dict, max_length=1000)
     distributions: dict[Name, Distribution] = Field(
-        default_factory=dict, max_length=200, description="of parameters"
+        default_factory=dict, max_length=200, description="distributions of parameter values"
     )
     roads: Roads = RouteLanes()
     origin: tuple[float, float, float] = Field(
         default=(0.0, 0.0, 0.0),
-        description="x, y [m] and heading [rad], in the scene's world, of the frame that positions "
-        "of kind 'world' are in",
+        description=(
+            "x, y [m] and heading [rad], in the scene's world, of the frame of positions of "
+            "kind 'world'"
+        ),
     )
     entities: list[Entity] = Field(default_factory=list, max_length=MAX_ENTITIES)
     signals: list[SignalHead] = Field(default_factory=list, max_length=1000)
@@ -319,11 +331,13 @@ class Storyboard(Model):
     stories: list[Story] = Field(default_factory=list, max_length=100)
     stop: Trigger | None = Field(default=None, description="ends all acts; None: never")
     drives_ego: bool = Field(
-        default=False, description="moves the ego too, whatever the planner says"
+        default=False, description="also moves the ego and ignores the planner"
     )
     ends_episode: bool = Field(
         default=False,
-        description="the episode ends with `stop`; without one, once all stories are complete",
+        description=(
+            "the episode ends with `stop`; without a stop trigger, once all stories are complete"
+        ),
     )
 
     @model_validator(mode="after")

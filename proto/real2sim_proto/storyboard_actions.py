@@ -25,7 +25,7 @@ class Orientation(Model):
 
 
 DRIVING = Field(
-    default=None, description="None: as traffic goes there; relative: against the road's own way"
+    default=None, description="None: in driving direction; relative: to the road's direction"
 )
 
 
@@ -99,7 +99,8 @@ class RelativeLanePosition(Model):
     lanes: int | Value = 0
     ds: Value
     along: Literal["lane", "road"] = Field(
-        default="road", description="`ds` along the middle of its lane, or the reference line"
+        default="road",
+        description="measure `ds` along the centre of its lane, or the reference line",
     )
     offset: Value = 0.0
     orientation: Orientation | None = DRIVING
@@ -130,10 +131,11 @@ class RoutePosition(Model):
 
     kind: Literal["route"] = "route"
     route: Route
-    s: Value = Field(description="from the route's first place [m]")
-    t: Value = Field(default=0.0, description="positive on the left [m]")
+    s: Value = Field(description="distance from the first point of the route [m]")
+    t: Value = Field(default=0.0, description="positive to the left [m]")
     lane: int | Value | None = Field(
-        default=None, description="id there, from whose middle `t` counts; None: from the route"
+        default=None,
+        description="lane id at that point; `t` is measured from its centre; None: from the route",
     )
     orientation: Orientation | None = DRIVING
 
@@ -144,7 +146,7 @@ class TrajectoryPosition(Model):
     kind: Literal["trajectory"] = "trajectory"
     curve: Curve
     s: Value
-    t: Value = Field(default=0.0, description="positive on the left [m]")
+    t: Value = Field(default=0.0, description="positive to the left [m]")
     orientation: Orientation | None = DRIVING
 
 
@@ -167,7 +169,7 @@ class Dynamics(Model):
 
     shape: Shape = "linear"
     dimension: Literal["time", "distance", "rate"] = "time"
-    value: Value = Field(default=0.0, description="[s], [m], or the highest rate of the value")
+    value: Value = Field(default=0.0, description="[s], [m], or the largest rate of change")
 
 
 STEP = Dynamics(shape="step")
@@ -185,10 +187,10 @@ class SpeedAction(Model):
     """Change to a target speed, with a given transition."""
 
     kind: Literal["speed"] = "speed"
-    speed: Value = Field(description="[m/s]; or difference, or factor")
+    speed: Value = Field(description="[m/s]; or a difference [m/s] or a factor")
     relative_to: Reference | None = None
     relation: Literal["delta", "factor"] = "delta"
-    continuous: bool = Field(default=False, description="goes on following the other's speed")
+    continuous: bool = Field(default=False, description="keep following the other's speed")
     dynamics: Dynamics = STEP
 
 
@@ -211,9 +213,9 @@ class LaneChangeAction(Model):
     """Change to the lane with an id, or to a lane relative to an entity's."""
 
     kind: Literal["lane_change"] = "lane_change"
-    lane: int | Value = Field(description="id; or number of lanes, positive on the left")
+    lane: int | Value = Field(description="lane id; or number of lanes, positive to the left")
     relative_to: Reference | None = None
-    offset: Value = Field(default=0.0, description="from the middle of the lane there [m]")
+    offset: Value = Field(default=0.0, description="offset from the centre of the target lane [m]")
     dynamics: Dynamics = Dynamics(shape="sinusoidal", value=3.0)
 
 
@@ -221,12 +223,12 @@ class LaneOffsetAction(Model):
     """Lateral offset from the centre of its lane, or from an entity's offset."""
 
     kind: Literal["lane_offset"] = "lane_offset"
-    offset: Value = Field(description="positive on the left [m]")
+    offset: Value = Field(description="positive to the left [m]")
     relative_to: Reference | None = None
     continuous: bool = False
     shape: Shape = "step"
     acceleration: Value | None = Field(
-        default=None, description="highest one sideways [m/s^2]; None: at once"
+        default=None, description="largest lateral acceleration [m/s^2]; None: immediate"
     )
 
 
@@ -237,7 +239,7 @@ class LateralDistanceAction(Model):
     entity: Reference
     distance: Value
     side: Literal["any", "left", "right"] = Field(
-        default="any", description="of the entity, on which to be; 'any': where it is"
+        default="any", description="side of the entity to keep; 'any': the current side"
     )
     freespace: bool = False
     continuous: bool = False
@@ -277,13 +279,15 @@ class SynchronizeAction(Model):
     final_speed: Value | None = Field(default=None, description="[m/s]")
     relative: bool = Field(default=False, description="final_speed is the difference to its speed")
     steady_distance: Value | None = Field(
-        default=None, description="of its way before the arrival, with the final speed [m]"
+        default=None, description="distance driven at the final speed before the arrival [m]"
     )
-    steady_time: Value | None = Field(default=None, description="the same as a time [s]")
+    steady_time: Value | None = Field(
+        default=None, description="time driven at the final speed before the arrival [s]"
+    )
     master_tolerance: Value = 0.0
     tolerance: Value = 0.0
     limits: SpeedLimits = Field(
-        default=SpeedLimits(), description="of its own; OpenSCENARIO does not know them here"
+        default=SpeedLimits(), description="limits of the entity; OpenSCENARIO has none here"
     )
 
 
@@ -306,8 +310,10 @@ class Clothoid(Model):
 
     shape: Literal["clothoid"] = "clothoid"
     position: Position
-    curvature: Value = Field(description="at its start [1/m]")
-    curvature_rate: Value = Field(default=0.0, description="per way [1/m^2]")
+    curvature: Value = Field(description="curvature at its start [1/m]")
+    curvature_rate: Value = Field(
+        default=0.0, description="change of curvature per distance [1/m^2]"
+    )
     length: Value = Field(description="[m]")
     start_time: Value | None = None
     stop_time: Value | None = None
@@ -375,8 +381,8 @@ class FollowTrajectoryAction(Model):
     name: str = Field(default="trajectory", max_length=200)
     curve: Curve
     closed: bool = False
-    timing: Timing | None = Field(default=None, description="None: at its own speed")
-    offset: Value = Field(default=0.0, description="way from its start where it begins [m]")
+    timing: Timing | None = Field(default=None, description="None: the entity keeps its own speed")
+    offset: Value = Field(default=0.0, description="distance from its start at which to begin [m]")
 
 
 class AssignRouteAction(Model):
@@ -412,14 +418,18 @@ class FollowingParameters(Model):
     ``idm``."""
 
     desired_speed: Annotated[float, Field(ge=0, le=150)] | None = Field(
-        default=None, description="[m/s]; default: its speed when the action begins"
+        default=None, description="[m/s]; default: its speed at the start of the action"
     )
-    headway: Annotated[float, Field(gt=0, le=3600)] = Field(default=1.5, description="T [s]")
-    gap: Annotated[float, Field(ge=0, le=1e4)] = Field(default=2.0, description="s0 [m]")
+    headway: Annotated[float, Field(gt=0, le=3600)] = Field(
+        default=1.5, description="time headway T [s]"
+    )
+    gap: Annotated[float, Field(ge=0, le=1e4)] = Field(
+        default=2.0, description="gap s0 at rest [m]"
+    )
     acceleration: Annotated[float, Field(gt=0, le=10)] = Field(default=1.5, description="[m/s^2]")
     braking: Annotated[float, Field(gt=0, le=10)] = Field(default=2.0, description="[m/s^2]")
     lateral: Annotated[float, Field(gt=0, le=10)] = Field(
-        default=2.5, description="acceleration sideways that sets the speed in bends [m/s^2]"
+        default=2.5, description="lateral acceleration that limits the speed in bends [m/s^2]"
     )
 
 

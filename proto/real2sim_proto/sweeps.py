@@ -34,9 +34,11 @@ class CaseParameter(Model):
 
     path: str | list[str] | None = Field(
         default=None,
-        description="where its value goes: agents.drivers.van_0.gap in reset, operations.0.y in "
-        "the edits, or several; null for a parameter of the scenario file, or one that only "
-        "others are derived from",
+        description=(
+            "path that its value is written to: agents.drivers.van_0.gap in reset, "
+            "operations.0.y in the edits, or several paths; null for a parameter of the "
+            "scenario file, or one that is used only to derive others"
+        ),
     )
 
     @property
@@ -123,7 +125,7 @@ class GridMethod(Model):
 
     kind: Literal["grid"]
     levels: int | dict[ParameterName, int] = Field(
-        default=5, description="values of each parameter; of a choice all are taken"
+        default=5, description="number of values per parameter; a choice takes all its values"
     )
 
 
@@ -164,11 +166,16 @@ class SearchMethod(Model):
     kind: Literal["search"]
     episodes: int = Field(default=300, ge=20, le=MAX_EPISODES)
     seed: SweepSeed = 0
-    shrink: int = Field(default=3, ge=0, le=20, description="failures whose boundary is sought")
-    probability: int = Field(
-        default=0, ge=0, le=2000, description="episodes for how often it fails; 0: none"
+    shrink: int = Field(
+        default=3, ge=0, le=20, description="number of failures to find the boundary of"
     )
-    films: int = Field(default=0, ge=0, le=10, description="failures that are filmed")
+    probability: int = Field(
+        default=0,
+        ge=0,
+        le=2000,
+        description="number of episodes to estimate the failure rate; 0: none",
+    )
+    films: int = Field(default=0, ge=0, le=10, description="number of failures to film")
 
 
 SweepMethod = Annotated[
@@ -179,7 +186,9 @@ SweepMethod = Annotated[
 class StopRule(Model):
     """Stopping rule. Episodes count in the order of the table, independent of the worker."""
 
-    at_fault: int | None = Field(default=None, ge=1, description="so many at-fault collisions")
+    at_fault: int | None = Field(
+        default=None, ge=1, description="stop after this many at-fault collisions"
+    )
     collisions: int | None = Field(default=None, ge=1)
     episodes: int | None = Field(default=None, ge=1)
 
@@ -189,42 +198,47 @@ class SweepRequest(Model):
 
     scene: Identifier
     corner_case: Identifier | None = Field(
-        default=None, description="of `GET /v1/gallery`, laid along the scene's route"
+        default=None, description="name in `GET /v1/gallery`, placed along the scene's route"
     )
     openscenario: str | None = Field(
         default=None,
         max_length=1_000_000,
-        description="an OpenSCENARIO 1.0 to 1.3 file without catalogs, laid along the route",
+        description="an OpenSCENARIO 1.0 to 1.3 file without catalogs, placed along the route",
     )
     storyboard: Storyboard | None = Field(
         default=None, description="in the scene's frame, as `reset` takes it"
     )
     ego: str | None = Field(
-        default=None, max_length=200, description="entity that is the ego; default: Ego"
+        default=None, max_length=200, description="name of the ego entity; default: Ego"
     )
     leave_out: list[Annotated[str, Field(max_length=200)]] = Field(
         default_factory=list, max_length=100, description="elements of the file to leave out"
     )
     reset: dict[str, Any] = Field(
         default_factory=dict,
-        description="options of the episodes; the seed and what planners need are set",
+        description="options of the episodes; the seed and the needs of planners are filled in",
     )
     operations: list[Operation] = Field(default_factory=list, max_length=64)
     parameters: dict[ParameterName, SweepParameter] = Field(
         default_factory=dict,
         max_length=64,
-        description="by name; of a scenario's own parameters without a path. What a file draws "
-        "itself need not be named. kind may be left out where it is plain",
+        description=(
+            "distributions by name; parameters of a scenario file need no path. Leave out "
+            "parameters that the file draws itself, and `kind` if it is unambiguous"
+        ),
     )
     method: SweepMethod = Field(default_factory=SpreadMethod, description="or the name of its kind")
     seeds: list[SweepSeed] = Field(default=[0], min_length=1, max_length=1000)
     planners: list[PlannerName] = Field(default=["idm"], min_length=1, max_length=8)
     stop: StopRule | None = None
     metrics: list[Identifier] = Field(
-        default_factory=list, max_length=64, description="scores that get columns"
+        default_factory=list, max_length=64, description="scores to write as columns"
     )
     worst: int = Field(
-        default=3, ge=0, le=20, description="episodes that leave recordings, by rank_by"
+        default=3,
+        ge=0,
+        le=20,
+        description="number of episodes to keep recordings of, ranked by rank_by",
     )
     rank_by: Identifier = "criticality"
 
