@@ -150,9 +150,11 @@ WORKER_SCHEME, SESSION_SCHEME = "WorkerToken", "SessionToken"
 _bearer = HTTPBearer(
     auto_error=False,
     scheme_name=WORKER_SCHEME,
-    description="`Authorization: Bearer` with a token of the worker: `REAL2SIM_TOKEN` of its "
-    "settings, or a named one of `REAL2SIM_TOKENS_FILE`; a worker without asks for none. It opens "
-    "every session, too.",
+    description=(
+        "`Authorization: Bearer` with a token of the worker: `REAL2SIM_TOKEN`, or a "
+        "named token of `REAL2SIM_TOKENS_FILE`. A worker without tokens needs none. It "
+        "also opens every session."
+    ),
 )
 
 

@@ -41,7 +41,7 @@ ClientName = Annotated[
         alias=CLIENT_HEADER,
         max_length=80,
         pattern=r"^[ -~]*$",
-        description="who is calling; goes into the history of what is changed",
+        description="name of the client, written to the history of changes",
         examples=["alice"],
     ),
 ]
@@ -219,7 +219,7 @@ IdempotencyKey = Annotated[
         alias="Idempotency-Key",
         min_length=1,
         max_length=200,
-        description="a value of your own; the same request sent again with it takes effect once",
+        description="any unique value; a request repeated with the same value takes effect once",
     ),
 ]
 

@@ -122,7 +122,7 @@ async def describe(worker: WorkerOf, asset_id: Identifier) -> AssetInfo:
 async def delete(
     worker: WorkerOf,
     asset_id: Identifier,
-    dry_run: Annotated[bool, Query(description="check, change nothing")] = False,
+    dry_run: Annotated[bool, Query(description="validate without storing")] = False,
 ) -> Response:
     """Delete an asset that no scenario's history refers to; its id becomes available again.
 

@@ -67,7 +67,7 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=TokenRoute)
 async def list_jobs(
     worker: WorkerOf,
     subject: Annotated[
-        Identifier | None, Query(description="only of this scene or scenario")
+        Identifier | None, Query(description="jobs of this scene or scenario")
     ] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> JobList:
@@ -111,7 +111,7 @@ async def events(
         Header(
             alias="Last-Event-ID",
             pattern=r"^[0-9]{1,9}$",
-            description="go on behind this event",
+            description="continue after this event",
             examples=["3"],
         ),
     ] = None,
@@ -172,7 +172,7 @@ async def file(
     name: Identifier,
     signed: Annotated[
         bool,
-        Query(description="answer 307 with an address at the object store, where there is one"),
+        Query(description="answer 307 with an address of the object store, if there is one"),
     ] = False,
 ) -> Response:
     """A result file of a finished job; supports `Range`."""

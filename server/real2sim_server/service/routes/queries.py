@@ -30,7 +30,7 @@ class FrameQuery:
     """Query and headers of a render or preview."""
 
     camera: Annotated[
-        Identifier | None, Query(description="camera of the rig; default: its first one")
+        Identifier | None, Query(description="camera of the rig; default: the first")
     ] = None
     t_us: Annotated[
         Microseconds | None, Query(description="simulation time; default: start of the scenario")
@@ -106,7 +106,7 @@ class SweepQuery:
 
     lidar: Annotated[Identifier, Query(description="name in the catalogue")] = "synthetic-64"
     t_us: Annotated[
-        Microseconds | None, Query(description="when it ends; default: start of the scenario")
+        Microseconds | None, Query(description="end of the sweep; default: start of the scenario")
     ] = None
     accept: Annotated[str | None, Header(description=f"{MSGPACK} or {POINTS}")] = None
 

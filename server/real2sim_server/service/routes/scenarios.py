@@ -52,7 +52,7 @@ IfMatch = Annotated[
     str | None,
     Header(
         alias="If-Match",
-        description='refuse the change unless the scenario has this ETag, e.g. "r41"',
+        description='reject the change unless the scenario has this ETag, e.g. "r41"',
         examples=['"r41"'],
     ),
 ]
@@ -309,8 +309,10 @@ async def preview(
 async def points(
     worker: WorkerOf,
     scenario_id: Identifier,
-    t_us: Annotated[Microseconds | None, Query(description="default: its start")] = None,
-    part: Annotated[Part, Query(description="of the scene")] = "all",
+    t_us: Annotated[
+        Microseconds | None, Query(description="default: start of the scenario")
+    ] = None,
+    part: Annotated[Part, Query(description="part of the scene")] = "all",
 ) -> Response:
     """The centres of the Gaussians of the current scenario at a time: a point cloud with colour,
     normal, semantic class and instance. Faint Gaussians are omitted."""
@@ -504,7 +506,7 @@ async def import_xosc(  # noqa: PLR0917, one parameter for each part of the requ
         list[str] | None, Query(max_length=100, description="elements of the file to leave out")
     ] = None,
     ego: Annotated[
-        str | None, Query(max_length=200, description="entity that is the ego; default: Ego")
+        str | None, Query(max_length=200, description="name of the ego entity; default: Ego")
     ] = None,
 ) -> Response:
     """Set the storyboard from an OpenSCENARIO 1.0 to 1.3 file without catalogs.

@@ -109,7 +109,11 @@ async def load(
     scene: Identifier,
     prefer: Annotated[
         str | None,
-        Header(description="`respond-async` for 202 at once, `wait=<s>` to wait longer (RFC 7240)"),
+        Header(
+            description=(
+                "`respond-async` to answer 202 immediately, `wait=<s>` to wait longer (RFC 7240)"
+            )
+        ),
     ] = None,
     who: ClientName = "",
 ) -> Response:
@@ -355,11 +359,13 @@ KnownHash = Annotated[
     str | None,
     Query(
         max_length=64,
-        description="the scene's `content_hash`: the answer may then be kept for ever; "
-        "404 where it is another scene by now",
+        description=(
+            "the scene's `content_hash`, which makes the answer cacheable forever; 404 if "
+            "the scene has changed"
+        ),
     ),
 ]
-IfNoneMatch = Annotated[str | None, Header(description="304 where the ETag is still this one")]
+IfNoneMatch = Annotated[str | None, Header(description="answer 304 if the ETag is unchanged")]
 
 
 @router.get(
@@ -388,10 +394,14 @@ async def splats(
     worker: WorkerOf,
     scene: Identifier,
     object_id: Annotated[
-        Identifier | None, Query(description="of which, in its own frame; default: background")
+        Identifier | None, Query(description="object, in its own frame; default: the background")
     ] = None,
-    first: Annotated[int, Query(ge=0, description="how many more important ones to skip")] = 0,
-    count: Annotated[int, Query(ge=1, le=MAX_COUNT, description="at most")] = DEFAULT_COUNT,
+    first: Annotated[
+        int, Query(ge=0, description="number of more important Gaussians to skip")
+    ] = 0,
+    count: Annotated[
+        int, Query(ge=1, le=MAX_COUNT, description="largest number of Gaussians")
+    ] = DEFAULT_COUNT,
     content_hash: KnownHash = None,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
@@ -487,8 +497,10 @@ async def object_splats(
     *,
     worker: WorkerOf,
     scenario_id: Identifier,
-    object_id: Annotated[Identifier, Query(description="of which, in the frame of its box")],
-    t_us: Annotated[Microseconds | None, Query(description="default: its start")] = None,
+    object_id: Annotated[Identifier, Query(description="object, in the frame of its box")],
+    t_us: Annotated[
+        Microseconds | None, Query(description="default: start of the scenario")
+    ] = None,
 ) -> Response:
     """The current Gaussians of one object of a scenario, sorted by decreasing coverage: of an
     asset, or of a person in the pose at ``t_us``, at its edited size. An spz file in the frame of

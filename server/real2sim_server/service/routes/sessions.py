@@ -61,9 +61,12 @@ from ..worker import Worker, WorkerOf
 _bearer = HTTPBearer(
     auto_error=False,
     scheme_name=SESSION_SCHEME,
-    description="`Authorization: Bearer` with the token of one session: `token` in the answer that "
-    "made it (`POST /v1/sessions`, or `.../fork`), which is told only then. Calls of a session "
-    "need it also where the worker has no token of its own; where it has one, that does as well.",
+    description=(
+        "`Authorization: Bearer` with the token of one session: `token` in the answer "
+        "of `POST /v1/sessions` or `.../fork`, which is sent only once. Calls of a "
+        "session need it even if the worker has no tokens; a token of the worker works "
+        "as well."
+    ),
 )
 
 
@@ -250,9 +253,9 @@ async def edit(
 async def state(
     session: SessionOf,
     after: Annotated[
-        int | None, Query(ge=0, description="wait until the clock has left this step")
+        int | None, Query(ge=0, description="wait until the clock is past this step")
     ] = None,
-    wait_s: Annotated[float, Query(ge=0, le=30, description="for so long at most")] = 10.0,
+    wait_s: Annotated[float, Query(ge=0, le=30, description="longest wait")] = 10.0,
 ) -> Response:
     """Current poses of all objects, and the newest plan; `after` waits for the next step. Also
     available while a controller is connected."""
@@ -321,7 +324,7 @@ async def fork(
     request: Request,
     step: Annotated[
         int | None,
-        Query(ge=0, description="of the running episode; default: the present one"),
+        Query(ge=0, description="step of the running episode; default: the current step"),
     ] = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
@@ -346,7 +349,7 @@ async def fork(
 async def recording(
     worker: WorkerOf,
     session: SessionOf,
-    frames: Annotated[bool, Query(description="draw and keep the images too")] = False,
+    frames: Annotated[bool, Query(description="also render and keep the images")] = False,
 ) -> Response:
     """The current episode as a file, for replay and scoring: `real2sim replay`."""
     made = await recording_of(worker.sessions, session, frames=frames)
