@@ -74,7 +74,7 @@ def physics(
 
     if backend == "cuda":
         if peers:
-            raise CommandError("--peers are measured beside the CPU; take --backend cpu")
+            raise CommandError("--peers needs --backend cpu")
         select_backend("cuda")  # Says what it lacks.
     with progress("measuring") as report:
         figures = physics.run(peers=peers, backend=backend, on_progress=report)

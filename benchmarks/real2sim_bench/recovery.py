@@ -130,7 +130,7 @@ def run(options: RecoveryBenchOptions | None = None) -> Figures:
         figures[TOLD] = _summary(drive_all(scene, told, options))
     share = {name: figures[name]["success"] for name in (ALONE, WITH)}
     figures["gain"] = share[WITH] - share[ALONE]
-    print_figures("success from starts beside the path", figures)
+    print_figures("success from starts off the path", figures)
     return figures
 
 

@@ -177,7 +177,7 @@ TITLES = {
     "no_sensors_sdk": "the same, in the SDK",
     "one_raw_camera": "drive step, one raw camera",
     "real_time": "drive step, demo's street, three raw cameras",
-    "crowded": "drive step, one raw camera, beside large renders",
+    "crowded": "drive step, one raw camera, during large renders",
 }
 BY_STAGE = ("no_sensors", "one_raw_camera", "real_time")
 
@@ -316,7 +316,7 @@ def _measure(console: Console, options: ServeBenchOptions, *, url: str, pid: int
             figures["one_raw_camera"], _ = _drive(client, raw, options.camera_steps, CAMERA_STEP_US)
         with console.status("drive steps with three raw cameras on the demo's street"):
             figures["real_time"] = _real_time(client, options.real_time_steps)
-        with console.status(f"drive steps beside {CROWD} clients that render {CROWD_WIDTH} px"):
+        with console.status(f"drive steps during {CROWD} clients that render {CROWD_WIDTH} px"):
             figures["crowded"] = _crowded(client, url, raw, options.camera_steps)
         with console.status("the event loop while large pictures are drawn"):
             figures["event_loop"] = _event_loop(client, url, options.heavy_seconds)

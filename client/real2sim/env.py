@@ -131,7 +131,9 @@ class DriveEnv(gymnasium.Env[Obs, NDArray[np.float32]]):
         blind = not sensors and not self._ranging
         self._agents = agents if agents is not None else AGENTS if blind else 0
         if self._agents < 0:
-            raise ValueError(f"agents is {agents!r}; give how many road users are shown, 0 or more")
+            raise ValueError(
+                f"agents is {agents!r}; give the number of road users to show, 0 or more"
+            )
         self._options = dict(options or {})
         self._fixed = {"action": "control"} | ({"privileged": True} if self._agents else {})
         self._images: dict[str, NDArray[Any]] = {}

@@ -108,7 +108,7 @@ class Image(Handle):
         "pose": "frame.T_world_sensor",
         "pixels": "image.array",
         "rgb": "image.array",
-        "show": "image.save('front.jpg'); a notebook shows an image by itself",
+        "show": "image.save('front.jpg'); a notebook shows images automatically",
         "size": "image.array.shape",
         "time": "frame.t_us",
         "timestamp": "frame.t_us",

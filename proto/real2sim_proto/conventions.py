@@ -105,7 +105,7 @@ CONVENTIONS: dict[str, str] = {
     "semantic": "uint8 [H, W], "
     + ", ".join(f"{number} {name}" for name, number in SEMANTIC_CLASSES.items()),
     "uncertainty": "float32 [H, W], expected absolute error of the colour, of 1, mean of the "
-    "channels, as far as training rays tell; 0.25 for what none has met",
+    "channels, estimated from the training rays; 0.25 where there are none",
     "uncertainty_png": "16 bit, steps of 1/65535",
 }
 """Text of each convention by name."""

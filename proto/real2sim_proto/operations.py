@@ -24,8 +24,8 @@ DRAWN_PREFIX = "spawned:"
 def _not_drawn(object_id: Any) -> Any:
     if isinstance(object_id, str) and object_id.startswith(DRAWN_PREFIX):
         raise ValueError(
-            f"{object_id!r} came by agents.spawn and leaves by itself; edits name objects of the "
-            "scene and those that edits have put there, such as 'spawned_1' by the edit spawn"
+            f"{object_id!r} was created by agents.spawn and cannot be edited; edits take objects "
+            "of the scene and objects added by edits, for example 'spawned_1'"
         )
     return object_id
 

@@ -416,7 +416,7 @@ def _check_names(board: Storyboard) -> None:
     if len(set(names)) != len(names):
         raise ValueError(f"entities need names of their own; given are {', '.join(names)}")
     if sum(e.kind == "ego" for e in board.entities) > 1:
-        raise ValueError("one entity at most may be the ego")
+        raise ValueError("at most one entity can be the ego")
     if unknown := sorted(set(board.distributions) - set(board.parameters)):
         raise ValueError(f"distribution of {unknown[0]!r}, which is no parameter")
     for part in (board.init, board.global_init, board.stories, board.stop):

@@ -99,8 +99,8 @@ class Processes:
             fruitless = fruitless + 1 if len(left) == before else 0
             if fruitless >= MAX_TRIES:
                 raise ExecutorError(
-                    f"{next(iter(left))}: its processes died {fruitless} times; is there enough "
-                    "memory for so many workers?"
+                    f"{next(iter(left))}: its processes died {fruitless} times; use fewer "
+                    "workers if memory is short"
                 )
 
     def _done(self, recipe: Recipe, left: dict[str, Any], on_result: OnResult) -> None:

@@ -583,7 +583,7 @@ class AsyncScenario(ScenarioState, ScenarioEdits[Awaitable[OperationResult]]):
         self, request: Callable[[str, str], Call[OperationResult]], count: int
     ) -> OperationResult:
         if count < 1:
-            raise ValueError(f"count is {count!r}; give how many edits, 1 or more")
+            raise ValueError(f"count is {count!r}; give a number of edits, 1 or more")
         for _ in range(count):
             call = request(self.scenario_id, self._etag)
             result = await self._applied(await self._transport.send(call))

@@ -65,8 +65,8 @@ def import_(
     up_axis: Annotated[
         str | None,
         typer.Option(
-            help="Axis that points up in the file: z, y or -y; default: what the file says (y for "
-            "spz), else z."
+            help="Up axis of the file: z, y or -y; default: as stated by the file (y for spz), "
+            "otherwise z."
         ),
     ] = None,
     dataset: Annotated[

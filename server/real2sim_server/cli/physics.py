@@ -351,11 +351,11 @@ def _calibrated_values(found: ObjectCalibration) -> dict[str, object]:
     figures: dict[str, object] = {}
     for name, factor in fit.factors.items():
         if name in fit.undetermined:
-            figures[name] = "not told by these observations"
+            figures[name] = "not determined by these observations"
             continue
         value = f", {found.values[name]:.4g}" if name in found.values else ""
         figures[name] = f"times {factor:.3f} +- {100 * fit.uncertainty[name]:.1f} %{value}"
-    figures["differences over what is known"] = f"{fit.residual[0]:.3g} to {fit.residual[-1]:.3g}"
+    figures["differences over uncertainty"] = f"{fit.residual[0]:.3g} to {fit.residual[-1]:.3g}"
     figures["simulations"] = fit.runs
     return figures
 

@@ -244,7 +244,7 @@ def train_policy(
     epochs: Annotated[int, typer.Option(min=1, max=100_000)] = 60,
     shifted: Annotated[
         int,
-        typer.Option(min=0, max=100, help="Rendered views beside the path per frame of a scene."),
+        typer.Option(min=0, max=100, help="Rendered views off the path per frame of a scene."),
     ] = 5,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     log_format: LogFormat = None,

@@ -158,7 +158,10 @@ def evaluate(
     ] = "held-out",
     width: Annotated[int | None, typer.Option(min=16, max=8192, help="Image width [px].")] = None,
     shifts: Annotated[
-        str, typer.Option(help="Metres beside the path, for images where truth is, or roads.")
+        str,
+        typer.Option(
+            help="Lateral offsets [m] of views to score against ground truth or the road."
+        ),
     ] = "1,2,3",
     around: Annotated[
         bool, typer.Option("--around", help="Also view vehicles from all sides (synthetic logs).")

@@ -243,7 +243,7 @@ class Scenario:
             raise EditError(
                 ErrorCode.STALE_REVISION,
                 f"entry {entry.revision} does not follow revision {self.revision}",
-                hint="plan it again on the present state",
+                hint="plan the edit again on the current revision",
             )
         match entry.kind:
             case "edit":

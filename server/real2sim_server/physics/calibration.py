@@ -149,7 +149,7 @@ def _checked(solver: Solver, observed: Float, names: Sequence[str]) -> Tensor:
     if np.shape(observed) != shape or not len(observed):
         raise SolverError(f"observed must be {shape}, at least once, not {np.shape(observed)}")
     if not np.isfinite(observed).all():
-        raise SolverError("observed positions must be finite; leave out those that were not seen")
+        raise SolverError("observed positions must be finite; leave out unseen ones")
     unknown = sorted(set(names) - set(PARAMETERS))
     if unknown or not names:
         raise SolverError(f"cannot fit {unknown}; allowed are {list(PARAMETERS)}")

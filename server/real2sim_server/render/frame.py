@@ -44,8 +44,7 @@ from .types import Instance, LabelOutput, RasterOptions, RenderError, RenderOutp
 UNCERTAINTY = "uncertainty"
 """Name of the modality."""
 WITHOUT = (
-    "it is not known of this scene how well its training rays determine what it shows; train it "
-    "again, or run `real2sim fit-uncertainty SCENE LOG`"
+    "this scene has no uncertainties; train it again, or run `real2sim fit-uncertainty SCENE LOG`"
 )
 """Why a scene has no such images."""
 

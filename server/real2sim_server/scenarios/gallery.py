@@ -232,7 +232,7 @@ def board(
 # The corner cases of the gallery.
 
 
-@case("ahead", "CCRs: a car stands in the ego's lane", gap=40.0, offset=0.0)
+@case("ahead", "CCRs: a stationary car in the ego's lane", gap=40.0, offset=0.0)
 def ccrs() -> Fields:
     """Euro NCAP CCRs."""
     return board([("target", "car", CAR)], put("target", ahead("$gap", offset="$offset")))
@@ -275,7 +275,7 @@ def hard_brake() -> Fields:
     return board([("target", "car", CAR)], init, target=[brake])
 
 
-@case("ahead", "Stop and go: the car ahead slows down to a crawl and goes on",
+@case("ahead", "Stop and go: the lead vehicle slows to a crawl and accelerates again",
     gap=15.0, speed=8.0, slow=1.0, seconds=3.0,
 )  # fmt: skip
 def stop_and_go() -> Fields:
@@ -289,7 +289,7 @@ def stop_and_go() -> Fields:
     return board([("target", "car", CAR)], init, target=[event("slow_down", after(1.0), profile)])
 
 
-@case("ahead", "Debris lies in the ego's lane", gap=45.0, offset=0.3)
+@case("ahead", "Debris in the ego's lane", gap=45.0, offset=0.3)
 def debris() -> Fields:
     """Too high to drive over."""
     return board([("debris", "obstacle", DEBRIS)], put("debris", ahead("$gap", offset="$offset")))
@@ -335,7 +335,7 @@ def cut_in_brake() -> Fields:
 
 @case(
     "lanes",
-    "Cut-out: the car ahead moves out before one that stands",
+    "Cut-out: the lead vehicle leaves the lane before a stationary car",
     gap=14.0,
     speed=9.0,
     reveal=25.0,
@@ -519,7 +519,7 @@ def occluded_pedestrian() -> Fields:
     return _crossing("pedestrian", CHILD, NEAR, hidden=True)
 
 
-@case("crossing", "Hesitating pedestrian: an adult stops in the ego's lane and goes on",
+@case("crossing", "Hesitating pedestrian: an adult stops in the ego's lane, then continues",
     ahead=45.0, distance=4.0, speed=1.39, impact=0.5, stop=3.2, pause=1.5,
 )  # fmt: skip
 def hesitating_pedestrian() -> Fields:

@@ -111,7 +111,7 @@ class Retention:
         query = query.where(mine & (s.c.created_us < cutoff_us) & unused)
         for row in await self._store.read(query):
             if row["session_id"] not in in_use:
-                reason = f"nobody has used it for {self._limits.session_days:g} days"
+                reason = f"unused for {self._limits.session_days:g} days"
                 await self._store.close_session(Claim(**row), reason=reason)
 
     async def _ended(self, *, before_us: int | None = None) -> Sequence[str]:

@@ -178,7 +178,7 @@ class Sharing:
                 bundles = [SharedBundle.of_document(r.kind, r.name, r.document) for r in rows]
                 wanted = {file.digest for bundle in bundles for file in bundle.files}
                 if gone := await self._on_thread(partial(self._folders.sweep, wanted)):
-                    log.info("objects removed that nobody needs", objects=gone)
+                    log.info("removed unused objects", objects=gone)
             except (StoreError, ObjectStoreError) as error:
                 log.warning("sweeping of objects put off", reason=str(error))
 

@@ -347,7 +347,7 @@ class World:
                 ErrorCode.STALE_REVISION,
                 f"the edit was made for revision {base_revision}; the session is at "
                 f"{self.revision}",
-                hint="look at the objects again and send the edit for the present revision",
+                hint="read the objects again and send the edit for the current revision",
             )
         s, t_us = self._path_point.s, self.t_us
         known = [placed(o, self._path, s, self.ground, t_us=t_us) for o in operations]

@@ -333,9 +333,9 @@ def test_an_edit_leaves_spawned_cars_alone(street):
 
 
 def test_edits_that_name_a_drawn_road_user_say_what_they_may_name():
-    with pytest.raises(ValueError, match=r"'spawned:1' came by agents.spawn .* 'spawned_1'"):
+    with pytest.raises(ValueError, match=r"'spawned:1' was created by agents.spawn .* 'spawned_1'"):
         Translate(object_id="spawned:1", y=-1.0)
-    with pytest.raises(ValueError, match="leaves by itself"):
+    with pytest.raises(ValueError, match="cannot be edited"):
         OPERATION.validate_python({"op": "delete", "object_id": "spawned:1"})
 
 

@@ -93,8 +93,8 @@ def test_where_the_recorded_drive_stands_standing_is_right_and_the_scores_say_so
     found = scores(drive([0.0] * 41), slow(0.1))
     assert found["pdms"].value == found["alpasim"].value == 1.0
     for name in ("pdms", "nuplan_cls", "hugsim_hd", "carla_ds", "alpasim"):
-        assert "the recorded drive stands still" in " ".join(found[name].assumed), name
-        assert "progress (the recorded drive stands still)" in found[name].cannot_see
+        assert "the recorded ego does not move" in " ".join(found[name].assumed), name
+        assert "progress (the recorded ego does not move)" in found[name].cannot_see
 
 
 # --- the warm-up ------------------------------------------------------------------------------
@@ -408,7 +408,7 @@ def test_driving_beside_the_route_all_the_way_completes_nothing():
     beside = scores(drive([10.0] * 41, y=2.9), context(40))
     assert beside["carla_ds"].value == 0.0
     assert beside["carla_ds"].terms["in_lanes"] == 0.0
-    assert "40 m beside all lanes that were driven" in beside["hugsim_hd"].cannot_see
+    assert "40 m off all driven lanes" in beside["hugsim_hd"].cannot_see
 
 
 @pytest.mark.parametrize(("turn", "share"), [(1, 1.0), (-1, 0.0)])

@@ -143,8 +143,8 @@ def render_page(results: Sequence[CaseResult], *, backend: str) -> str:
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>"
         f"<title>Validation of the solver: {escape(verdict)}</title><style>{STYLE}</style></head>"
         f"<body><h1>Validation of the solver</h1><p>SolverBackend {escape(backend)}: "
-        f"<span class='{kind}'>{escape(verdict)}</span>. Margins show where within its tolerance "
-        f"a measured value lies.</p>\n{body}\n</body></html>\n"
+        f"<span class='{kind}'>{escape(verdict)}</span>. Margins show the position of a "
+        f"measured value within its tolerance.</p>\n{body}\n</body></html>\n"
     )
 
 

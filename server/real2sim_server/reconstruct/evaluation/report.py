@@ -221,7 +221,7 @@ def write_report(
 def _heading(evaluation: Evaluation) -> str:
     count = len(evaluation.frames)
     seen = (
-        "none of which was used to make it"
+        "none of which was used for training"
         if evaluation.frames_unseen
         else "which may have been used to make it: figures on new images are lower"
     )

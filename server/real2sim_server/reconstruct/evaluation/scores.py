@@ -326,7 +326,7 @@ def _shifted(
         return (), "no shifts were asked for"
     truth = find_truth(log)
     if truth.log is None:
-        return (), f"no truth exists beside the recorded path: {truth.missing}"
+        return (), f"no ground truth exists off the recorded path: {truth.missing}"
     count = min(options.shifted_frames, len(times_us))
     chosen_times = sorted({round(i) for i in np.linspace(0, len(times_us) - 1, count)})
     scores = evaluate_shifts(

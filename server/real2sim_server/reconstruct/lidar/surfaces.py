@@ -262,7 +262,7 @@ def fit_lidar_surfaces(
     elif not held_out <= held_out_of(surfaces):
         raise ReconstructError(
             f"the scene holds out {len(held_out)} frames, and the surfaces given do not say that "
-            "they were made without them; leave the surfaces out to have them made anew"
+            "they were made without them; leave the surfaces out to compute them again"
         )
     _check_objects(scene, surfaces)
     points, sweeps = MeasuredPoints(log), []

@@ -336,7 +336,7 @@ class Trainer:
             )
         if from_values(TrainOptions, held.options) != self.options:
             raise ReconstructError(
-                f"{self.folder}: was begun with other options; resume with the same or start anew"
+                f"{self.folder}: has other options; resume with the same options or start a new run"
             )
         parts: dict[str, dict[str, Tensor]] = {"model": {}, "priors": {}, "adam": {}, "sums": {}}
         for name, tensor in held.tensors.items():

@@ -254,8 +254,7 @@ def _refuse_to_replace(path: Path, *, overwrite: bool) -> None:
         return
     if not (path / DOCUMENT_NAME).is_file():
         raise BundleError(
-            f"{path}: is a folder with other things in it, which is never replaced; "
-            "choose another path"
+            f"{path}: is a folder with other files, which is never replaced; choose another path"
         )
     if not overwrite:
         raise BundleError(f"{path}: exists; pass overwrite=True or choose another path")

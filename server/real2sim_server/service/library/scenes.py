@@ -599,5 +599,5 @@ def _broken(name: str, reason: str | None) -> ServiceError:
     return ServiceError(
         ErrorCode.SCENE_BROKEN,
         f"scene {name!r} cannot be read: {reason}",
-        hint="copy or import the bundle again; the worker notices by itself",
+        hint="copy or import the bundle again; the worker detects it automatically",
     )

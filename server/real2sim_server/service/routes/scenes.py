@@ -102,7 +102,7 @@ async def lanes(worker: WorkerOf, scene: Identifier, roads: bool = True) -> Resp
 @router.put(
     "/scenes/{scene}/residency",
     response_model=SceneInfo,
-    responses={202: {"model": JobInfo, "description": "loading goes on as a job"}},
+    responses={202: {"model": JobInfo, "description": "loading continues as a job"}},
 )
 async def load(
     worker: WorkerOf,
@@ -380,7 +380,7 @@ IfNoneMatch = Annotated[str | None, Header(description="answer 304 if the ETag i
                     "schema": {"type": "integer"},
                 },
                 "X-Real2Sim-Figure": {
-                    "description": "`rest`: of a person who walks, who is sent in the rest pose",
+                    "description": "`rest`: a walking person, in the rest pose",
                     "schema": {"type": "string"},
                 },
             },
@@ -485,7 +485,7 @@ object_router = APIRouter(prefix="/v1/scenarios", tags=["scenarios"], route_clas
             "description": "an spz file of version 3",
             "headers": {
                 "X-Real2Sim-Figure": {
-                    "description": "`posed`: of a person who walks, at this instant",
+                    "description": "`posed`: a walking person, in its pose at this time",
                     "schema": {"type": "string"},
                 },
             },

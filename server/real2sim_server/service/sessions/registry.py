@@ -414,7 +414,7 @@ class Sessions:
             raise ServiceError(
                 ErrorCode.INVALID_REQUEST,
                 f"step {step} is not one of the episode, which is at {session.lockstep.step}",
-                hint="fork from a step between 0 and the present one",
+                hint="fork from a step between 0 and the current one",
             )
         world, count = back
         return world, rows[: len(rows) - len(episode) + count]

@@ -466,12 +466,12 @@ def _lock(descriptor: int, place: Path, *, name: str | None = None) -> None:
 def _taken(place: Path, owner: str, name: str | None) -> StateFolderError:
     if name is None:
         return StateFolderError(
-            f"the state folder {str(place)!r} is in use by another worker ({owner}). Stop that "
-            "one, or give this one a folder of its own with --data or REAL2SIM_DATA_DIR"
+            f"the state folder {str(place)!r} is in use by another worker ({owner}). Stop it, "
+            "or give this worker another folder with --data or REAL2SIM_DATA_DIR"
         )
     return StateFolderError(
-        f"a worker {name!r} runs on the store {str(place)!r} already ({owner}). Stop that one, or "
-        "give this one another name with REAL2SIM_WORKER_ID"
+        f"a worker {name!r} already runs on the store {str(place)!r} ({owner}). Stop it, or give "
+        "this worker another name with REAL2SIM_WORKER_ID"
     )
 
 
@@ -555,8 +555,8 @@ class NameOnServer:
             name | {"space": NAME_SPACE},
         ).scalar()
         return (
-            f"a worker {self._worker_id!r} runs on this store already ({owner or 'unknown'}). Stop "
-            "that one, or give this one another name with REAL2SIM_WORKER_ID"
+            f"a worker {self._worker_id!r} already runs on this store ({owner or 'unknown'}). Stop "
+            "it, or give this worker another name with REAL2SIM_WORKER_ID"
         )
 
 

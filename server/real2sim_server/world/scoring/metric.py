@@ -190,7 +190,7 @@ def cannot_see(
     if not context.background:
         blind.append("walls and poles (contact.background is off)")
     if not context.reactive:
-        blind.append("how others would react (they repeat what was recorded)")
+        blind.append("reactions of others (they replay the recording)")
     sentence = f"Cannot see {_listed(blind)}"
     uncounted = _uncounted(sees, accumulator, context)
     return f"{sentence}; uncounted here: {_listed(uncounted)}." if uncounted else f"{sentence}."
@@ -202,7 +202,7 @@ def _seen_in_part(
     """Inputs of the score that this episode does not simulate."""
     found = []
     if "progress" in sees and expert_progress(accumulator, context) < MIN_ROUTE:
-        found.append("progress (the recorded drive stands still)")
+        found.append("progress (the recorded ego does not move)")
     if "road" in sees:
         found.append(
             f"where the road ends (no map: {context.corridor:g} m to either side of the recorded "
@@ -213,7 +213,7 @@ def _seen_in_part(
         if context.dt > LONG_STEP:
             found.append(f"near misses between instants, {context.dt:g} s apart")
     if "lane" in sees:
-        found.append("lanes that nobody drove in the recording")
+        found.append("lanes not driven in the recording")
     if "comfort" in sees:
         short = accumulator.steps * context.dt < WINDOW_S
         half = f"{WINDOW_S / 2:g} s"
@@ -241,7 +241,7 @@ def _uncounted(
     if "progress" not in sees and accumulator.cut >= NOT_NOTICED:
         found.append(f"{accumulator.cut:.0f} m of the route left out by a short cut")
     if "lane" not in sees and accumulator.outside >= NOT_NOTICED:
-        found.append(f"{accumulator.outside:.0f} m beside all lanes that were driven")
+        found.append(f"{accumulator.outside:.0f} m off all driven lanes")
     if "lights" not in sees and (ran := len(accumulator.lights.ran)):
         found.append(f"stop lines crossed on red ({ran})")
     without_fault = accumulator.collisions - sum(accumulator.at_fault.values())

@@ -62,7 +62,7 @@ def assumed_progress(accumulator: MetricAccumulator, context: ScoringContext) ->
     """Assumption made if the recorded drive is too short to measure progress."""
     expert = expert_progress(accumulator, context)
     if expert < MIN_ROUTE:
-        return (f"progress 1: the recorded drive stands still ({expert:.1f} m)",)
+        return (f"progress 1: the recorded ego does not move ({expert:.1f} m)",)
     if expert <= SHORT_ROUTE:
         return (
             f"progress is measured though the recorded drive is short ({expert:.1f} m); NAVSIM and "
@@ -76,7 +76,7 @@ def assumed_route(accumulator: MetricAccumulator, context: ScoringContext) -> tu
     whole = whole_route(accumulator, context)
     if whole >= MIN_ROUTE:
         return ()
-    return (f"route completed: the recorded drive stands still ({whole:.1f} m)",)
+    return (f"route completed: the recorded ego does not move ({whole:.1f} m)",)
 
 
 def roads(context: ScoringContext) -> tuple[str, ...]:
@@ -91,7 +91,7 @@ def roads(context: ScoringContext) -> tuple[str, ...]:
 def driven_lanes(context: ScoringContext) -> tuple[str, ...]:
     """Assumption on lanes."""
     if context.road_map is None:
-        return ("lanes are those that were driven in the recording",)
+        return ("lanes are the driven lanes of the recording",)
     return roads(context)
 
 
