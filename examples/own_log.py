@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     apply_transform,
     invert_transform,
     transform_from,

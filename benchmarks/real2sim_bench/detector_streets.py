@@ -23,7 +23,7 @@ from real2sim_server.datasets.labels.views import without_blobs
 from real2sim_server.datasets.perturbed import Perturbation
 from real2sim_server.datasets.plan import ExportPlan, Variant, swept
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.box import box_penetration
+from real2sim_server.geometry import box_penetration
 from real2sim_server.scene import Camera, Scene
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 

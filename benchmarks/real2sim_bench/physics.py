@@ -12,7 +12,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from real2sim_server.geometry.transform import Float, transform_from
+from real2sim_server.geometry import Float, transform_from
 from real2sim_server.physics.body import Body, box_particles
 from real2sim_server.physics.colliders import Box, Plane
 from real2sim_server.physics.materials import FixedCorotated, Material, NeoHookean

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float, matrix_to_quaternion
+from ..geometry import Float, matrix_to_quaternion
 from .gait import GRAVITY, leg_lengths, put_leg, put_spine
 from .model import JOINTS, LATERAL, Body, Pose, about, aim, bend, chain_transforms, joint_positions
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float, matrix_to_quaternion
+from ..geometry import Float, matrix_to_quaternion
 from .model import (
     JOINTS,
     LATERAL,

@@ -12,7 +12,7 @@ from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
 from .._numba import kernel
-from ..geometry.transform import Float, quaternion_to_matrix
+from ..geometry import Float, quaternion_to_matrix
 
 # Its data, ``asset.npz``, come from MakeHuman (CC0); see ``ASSET.md``.
 

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..geometry.transform import transform_from, yaw_quaternion
+from ..geometry import transform_from, yaw_quaternion
 from ..physics.body import Body, box_particles
 from ..physics.colliders import Plane
 from ..physics.materials import FixedCorotated

@@ -24,7 +24,7 @@ from .common import (
 
 if TYPE_CHECKING:
     from ..edit.state import ScenarioState
-    from ..geometry.transform import Float
+    from ..geometry import Float
     from ..logs import DrivingLog
     from ..render import Frame
     from ..scene import Ground, LaneGraph, Scene
@@ -359,7 +359,7 @@ def _lidar_points(log: DrivingLog) -> Float:
     """Points [N, 3] of some sweeps in the world, without what lies in tracked boxes."""
     import numpy as np
 
-    from ..geometry.transform import apply_transform, invert_transform
+    from ..geometry import apply_transform, invert_transform
 
     frames = np.unique(np.linspace(0, log.frame_count - 1, SWEEPS_MAX).astype(int))
     kept = []
@@ -387,7 +387,7 @@ def _draw(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from ..geometry.transform import apply_transform, invert_transform
+    from ..geometry import apply_transform, invert_transform
     from ..simulation.experiments.film import look_at
 
     ahead = T_world_vehicle[:3, 0]

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from .._files import unpack_tar
 from ..executors import Executor, ExecutorError
-from ..geometry.transform import Float, invert_transform
+from ..geometry import Float, invert_transform
 from ..render import Backend, encode_image
 from ..render.cast import CastBackend, select_caster
 from ..scene import Camera

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..edit import AssetLookup, ObjectState, PlacedObjects, ScenarioState, instances_at
 from ..edit.compose import NO_STRIDES, background_target, object_target, sweep_of
-from ..geometry.transform import Float, matrix_to_quaternion
+from ..geometry import Float, matrix_to_quaternion
 from ..render.cast.call import SweepScene, incidence_of, sensor_poses, transforms_at
 from ..render.types import Instance
 from ..scene import Lidar, Scene, Stride, Trajectory

@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..edit import ObjectState, PlacedObjects
-from ..geometry.box import box_penetration
-from ..geometry.transform import Float, invert_transform
+from ..geometry import Float, box_penetration, invert_transform
 from ..scene import Lidar, Scene
 from .drive import Drive, MetSweep, Moment
 

@@ -18,7 +18,7 @@ from real2sim_proto.jobs import DatasetSweep, SweptValues
 from real2sim_proto.operations import Operation
 
 from ..edit import EditError, ScenarioState, apply_operations
-from ..geometry.transform import transform_from
+from ..geometry import transform_from
 from ..scene import Camera, CameraRig, Lidar, LidarError, Scene, SceneError
 from ..scene.camera import T_VEHICLE_OPTICAL
 from ..scene.range_sensors import catalogue_lidar, lidar_from_values

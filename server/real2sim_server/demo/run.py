@@ -25,8 +25,7 @@ from real2sim.planners import EpisodeSummary, FollowRoute, Planner, run_episode
 from real2sim_proto.operations import Duplicate, Operation, Translate
 
 from ..console import StatusLine, console, print_figures, write_json
-from ..geometry.box import box_corners
-from ..geometry.transform import transform_from
+from ..geometry import box_corners, transform_from
 from ..render.images import video_file, write_png
 from ..scene.io import DEMO_SCENE as SCENE
 

@@ -11,8 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.box import bottom_centres
-from ..geometry.transform import Float, invert_transform, transform_from, yaw_quaternion
+from ..geometry import (
+    Float,
+    bottom_centres,
+    invert_transform,
+    transform_from,
+    yaw_quaternion,
+)
 from ..render.types import Instance
 from ..scene import UNSEEN, GaussianCloud, Ground, Scene
 from ..scene.cloud import SH_C0

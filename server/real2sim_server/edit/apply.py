@@ -14,7 +14,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.operations import Operation, subject_of
 from real2sim_proto.scenarios import EditWarning
 
-from ..geometry.box import box_corners, first_overlap
+from ..geometry import box_corners, first_overlap
 from ..scene import Ground, SceneError, Trajectory
 from . import lifecycle, motion
 from .motion import AppliedOperation, apply_operation

@@ -18,7 +18,7 @@ from real2sim_proto.base import Pose
 from real2sim_proto.conventions import GROUND, STATIC, semantic_class
 from real2sim_proto.operations import EraseRegion
 
-from ..geometry.transform import Float, invert_transform, quaternion_to_matrix, transform_from
+from ..geometry import Float, invert_transform, quaternion_to_matrix, transform_from
 from ..render.cast.call import Attributes, SweepScene, incidence_of, lidar_target, transforms_at
 from ..render.lens import TOLERANCE
 from ..render.types import Instance

@@ -23,8 +23,13 @@ from real2sim_proto.operations import (
     Translate,
 )
 
-from ..geometry.box import bottom_centres
-from ..geometry.transform import Float, multiply_quaternions, quaternion_to_matrix, transform_from
+from ..geometry import (
+    Float,
+    bottom_centres,
+    multiply_quaternions,
+    quaternion_to_matrix,
+    transform_from,
+)
 from ..scene import Ground, Trajectory
 from .state import EditError, ObjectState, ScenarioState
 from .tracks import sample_poses

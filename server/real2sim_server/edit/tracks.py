@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .._numba import kernel
 from .._records import made_quickly
-from ..geometry.transform import slerp, transform_from
+from ..geometry import slerp, transform_from
 from ..scene import Trajectory
 
 # --- Kernels -------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from real2sim_proto.conventions import CLASS_OF_CATEGORY
 
-from ..geometry.transform import Float, apply_transform, invert_transform, quaternion_to_matrix
+from ..geometry import Float, apply_transform, invert_transform, quaternion_to_matrix
 from ..scene import Camera, Trajectory
 from .drawing import points_in_box
 from .driving_log import ChecksFiles, DrivingLog, LidarSweep, LogError, ObjectTrack, damage_named

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float, apply_transform, invert_transform
+from ..geometry import Float, apply_transform, invert_transform
 from ..scene import Camera
 from .driving_log import DrivingLog, LidarSweep, ObjectTrack
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import CameraRig, LaneGraph, Trajectory
 
 

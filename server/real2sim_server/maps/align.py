@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import Ground, LaneGraph, Scene, Trajectory
 from .reader import MapError
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from real2sim_proto.lanes import LaneKind
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph
 from .reader import MapError, between, damage_named, joined, read_json
 

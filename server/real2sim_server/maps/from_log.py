@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from ..geometry.transform import Float, apply_transform
+from ..geometry import Float, apply_transform
 from ..logs import DrivingLog
 from ..scene import Lane, LaneGraph
 from .align import VEHICLES

@@ -14,7 +14,7 @@ import numpy as np
 
 from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
 from .reader import MapError, between, damage_named, head_of, joined, number, read_xml
 

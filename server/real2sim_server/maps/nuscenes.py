@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import Area, Lane, LaneGraph, Signal, StopLine
 from .reader import MapError, damage_named, head_of, joined, read_json
 

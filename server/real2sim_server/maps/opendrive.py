@@ -13,7 +13,7 @@ import numpy as np
 
 from real2sim_proto.lanes import SignalKind
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene.lane import TRAVELLED, Area, Lane, Road, RoadLane, Signal, StopLine
 from ..scene.lane_graph import LaneGraph
 from .opendrive_roads import SPEED_UNITS, OpenDriveRoad, SectionLane, read_road

@@ -13,7 +13,7 @@ from scipy.special import fresnel
 
 from real2sim_proto.lanes import LaneKind
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from .reader import MapError, integer, number
 
 # --- Plan view -----------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import GaussianCloud, LaneGraph, Scene
 
 REACH_M = 25.0

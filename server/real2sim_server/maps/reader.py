@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import Lane, LaneGraph
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float, apply_transform, is_rigid
+from ..geometry import Float, apply_transform, is_rigid
 from .errors import MaterialError, ParticleError
 from .materials import Material
 

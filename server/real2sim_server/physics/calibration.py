@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from . import stress
 from .backends.reference import TorchParameters, TorchState, substep, torch_model, with_stress
 from .colliders import Collider

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float, is_rigid
+from ..geometry import Float, is_rigid
 from .contact import MESH_NODE
 from .errors import ColliderError
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from .body import Body
 from .colliders import Collider, Plane
 from .errors import PhysicsError, SolverError

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from . import contact as collider_rows
 from . import stress
 from .body import Body

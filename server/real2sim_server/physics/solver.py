@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from . import stress
 from .backends import Measure, Model, ParticleArrays, Simulation, select_backend
 from .body import Body

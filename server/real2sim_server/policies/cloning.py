@@ -20,7 +20,7 @@ from ..datasets.clips import Clip
 from ..datasets.labels.boxes import STEP_US
 from ..edit import ScenarioState
 from ..edit.compose import instances_at
-from ..geometry.transform import quaternion_yaw, transform_from
+from ..geometry import quaternion_yaw, transform_from
 from ..logs import DrivingLog
 from ..render import render_cameras, select_backend
 from ..scene import Scene, Trajectory

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import quaternion_yaw
+from ..geometry import quaternion_yaw
 from ..render import RasterOptions, render_cameras, select_backend
 from ..render.images import video_file
 from ..scene import Scene

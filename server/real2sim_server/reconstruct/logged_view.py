@@ -8,8 +8,7 @@ from collections.abc import Collection, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.box import box_corners
-from ..geometry.transform import Float, apply_transform, invert_transform
+from ..geometry import Float, apply_transform, box_corners, invert_transform
 from ..logs import DrivingLog, LidarSweep, ObjectTrack
 from ..scene import Camera, Scene
 

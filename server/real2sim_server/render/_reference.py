@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene.camera import turned
 from ..scene.cloud import evaluate_sh
 from .backend import (

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.conventions import GROUND, STATIC
 
-from ..geometry.transform import Float, invert_transform, quaternion_to_matrix
+from ..geometry import Float, invert_transform, quaternion_to_matrix
 from ..scene import Camera, Ground
 from ..scene.camera import CameraMotion
 from .types import weak_cache

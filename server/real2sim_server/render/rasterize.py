@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..geometry.transform import are_rigid, is_rotation
+from ..geometry import are_rigid, is_rotation
 from ..scene import GaussianCloud, TimeColour
 from .backend import Backend, BatchBackend, RasterRequest, check_optics, is_reduced
 from .lens import LensView

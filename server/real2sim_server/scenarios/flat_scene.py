@@ -19,7 +19,7 @@ from real2sim_proto.storyboard_actions import (
 )
 
 from ..edit import ObjectState, PackedTracks
-from ..geometry.transform import Float, yaw_quaternion
+from ..geometry import Float, yaw_quaternion
 from ..maps import read_map
 from ..scene import Camera, CameraRig, GaussianCloud, Ground, Scene, SceneObject, Sky, Trajectory
 from ..scene.asset import person_asset

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..body import JOINTS, Body, body_model, joint_transforms, skin
 from ..body.gait import GaitStyle, plan_gait
-from ..geometry.transform import Float, matrix_to_quaternion
+from ..geometry import Float, matrix_to_quaternion
 from .cloud import SH_C0, GaussianCloud
 from .errors import SceneError
 from .figure import Figure

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.sensors import ShutterDirection
 
-from ..geometry.transform import (
+from ..geometry import (
     Float,
     invert_transform,
     is_rigid,

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ..geometry.transform import Float, is_rigid, matrix_to_quaternion, quaternion_to_matrix
+from ..geometry import Float, is_rigid, matrix_to_quaternion, quaternion_to_matrix
 from .errors import SceneError
 
 # Real spherical harmonics, degree 0 to 3. Basis order and signs are those of 3D Gaussian Splatting

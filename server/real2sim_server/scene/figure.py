@@ -29,7 +29,7 @@ from .._numba import kernel
 from ..body import JOINTS, Body, body_model, joint_transforms, keypoints, skin
 from ..body.gait import LEAD, STANDING, Gait, GaitStyle, plan_gait, stride_length
 from ..body.model import joint_positions
-from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix, quaternion_yaw
+from ..geometry import Float, matrix_to_quaternion, quaternion_to_matrix, quaternion_yaw
 from .cloud import GaussianCloud
 from .errors import SceneError
 from .trajectory import Trajectory

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._numba import func, kernel
-from ..geometry.transform import Float, quaternion_yaw
+from ..geometry import Float, quaternion_yaw
 from .cloud import GaussianCloud
 from .errors import SceneError
 from .trajectory import Trajectory

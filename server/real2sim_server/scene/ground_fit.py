@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float, apply_transform, quaternion_to_matrix
+from ..geometry import Float, apply_transform, quaternion_to_matrix
 from .cloud import GaussianCloud
 from .errors import SceneError
 from .ground import Ground

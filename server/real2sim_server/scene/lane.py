@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from real2sim_proto.lanes import AreaKind, LaneKind, SignalKind
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from .errors import SceneError
 
 # Roads and their reference lines, as in OpenDRIVE and OpenSCENARIO.

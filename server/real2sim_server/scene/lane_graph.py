@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._numba import func, kernel
-from ..geometry.transform import Float
+from ..geometry import Float
 from .errors import SceneError
 from .lane import DRIVABLE, TRAVELLED, Area, Lane, LanePlace, Road, Signal, StopLine, turned
 

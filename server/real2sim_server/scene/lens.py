@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from .errors import SceneError
 
 Valid = NDArray[np.bool_]

@@ -27,7 +27,7 @@ from real2sim_proto.sensors import (
     TableBeams,
 )
 
-from ..geometry.transform import Float, is_rigid
+from ..geometry import Float, is_rigid
 from .errors import LidarError, RadarError
 
 MAX_SLOTS = 2048

@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry.box import box_corners
-from ..geometry.transform import Float
+from ..geometry import Float, box_corners
 from .camera import CameraRig
 from .cloud import GaussianCloud, TimeColour
 from .errors import SceneError, UnknownObjectError

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import (
+from ..geometry import (
     Float,
     apply_transform,
     are_rigid,

@@ -21,7 +21,7 @@ from real2sim_proto.plans import PLAN
 
 from ..datasets.drive import EpisodeDrive
 from ..edit import AssetLookup
-from ..geometry.transform import matrix_to_quaternion
+from ..geometry import matrix_to_quaternion
 from ..world import World, plan_in_world
 from ..world.ego.plan import PlannedTrajectory
 from ..world.recording.recording import Recording, load_recording, to_bytes

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float, invert_transform
+from ..geometry import Float, invert_transform
 from ..physics.colliders import Box, HeightField
 from ..scene import GaussianCloud, Ground, Scene
 from ..scene.ground import (

@@ -14,8 +14,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.box import box_penetration
-from ..geometry.transform import Float, apply_transform
+from ..geometry import Float, apply_transform, box_penetration
 from ..physics.body import Body, Particles
 from ..physics.colliders import Collider, Solid
 from ..physics.materials import Material

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float, quaternion_to_matrix
+from ..geometry import Float, quaternion_to_matrix
 from ..scene import GaussianCloud
 from .structure import VEHICLES
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from real2sim_proto.jobs import Observations as Requested
 from real2sim_proto.jobs import ObservedBox, ObservedImage, ObservedPoint
 
-from ..geometry.transform import Float, apply_transform, quaternion_to_matrix
+from ..geometry import Float, apply_transform, quaternion_to_matrix
 from ..physics.errors import PhysicsError
 from ..physics.fitting import Fit, fit
 from ..physics.materials import Foam, Material, Snow

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import GaussianCloud
 from .breakage import Part, in_wheels, parts_of
 from .particles import Deformed, Embedding, deform_cloud, replaced_rows
@@ -644,7 +644,7 @@ def _split(cloud: GaussianCloud, changed: NDArray[np.int64], F: Float) -> Gaussi
 
 def _axes(quats: torch.Tensor) -> torch.Tensor:
     """[K, 3, 3] axes of Gaussians, as columns."""
-    from ..geometry.transform import quaternion_to_matrix
+    from ..geometry import quaternion_to_matrix
 
     matrices = quaternion_to_matrix(quats.detach().cpu().numpy())
     return torch.from_numpy(matrices.astype(np.float32)).to(quats.device)

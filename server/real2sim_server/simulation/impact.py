@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.transform import Float, apply_transform
+from ..geometry import Float, apply_transform
 from ..physics.body import Particles, box_particles
 from ..physics.colliders import Box, Collider
 from ..physics.materials import Material

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..geometry.transform import Float, matrix_to_quaternion, quaternion_to_matrix
+from ..geometry import Float, matrix_to_quaternion, quaternion_to_matrix
 from ..physics.body import Particles
 from ..physics.errors import ParticleError
 from ..physics.model import check_memory

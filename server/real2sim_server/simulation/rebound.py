@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..physics.colliders import Collider, Plane, Solid
 from ..physics.fitting import fit_restitution
 from ..physics.solver import ContactTotals, SolverOptions

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..physics.colliders import Collider
 from .body import BodyMode, DeformableBody
 from .rigid import RigidMotion, clearance, rotation_of

@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save_file
 from real2sim_proto.conventions import semantic_class
 
 from .._files import atomic_folder
-from ..geometry.transform import Float, transform_from
+from ..geometry import Float, transform_from
 from ..physics.errors import PhysicsError
 from ..render.types import Instance
 from ..scene import GaussianCloud, Scene, Trajectory

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._numba import kernel
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..physics.colliders import Box, Collider, HeightField, Plane, Solid
 from ..physics.contact import collider_distance, collider_velocity
 from ..physics.model import pack_colliders

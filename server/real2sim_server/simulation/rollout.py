@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.transform import Float, apply_transform, matrix_to_quaternion
+from ..geometry import Float, apply_transform, matrix_to_quaternion
 from ..physics.colliders import Box, Collider
 from ..physics.errors import PhysicsError
 from ..scene import Scene

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..physics.colliders import Box, Collider
 from ..physics.solver import ContactTotals, Solver, SolverOptions
 from .body import SLEEP_SPEED, BodyMode, DeformableBody

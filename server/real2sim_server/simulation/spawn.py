@@ -9,8 +9,13 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from ..geometry.box import box_penetration
-from ..geometry.transform import Float, apply_transform, is_rigid, quaternion_to_matrix
+from ..geometry import (
+    Float,
+    apply_transform,
+    box_penetration,
+    is_rigid,
+    quaternion_to_matrix,
+)
 from ..physics.body import Particles
 from ..physics.colliders import Collider, Solid, TriangleMesh
 from ..physics.errors import PhysicsError

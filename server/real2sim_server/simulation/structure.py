@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from real2sim_proto.operations import PhysicsValues
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..physics.body import Particles
 from ..physics.errors import ParticleError, PhysicsError
 from ..physics.materials import (

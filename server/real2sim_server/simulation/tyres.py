@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._numba import func, kernel
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..physics.colliders import Collider
 from ..physics.contact import collider_distance
 from .rigid import RigidMotion, clearance, nearest, packed

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import func, kernel
-from ..geometry.transform import Float
+from ..geometry import Float
 from .mesh import Mesh
 
 # Bounding volume hierarchies.

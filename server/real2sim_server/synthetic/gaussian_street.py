@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..geometry.transform import matrix_to_quaternion, transform_from, yaw_quaternion
+from ..geometry import matrix_to_quaternion, transform_from, yaw_quaternion
 from ..render.types import Instance
 from ..scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Sky, Trajectory
 from ..scene.camera import T_VEHICLE_OPTICAL

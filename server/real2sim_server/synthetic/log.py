@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.transform import Float, apply_transform, invert_transform
+from ..geometry import Float, apply_transform, invert_transform
 from ..logs.driving_log import DrivingLog, LidarSweep, ObjectTrack
 from ..logs.readers.native import write_native_log
 from ..scene import Camera, CameraMotion, CameraRig, Lidar

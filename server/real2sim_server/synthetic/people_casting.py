@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..body.bicycle import CRANK, FRAME, RIM, SADDLE, SURFACES, TYRE, Ride
 from ..body.model import vertex_normals
-from ..geometry.transform import Float, apply_transform, invert_transform
+from ..geometry import Float, apply_transform, invert_transform
 from .casting import Geometry, Instances, append_geometry, refit
 from .materials import PLAIN
 from .mesh import Mesh

@@ -12,7 +12,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from .._numba import func, kernel
-from ..geometry.transform import Float
+from ..geometry import Float
 from .casting import Instances, cast, is_blocked, new_stack, rotate
 from .materials import (
     BODY,

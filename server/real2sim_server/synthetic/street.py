@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from real2sim_proto.lanes import LaneKind
 
-from ..geometry.transform import Float, transform_from, yaw_quaternion
+from ..geometry import Float, transform_from, yaw_quaternion
 from ..scene import Area, Camera, CameraRig, Lane, LaneGraph, StopLine
 from ..scene.camera import T_VEHICLE_OPTICAL
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from .materials import (
     BARK,
     DOOR,

@@ -17,7 +17,7 @@ from ..body import Body, Pose, body_model, joint_transforms, keypoints, skin
 from ..body.bicycle import Ride, plan_ride
 from ..body.gait import Gait, GaitStyle, plan_gait
 from ..body.model import joint_positions
-from ..geometry.transform import Float, slerp, transform_from, yaw_quaternion
+from ..geometry import Float, slerp, transform_from, yaw_quaternion
 from ..scene import Trajectory
 from .materials import PARKING_BAY
 from .street import EGO_OFFSET, KERB, KERB_HEIGHT, LANE, Street, SyntheticConfig, lay_street

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from ..geometry.transform import Float
+from ..geometry import Float
 from .materials import BODY, PLAIN, WHEEL
 from .mesh import Mesh, MeshBuilder
 

@@ -15,7 +15,7 @@ from real2sim_proto.drive import EventType
 
 from ..edit import ObjectState, PlacedObjects
 from ..edit.compose import figure_of
-from ..geometry.transform import Float
+from ..geometry import Float
 from ..scene import Figure, Scene, Stride
 
 Agents = PlacedObjects[ObjectState]

@@ -19,7 +19,7 @@ from real2sim_proto.episode import AgentsSpec, IdmDriver, ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 
 from ..edit import ObjectState, ScenarioState, compose, things_of
-from ..geometry.transform import transform_from
+from ..geometry import transform_from
 from ..render.types import Instance
 from ..scene import Ground, Scene
 from .agents import Agents

@@ -23,8 +23,7 @@ from real2sim_proto.operations import Operation, SetStoryboard, Spawn
 
 from ..edit import EditError, ObjectState, ScenarioState
 from ..edit.tracks import PackedTracks
-from ..geometry.box import boxes_overlap
-from ..geometry.transform import yaw_quaternion
+from ..geometry import boxes_overlap, yaw_quaternion
 from ..scene import Ground, Scene, Trajectory
 from .common import Draws, WorldError
 from .ego.motion import Motion

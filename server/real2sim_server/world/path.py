@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import kernel
-from ..geometry.transform import quaternion_to_matrix, quaternion_yaw
+from ..geometry import quaternion_to_matrix, quaternion_yaw
 from ..scene import Trajectory
 
 KNOT = 11

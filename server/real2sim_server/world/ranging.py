@@ -15,7 +15,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.base import Pose
 from real2sim_proto.sensors import LidarModel, LidarSpec, RadarModel, RadarSpec
 
-from ..geometry.transform import (
+from ..geometry import (
     Float,
     matrix_to_quaternion,
     quaternion_to_matrix,

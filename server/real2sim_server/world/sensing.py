@@ -14,7 +14,7 @@ from real2sim_proto.conventions import GROUND, STATIC
 
 from ..edit import ScenarioState
 from ..edit.compose import background_target, compose, object_target, sweep_of
-from ..geometry.transform import Float, invert_transform, quaternion_to_matrix
+from ..geometry import Float, invert_transform, quaternion_to_matrix
 from ..render.cast.call import Attributes, SweepScene, incidence_of, sensor_poses
 from ..render.cast.sensors import Patches, Sweep, detect, radar_detections
 from ..render.cast.types import CastBackend, CastRequest, Echo

@@ -18,7 +18,7 @@ from real2sim.planners import load_planner, needs_of
 from real2sim.planners.alpasim import AlpasimDriver
 from real2sim.planners.peer import PeerError
 from real2sim_proto.scenes import CameraInfo
-from real2sim_server.geometry.transform import quaternion_to_matrix
+from real2sim_server.geometry import quaternion_to_matrix
 from tests.waiting import LIMIT_S
 
 from . import rig

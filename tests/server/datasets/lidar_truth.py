@@ -9,7 +9,7 @@ import numpy as np
 from real2sim_server.datasets.drive import ScenarioDrive
 from real2sim_server.datasets.labels import boxes_at, lidar_points
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import apply_transform, invert_transform
+from real2sim_server.geometry import apply_transform, invert_transform
 from real2sim_server.render.cast import select_caster
 from real2sim_server.scene import Lidar, Scene
 from real2sim_server.synthetic import SyntheticLog

@@ -10,7 +10,7 @@ import numpy as np
 from real2sim_server.datasets.drive import ScenarioDrive
 from real2sim_server.datasets.labels import boxes_at, draw_moment, flow_between, views_of
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.geometry import invert_transform
 from real2sim_server.scene import Scene
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 from real2sim_server.synthetic.sensors import shoot_image

@@ -25,7 +25,7 @@ from real2sim_server.datasets.plan import (
     planned_shards,
     swept,
 )
-from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.geometry import invert_transform
 
 PLAN = ExportPlan(
     formats=("labels",),

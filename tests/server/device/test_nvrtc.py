@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import (
     Frame,
     Instance,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import yaw_quaternion
+from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import GaussianCloud, Trajectory
 from real2sim_server.scene.ground_fit import fit_scene_ground
 

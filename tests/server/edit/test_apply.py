@@ -19,8 +19,7 @@ from real2sim_proto.operations import (
 )
 from real2sim_server.edit import EditError, ObjectState, ScenarioState, apply_operations
 from real2sim_server.edit.apply import replay_operations
-from real2sim_server.geometry.box import box_corners
-from real2sim_server.geometry.transform import quaternion_yaw
+from real2sim_server.geometry import box_corners, quaternion_yaw
 
 
 def after(state: ScenarioState, *operations: Operation, of: str = "turning") -> ObjectState:

@@ -15,8 +15,7 @@ from real2sim_proto.operations import (
 )
 from real2sim_server.edit import EditError, apply_operations
 from real2sim_server.edit.tracks import sample
-from real2sim_server.geometry.box import box_corners
-from real2sim_server.geometry.transform import quaternion_yaw
+from real2sim_server.geometry import box_corners, quaternion_yaw
 
 SECOND = 1_000_000
 

@@ -5,8 +5,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import linprog
 
-from real2sim_server.geometry.box import box_corners, box_penetration, boxes_overlap
-from real2sim_server.geometry.transform import transform_from, yaw_quaternion
+from real2sim_server.geometry import (
+    box_corners,
+    box_penetration,
+    boxes_overlap,
+    transform_from,
+    yaw_quaternion,
+)
 
 sizes = arrays(np.float64, 3, elements=st.floats(0.1, 5))
 poses = st.builds(

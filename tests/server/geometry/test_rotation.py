@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     is_rotation,
     matrix_to_quaternion,
     multiply_quaternions,

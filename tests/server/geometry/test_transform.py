@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     apply_transform,
     invert_transform,
     is_rigid,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.transform import apply_transform, invert_transform
+from real2sim_server.geometry import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, write_native_log
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 

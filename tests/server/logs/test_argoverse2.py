@@ -10,7 +10,7 @@ import pytest
 from pyarrow import feather
 
 from real2sim_server.datasets.labels import points_in_boxes
-from real2sim_server.geometry.transform import apply_transform
+from real2sim_server.geometry import apply_transform
 from real2sim_server.logs import DrivingLog, LogError, check_log, open_log
 from real2sim_server.synthetic import SyntheticLog
 

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
-from real2sim_server.geometry.transform import apply_transform, invert_transform
+from real2sim_server.geometry import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, open_log
 from real2sim_server.reconstruct import InitialiseOptions, initialise_scene
 

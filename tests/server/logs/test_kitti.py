@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     apply_transform,
     invert_transform,
     matrix_to_quaternion,

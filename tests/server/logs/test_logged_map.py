@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.geometry import invert_transform
 from real2sim_server.logs import LoggedMap, open_log
 from real2sim_server.maps import MapError, lanes_of_log
 from real2sim_server.scene import Lane, LaneGraph

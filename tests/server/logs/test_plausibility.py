@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     apply_transform,
     invert_transform,
     matrix_to_quaternion,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.transform import apply_transform
+from real2sim_server.geometry import apply_transform
 from real2sim_server.logs import DrivingLog, LidarSweep, ObjectTrack, open_log
 from real2sim_server.logs.drawing import points_in_box
 from real2sim_server.logs.tracking import TrackingOptions, track_moving_objects

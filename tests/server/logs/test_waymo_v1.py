@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
-from real2sim_server.geometry.transform import apply_transform, invert_transform
+from real2sim_server.geometry import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, LogError, ObjectTrack, open_log
 from real2sim_server.logs.readers.waymo_v1 import (
     ProtoMessage,

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     Float,
     apply_transform,
     invert_transform,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import quaternion_to_matrix
+from real2sim_server.geometry import quaternion_to_matrix
 from real2sim_server.physics import (
     Body,
     Box,

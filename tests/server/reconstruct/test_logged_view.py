@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.box import box_corners
+from real2sim_server.geometry import box_corners
 from real2sim_server.logs import ObjectTrack
 from real2sim_server.reconstruct.logged_view import box_outline, moving_tracks, tracks_mask
 from real2sim_server.scene import Camera, Trajectory

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import Instance, RasterOptions, RenderOutput, rasterize
 from real2sim_server.scene import GaussianCloud, Sky
 

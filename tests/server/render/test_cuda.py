@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import Instance, RasterOptions, describe_backends, rasterize
 from real2sim_server.scene import GaussianCloud, Sky
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import Instance, rasterize
 from real2sim_server.render._cpu import backend as cpu
 from real2sim_server.render._cpu.drawing import all_chunks, bounds_of, seen_chunks, view_of

@@ -9,7 +9,7 @@ import torch
 
 from real2sim_server.demo.street import SHIPPED
 from real2sim_server.edit import ScenarioState, instances_at
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import (
     Instance,
     RasterOptions,

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from real2sim_proto import SEMANTIC_CLASSES
-from real2sim_server.geometry.transform import transform_from, yaw_quaternion
+from real2sim_server.geometry import transform_from, yaw_quaternion
 from real2sim_server.render import (
     Instance,
     RasterOptions,

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import Instance, RasterOptions, RenderOutput, rasterize
 from real2sim_server.scene import GaussianCloud, Sky
 

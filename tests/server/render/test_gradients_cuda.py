@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import Instance, RasterOptions, describe_backends, rasterize
 from real2sim_server.render._cuda.gsplat import track_screen
 from real2sim_server.render.backend import RasterRequest

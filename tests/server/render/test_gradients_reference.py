@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import Instance, RasterOptions, rasterize
 from real2sim_server.render._reference import ReferenceBackend
 from real2sim_server.scene import GaussianCloud, Sky

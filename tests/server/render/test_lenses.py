@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import transform_from, yaw_quaternion
+from real2sim_server.geometry import transform_from, yaw_quaternion
 from real2sim_server.render import (
     Instance,
     RasterOptions,

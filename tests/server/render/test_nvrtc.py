@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import (
     Instance,
     RasterOptions,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     invert_transform,
     matrix_to_quaternion,
     multiply_quaternions,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import yaw_quaternion
+from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import (
     Camera,
     CameraRig,

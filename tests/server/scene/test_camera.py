@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.transform import apply_transform, transform_from, yaw_quaternion
+from real2sim_server.geometry import apply_transform, transform_from, yaw_quaternion
 from real2sim_server.scene import Camera, CameraRig, SceneError
 from real2sim_server.scene.camera import T_VEHICLE_OPTICAL
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import apply_transform, quaternion_to_matrix, transform_from
+from real2sim_server.geometry import apply_transform, quaternion_to_matrix, transform_from
 from real2sim_server.scene import UNSEEN, GaussianCloud, SceneError
 from real2sim_server.scene.cloud import sh_basis
 

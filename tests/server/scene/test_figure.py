@@ -11,7 +11,7 @@ import torch
 
 from real2sim_server.body import JOINTS, joint_transforms
 from real2sim_server.body.gait import GaitStyle, plan_gait
-from real2sim_server.geometry.transform import quaternion_to_matrix, yaw_quaternion
+from real2sim_server.geometry import quaternion_to_matrix, yaw_quaternion
 from real2sim_server.scene import BundleError, SceneError, SceneObject, Stride, Trajectory
 from real2sim_server.scene.asset import person_asset
 from real2sim_server.scene.io import (

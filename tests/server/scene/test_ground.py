@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import multiply_quaternions, transform_from, yaw_quaternion
+from real2sim_server.geometry import multiply_quaternions, transform_from, yaw_quaternion
 from real2sim_server.scene import GaussianCloud, Ground, SceneError, Trajectory
 from real2sim_server.scene.ground_fit import (
     BoxBottoms,

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from real2sim_server.geometry.transform import quaternion_yaw, transform_from, yaw_quaternion
+from real2sim_server.geometry import quaternion_yaw, transform_from, yaw_quaternion
 from real2sim_server.scene import SceneError, TimeOutOfRangeError, Trajectory
 from real2sim_server.scene.trajectory import relative_transform
 

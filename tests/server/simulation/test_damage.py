@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from real2sim_server.edit.state import ScenarioState
-from real2sim_server.geometry.transform import quaternion_to_matrix
+from real2sim_server.geometry import quaternion_to_matrix
 from real2sim_server.physics.body import box_particles
 from real2sim_server.scene import GaussianCloud
 from real2sim_server.simulation.breakage import (

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from real2sim_server.geometry.transform import quaternion_to_matrix
+from real2sim_server.geometry import quaternion_to_matrix
 from real2sim_server.physics import Body, FixedCorotated, Solver, SolverOptions, box_particles
 from real2sim_server.physics.validation.check import placed as at
 from real2sim_server.scene import GaussianCloud

@@ -12,7 +12,7 @@ import pytest
 from real2sim_proto.operations import Duplicate
 from real2sim_server.edit import apply_operations
 from real2sim_server.edit.state import ScenarioState
-from real2sim_server.geometry.box import box_penetration
+from real2sim_server.geometry import box_penetration
 from real2sim_server.physics import PhysicsError
 from real2sim_server.simulation.experiments import FilmPlan, set_up, views
 from real2sim_server.simulation.experiments.film import FilmView, draw, look_at, obstacle_cloud

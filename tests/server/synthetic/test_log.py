@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from real2sim_server.geometry.transform import Float, apply_transform, invert_transform
+from real2sim_server.geometry import Float, apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog, ObjectTrack, open_log
 from real2sim_server.scene import Camera
 from real2sim_server.synthetic import (

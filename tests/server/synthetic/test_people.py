@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.transform import apply_transform, invert_transform
+from real2sim_server.geometry import apply_transform, invert_transform
 from real2sim_server.logs.driving_log import DrivingLog
 from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_log
 from real2sim_server.synthetic.people_casting import part_names

@@ -10,7 +10,7 @@ import torch
 
 from real2sim_proto.drive import ResetSpec
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import yaw_quaternion
+from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Trajectory
 from real2sim_server.world import World
 

@@ -12,7 +12,7 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.operations import OPERATION, Translate
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import yaw_quaternion
+from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import Trajectory
 from real2sim_server.world import World, WorldError
 from real2sim_server.world.path import LoggedPath

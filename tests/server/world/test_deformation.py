@@ -12,7 +12,7 @@ import torch
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import transform_from, yaw_quaternion
+from real2sim_server.geometry import transform_from, yaw_quaternion
 from real2sim_server.scene import GaussianCloud, SceneObject
 from real2sim_server.simulation import impact as crash
 from real2sim_server.world import World

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
-from real2sim_server.geometry.transform import yaw_quaternion
+from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import Trajectory
 
 STEPS = 60

@@ -13,10 +13,14 @@ from scipy.spatial import cKDTree
 
 from real2sim_proto.operations import Translate
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
+from real2sim_server import geometry
 from real2sim_server.edit import tracks
-from real2sim_server.geometry import box
-from real2sim_server.geometry.box import box_penetration
-from real2sim_server.geometry.transform import quaternion_yaw, transform_from, yaw_quaternion
+from real2sim_server.geometry import (
+    box_penetration,
+    quaternion_yaw,
+    transform_from,
+    yaw_quaternion,
+)
 from real2sim_server.world import boxes as world_boxes
 from real2sim_server.world import path, warm_up
 from real2sim_server.world.driving import entries
@@ -389,7 +393,7 @@ def test_steps_and_edits_after_the_warm_up_compile_nothing(
         warm_up_planning()
     modules = (
         entries,
-        box,
+        geometry,
         tracks,
         path,
         world_boxes,

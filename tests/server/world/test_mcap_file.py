@@ -15,7 +15,7 @@ from real2sim_proto import encode
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.world.ranging import Cloud
 from real2sim_server.world.recording.mcap_file import (
     cloud_document,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from real2sim_server.geometry.transform import multiply_quaternions, yaw_quaternion
+from real2sim_server.geometry import multiply_quaternions, yaw_quaternion
 from real2sim_server.scene import Trajectory
 from real2sim_server.world import LoggedPath
 from real2sim_server.world.path import command_ahead, route_ahead, strip_ahead

@@ -13,7 +13,7 @@ from real2sim_proto.operations import Translate
 from real2sim_proto.plans import Control
 from real2sim_proto.sensors import LidarModel, SpinningBeams
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import quaternion_to_matrix, yaw_quaternion
+from real2sim_server.geometry import quaternion_to_matrix, yaw_quaternion
 from real2sim_server.render.cast import select_caster
 from real2sim_server.scene import GaussianCloud, LidarSurfaces, Reflector
 from real2sim_server.world import World, WorldError

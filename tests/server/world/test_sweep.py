@@ -15,7 +15,7 @@ from real2sim_proto import decode, encode
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control, PoseCommand, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
-from real2sim_server.geometry.transform import yaw_quaternion
+from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import CameraRig, GaussianCloud, Scene, Trajectory
 from real2sim_server.world import World
 from real2sim_server.world.boxes import first_contacts

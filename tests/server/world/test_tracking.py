@@ -10,7 +10,7 @@ import pytest
 
 from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import TrajectoryPlan
-from real2sim_server.geometry.transform import quaternion_yaw, yaw_quaternion
+from real2sim_server.geometry import quaternion_yaw, yaw_quaternion
 from real2sim_server.logs import open_log
 from real2sim_server.scene import Trajectory
 from real2sim_server.world import World

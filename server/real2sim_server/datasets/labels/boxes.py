@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from ...edit import ObjectState, PlacedObjects
-from ...geometry.box import box_corners
-from ...geometry.transform import (
+from ...geometry import (
     Float,
     apply_transform,
+    box_corners,
     invert_transform,
     matrix_to_quaternion,
     quaternion_yaw,

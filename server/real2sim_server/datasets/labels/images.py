@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.conventions import SKY, UNLABELED
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from ...render import Backend, render_cameras, select_backend
 from ...render.frame import classes_of, label_cameras, labels_while_drawing
 from ...render.types import Window

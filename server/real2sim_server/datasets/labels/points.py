@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from real2sim_proto.conventions import GROUND, STATIC, semantic_class
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...render.cast import CastBackend, CastRequest, Echo, Sweep, detect
 from ...render.lens import TOLERANCE, back_projected
 from ...scene import Ground, Lidar

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...edit import ObjectState, PlacedObjects
 from ...edit.compose import NO_STRIDES, figure_of
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
 from ...render.types import Window
 from ...scene import Scene, Stride

@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import feather
 
-from ...geometry.transform import Float, matrix_to_quaternion
+from ...geometry import Float, matrix_to_quaternion
 from ...logs.readers.argoverse2 import AXLE_HEIGHT
 from ...render import encode_image
 from ...scene import Camera

@@ -13,7 +13,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...logs.readers.common import compensate_sweep
 from ...scene import Camera
 from ...scene.camera import T_VEHICLE_OPTICAL

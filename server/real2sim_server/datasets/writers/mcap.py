@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.transform import Float, matrix_to_quaternion
+from ...geometry import Float, matrix_to_quaternion
 from ...render import encode_image
 from ...scene import Camera
 from ...world.recording.mcap_file import json_channel, stamp_of

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip

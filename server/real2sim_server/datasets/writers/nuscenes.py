@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.conventions import GROUND
 
-from ...geometry.transform import Float, apply_transform, invert_transform, matrix_to_quaternion
+from ...geometry import Float, apply_transform, invert_transform, matrix_to_quaternion
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip

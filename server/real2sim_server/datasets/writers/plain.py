@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.conventions import GROUND, SKY, STATIC, UNLABELED
 
-from ...geometry.box import box_corners
+from ...geometry import box_corners
 from ...render import encode_image
 from ...scene import Camera
 from ..clips import Clip, read_flow

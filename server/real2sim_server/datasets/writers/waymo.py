@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from real2sim_proto.conventions import SEMANTIC_CLASSES
 
-from ...geometry.transform import Float, apply_transform, matrix_to_quaternion, quaternion_yaw
+from ...geometry import Float, apply_transform, matrix_to_quaternion, quaternion_yaw
 from ...logs.readers.waymo_common import (
     CAMERA_NAMES,
     FRONT,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform, transform_from
+from ...geometry import Float, invert_transform, transform_from
 from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, LoggedMap, ObjectTrack
 from .common import FrameBox, Lens, TimedImages, build_tracks, match_images, select_sequence

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from ...scene import BrownConrady, Camera, SceneError, Shutter, Trajectory
 from ...scene.camera import GLOBAL, Optics
 from ..driving_log import DrivingLog, LogError, ObjectTrack

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from ...scene import CameraRig, SceneError, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import image_size

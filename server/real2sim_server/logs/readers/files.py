@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, is_rotation
+from ...geometry import Float, is_rotation
 from ...scene import Trajectory
 from ..driving_log import LogError
 from ..images import check_image_file, read_image

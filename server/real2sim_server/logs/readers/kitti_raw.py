@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from ...scene import Trajectory
 from ..driving_log import DrivingLog, LogError, ObjectTrack
 from .common import FrameBox, build_tracks, select_sequence, upright_pose

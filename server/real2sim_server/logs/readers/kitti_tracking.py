@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...scene import Camera, CameraRig, Trajectory
 from ..driving_log import DrivingLog, LidarSweep, LogError, ObjectTrack
 from ..images import check_image_file, image_size, read_image

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._confined import ConfinedError, Limits, run_confined
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ..driving_log import DrivingLog, LidarSweep, LogError
 from ..images import image_size

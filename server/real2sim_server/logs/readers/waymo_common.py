@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...scene import Camera, CameraRig, Shutter, Trajectory
 from ...scene.camera import DIRECTIONS, GLOBAL, MAX_READOUT_US, T_VEHICLE_OPTICAL
 from ..driving_log import DrivingLog, FrameSource, LidarSweep, LogError

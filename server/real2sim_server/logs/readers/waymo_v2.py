@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ..driving_log import DrivingLog, LidarSweep, LogError
 from ..images import check_encoded_image, decode_image
 from .common import select_sequence

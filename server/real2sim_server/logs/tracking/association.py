@@ -12,7 +12,7 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from ...geometry.transform import Float, apply_transform
+from ...geometry import Float, apply_transform
 from ..driving_log import LidarSweep
 
 # --- Ground of a sweep ---------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, apply_transform, invert_transform, yaw_quaternion
+from ...geometry import Float, apply_transform, invert_transform, yaw_quaternion
 from ...scene import Trajectory
 from ..driving_log import DrivingLog, LidarSweep, ObjectTrack
 from .association import (

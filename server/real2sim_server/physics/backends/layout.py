@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ..colliders import Collider, HeightField, Solid
 from ..contact import AXES, COUNT_X, COUNT_Y, FIRST_HEIGHT, KIND, PLANE, POINT, SPACING
 from ..errors import ParticleError

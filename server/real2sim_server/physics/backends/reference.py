@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from .. import stress
 from ..colliders import Collider, Solid
 from ..contact import CRUSHED, FLAT_MOMENT, INSIDE, ON_FACE, OPPOSED, STICKS, SURFACE, THIN_MARGIN

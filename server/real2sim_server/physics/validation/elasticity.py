@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ..body import Body, Particles, ball_particles, box_particles
 from ..colliders import Box, Plane
 from ..materials import FixedCorotated

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from ...logs import DrivingLog, ObjectTrack
 from ...render import Instance, RasterOptions, rasterize
 from ...scene import Camera, Scene

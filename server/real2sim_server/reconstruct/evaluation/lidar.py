@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render.cast import Echo, recorded_sweep
 from ...render.cast.sensors import drop_probability

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...logs import DrivingLog
 from ...render import Frame, Instance, RasterOptions, render_cameras
 from ...scene import Camera, Scene

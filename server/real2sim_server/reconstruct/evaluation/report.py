@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._files import atomic_file
-from ...geometry.box import box_corners
+from ...geometry import box_corners
 from ...logs import DrivingLog, same_part
 from ...render import Frame, encode_rgb
 from ...render.frame import uncertainty_picture

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera, Ground, Scene
 from ...synthetic import SyntheticLog

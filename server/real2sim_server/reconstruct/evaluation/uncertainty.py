@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...logs import DrivingLog
 from ...render import Instance, RasterOptions, rasterize
 from ...render.backend import Backend

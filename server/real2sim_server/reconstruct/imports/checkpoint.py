@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from ..._confined import Limits, run_confined
-from ...geometry.transform import Float, is_rigid
+from ...geometry import Float, is_rigid
 from ...scene import GaussianCloud, Scene, Sky
 from ...scene.cloud import SH_DEGREES, rotate_sh
 from ...scene.errors import SceneError

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform, transform_from
+from ...geometry import Float, invert_transform, transform_from
 from ...scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Sky, Trajectory
 from ...scene.camera import T_VEHICLE_OPTICAL
 from ...scene.cloud import SH_C0

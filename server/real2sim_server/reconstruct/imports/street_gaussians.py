@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, apply_transform, transform_from, yaw_quaternion
+from ...geometry import Float, apply_transform, transform_from, yaw_quaternion
 from ...scene import Camera, CameraRig, GaussianCloud, Scene, SceneObject, Sky, Trajectory
 from ...scene.errors import SceneError
 from ...scene.trajectory import leads_anywhere

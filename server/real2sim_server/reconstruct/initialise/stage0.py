@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...logs import DrivingLog, ObjectTrack
 from ...maps import laid_on, lanes_of_log
 from ...scene import GaussianCloud, Ground, Scene, SceneObject, Sky

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, matrix_to_quaternion
+from ...geometry import Float, matrix_to_quaternion
 from ...scene import Ground
 from ...scene.ground_fit import GroundFit, pull_push
 

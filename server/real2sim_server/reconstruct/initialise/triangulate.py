@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...scene import Camera
 from ..logged_view import resized, still_surfaces

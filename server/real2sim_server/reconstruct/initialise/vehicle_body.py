@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from ...logs import DrivingLog, ObjectTrack
 from ...scene import Scene
 from ...synthetic.materials import BODY, PLAIN, WHEEL

@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...scene import SceneObject, Trajectory
 from ...synthetic.vehicles import VehicleShape, roof_heights
 from .surfels import MIN_OBSERVED, modal_colour

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...logs import DrivingLog
 from ...scene import Camera, Sky
 from ...scene.scene import face_directions

@@ -11,7 +11,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ..._numba import kernel
-from ...geometry.transform import Float, invert_transform, quaternion_to_matrix
+from ...geometry import Float, invert_transform, quaternion_to_matrix
 from ...logs import DrivingLog
 from ...render.cast.call import recorded_scene, sensor_poses
 from ...render.cast.cpu import CpuCaster

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.sensors import MAX_RAYS
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...logs import DrivingLog
 from ...render.cast.call import transforms_at
 from ...scene import Beams, Detection, Lidar

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, apply_transform, invert_transform
+from ...geometry import Float, apply_transform, invert_transform
 from ...logs import DrivingLog, ObjectTrack, log_of_frames
 from ...scene import GaussianCloud, Scene
 from ..initialise.accumulate import (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ...geometry.transform import Float, matrix_to_quaternion
+from ...geometry import Float, matrix_to_quaternion
 from ...scene import GaussianCloud, SceneObject
 from ...scene.cloud import SH_C0
 from ..initialise.vehicle_body import SPACING, VehicleBody, body_colours

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry.transform import (
+from ...geometry import (
     Float,
     multiply_quaternions,
     quaternion_to_matrix,

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..._numba import is_on_disk
-from ...geometry.transform import (
+from ...geometry import (
     Float,
     are_rigid,
     invert_transform,

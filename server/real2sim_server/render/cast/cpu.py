@@ -7,7 +7,7 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from .._cpu.blend import sort_records, tile_starts
 from .._cpu.drawing import NO_COVARS, Workspace, array_of, arrays_of, timed
 from .._cpu.records import CHUNK, Records

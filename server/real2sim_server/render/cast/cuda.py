@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..._nvrtc import KernelSource
-from ...geometry.transform import invert_transform
+from ...geometry import invert_transform
 from ...scene import Beams, GaussianCloud
 from .._cuda.launcher import CudaLauncher, Launcher, Usage, usage_of
 from ..types import RenderError

@@ -14,7 +14,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ..._numba import PARALLEL_LOOPS
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...scene import Beams
 from ...scene.range_sensors import wrapped
 from .._cpu.lanes import LANES, inlined, kernel, prefetch

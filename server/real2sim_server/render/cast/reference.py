@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from ..backend import ALPHA_MAX, ALPHA_MIN
 from ..types import Instance
 from .types import ECHO_MIN, HALF_LIGHT, TRANSMITTANCE_MIN, CastRequest, Echo, Return

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from real2sim_proto.conventions import SEMANTIC_CLASSES
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...scene import Lidar, Radar
 from .types import CastRequest, Echo, Image, point_velocities
 

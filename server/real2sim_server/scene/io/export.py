@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..._files import atomic_file, atomic_folder
-from ...geometry.transform import Float, invert_transform, matrix_to_quaternion
+from ...geometry import Float, invert_transform, matrix_to_quaternion
 from ..camera import Camera
 from ..cloud import SH_C0, GaussianCloud
 from ..errors import SceneError

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..._files import atomic_file
-from ...geometry.transform import Float
+from ...geometry import Float
 from ..cloud import SH_C0, SH_DEGREES, GaussianCloud
 from ..errors import BundleError
 from .splat_format import (

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..._files import atomic_file
-from ...geometry.transform import Float
+from ...geometry import Float
 from ..cloud import SH_C0, GaussianCloud
 from ..errors import BundleError, BundleTooLargeError
 

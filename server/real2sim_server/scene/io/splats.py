@@ -10,7 +10,7 @@ from typing import Any, Literal, cast, overload
 
 import numpy as np
 
-from ...geometry.transform import Float, quaternion_to_matrix, yaw_quaternion
+from ...geometry import Float, quaternion_to_matrix, yaw_quaternion
 from ..asset import Asset
 from ..camera import T_VEHICLE_OPTICAL, Camera, CameraRig
 from ..cloud import GaussianCloud

@@ -17,7 +17,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from ..._files import atomic_file
-from ...geometry.transform import Float
+from ...geometry import Float
 from ..cloud import GaussianCloud
 from ..errors import BundleError, SceneError
 from .splat_format import UpAxis, build_cloud, check_memory, host_array

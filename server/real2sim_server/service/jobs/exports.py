@@ -24,7 +24,7 @@ from ...datasets.labels.boxes import BoxNoise
 from ...datasets.perturbed import Perturbation
 from ...datasets.plan import ExportPlan, Variant, planned_cameras, planned_lidar, planned_shards
 from ...datasets.writers import writer_of
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...render import Backend, Instance, RenderOutput
 from ...render.backend import RasterRequest
 from ...render.cast import CastRequest, Echo, select_caster

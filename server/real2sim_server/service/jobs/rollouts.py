@@ -29,7 +29,7 @@ from real2sim_proto.operations import (
 
 from ...edit import ObjectState, ScenarioState
 from ...edit.compose import composed_background, contact_shadows
-from ...geometry.transform import Float, quaternion_to_matrix, transform_from
+from ...geometry import Float, quaternion_to_matrix, transform_from
 from ...physics.colliders import (
     Box,
     Capsule,

@@ -22,7 +22,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.scenes import AssetInfo, AssetUpload
 
 from ...edit.appearance import Colour, ambient_colour, contact_shadow, relighting_gain, relit
-from ...geometry.transform import Float, invert_transform
+from ...geometry import Float, invert_transform
 from ...render import Backend, Instance, RasterOptions, rasterize
 from ...scene import Asset, BundleError, Figure, GaussianCloud, Ground, Scene, Trajectory
 from ...scene.io import (

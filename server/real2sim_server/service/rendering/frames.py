@@ -20,7 +20,7 @@ from real2sim_proto import encode
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.sensors import LensSpec, MotionBlurSpec, Optics
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...render import Instance, RigView
 from ...render.images import JpegEncoder, Light, to_display, to_light, turbo_jpeg
 from ...render.modalities import encode_image

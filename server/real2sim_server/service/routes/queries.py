@@ -16,7 +16,7 @@ from real2sim_proto.sensors import LidarSpec
 from real2sim_proto.sessions import FreeCamera, SceneView
 
 from ...edit import ScenarioState, instances_at, posed_instances
-from ...geometry.transform import Float, apply_transform, transform_from
+from ...geometry import Float, apply_transform, transform_from
 from ...render import Instance
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ...world.ranging import Cloud, MountedLidar, mounted_sensors

@@ -24,7 +24,7 @@ from real2sim_proto.episode import SensorSpec
 from real2sim_proto.operations import Operation
 
 from ...edit import EditError, instances_at, replay_operations
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...render import Instance, RenderError
 from ...render.frame import UNCERTAINTY, uncertainty_picture
 from ...render.images import encode_rgb

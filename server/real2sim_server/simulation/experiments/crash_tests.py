@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...physics.body import box_particles
 from ...physics.colliders import Box, Collider, Plane
 from ...physics.materials import FixedCorotated

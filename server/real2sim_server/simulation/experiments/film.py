@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..._files import atomic_file
-from ...geometry.transform import Float, apply_transform, matrix_to_quaternion
+from ...geometry import Float, apply_transform, matrix_to_quaternion
 from ...physics.colliders import Box, Plane
 from ...physics.errors import PhysicsError
 from ...render import Instance, RasterOptions, render_cameras

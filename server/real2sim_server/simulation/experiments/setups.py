@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...geometry.box import box_penetration
-from ...geometry.transform import Float, apply_transform
+from ...geometry import Float, apply_transform, box_penetration
 from ...physics.colliders import Box, Collider, HeightField, Plane
 from ...physics.errors import PhysicsError
 from ...physics.materials import FixedCorotated

@@ -23,7 +23,7 @@ from real2sim_proto.conventions import semantic_class
 
 from ...edit import ObjectState
 from ...edit.compose import cloud_of
-from ...geometry.transform import Float, transform_from, yaw_quaternion
+from ...geometry import Float, transform_from, yaw_quaternion
 from ...physics.colliders import Box
 from ...physics.errors import PhysicsError
 from ...render.types import Instance

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...geometry.transform import Float, multiply_quaternions, quaternion_yaw, yaw_quaternion
+from ...geometry import Float, multiply_quaternions, quaternion_yaw, yaw_quaternion
 from ..agents import rows_of
 from ..boxes import first_contacts
 from ..ego.motion import Motion

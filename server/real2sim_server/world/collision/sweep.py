@@ -18,8 +18,7 @@ from real2sim_proto.episode import EgoSpec, ResetSpec
 
 from ..._records import made_quickly
 from ...edit import ObjectState
-from ...geometry.box import boxes_overlap
-from ...geometry.transform import quaternion_yaw
+from ...geometry import boxes_overlap, quaternion_yaw
 from ...scene.ground import OBSTACLE_CELL
 from ..agents import Agents, rows_in
 from ..boxes import REAR_OVERHANG, ego_box, first_contacts, first_occupied, holds_any, within_reach

@@ -10,7 +10,7 @@ import numpy as np
 
 from real2sim_proto.episode import EgoSpec, SuspensionSpec
 
-from ...geometry.transform import quaternion_yaw
+from ...geometry import quaternion_yaw
 from ...scene import Trajectory
 from ..common import cache_by_identity
 from ..driving import (

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from real2sim_proto import CodecError, decode
 
 from ..._files import atomic_file
-from ...geometry.transform import are_rigid, matrix_to_quaternion
+from ...geometry import are_rigid, matrix_to_quaternion
 from .. import scoring
 from ..ranging import Cloud
 from ..scoring import Instant

@@ -34,7 +34,7 @@ from real2sim_proto import decode, encode
 from ..._files import atomic_file
 from ..._npy import read_entries
 from ...edit import AssetLookup, EditError, ScenarioState, pack_state, unpack_state
-from ...geometry.transform import Float
+from ...geometry import Float
 from ...scene import Scene
 from .. import scoring
 from ..common import WorldError

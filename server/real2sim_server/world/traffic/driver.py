@@ -20,7 +20,7 @@ from real2sim_proto.episode import (
 )
 
 from ...edit import ObjectState
-from ...geometry.transform import quaternion_yaw
+from ...geometry import quaternion_yaw
 from ...scene import Ground, Trajectory
 from ...scene.lane_graph import LaneGraph
 from ..agents import Agents, rows_of

@@ -14,7 +14,7 @@ from real2sim_proto.episode import AgentsSpec, IdmDriver, LaneSpec, SpawnSpec
 from real2sim_proto.operations import DRAWN_PREFIX
 
 from ...edit import ObjectState, ScenarioState
-from ...geometry.transform import quaternion_yaw
+from ...geometry import quaternion_yaw
 from ...scene import Ground, Trajectory
 from ...scene.scene import MAX_OBJECTS
 from ..agents import Agents

@@ -25,7 +25,7 @@ from real2sim_proto.episode import (
 
 from ...edit import ObjectState
 from ...edit.tracks import PackedTracks
-from ...geometry.transform import transform_from
+from ...geometry import transform_from
 from ..agents import Agents, rows_of
 from ..common import WorldError, copy_with
 from ..path import Float

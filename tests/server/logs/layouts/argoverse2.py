@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
-from real2sim_server.geometry.transform import invert_transform, matrix_to_quaternion
+from real2sim_server.geometry import invert_transform, matrix_to_quaternion
 from real2sim_server.logs import DrivingLog
 from real2sim_server.logs.images import write_image
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     invert_transform,
     matrix_to_quaternion,
     quaternion_yaw,

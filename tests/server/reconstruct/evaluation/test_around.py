@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.geometry import invert_transform
 from real2sim_server.reconstruct import InitialiseOptions, initialise_scene
 from real2sim_server.reconstruct.evaluation.images import (
     HEIGHT,

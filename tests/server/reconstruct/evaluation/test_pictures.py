@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.reconstruct.evaluation.report import depth_image, error_image, object_crops
 from real2sim_server.reconstruct.logged_view import moving_tracks, tracks_mask
 

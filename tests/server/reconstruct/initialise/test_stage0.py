@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import apply_transform, invert_transform
+from real2sim_server.geometry import apply_transform, invert_transform
 from real2sim_server.logs import DrivingLog
 from real2sim_server.reconstruct import (
     InitialiseOptions,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.geometry import invert_transform
 from real2sim_server.reconstruct.initialise.vehicle_body import VehicleBody, fitted_body
 from real2sim_server.reconstruct.training import SceneModel
 from real2sim_server.reconstruct.training.closed_vehicles import (

@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from real2sim_server.geometry.transform import transform_from, yaw_quaternion
+from real2sim_server.geometry import transform_from, yaw_quaternion
 from real2sim_server.render import Instance, RenderError
 from real2sim_server.render.cast import Echo, cast
 from real2sim_server.scene import Beams, GaussianCloud, Lidar

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import transform_from
+from real2sim_server.geometry import transform_from
 from real2sim_server.render import Instance, RenderError
 from real2sim_server.render._cuda.needs import unmet_nvrtc_need
 from real2sim_server.render.cast import Echo, cast, select_caster

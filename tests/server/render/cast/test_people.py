@@ -7,7 +7,7 @@ import pytest
 
 from real2sim_server.body import joint_transforms, skin
 from real2sim_server.body.gait import plan_gait
-from real2sim_server.geometry.transform import yaw_quaternion
+from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.render import Instance
 from real2sim_server.render.cast import cast
 from real2sim_server.scene import Beams, Lidar, Trajectory

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 
-from real2sim_server.geometry.transform import quaternion_to_matrix
+from real2sim_server.geometry import quaternion_to_matrix
 from real2sim_server.scene import GaussianCloud
 
 

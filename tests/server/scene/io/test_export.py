@@ -6,7 +6,7 @@ import torch
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
-from real2sim_server.geometry.transform import apply_transform
+from real2sim_server.geometry import apply_transform
 from real2sim_server.scene import GaussianCloud, SceneError, Trajectory, UnknownObjectError
 from real2sim_server.scene.io import (
     export_scene,

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from real2sim_server.geometry.transform import yaw_quaternion
+from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import (
     CameraRig,
     GaussianCloud,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from real2sim_server.geometry.transform import apply_transform
+from real2sim_server.geometry import apply_transform
 from real2sim_server.scene import Asset, BundleError, GaussianCloud, Scene, SceneError
 from real2sim_server.scene.io import (
     import_splats,

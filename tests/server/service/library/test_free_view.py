@@ -7,7 +7,7 @@ import pytest
 import simplejpeg
 
 from real2sim_proto import ErrorCode, decode
-from real2sim_server.geometry.transform import matrix_to_quaternion
+from real2sim_server.geometry import matrix_to_quaternion
 
 VIEW = "/v1/scenes/tiny/render"
 MSGPACK = {"Accept": "application/msgpack"}

@@ -24,7 +24,7 @@ import real2sim
 from real2sim._alpasim import RENDERER, RENDERER_METHODS, messages
 from real2sim.renderers.alpasim import AlpasimRenderer
 from real2sim.renderers.linked_scene import SceneLink
-from real2sim_server.geometry.transform import (
+from real2sim_server.geometry import (
     invert_transform,
     matrix_to_quaternion,
     quaternion_to_matrix,

@@ -29,7 +29,7 @@ import real2sim
 from real2sim.planners.peer import PeerError
 from real2sim.renderers.linked_scene import SceneLink
 from real2sim.renderers.neuroncap import NeuroNcapRenderer
-from real2sim_server.geometry.transform import invert_transform
+from real2sim_server.geometry import invert_transform
 from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.network

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 import real2sim
-from real2sim_server.geometry.transform import matrix_to_quaternion
+from real2sim_server.geometry import matrix_to_quaternion
 from tests.waiting import wait_until
 
 from .hands import drag, kept, shown

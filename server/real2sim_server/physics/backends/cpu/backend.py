@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from ....geometry.transform import Float
+from ....geometry import Float
 from ...colliders import Collider
 from ...model import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, pack_colliders
 from ...stress import LAW

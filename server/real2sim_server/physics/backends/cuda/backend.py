@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ....geometry.transform import Float
+from ....geometry import Float
 from ....render._cuda.needs import unmet_nvrtc_need
 from ...colliders import Collider
 from ...contact import AXES, POINT, SPEED, SPIN

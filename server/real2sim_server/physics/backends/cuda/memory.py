@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ....geometry.transform import Float
+from ....geometry import Float
 from ...contact import THIN
 from ...model import TOTALS, Model
 from . import launcher as records

@@ -1,1 +1,0 @@
-"""Rotations, poses and boxes, with their kernels."""
