@@ -13,8 +13,11 @@ Its parts, lowest first. Each imports only earlier ones; there are no import cyc
 - ``http``: shared by all replies: errors, authorisation, idempotency, limits, telemetry and
   connections.
 - ``library``: scenes and assets, on disk and in memory.
-- ``rendering``: render requests, and images as frames of the protocol.
-- ``scenarios``: edits under one lock per scenario, cached, stored before they take effect.
+- ``frames``: images as frames of the protocol.
+- ``render_background``: background work of the renderer.
+- ``renderer``: render requests.
+- ``scenario_cache``: scenarios and sessions' states in memory.
+- ``scenarios``: edits under one lock per scenario, stored before they take effect.
 - ``jobs``: long-running work: rollouts, videos, data sets.
 - ``sessions``: closed loops; ``pipeline`` processes a step from the socket to the encoded reply.
 - ``drives``: jobs in which planners drive sessions.

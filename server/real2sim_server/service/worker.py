@@ -41,8 +41,8 @@ from .library.scenes import MemoryBudget, Quota, SceneCache, SceneCatalog
 from .library.views import SplatFiles
 from .maintenance import Maintenance
 from .membership import Agent, Membership, Prewarming, Sharing, Willingness, takes_work
-from .rendering.renderer import Renderer
-from .scenarios.scenarios import Scenarios
+from .renderer import Renderer
+from .scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline
 from .sessions.shared_memory import Segments

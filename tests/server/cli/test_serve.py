@@ -12,7 +12,7 @@ from ..worker_processes import Finished, run_real2sim
 
 LOST = (
     "import sys\n"
-    "from real2sim_server.service.rendering import renderer\n"
+    "from real2sim_server.service import renderer\n"
     "def lose(*_): raise RuntimeError('CUDA error: an illegal memory access was encountered')\n"
     "renderer.warm_up = lose\n"
 )

@@ -4,7 +4,7 @@ import pytest
 
 from real2sim_server.cli.logs import track
 from real2sim_server.logs import open_log
-from real2sim_server.logs.tracking.track import same_object
+from real2sim_server.logs.tracking import same_object
 from real2sim_server.synthetic import SyntheticConfig, synthesize
 
 

@@ -21,7 +21,7 @@ from real2sim_server.render.backend import Backend, RasterRequest
 from real2sim_server.scene import Scene
 from real2sim_server.service.engine import Engine
 from real2sim_server.service.http.telemetry import Metrics
-from real2sim_server.service.rendering.renderer import Renderer
+from real2sim_server.service.renderer import Renderer
 from real2sim_server.service.sessions.pipeline import (
     EncodedObservation,
     LogWrite,

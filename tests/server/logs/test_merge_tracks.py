@@ -3,8 +3,7 @@
 import numpy as np
 
 from real2sim_server.logs import ObjectTrack
-from real2sim_server.logs.tracking import merge_tracks
-from real2sim_server.logs.tracking.track import same_object
+from real2sim_server.logs.tracking import merge_tracks, same_object
 from real2sim_server.scene import Trajectory
 
 

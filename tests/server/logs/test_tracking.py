@@ -8,9 +8,9 @@ import pytest
 
 from real2sim_server.geometry import apply_transform
 from real2sim_server.logs import DrivingLog, LidarSweep, ObjectTrack, open_log
+from real2sim_server.logs.association import SweepRays, find_sweep_ground, smooth
 from real2sim_server.logs.drawing import points_in_box
 from real2sim_server.logs.tracking import TrackingOptions, track_moving_objects
-from real2sim_server.logs.tracking.association import SweepRays, find_sweep_ground, smooth
 from real2sim_server.synthetic import SyntheticConfig, generate_log
 
 NEAR = 30.0

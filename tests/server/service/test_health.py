@@ -35,9 +35,7 @@ def test_a_started_worker_lives_and_becomes_ready(client):
 
 def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypatch):
     warm = threading.Event()
-    monkeypatch.setattr(
-        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(LIMIT_S)
-    )
+    monkeypatch.setattr("real2sim_server.service.renderer.warm_up", lambda _: warm.wait(LIMIT_S))
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
         assert client.get("/livez").status_code == 200
         response = client.get("/readyz")
@@ -53,9 +51,7 @@ def test_while_kernels_warm_up_it_lives_but_is_not_ready(make_settings, monkeypa
 
 def test_while_kernels_are_compiled_it_says_how_many_are_ready(make_settings, monkeypatch):
     warm = threading.Event()
-    monkeypatch.setattr(
-        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(LIMIT_S)
-    )
+    monkeypatch.setattr("real2sim_server.service.renderer.warm_up", lambda _: warm.wait(LIMIT_S))
     monkeypatch.setattr("real2sim_server.service.warm_up.made", Made(12, 40, compiled=3))
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
         assert any(": 12 of 40" in r for r in client.get("/readyz").json()["reasons"])
@@ -66,7 +62,7 @@ def test_while_kernels_are_compiled_it_says_how_many_are_ready(make_settings, mo
 def test_it_is_ready_before_the_kernels_of_small_images(make_settings, monkeypatch):
     made = threading.Event()
     monkeypatch.setattr(
-        "real2sim_server.service.rendering.renderer.warm_up_small_images",
+        "real2sim_server.service.renderer.warm_up_small_images",
         lambda _: made.wait(LIMIT_S),
     )
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
@@ -79,7 +75,7 @@ def test_a_failed_warm_up_is_the_reason(make_settings, monkeypatch):
     def fail(_backend):
         raise RuntimeError("no compiler")
 
-    monkeypatch.setattr("real2sim_server.service.rendering.renderer.warm_up", fail)
+    monkeypatch.setattr("real2sim_server.service.renderer.warm_up", fail)
     with TestClient(create_app(make_settings()), base_url="http://127.0.0.1") as client:
         wait_until(lambda: "no compiler" in client.get("/readyz").text, "the reason")
         assert client.get("/livez").status_code == 200

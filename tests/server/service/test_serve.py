@@ -75,9 +75,7 @@ def test_a_worker_that_does_not_get_ready_says_why(make_settings, monkeypatch):
             warm.set()
         return ready, answer
 
-    monkeypatch.setattr(
-        "real2sim_server.service.rendering.renderer.warm_up", lambda _: warm.wait(LIMIT_S)
-    )
+    monkeypatch.setattr("real2sim_server.service.renderer.warm_up", lambda _: warm.wait(LIMIT_S))
     monkeypatch.setattr(serve_module, "_ask_readiness", ask_until_told)
     clock = SimpleNamespace(monotonic=lambda: now[0], sleep=time.sleep)
     monkeypatch.setattr(serve_module, "time", clock)

@@ -31,10 +31,10 @@ from ...render.cast import CastRequest, Echo, select_caster
 from ...render.images import VideoError, VideoFile
 from ...scene import Scene
 from ..engine import Engine, Priority, QueueFullError
+from ..frames import EncodedFrame
 from ..http.responses import ServiceError
 from ..library.scenes import Quota
-from ..rendering.frames import EncodedFrame
-from ..rendering.renderer import Renderer, RenderRequest, check_sensors
+from ..renderer import Renderer, RenderRequest, check_sensors
 from .jobs import JobContext, JobResult
 
 VIDEO = "video.webm"

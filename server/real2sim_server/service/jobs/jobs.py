@@ -24,7 +24,7 @@ from ..clock import now_us
 from ..http.requests import IdempotentRequest
 from ..http.responses import ServiceError, problem_of, service_error
 from ..library.scenes import Quota
-from ..scenarios.scenario_cache import iso_time
+from ..scenario_cache import iso_time
 from ..storage.job_log import ClaimedJob, JobLog
 from ..storage.store import FencedError, StoreError, StoreTroubleError
 

@@ -59,7 +59,7 @@ from ...simulation.structure import ObjectPhysics, with_values
 from ..http.requests import IdempotentRequest
 from ..http.responses import ServiceError
 from ..library.scenes import SceneCache
-from ..scenarios.scenarios import Scenarios
+from ..scenarios import Scenarios
 from .exports import VideoSource
 from .jobs import JobCancelled, JobContext, JobResult, Jobs, NewJob, Work, require_success
 

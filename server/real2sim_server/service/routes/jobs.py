@@ -41,7 +41,7 @@ from ..jobs.exports import (
     plan_of,
 )
 from ..jobs.jobs import JobContext, JobResult, Jobs, NewJob, Work, accepted_headers
-from ..rendering.renderer import FRAME_RESPONSES, RenderRequest, frame_response
+from ..renderer import FRAME_RESPONSES, RenderRequest, frame_response
 from ..sessions.recording import RECORDING, episode_of
 from ..sessions.registry import check_not_closed
 from ..sessions.session import opens_session

@@ -20,9 +20,9 @@ from ...geometry import Float, apply_transform, transform_from
 from ...render import Instance
 from ...scene import Camera, CameraRig, Scene, SceneError
 from ...world.ranging import Cloud, MountedLidar, mounted_sensors
+from ..frames import cloud_parts, lens_of
 from ..http.responses import ServiceError, choose_among, etag
-from ..rendering.frames import cloud_parts, lens_of
-from ..rendering.renderer import CODEC_OF, MSGPACK, RenderRequest, choose_media_type
+from ..renderer import CODEC_OF, MSGPACK, RenderRequest, choose_media_type
 
 
 @dataclass(frozen=True)

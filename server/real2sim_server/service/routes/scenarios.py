@@ -41,8 +41,8 @@ from ..http.auth import TokenRoute
 from ..http.requests import ClientName, IdempotencyKey, IdempotentRequest
 from ..http.responses import ServiceError, cancel_on_disconnect, etag, info_response, large_response
 from ..jobs.jobs import accepted_headers
-from ..rendering.renderer import FRAME_RESPONSES, frame_response
-from ..scenarios.scenarios import created_headers, tag
+from ..renderer import FRAME_RESPONSES, frame_response
+from ..scenarios import created_headers, tag
 from ..worker import Worker, WorkerOf
 from .queries import SWEEP_RESPONSES, FrameQueryOf, SweepQueryOf, sweep_response
 

@@ -45,12 +45,7 @@ from ..library.imports import (
 )
 from ..library.scenes import bundle_folder
 from ..library.views import GZIP_LEVEL, scene_info
-from ..rendering.renderer import (
-    FRAME_RESPONSES,
-    choose_frames_type,
-    frame_response,
-    frames_response,
-)
+from ..renderer import FRAME_RESPONSES, choose_frames_type, frame_response, frames_response
 from ..worker import Worker, WorkerOf
 from .queries import FrameQueryOf, free_view_request
 

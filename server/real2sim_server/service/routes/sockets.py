@@ -31,11 +31,11 @@ from ...render.images import encode_rgb
 from ...scene import Scene, SceneError
 from ..accounts import Account, RevokedError, admit_message, owner_name
 from ..engine import QueueFullError
+from ..frames import EncodedFrame
 from ..http.auth import act_for, bearer_token, unauthorized
 from ..http.connections import close_quietly, receive_text
 from ..http.responses import REQUEST_ID_KEY, ServiceError, problem_response, service_error
-from ..rendering.frames import EncodedFrame
-from ..rendering.renderer import RenderRequest
+from ..renderer import RenderRequest
 from ..sessions.connection import Connection
 from ..sessions.messages import (
     FatalError,

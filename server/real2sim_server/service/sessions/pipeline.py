@@ -38,9 +38,9 @@ from ...scene import Camera, Scene
 from ...world import World
 from ...world.ranging import NO_SENSORS, Cloud, Mounted, MountedLidar, RangingSensors
 from ..engine import Engine, Priority
+from ..frames import EncodedFrame, RenderedImage, cloud_parts, needs_motion
 from ..http.telemetry import Metrics
-from ..rendering.frames import EncodedFrame, RenderedImage, cloud_parts, needs_motion
-from ..rendering.renderer import Renderer, RenderRequest
+from ..renderer import Renderer, RenderRequest
 from ..storage.store import Claim, SessionEntry, Store
 from ..warm_up import DeformationKernels
 from .sensors import WorldClouds, cameras_of, raw_image_bytes

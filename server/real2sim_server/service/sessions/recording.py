@@ -12,8 +12,8 @@ from ...world.ranging import MountedLidar, MountedRadar, RangingSensors
 from ...world.recording.mcap_file import cloud_document
 from ...world.recording.recording import Recording, record, to_bytes
 from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
+from ..frames import EncodedFrame
 from ..http.responses import ServiceError
-from ..rendering.frames import EncodedFrame
 from .pipeline import EncodedObservation, StepPipeline
 from .registry import Sessions
 from .session import EpisodeStart, Session

@@ -31,7 +31,7 @@ from ..http.requests import IdempotentRequest
 from ..http.responses import ServiceError
 from ..http.telemetry import Metrics
 from ..library.scenes import SceneCache
-from ..scenarios.scenarios import Scenarios
+from ..scenarios import Scenarios
 from ..storage.fleet import Leases
 from ..storage.store import SessionEntry, SessionRow, Store
 from ..warm_up import KernelWarmUp

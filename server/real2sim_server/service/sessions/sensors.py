@@ -29,8 +29,8 @@ from ...world.ranging import (
 from ...world.sensing import clouds_of, recorded_cloud
 from ..engine import Engine
 from ..http.responses import ServiceError
-from ..rendering.background import BackgroundCompile
-from ..rendering.renderer import check_known, check_sensors
+from ..render_background import BackgroundCompile
+from ..renderer import check_known, check_sensors
 
 MAX_IMAGE_BYTES = MAX_SERVER_MESSAGE_BYTES - 1024 * 1024
 """Limit of raw images in one message; the remainder is for its other members."""

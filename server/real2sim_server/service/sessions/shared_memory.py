@@ -34,10 +34,10 @@ from real2sim_proto.drive import (
     SHM_SECRET_BYTES,
 )
 
+from ..frames import EncodedFrame, placed_frame
 from ..http.auth import secrets_equal
 from ..http.responses import ServiceError
 from ..library.scenes import IdleItem, MemoryBudget
-from ..rendering.frames import EncodedFrame, placed_frame
 
 SLOTS = 4
 """The observation in progress, the newest, and two earlier ones that a planner may hold."""

@@ -13,7 +13,7 @@ import msgpack
 from real2sim_proto import PROTOCOL_VERSION
 
 from ..._records import made_quickly
-from ..rendering.frames import EncodedFrame, Part, array_header, map_header, pack_pairs
+from ..frames import EncodedFrame, Part, array_header, map_header, pack_pairs
 
 FRAMES: bytes = msgpack.packb("frames")
 CLOUDS: bytes = msgpack.packb("clouds")

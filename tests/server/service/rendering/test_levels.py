@@ -13,7 +13,7 @@ from real2sim_server.render import levels_bytes, scene_levels_bytes, select_back
 from real2sim_server.render._cpu import detail_levels
 from real2sim_server.service.http.responses import ServiceError
 from real2sim_server.service.library.scenes import MemoryBudget
-from real2sim_server.service.rendering.background import DetailLevels
+from real2sim_server.service.render_background import DetailLevels
 
 from ...conftest import make_tiny_scene
 from ..waiting import wait_ready

@@ -17,9 +17,9 @@ from real2sim_server.render.images import EXACT_CODECS, encode_lossless
 from real2sim_server.render.modalities import SensorModality, register, unregister
 from real2sim_server.scene import Scene
 from real2sim_server.service.engine import Engine
+from real2sim_server.service.frames import EncodedFrame
 from real2sim_server.service.http.telemetry import Metrics
-from real2sim_server.service.rendering.frames import EncodedFrame
-from real2sim_server.service.rendering.renderer import Renderer, RenderRequest
+from real2sim_server.service.renderer import Renderer, RenderRequest
 from real2sim_server.service.sessions.wire import PhaseTimer, pack_members, pack_with_frames
 
 

@@ -11,7 +11,7 @@ from real2sim_proto import ErrorCode, decode
 from real2sim_proto.scenarios import History, OperationResult, ScenarioInfo
 from real2sim_server.edit import replay_operations
 from real2sim_server.scene.io import save_scene
-from real2sim_server.service.scenarios import scenario_cache
+from real2sim_server.service import scenario_cache
 from real2sim_server.service.storage.store import StoreError
 
 DELETE_RED = {"op": "delete", "object_id": "car_red"}

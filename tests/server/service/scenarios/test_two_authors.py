@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from real2sim_proto.scenarios import HistoryEntry
 from real2sim_server.edit import EditError, PlannedEntry, Scenario, ScenarioState
-from real2sim_server.service.scenarios.scenario_cache import ScenarioView, replayed
+from real2sim_server.service.scenario_cache import ScenarioView, replayed
 
 NAMES = ("anna", "bert")
 OBJECTS = st.sampled_from(["car_red", "car_blue", "post", "car_red_copy1"])

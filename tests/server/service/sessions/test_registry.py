@@ -171,7 +171,7 @@ def test_a_step_that_cannot_be_shown_is_taken_off_the_record(site, join, monkeyp
         raise RenderError("no memory for this picture")
 
     with monkeypatch.context() as patch:
-        patch.setattr("real2sim_server.service.rendering.renderer.encode_frame", fail)
+        patch.setattr("real2sim_server.service.renderer.encode_frame", fail)
         assert planner.act(0)["type"] == "error"
     assert [e.kind for e in entries(site, info)] == ["reset"]
     assert planner.act(0, acceleration=0.2)["step"] == 1

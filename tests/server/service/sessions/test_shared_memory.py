@@ -16,8 +16,8 @@ import real2sim
 from real2sim_proto.codec import MAX_SERVER_MESSAGE_BYTES
 from real2sim_proto.drive import SHM_FOLDER, SHM_HEADER_BYTES, SHM_MAGIC, SHM_SECRET_BYTES
 from real2sim_proto.episode import SensorSpec
+from real2sim_server.service.frames import EncodedFrame, RenderedImage, encode_frame
 from real2sim_server.service.library.scenes import MemoryBudget
-from real2sim_server.service.rendering.frames import EncodedFrame, RenderedImage, encode_frame
 from real2sim_server.service.sessions import shared_memory as module
 from real2sim_server.service.sessions.sensors import MAX_IMAGE_BYTES
 from real2sim_server.service.sessions.shared_memory import SLOTS, Segment, Segments, sweep_segments

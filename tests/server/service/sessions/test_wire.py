@@ -14,10 +14,7 @@ from real2sim_proto.base import Modality
 from real2sim_proto.drive import SERVER_MESSAGE
 from real2sim_proto.episode import SensorSpec
 from real2sim_server.geometry import transform_from
-from real2sim_server.service.rendering.frames import (
-    RenderedImage,
-    encode_frame,
-)
+from real2sim_server.service.frames import RenderedImage, encode_frame
 from real2sim_server.service.sessions.wire import (
     PhaseTimer,
     pack_members,

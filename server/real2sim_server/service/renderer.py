@@ -22,7 +22,7 @@ from real2sim_proto.base import Codec, Modality
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.sensors import MotionBlurSpec
 
-from ...render import (
+from ..render import (
     Backend,
     Frame,
     Instance,
@@ -35,18 +35,18 @@ from ...render import (
     warm_up,
     warm_up_small_images,
 )
-from ...render.backend import device_of
-from ...render.frame import UNCERTAINTY, WITHOUT, at_once
-from ...render.images import JpegEncoder, jpeg_encoder_for, turbo_jpeg, with_effects
-from ...render.lens import with_ground
-from ...render.modalities import modality_names, modality_of, options_for
-from ...scene import Camera, CameraRig, Scene, SceneError
-from ..engine import Engine, Priority, lower_priority
-from ..http.responses import ServiceError, choose_among, etag
-from ..http.telemetry import Metrics
-from ..library.scenes import MemoryBudget
-from .background import BackgroundCompile, DetailLevels, LensKernels
+from ..render.backend import device_of
+from ..render.frame import UNCERTAINTY, WITHOUT, at_once
+from ..render.images import JpegEncoder, jpeg_encoder_for, turbo_jpeg, with_effects
+from ..render.lens import with_ground
+from ..render.modalities import modality_names, modality_of, options_for
+from ..scene import Camera, CameraRig, Scene, SceneError
+from .engine import Engine, Priority, lower_priority
 from .frames import EncodedFrame, FollowingImage, RenderedImage, blurred, camera_with, encode_frame
+from .http.responses import ServiceError, choose_among, etag
+from .http.telemetry import Metrics
+from .library.scenes import MemoryBudget
+from .render_background import BackgroundCompile, DetailLevels, LensKernels
 
 log = structlog.get_logger(__name__)
 

@@ -20,14 +20,14 @@ from real2sim_proto import encode
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.sensors import LensSpec, MotionBlurSpec, Optics
 
-from ...geometry import Float
-from ...render import Instance, RigView
-from ...render.images import JpegEncoder, Light, to_display, to_light, turbo_jpeg
-from ...render.modalities import encode_image
-from ...scene import Camera, Lens, Shutter
-from ...scene.camera import moved
-from ...scene.lens import lens_from
-from ...world.ranging import Cloud
+from ..geometry import Float
+from ..render import Instance, RigView
+from ..render.images import JpegEncoder, Light, to_display, to_light, turbo_jpeg
+from ..render.modalities import encode_image
+from ..scene import Camera, Lens, Shutter
+from ..scene.camera import moved
+from ..scene.lens import lens_from
+from ..world.ranging import Cloud
 
 # --- Optics --------------------------------------------------------------------------------------
 

@@ -12,8 +12,8 @@ import structlog
 from real2sim_proto import ErrorCode
 from real2sim_proto.episode import SensorSpec
 
-from ..._numba import COMPILING
-from ...render import (
+from .._numba import COMPILING
+from ..render import (
     Backend,
     Instance,
     RenderError,
@@ -23,18 +23,18 @@ from ...render import (
     uses_levels,
     without_levels,
 )
-from ...render.frame import (
+from ..render.frame import (
     UNCERTAINTY,
     kernels_of_lenses_on_disk,
     refuse_lenses,
     shown_as_colour,
     warm_up_lenses,
 )
-from ...scene import Camera
-from ..engine import Engine
-from ..http.responses import ServiceError
-from ..library.scenes import IdleItem, MemoryBudget
-from ..preflight import awaited, compile_beside
+from ..scene import Camera
+from .engine import Engine
+from .http.responses import ServiceError
+from .library.scenes import IdleItem, MemoryBudget
+from .preflight import awaited, compile_beside
 
 log = structlog.get_logger(__name__)
 

@@ -20,14 +20,13 @@ from real2sim_proto.scenarios import (
     ScenarioInfo,
 )
 
-from ...edit import AssetLookup, EditError, LogEntry, PlannedEntry, Scenario, ScenarioState
-from ...scene.io import SceneSummary
-from ..clock import now_us
-from ..http.requests import IdempotentRequest
-from ..http.responses import ServiceError, uncancellable
-from ..http.telemetry import Metrics
-from ..library.scenes import BUNDLE_SUFFIX, SceneCache
-from ..storage.store import ConflictError, ScenarioRow, Store, StoredReply
+from ..edit import AssetLookup, EditError, LogEntry, PlannedEntry, Scenario, ScenarioState
+from ..scene.io import SceneSummary
+from .clock import now_us
+from .http.requests import IdempotentRequest
+from .http.responses import ServiceError, uncancellable
+from .http.telemetry import Metrics
+from .library.scenes import BUNDLE_SUFFIX, SceneCache
 from .scenario_cache import (
     CachedScenario,
     ScenarioCache,
@@ -45,6 +44,7 @@ from .scenario_cache import (
     stale_revision,
     tag,
 )
+from .storage.store import ConflictError, ScenarioRow, Store, StoredReply
 
 __all__ = ["ScenarioView", "Scenarios", "created_headers", "tag"]
 

@@ -12,8 +12,8 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from ...geometry import Float, apply_transform
-from ..driving_log import LidarSweep
+from ..geometry import Float, apply_transform
+from .driving_log import LidarSweep
 
 # --- Ground of a sweep ---------------------------------------------------------------------------
 

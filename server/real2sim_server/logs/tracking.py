@@ -10,9 +10,8 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry import Float, apply_transform, invert_transform, yaw_quaternion
-from ...scene import Trajectory
-from ..driving_log import DrivingLog, LidarSweep, ObjectTrack
+from ..geometry import Float, apply_transform, invert_transform, yaw_quaternion
+from ..scene import Trajectory
 from .association import (
     FittedBox,
     LidarCluster,
@@ -22,6 +21,7 @@ from .association import (
     find_clusters,
     fit_box,
 )
+from .driving_log import DrivingLog, LidarSweep, ObjectTrack
 
 MAX_LENGTH, MAX_WIDTH, MAX_HEIGHT = 20.0, 3.9, 4.3
 MIN_STRAIGHTNESS = 0.6

@@ -26,7 +26,7 @@ from real2sim_proto.operations import (
 )
 from real2sim_proto.scenarios import HistoryEntry, OperationResult, ScenarioInfo
 
-from ...edit import (
+from ..edit import (
     AssetLookup,
     EditError,
     LogEntry,
@@ -36,11 +36,11 @@ from ...edit import (
     pack_state,
     unpack_state,
 )
-from ...scene.io import SceneSummary
-from ..http.responses import ServiceError, etag
-from ..library.scenes import SceneCache
-from ..library.views import edited_objects
-from ..storage.store import ScenarioRow, SnapshotRow, Store, StoreError
+from ..scene.io import SceneSummary
+from .http.responses import ServiceError, etag
+from .library.scenes import SceneCache
+from .library.views import edited_objects
+from .storage.store import ScenarioRow, SnapshotRow, Store, StoreError
 
 # REST models and stored forms of scenarios.
 
