@@ -4,10 +4,10 @@ Space is divided into cells along a Z curve, so cells of every size are contiguo
 order. Each block of cells selects its level independently. Level 0 is the cloud itself, without a
 copy. A Gaussian larger than the cells of a level is not merged there.
 
-The Gaussians of a cell merge into one with the same moments. Each is weighted by ``tau area``, where
-tau = -ln(1 - opacity) is its optical depth and ``area`` its cross section averaged over all
-directions. The merged Gaussian has the weighted mean centre and colour and the covariance about that
-centre. Its optical depth is the sum of the weights divided by its own area.
+The Gaussians of a cell merge into one with the same moments. Each has the weight ``tau area``,
+where tau = -ln(1 - opacity) is its optical depth and ``area`` its cross section averaged over all
+directions. The merged Gaussian has the weighted mean centre and colour, and the covariance about
+that centre. Its optical depth is the sum of the weights divided by its own area.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -80,8 +80,8 @@ def count_merged(codes, order, sizes, opacities, block_starts, shift, largest, c
         sizes: [N] float32, largest standard deviations [m].
         opacities: [N] float32.
         block_starts: [B + 1] int64, starts of the blocks in ``codes``.
-        shift: Bits of a code within a cell of the level.
-        largest: Standard deviation above which a Gaussian is not merged [m].
+        shift: bits of a code within a cell of the level.
+        largest: standard deviation above which a Gaussian is not merged [m].
         counts: [B] int64, written.
     """
     for block in prange(counts.shape[0]):
@@ -207,8 +207,8 @@ def close_cell(moments, colour, origin, slot, out_means, out_covars, out_opaciti
 def merged_opacity(depth, several):
     """Opacity of a merged Gaussian from the optical depth at its centre.
 
-    Several opaque Gaussians next to each other have a plateau and an edge. An opacity above 1, which
-    blending clips, reproduces both: the point of half transmittance is the same.
+    Several opaque Gaussians next to each other have a plateau and an edge. An opacity above 1,
+    which blending clips, reproduces both: the point of half transmittance is the same.
     """
     opacity = min(-math.expm1(-depth), OPACITY_MAX)
     if several:
@@ -261,15 +261,15 @@ class Hierarchy:
     """A cloud with its levels of detail.
 
     Attributes:
-        cloud: Level 0, the cloud itself.
+        cloud: level 0, the cloud itself.
         coefficients: [N, F, 3] of its TimeColour; F is 0 without one.
         order: [N] int64, Gaussians of level 0 by block.
         starts: [1 + LEVELS, B + 1] int64, starts of the blocks: row 0 in ``order``, the others in
             the merged arrays.
         low, high: [B, 3] float64, boxes around the centres of a block [m].
         sigmas: [B] float64, largest standard deviation in a block [m].
-        cell: Side of the cells of level 1 [m]; 0 if all Gaussians are merged ones of level 1.
-        means, covars, opacities, sh, merged_coefficients: Concatenated merged levels.
+        cell: side of the cells of level 1 [m]; 0 if all Gaussians are merged ones of level 1.
+        means, covars, opacities, sh, merged_coefficients: concatenated merged levels.
     """
 
     cloud: CloudArrays

@@ -83,10 +83,10 @@ def _blend(
 
     Args:
         builder: IR builder of the kernel.
-        state: Eight pixels; the front is the plane after the colours.
-        seen: Alpha, and the mask of touched pixels.
-        colours: Red, green and blue, or empty.
-        asked: Front (index + 1) and level.
+        state: eight pixels; the front is the plane after the colours.
+        seen: alpha, and the mask of touched pixels.
+        colours: red, green and blue, or empty.
+        asked: front (index + 1) and level.
     """
     alpha, touched = seen
     front, level = (splat(builder, scalar) for scalar in asked)
@@ -197,8 +197,8 @@ def blend_labels(
     """Blend tiles [first_tile, last_tile) into RGB and alpha of Images, and find fronts.
 
     Args:
-        values, lists, starts, background: See blend_tiles.
-        level: Transmittance that defines a pixel's front.
+        values, lists, starts, background: see blend_tiles.
+        level: transmittance that defines a pixel's front.
         objects: Objects.
         fronts: FirstHits.
     """
@@ -354,7 +354,7 @@ def write_own(own, own_alive, windows, x0, y0, shape, alone, used):
 
 
 # Depth of a pixel's front: the point on its ray where the Gaussian's response peaks. That is the
-# point nearest to the centre in the Gaussian's own metric (Moenne-Loccoz et al. 2024), including the
+# point nearest to the centre in the Gaussian's own metric (Moenne-Loccoz et al. 2024), with the
 # image blur. The depth of the centre can be off by decimetres, e.g. for discs on a road.
 
 
@@ -369,8 +369,8 @@ def shape_fronts(cluster, view, base, chunks, values, counts, used, shapes):
     """Write the shapes of the records of one Cluster that are a front.
 
     Args:
-        cluster, view, base, chunks: See project_cluster.
-        values, counts: See Records.
+        cluster, view, base, chunks: see project_cluster.
+        values, counts: see Records.
         used: [1 + M] uint8, nonzero at 1 + m if record m is a front.
         shapes: [M, SHAPE] float32, written.
     """
@@ -444,7 +444,7 @@ def read_fronts(fronts, left, top, view, values, shapes, depth, instance):
 
     Args:
         fronts: [h, w] int32, 1 + index of a record, 0 for none.
-        left, top: Position of the window in the image [px].
+        left, top: position of the window in the image [px].
         shapes: [M, SHAPE]; if [0, SHAPE], the depth is that of the centre.
     """
     inverse_x, inverse_y = F32(1) / view.fx, F32(1) / view.fy
@@ -517,10 +517,10 @@ class LabelPass:
     """Label options of one camera, and the results of its pass.
 
     Attributes:
-        windows: Windows of the objects to draw without occluders.
-        level: Transmittance that defines a pixel's front.
-        along_rays: If true, depth is taken along the ray of the pixel, else at the front's centre.
-        objects, fronts, records: Set when the pass begins.
+        windows: windows of the objects to draw without occluders.
+        level: transmittance that defines a pixel's front.
+        along_rays: if true, depth is taken along the ray of the pixel, else at the front's centre.
+        objects, fronts, records: set when the pass begins.
     """
 
     windows: Sequence[Window]

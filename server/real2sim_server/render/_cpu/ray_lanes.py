@@ -435,11 +435,11 @@ def _in_perspective(
     The derivative alone underestimates the nearer part.
 
     Args:
-        ellipse: Covariance from the derivative.
-        lean_x, lean_y: Covariance of image positions with distances along the axis [px], divided
+        ellipse: covariance from the derivative.
+        lean_x, lean_y: covariance of image positions with distances along the axis [px], divided
             by the distance of the centre.
-        share: Extent of the ellipsoid along the axis, divided by that distance.
-        reach: Standard deviations of the outline.
+        share: extent of the ellipsoid along the axis, divided by that distance.
+        reach: standard deviations of the outline.
     """
     xx, xy, yy, determinant = ellipse
     grown = (-(share * share) + 1.0).reciprocal()

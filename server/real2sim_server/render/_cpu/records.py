@@ -67,10 +67,10 @@ class CameraParameters(NamedTuple):
     """Camera and options as float32 numbers.
 
     Attributes:
-        fx, fy, cx, cy, width, height: Pinhole intrinsics and image size [px].
-        left, right, top, bottom: Bounds of x/z and y/z in the Jacobian of the projection.
-        near_plane, far_plane, eps2d, radius_clip, antialiased: See RasterOptions.
-        blur: Square root of ``eps2d`` [px].
+        fx, fy, cx, cy, width, height: pinhole intrinsics and image size [px].
+        left, right, top, bottom: bounds of x/z and y/z in the Jacobian of the projection.
+        near_plane, far_plane, eps2d, radius_clip, antialiased: see RasterOptions.
+        blur: square root of ``eps2d`` [px].
     """
 
     fx: np.float32
@@ -149,15 +149,15 @@ class RayParameters(NamedTuple):
     """Camera and options for the lens kernels.
 
     Attributes:
-        width, height: Image size [px].
-        near_plane, far_plane, eps2d, radius_clip, antialiased: See RasterOptions.
+        width, height: image size [px].
+        near_plane, far_plane, eps2d, radius_clip, antialiased: see RasterOptions.
         ranges: 1 if depth is the distance from the camera, 0 if it is along z.
-        rolls: Whether the camera has a rolling shutter.
-        bend, slack: See LensTables.
-        edge: Extent of small Gaussians on the image beyond their size [px].
-        cosine, sine: Cosine and sine of the largest angle between a ray and the axis.
-        turned: Length of ``turn`` [rad].
-        directory: See LensTables.
+        rolls: whether the camera has a rolling shutter.
+        bend, slack: see LensTables.
+        edge: extent of small Gaussians on the image beyond their size [px].
+        cosine, sine: cosine and sine of the largest angle between a ray and the axis.
+        turned: length of ``turn`` [rad].
+        directory: see LensTables.
         line: [3] float32; the dot product with (x, y, 1), clipped to -0.5 to 0.5, is the exposure
             time of an image position.
         shift, turn: [3] float64, camera motion over the readout, see LensView.

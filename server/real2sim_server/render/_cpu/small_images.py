@@ -78,7 +78,7 @@ def draw_images(
     """Draw M images, each on one core.
 
     Args:
-        table: See table_of.
+        table: see table_of.
         tones: [D, F] float32, time basis of the draws with time-dependent colours.
         draws: [D, 2] int64, row of ``table`` and instance id of each draw, by image.
         linear, offset: [D, 3, 3], [D, 3] float64, cloud frame to camera frame.
@@ -86,11 +86,11 @@ def draw_images(
         scale: [D, 3] float32.
         first_draws: [M + 1] int64, index of the first draw of each image.
         views: [M, 16] float32, CameraParameters.
-        cell_pixels: Largest size of merged cells on the image [px].
+        cell_pixels: largest size of merged cells on the image [px].
         background: [3] float32, used without a sky.
         faces: [6, R, R, 3] float32; R is 0 without a sky.
         sky_matrices: [M, 3, 3] float32, pixels to directions.
-        work: Arrays for S threads and the G Gaussians of the largest image: values [S, G, RECORD]
+        work: arrays for S threads and the G Gaussians of the largest image: values [S, G, RECORD]
             float32, footprints [S, G] int64, depths [S, G] float32, pairs [2, S, G] uint64 and
             chosen [S, G] int64.
         rgb, alpha: [M, H, W, 3] and [M, H, W], written.
@@ -410,8 +410,8 @@ def sky_image(faces, matrix, rgb, alpha):
 CELL_PIXELS = 2.5
 """Largest size of merged cells on the image [px].
 
-Relative to 2 px, it takes 1/7 less time and loses 0.7 dB PSNR against a downscaled large image; 3 px
-would take 1/5 less time and lose 1.4 dB.
+Relative to 2 px, it takes 1/7 less time and loses 0.7 dB PSNR against a downscaled large image.
+3 px would take 1/5 less time and lose 1.4 dB.
 """
 PIXEL_VARIANCE = 0.1
 """Variance of the pixel blur, slightly more than that of a pixel's square (1/12) [px^2].
@@ -498,8 +498,8 @@ class _Draws:
     """Arguments of draw_images.
 
     Attributes:
-        held: Keeps the arrays alive that ``table`` points to.
-        gaussians: Largest number of Gaussians in an image.
+        held: keeps the arrays alive that ``table`` points to.
+        gaussians: largest number of Gaussians in an image.
     """
 
     held: Sequence[Hierarchy]
