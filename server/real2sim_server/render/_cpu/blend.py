@@ -226,9 +226,9 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
 def open_tile(pixels, planes, x0, y0, shape):
     """Clear the state and finish pixels outside the image.
 
-    Half rows of eight pixels are numbered down the left half of the tile, then down the right one;
-    each has ``planes`` of them, the first is its transmittance.
-    Returns a bit for each that has something to draw.
+    Half rows of eight pixels are numbered down the left half of the tile, then down the right half.
+    Each has ``planes`` vectors, the first of which is its transmittance.
+    Returns a bit per half row, set if it has unfinished pixels.
     """
     pixels[:] = 0
     alive = np.int64(0)
