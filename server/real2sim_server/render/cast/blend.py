@@ -67,7 +67,7 @@ RAY = 6
 def _build(
     rays: Planes, state: Planes, record: list[Lanes], limits: list[Lanes], *, returns: bool
 ) -> Any:
-    """Emit the meeting of one record; returns bits of the rays that go on."""
+    """Emit the absorption by one record; returns bits of the unfinished rays."""
     builder = state.builder
     near, far, pulse = limits
     origin = [rays.load(k) for k in range(3)]
@@ -77,8 +77,8 @@ def _build(
     start = whitened(whitening, [o - m for o, m in zip(origin, mean, strict=True)])
     along = whitened(whitening, direction)
     inverse = dot(along, along).reciprocal()
-    # |start x along|^2 / |along|^2 keeps the digits that |start|^2 - (start along)^2 / |along|^2
-    # loses.
+    # |start x along|^2 / |along|^2 stays precise where |start|^2 - (start along)^2 / |along|^2
+    # cancels.
     off = [start[i] * along[j] - start[j] * along[i] for i, j in ((1, 2), (2, 0), (0, 1))]
     exponent = dot(off, off).fused(inverse, record[LEVEL])
     tau = -(dot(start, along) * inverse)

@@ -120,12 +120,12 @@ def _prepare(eight: Planes, sensor: Named, body: Named, *, deformed: bool) -> An
 
 
 def sensor_gain(body: Named, nearest: Lanes) -> Lanes:
-    """Upper bound of the angular speed of points at least ``nearest`` [m] from the sensor [rad/s]."""
+    """Upper bound of the angular speed [rad/s] of points at least ``nearest`` [m] away."""
     return body.number("speed") / nearest + body.number("turn")
 
 
 def _factors(eight: Planes, body: Named) -> list[Vector]:
-    """Covariance factor linear R diag(s), [3][3]: its product with its transpose is the covariance."""
+    """Factor F = linear R diag(s), [3][3], of the covariance F F^T."""
     columns = turn_columns([eight.load(SHAPE + k) for k in range(4)])
     scales = [eight.load(SHAPE + 4 + k) for k in range(3)]
     linear = _linear(body)

@@ -48,7 +48,7 @@ struct Sweep {
     const int *tile_lows, *tile_highs, *first_tiles, *first_bands, *last_bands;
     const int *rows_before, *rows_until, *slot_of;
     Met* met;          // two per Gaussian
-    int64* footprints;  // likewise; -1 where no ray passes
+    int64* footprints;  // two per Gaussian; -1 if no ray passes
     float* depths;
     int64* counts;      // tiles of each record; prefix sums when pairs are listed
     int64* keys;        // tile and depth of each pair

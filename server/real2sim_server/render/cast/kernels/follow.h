@@ -35,8 +35,8 @@ __device__ __forceinline__ float meet(const Sweep& sweep, const Ray& ray, const 
     whitened(met.whitening, off, start);
     whitened(met.whitening, ray.direction, along);
     const float square = fmaf(along[0], along[0], fmaf(along[1], along[1], along[2] * along[2]));
-    // |start x along|^2 / |along|^2 keeps the digits that |start|^2 - (start along)^2 / |along|^2
-    // loses.
+    // |start x along|^2 / |along|^2 stays precise where |start|^2 - (start along)^2 / |along|^2
+    // cancels.
     const float x = start[1] * along[2] - start[2] * along[1];
     const float y = start[2] * along[0] - start[0] * along[2];
     const float z = start[0] * along[1] - start[1] * along[0];
