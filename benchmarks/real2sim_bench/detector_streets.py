@@ -43,7 +43,7 @@ CLEAR = 0.5
 EGO_CENTRE, EGO_ROOM = np.eye(4), (16.0, 3.5, 4.0)
 """Box around the rear axle of the ego that copies must not enter [m]."""
 MIN_PIXELS, MIN_SIDE = 40, 6.0
-"""Minimum visible pixels and box side [px] of an object that counts."""
+"""Minimum visible pixels and box side of an object that counts, in pixels of the final image."""
 FORMATS = ("coco", "labels")
 FINER = 2
 """Supersampling factor. Images are drawn finer and averaged, so pixels integrate like a camera's,

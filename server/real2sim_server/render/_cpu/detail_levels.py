@@ -40,7 +40,7 @@ OPACITY_MAX = 0.999
 OPAQUE = 2.0
 """Largest opacity of a merged Gaussian."""
 EDGE = 0.5 / math.log(2.0)
-"""Opacity per optical depth at which the transmittance is 0.5 at the same distance."""
+"""Opacity per optical depth for which transmittance is 0.5 at the same distance from the centre."""
 MOMENTS = 11
 """Sums over a cell: weight, centre, upper half of the covariance, count."""
 

@@ -99,7 +99,7 @@ Rays are exact."""
 SMALL_ANGLE = 0.5
 """Largest relative nonlinearity of lens and perspective over a small Gaussian."""
 BENT = 0.6
-"""Bound for the error at the end of an extent, as a share of the change of slope over it."""
+"""Bound for the error at the end of an extent, as a fraction of the change of slope over it."""
 TINY = 1e-20
 
 Parts = tuple[Lanes, Lanes, Lanes, Lanes]
