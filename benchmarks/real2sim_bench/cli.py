@@ -1,4 +1,4 @@
-"""``real2sim bench``: what this machine takes for the work of a worker."""
+"""``real2sim bench``: commands that measure the performance of this machine."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ app = typer.Typer(
 
 
 LIBRARIES = ("real2sim", "numpy", "torch", "numba", "llvmlite")
-"""Those that decide how fast the code runs."""
+"""Libraries that determine performance."""
 
 
 class SoakFailedError(RuntimeError):
-    """The worker did not do what it should, or its memory grew."""
+    """The worker violated the protocol, or its memory grew."""
 
 
 @command("render", group=app)
@@ -75,7 +75,7 @@ def physics(
     if backend == "cuda":
         if peers:
             raise CommandError("--peers needs --backend cpu")
-        select_backend("cuda")  # Says what it lacks.
+        select_backend("cuda")  # Raises with the missing requirements.
     with progress("measuring") as report:
         figures = physics.run(peers=peers, backend=backend, on_progress=report)
     print_figures("particle-substeps per second", physics.as_rows(figures))
@@ -241,7 +241,7 @@ def detector(
 
 
 def _report(path: Path | None, figures: dict[str, Any]) -> None:
-    """Say what the figures were measured with, and write both where a path is given."""
+    """Print the environment of the figures; write both to ``path`` if it is given."""
 
     measured_with = environment()
     print_figures("measured with", measured_with)
@@ -249,11 +249,11 @@ def _report(path: Path | None, figures: dict[str, Any]) -> None:
 
 
 def environment() -> dict[str, str | int]:
-    """Versions of Python and of the libraries that compute, the operating system and the CPU.
+    """Versions of Python and of numerical libraries, operating system and CPU.
 
     Returns:
-        ``python``, one entry for each of LIBRARIES ("not installed" where it is absent),
-        ``system``, ``cpu`` (model) and ``cpu_threads``, those that this process may use.
+        ``python``, one entry for each of LIBRARIES ("not installed" if absent), ``system``, ``cpu``
+        (model), and ``cpu_threads`` available to this process.
     """
     return {
         "python": platform.python_version(),
@@ -272,7 +272,7 @@ def _version(library: str) -> str:
 
 
 def _cpu_model() -> str:
-    """The processor's name as Linux tells it, else what Python knows."""
+    """Name of the processor from Linux, else from Python."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

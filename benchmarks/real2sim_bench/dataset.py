@@ -1,8 +1,8 @@
-"""``real2sim bench dataset``: what a labelled frame costs beside its colours.
+"""``real2sim bench dataset``: cost of a labelled frame relative to its colour image.
 
-CPU time of this process, all threads, so that whoever shares the machine disturbs little: the least
-of several frames' drawings by the street of the demo, three cameras of 640x427. Frames a second are
-those of an export as it is written, with a LiDAR of 64 beams, on what the machine leaves over.
+CPU times are those of all threads of this process, which other load affects little. They are the
+minimum over several rounds of one frame of the demo street, with three cameras of 640x427. Frames
+per second are elapsed times of a complete export with a 64-beam LiDAR, and depend on other load.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ WIDTH = 640
 LIDAR = "hdl-64e"
 ROUNDS = 5
 FRAMES = 8
-"""Of the export that is timed."""
+"""Number of frames in the timed export."""
 
 STEP_US = 100_000
 Figures = dict[str, Any]
 
 
 def run(*, rounds: int = ROUNDS, frames: int = FRAMES) -> Figures:
-    """Milliseconds of CPU by part of a frame, their ratio to colours, and frames a second."""
+    """CPU time by part of a frame [ms], its ratio to the colour image, and frames per second."""
     scene = read_packed(SHIPPED)
     drive = ScenarioDrive(scene, ScenarioState.of(scene))
     cameras = [camera.resized(WIDTH) for camera in scene.rig]
@@ -59,7 +59,7 @@ def run(*, rounds: int = ROUNDS, frames: int = FRAMES) -> Figures:
 
 
 def _cpu_times(drive: ScenarioDrive, cameras: Sequence[Camera], rounds: int) -> Figures:
-    """Of one frame and its flow to the one before."""
+    """CPU times of a frame, and of its flow to the previous frame."""
     scene, t_us = drive.scene, sum(drive.span) // 2
     before, here = drive.at(t_us - STEP_US), drive.at(t_us)
     boxes = boxes_at(here.placed), boxes_at(before.placed)
@@ -85,7 +85,7 @@ def _cpu_times(drive: ScenarioDrive, cameras: Sequence[Camera], rounds: int) -> 
         ),
     }
     found = {name: float("inf") for name in parts}
-    for _ in range(rounds + 1):  # by turns; the first also compiles
+    for _ in range(rounds + 1):  # Interleaved; the first round also compiles.
         for name, part in parts.items():
             start = time.process_time()
             part()
@@ -106,7 +106,7 @@ def _flow(
 
 
 def _written(drive: ScenarioDrive, cameras: Sequence[Camera], frames: int) -> tuple[float, float]:
-    """Seconds, and seconds of CPU, of a frame of a clip with everything, as files."""
+    """Elapsed and CPU time per frame of a full export to files [s]."""
     plan = ExportPlan(formats=("labels",), period_us=STEP_US, clip_s=60.0, lidar=LIDAR)
     clip = planned_clips(drive, plan)[0]
     clip = replace(clip, times_us=clip.times_us[:frames])

@@ -1,8 +1,8 @@
-"""``real2sim bench detector``: what exported labels are worth to a detector.
+"""``real2sim bench detector``: quality of exported labels for training a detector.
 
-A small detector is trained twice: on frames of edited streets that were exported from a
-reconstruction, images and boxes both, and on the same frames by rays through the street that the
-reconstruction was made of. Both are tested on drives through other streets, by rays too.
+A small detector is trained twice: on images and boxes exported from edits of a reconstruction, and
+on the same frames ray-cast from the original synthetic street. Both are tested on ray-cast drives
+through other streets.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ EXPORTED, CAST = "trained on exported frames", "trained on ray-cast truth"
 
 @dataclass(frozen=True)
 class DetectorBenchOptions:
-    """How much is measured.
+    """Size of the benchmark.
 
     Attributes:
-        scene: bundle of a synthetic drive; None for the demo's street.
-        frames: that each detector is trained on.
-        epochs: of training.
-        drives: through other streets that both are tested on.
-        period_us: between frames of those.
-        width: of images [px].
-        seed: of edits, exports and training; drives have the seeds after that of the scene.
-        workers: processes that export.
-        camera: that sees everything.
+        scene: scene bundle of a synthetic drive; None for the demo street.
+        frames: training frames of each detector.
+        epochs: training epochs.
+        drives: test drives through other streets.
+        period_us: time between frames of test drives [us].
+        width: image width [px].
+        seed: seed of edits, exports and training; test drives use the seeds after the scene's.
+        workers: export processes.
+        camera: camera of all images.
     """
 
     scene: Path | None = None
@@ -108,7 +108,7 @@ def run(options: DetectorBenchOptions | None = None) -> Figures:
 def training_sets(
     scene: Scene, options: DetectorBenchOptions, folder: Path, report: Report
 ) -> dict[str, TrainingImages]:
-    """The same frames twice: exported, and by rays."""
+    """The same frames twice: exported, and ray-cast."""
     log, plan = true_log(scene), export_plan(options.camera, options.width, options.seed)
     drives = _drives(scene, plan, options)
     variants, out = drives(), folder / "export"
@@ -122,7 +122,7 @@ def training_sets(
 
 
 def _drives(scene: Scene, plan: ExportPlan, options: DetectorBenchOptions) -> EditedStreets:
-    """As many sweeps as give that many frames."""
+    """Sweeps that yield the requested number of frames."""
     one = EditedStreets.of(scene, 1, options.seed)
     frames = sum(len(clip.times_us) for clip in planned_shards(one(), plan))
     return EditedStreets.of(scene, -(-options.frames // frames), options.seed)
@@ -131,7 +131,7 @@ def _drives(scene: Scene, plan: ExportPlan, options: DetectorBenchOptions) -> Ed
 def train_both(
     pictures: dict[str, TrainingImages], options: DetectorBenchOptions, report: Report
 ) -> dict[str, Detector]:
-    """One detector a set, trained side by side, each on one core."""
+    """Train one detector per set in parallel, each on one core."""
 
     def train(name: str) -> Detector:
         return train_detector(
@@ -148,7 +148,7 @@ def train_both(
 def _withheld(
     scene: Scene, options: DetectorBenchOptions, report: Report
 ) -> tuple[np.ndarray[Any, np.dtype[np.uint8]], list[TrueBoxes]]:
-    """Images and objects of drives through streets that nobody was trained on."""
+    """Images and objects of the test drives."""
     own = SyntheticConfig.from_values(scene.provenance["config"])
     images, truth = [], []
     for k in range(options.drives):

@@ -1,7 +1,7 @@
-"""A small detector of one class: one stage, no anchors, trained on a CPU in minutes.
+"""A small single-class detector: one stage, anchor-free, trained on a CPU in minutes.
 
-After FCOS (Tian et al., ICCV 2019): every cell near the centre of an object says how likely it is
-one, and how far the four sides of its box are. About 0.3 million weights.
+After FCOS (Tian et al., ICCV 2019): every cell near the centre of an object predicts a score and
+the distances to the four sides of its box. About 0.3 million weights.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from torch.nn import functional
 # Average precision as COCO defines it, for one class.
 #
 # Source: Lin et al., "Microsoft COCO: Common Objects in Context", ECCV 2014, and its evaluation
-# page. Each detection, by falling score, matches the free object with the largest overlap.
-# Precision is made monotone, read at 101 recalls, and averaged over overlaps from 0.5 to 0.95.
-# Detections of ignored objects (small, hidden) do not count either.
+# page. Detections, by descending score, match the unmatched object with the largest overlap.
+# Precision is made monotone, sampled at 101 recalls, and averaged over overlaps from 0.5 to 0.95.
+# Ignored objects (small, hidden) and their detections do not count.
 
 Boxes = NDArray[np.float64]
 """[K, 4] left, top, right, bottom [px]."""
@@ -34,8 +34,8 @@ class TrueBoxes:
     """Objects of an image.
 
     Attributes:
-        boxes: of all of them.
-        counts: [K] bool, which are to be found.
+        boxes: boxes of all objects.
+        counts: [K] bool, whether each object must be detected.
     """
 
     boxes: Boxes
@@ -45,11 +45,11 @@ class TrueBoxes:
 def average_precision(
     found: Sequence[tuple[Boxes, NDArray[np.float64]]], truth: Sequence[TrueBoxes]
 ) -> dict[str, float]:
-    """``ap`` (overlaps of 0.5 to 0.95), ``ap50`` and ``ap75``, of 1.
+    """``ap`` (overlaps of 0.5 to 0.95), ``ap50`` and ``ap75``, each 0 to 1.
 
     Args:
         found: boxes and scores by image, best first.
-        truth: of the same images; at least one object counts.
+        truth: objects of the same images; at least one must count.
     """
     total = sum(int(one.counts.sum()) for one in truth)
     scores = np.concatenate([score for _, score in found])
@@ -68,7 +68,7 @@ def average_precision(
 def _matched(
     boxes: Boxes, truth: TrueBoxes, overlap: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which boxes [K] find an object, and which are not counted."""
+    """Masks [K] of boxes that match an object, and of boxes that are ignored."""
     hits, ignored = (np.zeros(len(boxes), np.bool_) for _ in range(2))
     shares = box_ious(boxes, truth.boxes)
     free = np.ones(len(truth.boxes), np.bool_)
@@ -104,15 +104,15 @@ def box_ious(one: Boxes, two: Boxes) -> Boxes:
 
 
 STRIDE = 8
-"""Pixels between the centres of cells, in both directions."""
+"""Distance of cell centres in both directions [px]."""
 NEAR_CENTRE = 1.5
-"""Cells within so many strides of an object's centre learn it."""
+"""Cells within this distance of an object's centre are positive [strides]."""
 PRIOR = 0.01
-"""Score of a cell before training."""
+"""Initial score of a cell."""
 ALPHA, GAMMA = 0.25, 2.0
 BATCH, RATE, DECAY = 16, 3e-3, 1e-4
 OVERLAP, MIN_SCORE, MOST = 0.55, 0.02, 100
-"""Of two boxes that overlap by more the better one is kept; those of a lower score are none."""
+"""IoU threshold of non-maximum suppression, minimum score, and maximum number of boxes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ class TrainingImages:
 
     Attributes:
         images: [N, H, W, 3] uint8.
-        boxes: of each image, [K, 4] left, top, right, bottom [px].
+        boxes: boxes of each image, [K, 4] left, top, right, bottom [px].
     """
 
     images: NDArray[np.uint8]
@@ -163,14 +163,16 @@ def train_detector(
     seed: int,
     on_progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Detector:
-    """Train by AdamW with a one-cycle rate, on images that are mirrored and of other brightness at
-    random; the same pictures and seed give the same weights.
+    """Train with AdamW and a one-cycle learning rate.
+
+    Images are randomly mirrored and changed in brightness. Weights are deterministic for images and
+    seed.
 
     Args:
-        pictures: at least one with an object.
-        epochs: passes over them.
-        seed: of weights, order and changes.
-        on_progress: called with (epochs done, all).
+        pictures: training images; at least one must have an object.
+        epochs: number of epochs.
+        seed: seed of weights, order and augmentation.
+        on_progress: callback with (epochs done, total).
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -215,7 +217,7 @@ def _scaled(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _loss(model: Detector, images: Tensor, boxes: Sequence[Boxes]) -> Tensor:
-    """Focal loss of scores, and 1 - GIoU of the boxes of cells that have an object."""
+    """Focal loss of scores, plus 1 - GIoU of the boxes of positive cells."""
     logits, sides = model(images)
     wanted = [_targets(own, logits.shape[1], logits.shape[2]) for own in boxes]
     target = torch.from_numpy(np.stack([found for _, found in wanted]))
@@ -233,7 +235,7 @@ def _loss(model: Detector, images: Tensor, boxes: Sequence[Boxes]) -> Tensor:
 def _targets(
     boxes: Boxes, height: int, width: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Which cells [h, w] learn an object, and its box [h, w, 4]; the smallest goes first."""
+    """Positive cells [h, w] and their boxes [h, w, 4]; the smallest object has precedence."""
     target = np.zeros((height, width, 4), np.float32)
     found = np.zeros((height, width), np.bool_)
     y, x = (np.mgrid[:height, :width] + 0.5) * STRIDE
@@ -244,7 +246,7 @@ def _targets(
         inside = (x > left) & (x < right) & (y > top) & (y < bottom)
         own = near & inside
         if not own.any():
-            # Smaller than a cell: the one that its centre is in.
+            # Smaller than a cell: use the cell that contains its centre.
             column, row = int((left + right) / 2 / STRIDE), int((top + bottom) / 2 / STRIDE)
             own[min(row, height - 1), min(column, width - 1)] = True
         target[own], found[own] = (left, top, right, bottom), True
@@ -252,7 +254,7 @@ def _targets(
 
 
 def _corners(sides: Tensor) -> Tensor:
-    """Boxes [N, h, w, 4] of the distances of sides from the centres of cells."""
+    """Boxes [N, h, w, 4] from the distances of their sides to the cell centres."""
     height, width = sides.shape[1:3]
     y = ((torch.arange(height) + 0.5) * STRIDE)[:, None].expand(height, width)
     x = ((torch.arange(width) + 0.5) * STRIDE)[None].expand(height, width)

@@ -1,7 +1,7 @@
-"""Edited streets for a detector: exported from a reconstruction, and ray-cast, frame by frame.
+"""Edited streets for a detector: exported from a reconstruction, and ray-cast from the truth.
 
-Both have the same vehicles at the same places, seen from the same poses; what differs is who drew
-the image and who made the boxes.
+Both have the same vehicles, poses and cameras, frame by frame. They differ in the source of images
+and boxes.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ from real2sim_server.synthetic import SyntheticConfig, SyntheticLog, generate_lo
 from .detector_model import TrainingImages, TrueBoxes
 
 REMOVED, ADDED, MOVED = 3, 4, 5
-"""Vehicles of a sweep that are taken away, doubled and moved."""
+"""Number of vehicles per sweep to delete, duplicate and move."""
 COPY = "__"
-"""Between the id of a vehicle and the number of its double."""
+"""Separator between a vehicle id and the number of its copy."""
 DRAWS = 10
-"""Drives of a sweep."""
+"""Drives per sweep."""
 PERIOD_US = 530_000
 PERTURBATION = Perturbation(lateral_sigma=0.4, heading_sigma=0.06, recover_s=4.0)
 TRIES = 50
 CLEAR = 0.5
-"""Doubles stand so far from everything else [m]."""
+"""Minimum distance of copies from other objects [m]."""
 EGO_CENTRE, EGO_ROOM = np.eye(4), (16.0, 3.5, 4.0)
-"""What is kept free about the ego: a box [m] about its rear axle."""
+"""Box around the rear axle of the ego that copies must not enter [m]."""
 MIN_PIXELS, MIN_SIDE = 40, 6.0
-"""An object counts from so many visible pixels and so large a box on [px]."""
+"""Minimum visible pixels and box side of an object that counts, in pixels of the final image."""
 FORMATS = ("coco", "labels")
 FINER = 2
-"""Pictures are drawn so many times finer, as the streets were recorded, and averaged: what a
-detector sees are pixels that integrate, as a camera's do, and boxes that end between them."""
+"""Supersampling factor. Images are drawn finer and averaged, so pixels integrate like a camera's,
+and boxes have subpixel edges."""
 
 
 @dataclass(frozen=True)
 class EditedStreets:
-    """Sweeps over a scene, each of DRAWS drives; what makes them in every worker of an export.
+    """Sweeps over a scene with DRAWS drives each; called in every worker of an export.
 
     Attributes:
-        scene: that is edited.
-        sweeps: parameters and edits.
-        seed: of the draws.
+        scene: scene to edit.
+        sweeps: parameters and edits of each sweep.
+        seed: seed of the draws.
     """
 
     scene: Scene
@@ -66,11 +66,11 @@ class EditedStreets:
 
     @classmethod
     def of(cls, scene: Scene, sweeps: int, seed: int) -> EditedStreets:
-        """So many sweeps, drawn by the seed."""
+        """Create ``sweeps`` random sweeps."""
         return cls(scene, tuple(edits_of(scene, number, seed) for number in range(sweeps)), seed)
 
     def __call__(self) -> list[Variant]:
-        """The drives of all sweeps."""
+        """Return the drives of all sweeps."""
         state = ScenarioState.of(self.scene)
         return [
             variant
@@ -80,10 +80,10 @@ class EditedStreets:
 
 
 def true_log(scene: Scene) -> SyntheticLog:
-    """The drive that a scene was reconstructed from.
+    """The synthetic drive that a scene was reconstructed from.
 
     Raises:
-        CommandError: it was not a synthetic one, so that nobody knows the truth.
+        CommandError: the drive is not synthetic, so there is no ground truth.
     """
     config = scene.provenance.get("config") if scene.objects else None
     if scene.provenance.get("reader") != "synthetic" or config is None:
@@ -95,8 +95,7 @@ def true_log(scene: Scene) -> SyntheticLog:
 
 
 def edits_of(scene: Scene, number: int, seed: int) -> DatasetSweep:
-    """The sweep of that number: some vehicles are gone, some are there twice, and some stand
-    elsewhere, drawn for each drive anew."""
+    """Sweep ``number``: deletes, duplicates and moves vehicles; moves differ between drives."""
     rng = np.random.default_rng([seed, number])
     names = rng.permutation(sorted(scene.objects)).tolist()
     removed = min(REMOVED, len(names) // 4)
@@ -118,7 +117,7 @@ def edits_of(scene: Scene, number: int, seed: int) -> DatasetSweep:
 
 
 def _doubles(scene: Scene, names: Sequence[str], rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Vehicles a second time, ahead of themselves or behind, where nothing else is."""
+    """Edits that duplicate vehicles, in free space ahead of or behind the original."""
     times = np.linspace(scene.start_us, scene.end_us, 25).astype(int).tolist()
     found: list[dict[str, Any]] = []
     state = ScenarioState.of(scene)
@@ -152,7 +151,7 @@ def _is_free(
 
 
 def export_plan(camera: str, width: int, seed: int) -> ExportPlan:
-    """About 20 frames of each drive, from beside its path, for pictures of that width."""
+    """Export plan with about 20 frames per drive, from perturbed paths, at the image width."""
     return ExportPlan(
         formats=FORMATS,
         cameras=(camera,),
@@ -166,7 +165,7 @@ def export_plan(camera: str, width: int, seed: int) -> ExportPlan:
 
 
 def exported_pictures(folder: Path) -> TrainingImages:
-    """Images and boxes of an export as a detector's loader reads them: from its COCO files."""
+    """Images and boxes of an export, read from its COCO files."""
     images, boxes = [], []
     content = json.loads((folder / "coco/annotations/instances_train.json").read_bytes())
     own: dict[int, list[list[float]]] = {}
@@ -187,13 +186,13 @@ def cast_pictures(
     camera: Camera,
     on_progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> TrainingImages:
-    """The frames of an export, in the same order, by rays through the street that they show.
+    """Ray-cast the frames of an export from the true street, in the same order.
 
     Args:
-        log: of the street.
-        folder: of the export.
-        camera: as fine as the export's.
-        on_progress: called with (frames done, all).
+        log: synthetic drive of the street.
+        folder: folder of the export.
+        camera: camera with the resolution of the export.
+        on_progress: callback with (frames done, total).
     """
     numbers = {track.object_id: k for k, track in enumerate(log.tracks)}
     frames = [frame for clip in _clips(folder) for frame in clip.frames]
@@ -217,7 +216,7 @@ def cast_pictures(
 def withheld_drive(
     config: SyntheticConfig, camera: str, width: int, period_us: int
 ) -> tuple[NDArray[np.uint8], list[TrueBoxes]]:
-    """Images [N, H, W, 3] of a synthetic drive as it is, by rays, and the objects in each."""
+    """Ray-cast images [N, H, W, 3] of an unedited synthetic drive, and the objects in each."""
     log = generate_log(config)
     lens = log.rig[camera].resized(width * FINER)
     images, boxes = [], []
@@ -230,7 +229,8 @@ def withheld_drive(
 
 
 def boxes_in(instance: NDArray[np.uint16]) -> TrueBoxes:
-    """Boxes of the objects of a finer instance image in pixels of the pictures, and which count."""
+    """Boxes [px of the final image] of the objects in a supersampled instance image, and which
+    count."""
     boxes, counts = [], []
     for number in np.unique(instance).tolist():
         mask = without_blobs(instance == number)
@@ -244,7 +244,7 @@ def boxes_in(instance: NDArray[np.uint16]) -> TrueBoxes:
 
 
 def _counts(pixels: int, width: float, height: float) -> bool:
-    """By the finer picture."""
+    """Whether an object counts; all arguments are in pixels of the supersampled image."""
     return pixels >= MIN_PIXELS * FINER**2 and min(width, height) >= MIN_SIDE * FINER
 
 

@@ -1,7 +1,7 @@
-"""A lean WebSocket client for drive sessions, which measures the worker and not its client.
+"""A lean WebSocket client for drive sessions, with little overhead in measurements.
 
 It uses one thread and reads each message directly from the socket. The websockets library only does
-the handshake and the close; messages are masked with zeros, which leaves them unchanged.
+the handshake and the close. Messages are masked with zeros, which leaves them unchanged.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from real2sim_proto.sessions import SessionInfo
 
 READ = 1 << 16
 STALLED_S = 60.0
-"""A message whose next part does not come within this time never will."""
+"""Timeout for the next part of a message [s]."""
 LENGTHS = {126: 2, 127: 8}
-"""Bytes of a payload's length behind a header that holds one of these numbers (RFC 6455, 5.2)."""
+"""Bytes of the extended payload length, by the length field of the header (RFC 6455, 5.2)."""
 LAST, OPCODE, LENGTH = 0x80, 0x0F, 0x7F
 MASKED, NO_MASK = 0x80, bytes(4)
 
 
 class LeanSocket:
-    """Use it in a ``with`` block; it speaks to servers that neither mask nor compress.
+    """A WebSocket connection, for use in a ``with`` block. Servers must neither mask nor compress.
 
     Args:
         url: ws://host:port/path.
-        subprotocol: to ask for.
+        subprotocol: requested subprotocol.
 
     Raises:
-        OSError: nobody listens there.
-        websockets.exceptions.InvalidHandshake: the server refuses.
+        OSError: the connection fails.
+        websockets.exceptions.InvalidHandshake: the server rejects the handshake.
     """
 
     def __init__(self, url: str, *, subprotocol: str) -> None:
@@ -71,24 +71,24 @@ class LeanSocket:
         self.close()
 
     def close(self) -> None:
-        """Leave; the server's own goodbye is not waited for."""
+        """Close the connection without waiting for the server's close frame."""
         self._protocol.send_close(1000)
-        with contextlib.suppress(OSError):  # The server may have been the first to go.
+        with contextlib.suppress(OSError):  # The server may have closed first.
             self._flush()
         self.socket.close()
 
     def send(self, message: bytes) -> None:
-        """One binary message."""
+        """Send a binary message."""
         self.socket.sendall(_head(len(message)) + message)
 
     def recv(self, timeout_s: float) -> bytes | bytearray:
-        """The next message as it came; pings on the way are answered.
+        """Receive the next message; pings are answered.
 
         Args:
-            timeout_s: to wait for something to come; a message that has begun is waited for.
+            timeout_s: timeout for the start of a message [s].
 
         Raises:
-            TimeoutError: nothing came; what comes later can still be read.
+            TimeoutError: no message started; later messages can still be read.
             ConnectionError: the server closed the connection, or stopped within a message.
         """
         while True:
@@ -109,7 +109,7 @@ class LeanSocket:
         self._protocol.send_request(self._protocol.connect())
         self._flush()
         while self._protocol.state is State.CONNECTING and self._protocol.handshake_exc is None:
-            # Byte by byte, for the first message may follow the handshake at once.
+            # Byte by byte, because the first message may follow the handshake immediately.
             self._protocol.receive_data(self._read(1))
         if self._protocol.handshake_exc is not None:
             raise self._protocol.handshake_exc
@@ -119,7 +119,7 @@ class LeanSocket:
             self.socket.sendall(data)
 
     def _message(self, timeout_s: float) -> tuple[int, bytes | bytearray]:
-        """Opcode and payload of the next message, its frames put together."""
+        """Opcode and payload of the next message, with its frames joined."""
         if not self._buffered:
             self._wait_at_most(timeout_s)
             self._buffered = self._read(READ)
@@ -135,13 +135,13 @@ class LeanSocket:
         return opcode, payload
 
     def _wait_at_most(self, timeout_s: float) -> None:
-        """A call of the system, spared where nothing changes."""
+        """Set the socket timeout; skips the system call if it is unchanged."""
         if timeout_s != self._timeout_s:
             self.socket.settimeout(timeout_s)
             self._timeout_s = timeout_s
 
     def _whole(self) -> tuple[int, bytes] | None:
-        """The next message where all of it has come in one frame, as small ones do."""
+        """The next message if it is complete in the buffer, in one frame; else None."""
         found, begin = self._buffered, 2
         if len(found) < begin or not found[0] & LAST:
             return None
@@ -191,7 +191,7 @@ class LeanSocket:
 
 
 def _head(size: int) -> bytes:
-    """Of a frame that is a whole binary message, masked by zeros."""
+    """Header of a frame with a whole binary message, masked with zeros."""
     first = LAST | Opcode.BINARY
     if size < min(LENGTHS):
         return bytes([first, MASKED | size]) + NO_MASK
@@ -210,19 +210,18 @@ POSES = [[SPEED * us * 1e-6, 0.0, 0.0] for us in AHEAD_US]
 
 
 class DriveProbe:
-    """Controls a session by messages made by hand; use it in a ``with`` block.
+    """Controls a session with hand-made messages, for use in a ``with`` block.
 
-    Pings are answered with the next message that is read, so read before the worker gives up.
+    Pings are only answered while a message is read, so read before the worker times out.
 
     Args:
-        info: of the session.
-        resume: of an earlier connection that this one goes on for: its resume token, and the step
-            of the last observation it has.
+        info: the session.
+        resume: resume token of an earlier connection, and the step of its last observation.
 
     Attributes:
-        socket: to the worker.
-        resume_token: with which a further connection may go on.
-        pushed: the last observation that nobody has asked for; None for none.
+        socket: connection to the worker.
+        resume_token: token to resume the session with another connection.
+        pushed: the last unrequested observation, or None.
     """
 
     def __init__(self, info: SessionInfo, *, resume: tuple[str, int] | None = None) -> None:
@@ -260,21 +259,21 @@ class DriveProbe:
     def reset(
         self, sensors: Sequence[Mapping[str, Any]], *, dt_us: int, **spec: Any
     ) -> tuple[dict[str, Any], float]:
-        """Begin an episode; its first observation and the seconds it took."""
+        """Start an episode; returns its first observation and the elapsed time [s]."""
         fields = {"dt_us": dt_us, "sensors": list(sensors), **spec}
         return self._accepted({"type": "reset", "spec": fields})
 
     def act(self, obs: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
-        """Drive straight on; the next observation and the seconds until its bytes were here."""
+        """Drive straight on; returns the next observation and the time until its arrival [s]."""
         return self._accepted(action(obs))
 
     def send(self, fields: Mapping[str, Any]) -> None:
-        """Send a message and wait for nothing."""
+        """Send a message without waiting for a reply."""
         self._id += 1
         self.socket.send(encode({"v": 1, "id": self._id, **fields}))
 
     def ask(self, fields: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
-        """The answer to a message, be it an error, and the seconds it took."""
+        """Send a message; returns the reply, which may be an error, and the elapsed time [s]."""
         started = time.perf_counter()
         self.send(fields)
         while True:
@@ -287,8 +286,8 @@ class DriveProbe:
                 return answer, seconds
 
     def listen(self, seconds: float, *, until_pushed: float = 0.0) -> None:
-        """Take what comes unasked for so long, and on until something came, if that takes less
-        than ``until_pushed`` seconds."""
+        """Receive unrequested messages for ``seconds``; if none arrives, wait up to
+        ``until_pushed`` seconds for one."""
         self.pushed, started = None, time.monotonic()
         while True:
             wanted = until_pushed if self.pushed is None else seconds
@@ -308,7 +307,7 @@ class DriveProbe:
 
 
 def action(obs: Mapping[str, Any]) -> dict[str, Any]:
-    """Straight on after an observation."""
+    """Action that drives straight on after an observation."""
     return {"type": "action", "step": obs["step"], "plan": straight_on(obs["t_us"])}
 
 

@@ -1,8 +1,8 @@
-"""``real2sim bench edit``: what an edit costs, what a thousand of them cost later, and how fast
-pictures follow an object that is dragged.
+"""``real2sim bench edit``: latency of an edit, of opening a scenario with many edits, and of
+previews while an object is dragged.
 
-Measured from outside over loopback, with a worker in a process of its own. Between writing and
-opening that process is killed, so that what is opened comes from the disk.
+Measured by a client over loopback, with the worker in a separate process. The worker is killed
+before the scenario is opened, so it is read from disk.
 """
 
 from __future__ import annotations
@@ -47,24 +47,24 @@ from real2sim_server.synthetic.gaussian_street import street
 
 from .serve import percentiles
 
-# Pictures of an object while it is dragged, over the view socket as in the studio.
+# Previews of an object while it is dragged, over the view socket as in the studio.
 
 SUBJECT, T_US = "van_0", 5_250_000
-"""What is dragged on the demo's street, and when: the van ahead, four metres from the camera."""
+"""Dragged object of the demo street, and time [us]: the van ahead, 4 m from the camera."""
 CAMERA, WIDTH = "front", 640
 REACH = 3.5
-"""It is dragged to the next lane and back [m]."""
+"""Lateral drag distance, to the next lane and back [m]."""
 ROUND = 40
-"""Pictures from one end to the other and back."""
+"""Previews per round trip."""
 WARM_UP = 10
 ANSWER_S = 60.0
 
 
 def drag(url: str, *, scene: str, frames: int) -> tuple[list[float], list[int]]:
-    """Times [ms] from a question to its picture, and the size (width, height) of the pictures.
+    """Times [ms] from request to preview, and the size (width, height) of previews.
 
-    Like the studio while a box is dragged on the map: a picture of the object at a new place is
-    asked for as soon as the last one is here, so that a second holds as many pictures as fit.
+    Like the studio while a box is dragged on the map: each preview is requested as soon as the
+    previous one arrives.
     """
     with real2sim.connect(url) as client:
         client.wait_ready()
@@ -117,7 +117,7 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True)
 class EditBenchOptions:
-    """How much is measured: edits on one scenario, Gaussians of its scene, previews of a drag."""
+    """Size of the benchmark: edits of a scenario, Gaussians of its scene, previews of a drag."""
 
     operations: int = 1000
     gaussians: int = 100_000
@@ -125,11 +125,11 @@ class EditBenchOptions:
 
 
 def run(options: EditBenchOptions | None = None) -> Figures:
-    """Edit one scenario many times, kill the worker, and open it again; figures in milliseconds.
+    """Edit a scenario many times, kill the worker, and open it again; figures in milliseconds.
 
-    ``append`` is the time from sending an edit to its answer, which is on disk by then; ``open``
-    that of the first answer about the scenario from a new process, ``describe`` that of later ones;
-    ``preview`` the time from asking for a picture of a moved object to having it.
+    ``append`` is the time from sending an edit to its response, when it is on disk. ``open`` is the
+    time of the first response about the scenario from a new process, ``describe`` that of later
+    ones. ``preview`` is the time from requesting an image of a moved object to receiving it.
     """
     options = options or EditBenchOptions()
     console = Console()
@@ -179,7 +179,7 @@ def _append(url: str, count: int) -> tuple[str, list[float]]:
     path = f"/v1/scenarios/{scenario.scenario_id}/operations"
     address = urlsplit(url)
     times = []
-    # With nothing of a client's own work between the request's bytes and those of the answer.
+    # Raw HTTP, to exclude client overhead between request and response.
     with closing(HTTPConnection(address.hostname or "", address.port)) as http:
         for operation in _edits(cars, count):
             body = json.dumps({"operations": [OPERATION.dump_python(operation, mode="json")]})
@@ -194,7 +194,7 @@ def _append(url: str, count: int) -> tuple[str, list[float]]:
 
 
 def _edits(cars: list[str], count: int) -> list[Operation]:
-    """All kinds that an author uses, most of them small moves, as of a drag in the browser."""
+    """Edits of all common kinds; most are small moves, as from dragging in the browser."""
     choose = random.Random(0)
     edits: list[Operation] = []
     while len(edits) < count:

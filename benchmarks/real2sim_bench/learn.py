@@ -1,7 +1,7 @@
-"""``real2sim bench learn``: steps and images a second, for planners that learn.
+"""``real2sim bench learn``: steps and images per second for learned planners.
 
-Each figure stands beside what it replaces, measured in the same run: worlds in a batch beside a
-single world, small images beside those of all Gaussians, many sessions beside one.
+Each figure is compared with its alternative in the same run: batched worlds with a single world,
+small images with images of all Gaussians, many sessions with one.
 """
 
 from __future__ import annotations
@@ -46,29 +46,29 @@ from real2sim_server.world.batch import BatchWorld
 
 from .drive_probe import ANSWER_S, DriveProbe, action
 
-# The upper bound: a server on the worker's own stack that answers each action with a prepared
-# observation. It has no world, no log and no accounts.
+# Upper bound: an echo server on the worker's stack, without world and log, that answers each action
+# with a prepared observation.
 
 Answer = Callable[[bytes], bytes]
-"""The message that answers an action."""
+"""Returns the reply to an action."""
 
 HOST = "127.0.0.1"
 ECHO_START_S = 300.0
 ECHOED = ("bytes", "messages")
-"""Paths of such a server: it answers by bytes as they are, or reads and checks each action as a
-worker does and packs each observation anew."""
+"""Paths of an echo server: it replies with prepared bytes, or it parses and validates each action
+like a worker and serialises each observation."""
 
 
 @contextlib.contextmanager
 def echo_servers(count: int, observation: bytes) -> Iterator[list[str]]:
-    """Where so many servers listen, each in a process of its own.
+    """Run echo servers in separate processes; yields their URLs.
 
     Args:
-        count: of them.
-        observation: that answers every action, with the id that it has, which is not 0.
+        count: number of servers.
+        observation: reply to every action, unchanged; its id must not be 0.
 
     Raises:
-        RuntimeError: one has not started.
+        RuntimeError: a server does not start.
     """
     spawning = multiprocessing.get_context("spawn")
     with contextlib.ExitStack() as running:
@@ -82,7 +82,7 @@ def echo_servers(count: int, observation: bytes) -> Iterator[list[str]]:
 
 
 def echo_session(url: str) -> SessionInfo:
-    """A session as a client of such a server knows it."""
+    """Session info of an echo server for a client."""
     return SessionInfo(
         session_id="echo", scene="none", ws_url=url, token="", created_at="", reset=ResetSpec()
     )
@@ -96,7 +96,7 @@ def _told(way: Connection) -> str:
 
 
 def _serve(told: Connection, observation: bytes) -> None:
-    """A process of its own, until it is terminated."""
+    """Main function of a server process; runs until terminated."""
     listener = bind(HOST, 0)
     listen(listener)
     told.send(url_of(HOST, listener).replace("http", "ws", 1))
@@ -113,7 +113,7 @@ def _serve(told: Connection, observation: bytes) -> None:
 
 
 def echo_app(observation: bytes) -> ASGIApp:
-    """What such a server runs: a connection is answered by its path, which is one of ``ECHOED``."""
+    """ASGI app of an echo server; the path of a connection is one of ``ECHOED``."""
     fields = unpack(observation)
 
     def read_and_packed(action: bytes) -> bytes:
@@ -123,7 +123,7 @@ def echo_app(observation: bytes) -> ASGIApp:
     answers = dict(zip(ECHOED, (lambda _action: observation, read_and_packed), strict=True))
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        # A client that leaves is no error.
+        # A disconnecting client is no error.
         with contextlib.suppress(WebSocketDisconnect):
             await _echo(WebSocket(scope, receive, send), answers[scope["path"].strip("/")])
 
@@ -131,7 +131,7 @@ def echo_app(observation: bytes) -> ASGIApp:
 
 
 async def _echo(socket: WebSocket, answer: Answer) -> None:
-    """Hello, reset, and actions."""
+    """Handle hello, reset and actions."""
     await socket.accept(subprotocol=DRIVE_SUBPROTOCOL)
     hello: dict[str, Any] = unpack(await socket.receive_bytes())
     welcome = {"v": 1, "type": "welcome", "id": hello["id"], "resume_token": ""}
@@ -140,15 +140,15 @@ async def _echo(socket: WebSocket, answer: Answer) -> None:
         await socket.send_bytes(answer(await socket.receive_bytes()))
 
 
-# Steps per second over sockets, for one worker and for two, next to the echo server. Planners share
-# the machine with the worker, so they do as little as possible.
+# Steps per second over sockets, for one and two workers, compared with the echo server. Planners
+# run on the same machine as the worker, so they do as little as possible.
 
 Figures = dict[str, Any]
 
 Drive = Callable[[int], None]
-"""Makes so many steps in sum, and a few more."""
+"""Makes at least the given total number of steps."""
 Driving = Callable[[str, int], AbstractContextManager[Drive]]
-"""Connects so many planners to the server at a URL."""
+"""Connects a number of planners to the server at a URL."""
 
 SCENE = "street"
 SHORT_STEP_US = 1_000
@@ -156,12 +156,12 @@ START_S, DRIVE_S = 120.0, 600.0
 
 
 def of_one_worker(sessions: int, steps: int, *, echo: bool = True) -> Figures:
-    """One session alone, and many on a socket each.
+    """Measure a single session, and many sessions with a socket each.
 
     Args:
-        sessions: driven at once.
-        steps: of each.
-        echo: whether they stand beside servers without worlds.
+        sessions: number of concurrent sessions.
+        steps: steps per session.
+        echo: whether to compare with echo servers.
     """
     with _workers(1) as (url,):
         one = _sessions_rate(_sessions, url, 1, steps)
@@ -181,7 +181,7 @@ def of_one_worker(sessions: int, steps: int, *, echo: bool = True) -> Figures:
 
 
 def of_two_workers(sessions: int, steps: int, *, echo: bool = True) -> Figures:
-    """Half of the sessions on each of two workers, each half driven by a process of its own."""
+    """Measure two workers with half of the sessions each; each has its own client process."""
     half = sessions // 2
 
     def rate(driving: Driving, urls: list[str]) -> float:
@@ -199,8 +199,7 @@ def of_two_workers(sessions: int, steps: int, *, echo: bool = True) -> Figures:
 def _beside_echoes(
     rate: float, observation: bytes, rate_of: Callable[[list[str]], float], *, servers: int = 1
 ) -> Figures:
-    """Answers a second of servers without worlds: such as only pass bytes, and such as also read
-    each action and pack each observation; and what of these ``rate`` is."""
+    """Replies per second of echo servers by path in ``ECHOED``, and ``rate`` relative to them."""
     figures: Figures = {}
     with echo_servers(servers, observation) as urls:
         for what in ECHOED:
@@ -210,7 +209,7 @@ def _beside_echoes(
 
 
 def _observation(url: str) -> bytes:
-    """One of a session of a worker, as it is sent."""
+    """A serialised observation of a worker's session."""
     with real2sim.connect(url) as client:
         info = client.sessions.create(scene=SCENE)
         with DriveProbe(info) as probe:
@@ -221,7 +220,7 @@ def _observation(url: str) -> bytes:
 
 @contextlib.contextmanager
 def _workers(count: int) -> Iterator[list[str]]:
-    """Where so many workers listen, each with a store of its own."""
+    """Run workers with separate data folders; yields their URLs."""
     with (
         tempfile.TemporaryDirectory(prefix="real2sim-bench-") as folder,
         contextlib.ExitStack() as running,
@@ -243,7 +242,7 @@ def _sessions_rate(driving: Driving, url: str, count: int, steps: int) -> float:
 
 
 class _Meeting(NamedTuple):
-    """Of clients that begin together: where they wait, and where each puts its seconds."""
+    """Synchronisation of clients: the start barrier, and the queue of their times [s]."""
 
     together: Any
     found: Any
@@ -252,7 +251,7 @@ class _Meeting(NamedTuple):
 def _driven_beside_each_other(
     driving: Driving, urls: list[str], count: int, steps: int
 ) -> list[float]:
-    """How long each of several clients takes [s], which begin together."""
+    """Times of client processes that start simultaneously [s]."""
     spawning = multiprocessing.get_context("spawn")
     meeting = _Meeting(spawning.Barrier(len(urls)), spawning.SimpleQueue())
     clients = [
@@ -269,7 +268,7 @@ def _driven_beside_each_other(
 
 
 def _drive(driving: Driving, url: str, count: int, steps: int, meeting: _Meeting) -> None:
-    """A client in a process of its own."""
+    """Main function of a client process."""
     with driving(url, count) as drive:
         drive(count)
         meeting.together.wait(START_S)
@@ -278,7 +277,7 @@ def _drive(driving: Driving, url: str, count: int, steps: int, meeting: _Meeting
 
 @contextlib.contextmanager
 def _sessions(url: str, count: int) -> Iterator[Drive]:
-    """Drives sessions of a worker, on a socket each."""
+    """Drive sessions of a worker, one socket each."""
     with real2sim.connect(url) as client:
         client.wait_ready()
         infos = [client.sessions.create(scene=SCENE) for _ in range(count)]
@@ -290,7 +289,7 @@ def _sessions(url: str, count: int) -> Iterator[Drive]:
 
 @contextlib.contextmanager
 def _echoes(url: str, count: int) -> Iterator[Drive]:
-    """The same of a server without worlds."""
+    """Drive sessions of an echo server, one socket each."""
     with _planners([echo_session(url)] * count) as drive:
         yield drive
 
@@ -329,7 +328,7 @@ def _seconds(call: Callable[[], None]) -> float:
 
 SIZE = 84
 LARGER = 6
-"""How many times as large the image is that is scaled down as the truth."""
+"""Scale of the large image that is downscaled as ground truth."""
 IMAGE_TIMES_S = (0.0, 2.0, 5.0, 8.0)
 FULL = RasterOptions(depth=False, instance=False)
 REDUCED = RasterOptions(depth=False, instance=False, detail="auto")
@@ -337,16 +336,16 @@ REDUCED = RasterOptions(depth=False, instance=False, detail="auto")
 
 @dataclass(frozen=True)
 class LearnBenchOptions:
-    """How much is measured.
+    """Size of the benchmark.
 
     Attributes:
-        worlds: of a batch.
-        steps: of the batch, of each kind.
-        image_steps: of the environment with images.
-        repetitions: of a single image; the best counts.
-        sessions: that are driven over sockets at once.
-        socket_steps: of each.
-        echo: whether they stand beside servers without worlds.
+        worlds: worlds per batch.
+        steps: steps of the batch, for each kind of traffic.
+        image_steps: steps of the environment with images.
+        repetitions: repetitions of a single image; the best counts.
+        sessions: number of concurrent sessions over sockets.
+        socket_steps: steps per session.
+        echo: whether to compare sessions with echo servers.
     """
 
     worlds: int = 64
@@ -372,7 +371,7 @@ def run(options: LearnBenchOptions | None = None) -> Figures:
 
 
 def batched_worlds(scene: Scene, options: LearnBenchOptions) -> Figures:
-    """World steps a second, in a batch and one by one."""
+    """World steps per second, batched and single."""
     return {
         traffic: _batched(scene, ResetSpec(action="control", agents={"default": traffic}), options)
         for traffic in ("log", "idm")
@@ -397,7 +396,7 @@ def _batched(scene: Scene, spec: ResetSpec, options: LearnBenchOptions) -> Figur
 
 
 def _single_rate(scene: Scene, spec: ResetSpec, steps: int) -> float:
-    """Steps a second of one world; making the next one when it is over does not count."""
+    """Steps per second of a single world, excluding the creation of the next world."""
     state = ScenarioState.of(scene)
     plan = Control(acceleration=0.5, steering=0.0)
     world = World(scene, state, spec)
@@ -413,7 +412,7 @@ def _single_rate(scene: Scene, spec: ResetSpec, steps: int) -> float:
 
 
 def vector_environment(_scene: Scene, options: LearnBenchOptions) -> Figures:
-    """Images a second of the environment, steps of its worlds included."""
+    """Images per second of the environment, including world steps."""
     env = VectorDriveEnv(
         options.worlds,
         cameras=["front"],
@@ -433,7 +432,7 @@ def vector_environment(_scene: Scene, options: LearnBenchOptions) -> Figures:
 
 
 def small_images(scene: Scene, options: LearnBenchOptions) -> Figures:
-    """Milliseconds of one image, and how near it is to a large one scaled down."""
+    """Milliseconds per image, and PSNR against a downscaled large image."""
     rows = [_small_image(scene, t, options.repetitions) for t in IMAGE_TIMES_S]
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return {
@@ -473,13 +472,13 @@ def _small_image(scene: Scene, seconds: float, repetitions: int) -> dict[str, fl
 
 
 def sessions_over_sockets(_scene: Scene, options: LearnBenchOptions) -> Figures:
-    """Steps a second of sessions without cameras, see :mod:`.socket_sessions`."""
+    """Steps per second of sessions without cameras, see :func:`of_one_worker`."""
     steps, echo = options.socket_steps, options.echo
     return of_one_worker(options.sessions, steps, echo=echo)
 
 
 def sessions_of_two_workers(_scene: Scene, options: LearnBenchOptions) -> Figures:
-    """The same sessions, half of them in a second worker on the same machine."""
+    """Like :func:`sessions_over_sockets`, with half of the sessions in a second worker."""
     steps, echo = options.socket_steps, options.echo
     return of_two_workers(options.sessions, steps, echo=echo)
 
@@ -494,7 +493,7 @@ PARTS: dict[str, Callable[[Scene, LearnBenchOptions], Figures]] = {
 
 
 def _rate(call: Callable[[], int], times: int) -> float:
-    """What calls say that they did, a second."""
+    """Sum of the results of ``times`` calls, per second."""
     started = time.perf_counter()
     done = sum(call() for _ in range(times))
     return done / (time.perf_counter() - started)

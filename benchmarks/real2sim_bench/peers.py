@@ -1,4 +1,4 @@
-"""The same physics in other frameworks: what a peer gets and returns, and which are installed."""
+"""The same physics in other frameworks: their interface, and which are installed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 CELLS = 40
-"""Nodes along an edge of the peers' dense grid; it reaches from the origin to CELLS dx."""
+"""Nodes along an edge of the peers' dense grid, which extends from the origin to CELLS dx."""
 
 Single = NDArray[np.float32]
 
@@ -21,11 +21,11 @@ class PeerBlock:
 
     Attributes:
         positions, velocities: [N, 3] [m], [m/s]; all stay inside the grid.
-        mass, volume: of one particle [kg], [m^3].
-        mu, lam: Lame's constants [Pa].
-        dx, dt: cell [m] and substep [s].
-        gravity: along z [m/s^2].
-        threads: to use.
+        mass, volume: mass [kg] and volume [m^3] of a particle.
+        mu, lam: Lame parameters [Pa].
+        dx, dt: cell size [m] and substep [s].
+        gravity: acceleration along z [m/s^2].
+        threads: number of threads.
     """
 
     positions: Single
@@ -42,11 +42,11 @@ class PeerBlock:
 
 @dataclass(frozen=True, eq=False)
 class PeerRun:
-    """A block in motion elsewhere.
+    """A simulation of a block in another framework.
 
     Attributes:
-        advance: makes that many substeps and waits for them.
-        positions: gives [N, 3] in the order of the block [m].
+        advance: runs a number of substeps and waits for them.
+        positions: returns positions [N, 3] in the order of the block [m].
     """
 
     advance: Callable[[int], None]
@@ -57,14 +57,14 @@ PEERS = ("taichi", "warp")
 
 
 def missing_reason(peer: str) -> str:
-    """Why a peer cannot run here, or nothing."""
+    """Reason why a peer cannot run here; empty if it can."""
     if importlib.util.find_spec(peer) is None:
         return f"{peer} is not installed"
     return ""
 
 
 def start_peer(peer: str, block: PeerBlock) -> PeerRun:
-    """Load a block into the peer of that name; only here is it imported."""
+    """Load a block into a peer, which is imported on demand."""
     if peer == "taichi":
         from .taichi_peer import start
     else:

@@ -1,4 +1,4 @@
-"""``real2sim bench physics``: particle-substeps per second, and what they depend on."""
+"""``real2sim bench physics``: particle substeps per second, and times of whole crashes."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from real2sim_server.simulation.tyres import Tyres
 
 from .peers import PEERS, PeerBlock, missing_reason, start_peer
 
-# Whole crashes and rolling vehicles: matter, rigid motion, contacts and tyres together. Bodies use
-# the ``vehicle`` preset and the time step of every simulation.
+# Whole crashes and rolling vehicles: material, rigid motion, contacts and tyres. Bodies use the
+# ``vehicle`` preset and the time step of all simulations.
 
 CAR, CRASH_CAR_MASS = (4.5, 1.8, 1.5), 1500.0
 TRUCK, TRUCK_MASS = (8.0, 2.5, 3.2), 20_000.0
 CONE, CONE_MASS = (0.4, 0.4, 0.7), 3.0
 CRASH_SPACING, CONE_SPACING = 0.125, 0.1
-"""Of particles of vehicles, and of the cone's [m]."""
+"""Particle spacing of vehicles and of the cone [m]."""
 CLEARANCE = 0.25
-"""Of bodies above the road: the wheels' [m]."""
+"""Ground clearance of vehicle bodies [m]."""
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 def _two_cars() -> list[DeformableBody]:
-    """One at 15 m/s into the rear of another that stands."""
+    """A car at 15 m/s hits the rear of a stationary one."""
     standing = _vehicle("standing", "car", CAR, CRASH_CAR_MASS, (CAR[0] + 0.05, 0.0))
     return [_vehicle("running", "car", CAR, CRASH_CAR_MASS, (0.0, 0.0), speed=15.0), standing]
 
 
 def _truck_and_cone() -> list[DeformableBody]:
-    """A truck at 8 m/s throws a cone aside."""
+    """A truck at 8 m/s hits a cone off-centre."""
     place = (TRUCK[0] + CONE[0]) / 2 + 0.2, 0.6, CONE[2] / 2
     cone = _body("cone", "cone", CONE, CONE_MASS, place, spacing=CONE_SPACING)
     truck = _vehicle("truck", "truck", TRUCK, TRUCK_MASS, (0.0, 0.0), speed=8.0, spacing=0.25)
@@ -52,7 +52,7 @@ def _truck_and_cone() -> list[DeformableBody]:
 
 
 def _car_on_a_car() -> list[DeformableBody]:
-    """A car comes down on the roof of another from 5 cm above it."""
+    """A car drops from 5 cm onto the roof of another."""
     return [
         _vehicle("under", "car", CAR, CRASH_CAR_MASS, (0.0, 0.0)),
         _vehicle("over", "car", CAR, CRASH_CAR_MASS, (0.3, 0.0), above=CAR[2] + 0.05),
@@ -60,7 +60,7 @@ def _car_on_a_car() -> list[DeformableBody]:
 
 
 def _rolling() -> list[DeformableBody]:
-    """A car at 10 m/s that nothing brakes."""
+    """A car rolls at 10 m/s without braking."""
     return [_vehicle("rolling", "car", CAR, CRASH_CAR_MASS, (0.0, 0.0), speed=10.0, brake=0.0)]
 
 
@@ -70,11 +70,11 @@ SITUATIONS: dict[str, tuple[Callable[[], list[DeformableBody]], float, float]] =
     "car on a car, 3 s": (_car_on_a_car, 3.0, 10.0),
     "a car that rolls, 1 s": (_rolling, 1.0, 0.02),
 }
-"""By name: the bodies, how long they are followed [s], and in what time they should be [s]."""
+"""By name: bodies, simulated time [s], and target for the elapsed time [s]."""
 
 
 def measure(name: str) -> dict[str, Any]:
-    """Elapsed and processor time of a situation [s], once all it needs is compiled."""
+    """Elapsed and processor time of a situation [s], excluding compilation."""
     build, seconds, target = SITUATIONS[name]
     _follow(build(), seconds=0.15)
     world = _world(build())
@@ -92,7 +92,7 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def as_row(line: dict[str, Any]) -> str:
-    """A line for a person."""
+    """The figures of a situation as text."""
     unit, factor = ("s", 1.0) if line["target_s"] >= 1 else ("ms", 1e3)
     shown = [f"{factor * line[k]:.3g} {unit}" for k in ("elapsed_s", "processor_s", "target_s")]
     return f"{shown[0]}, {shown[1]} of processors; {shown[2]} wanted"
@@ -130,7 +130,7 @@ def _vehicle(
     above: float = 0.0,
     spacing: float = CRASH_SPACING,
 ) -> DeformableBody:
-    """On its wheels, or ``above`` where it would stand [m]."""
+    """A vehicle on its wheels, raised by ``above`` [m]."""
     at = (*place, size[2] / 2 + above)
     body = _body(name, category, size, mass, at, spacing=spacing, clearance=CLEARANCE, speed=speed)
     centre: Float = body.rest.centre_of_mass
@@ -149,7 +149,7 @@ def _body(
     clearance: float = 0.0,
     speed: float = 0.0,
 ) -> DeformableBody:
-    """A block of the preset's structure, filled from ``clearance`` above its underside up [m]."""
+    """A block with the preset's structure, filled from ``clearance`` [m] above its underside."""
     lifted = transform_from(np.array([0.0, 0.0, clearance / 2]), np.array(UPRIGHT))
     block = box_particles((*size[:2], size[2] - clearance), spacing=spacing, density=1.0)
     filled = block.with_mass(mass).moved(lifted)
@@ -174,27 +174,27 @@ MATERIALS: dict[str, Material] = {
     "neo_hookean": NeoHookean(young=2e6, poisson=0.4),
 }
 VEHICLE = "vehicle_structure"
-"""A block of what cars of the ``vehicle`` preset are made of, all zones."""
+"""Name of a block with all zones of the ``vehicle`` preset."""
 VEHICLE_DENSITY = 150.0
-"""Of that block before its zones share mass out [kg/m^3]."""
+"""Density of that block before its zones redistribute mass [kg/m^3]."""
 PARTICLES_PER_CELL = 14
 SPACING = 0.05
 REPEATS = 8
-"""The best of this many runs counts: other work on the machine only ever makes them slower."""
+"""Number of runs; the best counts, because other load only slows runs down."""
 SECONDS_PER_RUN = 0.3
 REFERENCE_PARTICLES = 2_000
 PEER_PARTICLES = 100_000
 PEER_TURNS = 3
 PEER_STEPS = 30
-"""After so many substeps peers must have fallen as far."""
+"""Substeps after which the falling distance is compared with that of peers."""
 TARGETS = {"fixed_corotated": 10e6, "neo_hookean": 13e6, VEHICLE: 8e6}
-"""Particle-substeps per second of 100,000 particles on two cores."""
+"""Target particle substeps per second with 100,000 particles on two cores."""
 CUDA_TARGETS = dict.fromkeys(TARGETS, 500e6)
-"""The same of a million particles on an H200."""
+"""Target particle substeps per second with 1,000,000 particles on an H200."""
 CAR_SIZE, CAR_MASS, CAR_SPEED = (4.5, 1.8, 1.4), 1500.0, 15.7
-"""Of the car that is driven against a wall [m], [kg], [m/s]."""
+"""Size [m], mass [kg] and speed [m/s] of the car that hits a wall."""
 CRASH_SECONDS = 0.08
-"""While its front gives way."""
+"""Simulated time of the wall crash, while the front deforms [s]."""
 
 
 def run(
@@ -206,14 +206,14 @@ def run(
     """Measure the solver and return the figures.
 
     Args:
-        peers: also measure other frameworks, in the same process on the same block.
-        backend: ``cpu`` or ``cuda``; of the latter the rates alone, and bytes of a substep.
-        on_progress: takes (parts done, parts).
+        peers: also measure other frameworks on the same block, in the same process.
+        backend: ``cpu`` or ``cuda``; ``cuda`` only measures rates and memory traffic.
+        on_progress: callback with (parts done, total).
 
     Returns:
-        Figures as JSON takes them. ``rate`` is in particle-substeps per second, elapsed, the best
-        of REPEATS runs; ``cpu_rate`` is per second of processor time and thread, which says what
-        an otherwise idle machine would do.
+        Figures as JSON values. ``rate`` is in particle substeps per second of elapsed time, the
+        best of REPEATS runs. ``cpu_rate`` is per second of processor time and thread, an estimate
+        for an otherwise idle machine.
     """
     report_progress = on_progress or (lambda done, parts: None)
     cases = [(m, n) for m in (*MATERIALS, VEHICLE) for n in SIZES]
@@ -252,7 +252,7 @@ def run(
 
 
 def as_rows(figures: dict[str, Any]) -> dict[str, str]:
-    """The figures as lines for a person."""
+    """The figures as text, by name."""
     rows = {"backend": figures["backend"], "threads": str(figures["threads"])}
     for line in figures["speed"]:
         name = f"{line['material'].replace('_', ' ')}, {line['particles']:,} particles"
@@ -282,7 +282,7 @@ def as_rows(figures: dict[str, Any]) -> dict[str, str]:
 
 
 def _speed(material: str, particles: int, backend: str) -> dict[str, Any]:
-    """Rate of a turning, falling block of about that many particles."""
+    """Rate of a rotating, falling block of about ``particles`` particles."""
     solver = Solver([_block(material, particles)], [Plane(name="ground")], _options(backend))
     elapsed, processor = _time_substep(solver)
     count = len(solver.model.masses)
@@ -298,7 +298,7 @@ def _speed(material: str, particles: int, backend: str) -> dict[str, Any]:
 
 
 def _traffic(solver: Solver, elapsed: float) -> dict[str, Any]:
-    """Bytes of a substep on the device, counted, and how fast that moved them."""
+    """Counted memory traffic of a substep on the device [bytes], and its bandwidth [bytes/s]."""
     from real2sim_server.physics.backends.cuda.memory import substep_traffic
 
     simulation: Any = solver.simulation
@@ -315,14 +315,14 @@ def _traffic(solver: Solver, elapsed: float) -> dict[str, Any]:
 
 
 def _nodes(cells: Any) -> int:
-    """Nodes of the grid that particles at ``cells`` [N, 3] give to."""
+    """Number of grid nodes touched by particles at ``cells`` [N, 3]."""
     first = np.unique(np.floor(cells - 0.5).astype(np.int64), axis=0)
     offsets = np.stack(np.meshgrid(*[range(3)] * 3), axis=-1).reshape(-1, 3)
     return len(np.unique((first[:, None] + offsets).reshape(-1, 3), axis=0))
 
 
 def _domain() -> list[dict[str, Any]]:
-    """Two blocks of 50,000 particles, ever further apart: the cost stays."""
+    """Rates of two blocks of 50,000 particles at growing distance, which should be constant."""
     rows = []
     for distance in (4.0, 100.0, 2_000.0):
         blocks = [_block("fixed_corotated", 50_000, x, str(x)) for x in (0.0, distance)]
@@ -339,7 +339,7 @@ def _domain() -> list[dict[str, Any]]:
 
 
 def _crash() -> dict[str, Any]:
-    """A car of the ``vehicle`` preset against a wall, checks of each step included."""
+    """A car of the ``vehicle`` preset hits a wall; includes the checks of each step."""
     spacing = 0.1
     block = box_particles(CAR_SIZE, spacing=spacing, density=VEHICLE_DENSITY).with_mass(CAR_MASS)
     materials, regions, particles = vehicle_structure("car", block, spacing=spacing)
@@ -370,7 +370,7 @@ def _crash() -> dict[str, Any]:
 
 
 def _reference() -> dict[str, Any]:
-    """How many times faster than plain torch."""
+    """Speedup over plain torch."""
     rates = {}
     for backend in ("cpu", "reference"):
         body = _block("fixed_corotated", REFERENCE_PARTICLES)
@@ -381,7 +381,7 @@ def _reference() -> dict[str, Any]:
 
 
 def _peers() -> list[dict[str, Any]]:
-    """The same falling block here and elsewhere; all must fall as far."""
+    """Rates of the same falling block in all frameworks; the falling distances must agree."""
     edge = SPACING * round(PEER_PARTICLES ** (1 / 3))
     body = _block("fixed_corotated", PEER_PARTICLES)
     dx, n = _options().dx, len(body.particles)
@@ -422,7 +422,7 @@ def _peers() -> list[dict[str, Any]]:
 
 
 def _rates_by_turns(runs: dict[str, Callable[[int], None]], particles: int) -> dict[str, float]:
-    """Best rate of each; they take turns, so that a slow minute of the machine meets all."""
+    """Best rate of each framework; they take turns, so that temporary load affects all."""
     best = dict.fromkeys(runs, math.inf)
     for _ in range(PEER_TURNS):
         for name, advance in runs.items():
@@ -467,7 +467,7 @@ def _options(backend: str = "cpu") -> SolverOptions:
 
 
 def _time_substep(solver: Solver) -> tuple[float, float]:
-    """Shortest elapsed time of a substep [s], and processor time per thread [s]; no checks."""
+    """Shortest elapsed time of a substep [s], and processor time per thread [s], without checks."""
     simulation, dt = solver.simulation, solver.time_step()
     simulation.advance(2, dt, solver.colliders)
     return _best(lambda steps: simulation.advance(steps, dt, solver.colliders))

@@ -1,5 +1,4 @@
-"""``real2sim bench planners``: what a plan of the SDK's rule planners costs, beside a step of the
-world, which is what an episode without images is made of."""
+"""``real2sim bench planners``: time per plan of the SDK's rule planners, and per world step."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ PARTS = ("observe", "plan", "step")
 
 
 def run() -> Figures:
-    """Milliseconds of observing, planning and stepping by planner, and plans per step of the
-    world."""
+    """Milliseconds of observing, planning and stepping by planner, and plans per world step."""
     warm_up()
     scene = read_packed(SHIPPED)
     figures: Figures = {name: _planner(scene, name) for name in PLANNERS}
@@ -48,7 +46,7 @@ def _planner(scene: Scene, name: str) -> Figures:
 
 
 def _episode(scene: Scene, name: str) -> list[tuple[float, float, float]]:
-    """Seconds of the parts of each step."""
+    """Times of the parts of each step [s]."""
     planner = load_planner(name)
     spec = ResetSpec(privileged=True, action=needs_of(planner).action)
     world = World(scene, ScenarioState.of(scene), spec)

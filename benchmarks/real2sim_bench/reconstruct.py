@@ -1,4 +1,4 @@
-"""``real2sim bench reconstruct``: steps of training per second, by stage."""
+"""``real2sim bench reconstruct``: training steps per second, and time by stage."""
 
 from __future__ import annotations
 
@@ -24,25 +24,24 @@ from real2sim_server.synthetic import CameraSpec, SyntheticConfig, generate_log
 
 GAUSSIANS = 76_000
 SIZE = (621, 188)
-"""Gaussians and pixels at which OpenSplat's CPU trainer needs 0.85 s a step."""
+"""Number of Gaussians and image size at which OpenSplat's CPU trainer takes 0.85 s per step."""
 WARM_UP, ROUND = 6, 10
 
 
 def run(*, rounds: int = 4, gaussians: int = GAUSSIANS) -> dict[str, Any]:
     """Train on a synthetic street and time it.
 
-    Every round takes the same number of steps; each figure is the best of all rounds, so that
-    other programs disturb it least.
+    All rounds have the same number of steps. Each figure is the best of all rounds, to reduce the
+    effect of other load.
 
     Args:
-        rounds: of ROUND steps each.
-        gaussians: in the scene.
+        rounds: number of rounds of ROUND steps each.
+        gaussians: Gaussians in the scene.
 
     Returns:
         ``gaussians``, ``width``, ``height``, ``threads``; ``iterations_per_s``; ``stage_ms``:
-        milliseconds a step of data, forward, loss, backward, optimiser and densify (densifying
-        once in a round of ten, ten times as often as in training);
-        ``backward_per_forward``.
+        milliseconds per step of data, forward, loss, backward, optimiser and densify (once per
+        round of ten steps, ten times as often as in training); ``backward_per_forward``.
     """
     import numba
 
@@ -74,7 +73,7 @@ def run(*, rounds: int = 4, gaussians: int = GAUSSIANS) -> dict[str, Any]:
 
 
 def _options(rounds: int) -> TrainOptions:
-    """Nothing but steps: densification stays below its cap, and nothing is written."""
+    """Options for steps only: densification stays below its cap, and nothing is written."""
     steps = WARM_UP + ROUND * rounds
     return TrainOptions(
         iterations=4 * steps,

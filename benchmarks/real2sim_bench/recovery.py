@@ -1,9 +1,8 @@
-"""``real2sim bench recovery``: what recovery data is worth to a planner that learns from images.
+"""``real2sim bench recovery``: benefit of recovery data for a planner that learns from images.
 
-The project's learned planner is trained twice on exports of one scene, of the same number of
-frames and for as long: on the recorded path alone, and on the path with ``--perturb``. Both then
-drive from the same starts beside the path, in the same scene. A planner that is told the way stands
-beside them: what it cannot do from a start, nobody can be taught.
+The learned planner is trained twice on exports of one scene, with the same number of frames and
+epochs: on the recorded path only, and with ``--perturb``. Both drive from the same displaced starts
+in the same scene. A planner that follows the known route is the upper bound.
 """
 
 from __future__ import annotations
@@ -43,36 +42,37 @@ Report = Callable[[str, int, int], None]
 
 ALONE, WITH, TOLD = "path alone", "with recovery data", "told the route"
 COPIES = 4
-"""Starts beside the path of each clip."""
+"""Perturbed copies of each clip."""
 CLIP_S, RECOVER_S = 1.0, 2.5
 PERIOD_US = 100_000
-"""Between frames and between steps."""
+"""Period of frames and steps [us]."""
 AT_ONCE = 16
-"""Worlds whose images are drawn in one call."""
+"""Number of worlds whose images are drawn in one call."""
 INSTANTS = 8
-"""At which episodes begin."""
+"""Number of start times of episodes."""
 SEED_STEP = 1_000_003
 FAR_SHARE, MAX_DRAWS = 0.75, 100_000
-"""Starts are at least this share of the largest one away; so many are drawn to find them."""
+"""Minimum displacement of starts as a fraction of the largest one, and number of seeds to try."""
 OFFSET_M, TURNED = 0.5, math.radians(5)
-"""Within these of the recorded path at its end, an episode has come back."""
+"""Largest offset [m] and heading error [rad] from the recorded path at the end of a successful
+episode."""
 MIN_PATH_LENGTH = 0.5
-"""And it has driven at least this share of the way that was recorded in the time."""
+"""Minimum distance driven in a successful episode, as a fraction of the recorded one."""
 
 
 @dataclass(frozen=True)
 class RecoveryBenchOptions:
-    """How much is measured.
+    """Size of the benchmark.
 
     Attributes:
-        scene: bundle; None for the demo's street.
-        episodes: of each planner.
-        seconds: of each.
-        plan_s: how far plans reach [s].
-        lateral, heading: largest distance of starts from the path, and turn [m], [rad].
-        epochs: of training.
-        seed: of exports, training and starts.
-        camera: that the planner sees.
+        scene: scene bundle; None for the demo street.
+        episodes: episodes per planner.
+        seconds: length of an episode [s].
+        plan_s: horizon of plans [s].
+        lateral, heading: largest lateral offset [m] and heading offset [rad] of starts.
+        epochs: training epochs.
+        seed: seed of exports, training and starts.
+        camera: camera of the planner.
     """
 
     scene: Path | None = None
@@ -87,24 +87,24 @@ class RecoveryBenchOptions:
 
 
 class Planner(Protocol):
-    """What drives an episode."""
+    """A planner that drives an episode."""
 
     def reset(self, obs: Observation) -> None:
-        """Before the first plan."""
+        """Called before the first plan."""
 
     def plan(self, obs: Observation) -> TrajectoryPlan:
-        """At each step."""
+        """Called at each step."""
         ...
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an episode ended.
+    """Result of an episode.
 
     Attributes:
-        success: back on the path, without contact and on the road.
-        contact, off_road: whether there was any.
-        offset: from the path at the end [m].
+        success: whether it returned to the path, without contact and without leaving the road.
+        contact, off_road: whether it had a contact, or left the road.
+        offset: lateral offset from the path at the end [m].
     """
 
     success: bool
@@ -137,7 +137,7 @@ def run(options: RecoveryBenchOptions | None = None) -> Figures:
 def _trained(
     scene: Scene, shape: PolicyShape, options: RecoveryBenchOptions, folder: Path, report: Report
 ) -> dict[str, tuple[Path, Figures]]:
-    """Files of weights, and what training says, by name."""
+    """Weight files and training figures, by name."""
     sets = {}
     for name, plan in _plans(shape, options).items():
         drive = ScenarioDrive(scene, ScenarioState.of(scene))
@@ -160,7 +160,7 @@ def _trained(
 
 
 def _plans(shape: PolicyShape, options: RecoveryBenchOptions) -> dict[str, ExportPlan]:
-    """As many frames on the path alone as on the path and beside it together."""
+    """Export plans; ``dense`` has as many frames as ``path`` and ``beside`` together."""
     beside = Perturbation(
         lateral_sigma=options.lateral / 2,
         heading_sigma=options.heading / 2,
@@ -193,14 +193,14 @@ def drive_all(
     camera: Camera | None = None,
     report: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> list[Outcome]:
-    """Let each planner drive from a start of its own, the same for every call.
+    """Drive one episode per planner; starts are the same in every call.
 
     Args:
-        scene: as it was recorded.
-        planners: one an episode; they see ``camera``.
-        options: of starts and length.
-        camera: None where they look at nothing.
-        report: called with (steps done, all).
+        scene: the recorded scene.
+        planners: one planner per episode.
+        options: starts and length of episodes.
+        camera: camera of the planners; None for planners without images.
+        report: callback with (steps done, total).
     """
     worlds = displaced_worlds(scene, len(planners), options)
     steps = worlds[0].horizon
@@ -217,11 +217,11 @@ def drive_all(
 
 
 def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) -> list[World]:
-    """Episodes that begin at instants evenly over the drive, at least FAR_SHARE of what is asked
-    for beside the path and turned, where nothing else is.
+    """Episodes that start at evenly spaced times, displaced by at least FAR_SHARE of the largest
+    offsets and without contact.
 
     Raises:
-        CommandError: the scene is too short, or hardly a start is free.
+        CommandError: the scene is too short, or too few starts are free.
     """
     found: list[World] = []
     for seed in range(options.seed * SEED_STEP, options.seed * SEED_STEP + MAX_DRAWS):
@@ -230,7 +230,7 @@ def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) ->
         if any(abs(draws.around(w, name, 0)) < FAR_SHARE * w for name, w in least.items()):
             continue
         world = _world(scene, seed, len(found) % INSTANTS, options)
-        # Where the first draw is not free the world draws another.
+        # If the first draw is occupied, the world draws another.
         if all(abs(world.sampled[name]) >= FAR_SHARE * w for name, w in least.items()):
             found.append(world)
         if len(found) == count:
@@ -243,7 +243,7 @@ def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) ->
 
 def _world(scene: Scene, seed: int, instant: int, options: RecoveryBenchOptions) -> World:
     steps = round(options.seconds * 1e6 / PERIOD_US)
-    # Frames whose plan the drive does not cover teach nothing: nobody has seen the road there.
+    # Plans must end within the recorded drive: training has no frames beyond it.
     last_us = scene.end_us - round(options.plan_s * 1e6) - steps * PERIOD_US
     if last_us <= scene.start_us:
         seconds = (scene.end_us - scene.start_us) * 1e-6
@@ -264,7 +264,7 @@ def _world(scene: Scene, seed: int, instant: int, options: RecoveryBenchOptions)
 
 
 def _observations(worlds: Sequence[World], camera: Camera | None) -> list[Observation]:
-    """What sessions would show."""
+    """Observations of the worlds, like those of sessions."""
     blind = [observation_of(world) for world in worlds]
     if camera is None or not worlds:
         return blind

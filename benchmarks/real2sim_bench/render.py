@@ -1,4 +1,4 @@
-"""``real2sim bench render``: how fast this machine draws, by stage, and against the reference."""
+"""``real2sim bench render``: rendering time by stage, and relative to the reference."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from real2sim_server.synthetic.gaussian_street import street_scene
 
 REDUCED_GAUSSIANS = 20_000
 REDUCED_SIZE = 4
-"""The reference draws every n-th Gaussian at this fraction of the size, where it takes seconds."""
+"""Divisor of the image size in the comparison with the reference, which would take seconds."""
 
 IMAGE_SETS = (("rgb", "RGB"), ("rgb_depth_instance", "RGB + depth + ids"))
-"""Key of a timing in a case, and what was drawn."""
+"""Key of a timing in a case, and its title."""
 
 
 @dataclass(frozen=True, eq=False)
 class RenderCase:
-    """One picture to draw."""
+    """An image to draw."""
 
     name: str
     instances: list[Instance]
@@ -49,11 +49,11 @@ class RenderCase:
 
     @property
     def gaussian_count(self) -> int:
-        """Gaussians of all instances together."""
+        """Total number of Gaussians of all instances."""
         return sum(len(instance.cloud) for instance in self.instances)
 
     def draw(self, backend: Backend, *, images: bool) -> RenderOutput:
-        """Draw RGB and alpha, with depth and instance when ``images``."""
+        """Draw RGB and alpha, plus depth and instance if ``images``."""
         options = RasterOptions(background=self.background, depth=images, instance=images)
         return rasterize(
             self.instances,
@@ -67,7 +67,7 @@ class RenderCase:
         )
 
     def reduced(self) -> RenderCase:
-        """Every n-th Gaussian, in a smaller picture."""
+        """The case with every Nth Gaussian, in a smaller image."""
         step = -(-self.gaussian_count // REDUCED_GAUSSIANS)
         K = self.K.copy()
         K[:2] /= REDUCED_SIZE
@@ -85,7 +85,7 @@ class RenderCase:
 
 @dataclass(frozen=True)
 class Timing:
-    """Milliseconds of repeated draws: the best one with its stages, and the median."""
+    """Milliseconds of repeated draws: the best draw with its stages, and the median."""
 
     best_ms: float
     median_ms: float
@@ -101,9 +101,9 @@ def run(
     """Measure, print a table and return the figures.
 
     Args:
-        splat: for the first case; default is the test-data folder's biker, where it is at hand.
-        backend: as in rasterize().
-        repetitions: draws of each picture, after one that warms up.
+        splat: file of the first case; by default the biker in the test-data folder, if present.
+        backend: see rasterize().
+        repetitions: draws of each image, after a warm-up draw.
     """
     console = Console()
     with console.status("measuring the renderer") as status:
@@ -168,7 +168,7 @@ def _cases(splat: Path | None, street_gaussians: int) -> tuple[list[RenderCase],
 
 
 def splat_case(path: Path) -> RenderCase:
-    """An asset at 1920x1280 on white, seen along its +z from 1.6 times its y extent away."""
+    """An asset at 1920x1280 on white, viewed along +z from 1.6 times its y extent away."""
     cloud = read_splats(path)
     low, high = cloud.means.amin(0).double().numpy(), cloud.means.amax(0).double().numpy()
     eye = (low + high) / 2 - (0, 0, 1.6 * (high - low)[1])
@@ -208,7 +208,7 @@ def _measure(
 
 
 def _time(draw: Callable[[], RenderOutput], repetitions: int) -> Timing:
-    """Time draws, after one that does not count where there are several."""
+    """Time draws; several repetitions follow a warm-up draw."""
     times, stages = [], []
     for _ in range(repetitions + (repetitions > 1)):
         start = time.perf_counter()

@@ -1,5 +1,5 @@
-"""``real2sim bench search``: episodes to the first avoidable failure of a planner, searched for and
-drawn at random, and how many kinds a whole search finds."""
+"""``real2sim bench search``: episodes to the first avoidable failure of a planner, for search and
+random sampling, and the number of failure kinds that a complete search finds."""
 
 from __future__ import annotations
 
@@ -30,23 +30,22 @@ CASES: Mapping[str, str] = {
     "pid": "cut_in_calm",
     "learned": "cut_in_brief",
 }
-"""In which space each planner is tested: one in which it fails once in hundreds of times."""
+"""Test space of each planner; it fails there once in hundreds of episodes."""
 LEARNED = "learned"
 ALL_SPACES = ("cut_in", "hard_brake", "junction_crossing", "oncoming", "slow_crossing")
 
 
 @dataclass(frozen=True)
 class SearchBenchOptions:
-    """How much is measured.
+    """Size of the benchmark.
 
     Attributes:
-        episodes: at most, of each search.
-        seeds: of each planner.
-        first_seed: of them; spaces were chosen on seeds from 1000 on.
-        policy: weights of the learned planner, as of `train-policy`; None leaves it out.
-        planners: by name.
-        whole: searches of each planner through all spaces, with all episodes, for the kinds of
-            failures.
+        episodes: maximum episodes per search.
+        seeds: number of seeds per planner.
+        first_seed: first seed; the spaces were chosen with seeds from 1000.
+        policy: weights of the learned planner from `train-policy`; None skips it.
+        planners: names of planners.
+        whole: complete searches per planner over all spaces, for the kinds of failures.
     """
 
     episodes: int = 300
@@ -58,12 +57,12 @@ class SearchBenchOptions:
 
     @property
     def all_seeds(self) -> range:
-        """Those of the searches."""
+        """Seeds of the searches."""
         return range(self.first_seed, self.first_seed + self.seeds)
 
 
 def run(options: SearchBenchOptions | None = None) -> Figures:
-    """Search, draw at random, print and return all figures."""
+    """Run search and random sampling; print and return all figures."""
     options = options or SearchBenchOptions()
     warm_up()
     scene, figures = open_scene("demo_street"), Figures()
@@ -94,11 +93,11 @@ def _compared(scene: Scene, planner: str, space: str, options: SearchBenchOption
         for way, look in ways.items():
             budget = SearchBudget(options.episodes, seed, stop_at_first=True)
             state = look(Evaluator(scene, [load_space(space)], planner), budget)
-            # One that found none needs more than all episodes.
+            # A search without failures counts as one more than all episodes.
             firsts[way].append(state.archive.first or options.episodes + 1)
         drawn, failed = drawn + len(state.evaluations), failed + (state.archive.first is not None)
     medians = {way: float(np.median(found)) for way, found in firsts.items()}
-    # Draws that end with the first failure: failures over draws is the likeliest rate.
+    # Sampling stops at the first failure; failures / draws is the maximum likelihood rate.
     odds = wilson(failed, drawn)
     return {
         **firsts,
@@ -114,7 +113,7 @@ def _compared(scene: Scene, planner: str, space: str, options: SearchBenchOption
 
 
 def _whole(scene: Scene, planner: str, options: SearchBenchOptions) -> Figures:
-    """Kinds of failures that whole searches find, one figure a seed."""
+    """Number of failure kinds that complete searches find, by seed."""
     spaces = [load_space(name) for name in ALL_SPACES]
     rows: list[Figures] = []
     for seed in range(options.first_seed, options.first_seed + options.whole):
@@ -135,7 +134,7 @@ def _whole(scene: Scene, planner: str, options: SearchBenchOptions) -> Figures:
 
 
 def _replays(scene: Scene, found: Evaluation) -> bool:
-    """Whether a failure's recording comes out the same, bit for bit, its collision at the end."""
+    """Whether the replay of a failure is bitwise equal to its recording and ends in a collision."""
     planner = load_planner(found.drive.planner)
     recording = recording_of(scene, drive_episode(scene, found.drive, planner, keep_entries=True))
     same = first_difference(recording, recording.replayer(scene)) is None

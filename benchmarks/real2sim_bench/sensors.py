@@ -1,4 +1,4 @@
-"""``real2sim bench sensors``: how long a sweep takes, and images through lenses."""
+"""``real2sim bench sensors``: time of a LiDAR sweep, and of images with lenses and shutters."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TURNS = 9
 
 
 def run() -> dict[str, Any]:
-    """Measure by turns, print a table and return milliseconds of wall and processor time."""
+    """Measure interleaved runs; print a table and return wall and processor times [ms]."""
     console = Console()
     with console.status("measuring sensors"):
         figures = _by_turns(_sweep() | _lenses())
@@ -46,7 +46,7 @@ def run() -> dict[str, Any]:
 
 
 def _by_turns(drawn: Mapping[str, Callable[[], object]]) -> dict[str, dict[str, float]]:
-    """Least and median wall time and least processor time of TURNS, after one that compiles."""
+    """Minimum and median wall time and minimum processor time of TURNS, after a warm-up turn."""
     wall: dict[str, list[float]] = {name: [] for name in drawn}
     processor: dict[str, list[float]] = {name: [] for name in drawn}
     for turn in range(TURNS + 1):
@@ -67,7 +67,7 @@ def _by_turns(drawn: Mapping[str, Callable[[], object]]) -> dict[str, dict[str, 
 
 
 def _sweep() -> dict[str, Callable[[], object]]:
-    """One sweep of the bench's own street, 64 rings of 1,024 beams."""
+    """A sweep of 64 rings with 1,024 beams on the benchmark's street."""
     instances, lidar = street_scene(GAUSSIANS).instances, catalogue_lidar(LIDAR)
     pose = np.eye(4)
     pose[2, 3] = 1.73
@@ -75,7 +75,7 @@ def _sweep() -> dict[str, Callable[[], object]]:
 
 
 def _lenses() -> dict[str, Callable[[], object]]:
-    """The demo's front camera through lenses and a shutter."""
+    """The demo's front camera as a pinhole, with lenses, and with a rolling shutter."""
     scene = read_packed(SHIPPED)
     vehicle, instances = scene.ego.transform(AT_US), posed_instances(scene, AT_US, {})
     front = scene.rig["front"].resized(WIDTH)

@@ -1,7 +1,7 @@
-"""``real2sim bench serve``: what a drive step costs, and what it leaves to others.
+"""``real2sim bench serve``: latency of a drive step, and load on other clients.
 
-The worker runs in a process of its own, as it does for a planner; everything is measured from
-outside, over loopback.
+The worker runs in a separate process, as for a planner. Measurements are taken by a client over
+loopback.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from real2sim_server.synthetic.gaussian_street import street
 
 from .drive_probe import DriveProbe, straight_on
 
-# Clients that request large pictures, one after the other.
+# Clients that request large images in a loop.
 
 TIMEOUT_S = 120.0
 
@@ -41,7 +41,7 @@ TIMEOUT_S = 120.0
 def large_renders(
     url: str, scene: str, camera: str, *, width: int, clients: int = 1
 ) -> Iterator[list[float]]:
-    """Pictures of ``width`` px for the length of the block; yields the milliseconds each took."""
+    """Render images of ``width`` px during the block; yields the list of their times [ms]."""
     taken: list[float] = []
     stop = threading.Event()
 
@@ -65,7 +65,7 @@ def large_renders(
             thread.join(TIMEOUT_S)
 
 
-# Lag of the worker's event loop while it draws large pictures.
+# Lag of the worker's event loop while it draws large images.
 
 HEAVY_WIDTH = 1920
 PING_EVERY_S = 0.005
@@ -76,11 +76,10 @@ BUCKET = re.compile(r'^real2sim_event_loop_lag_seconds_bucket{le="([^"]+)"} (\S+
 def loop_lag(
     probe: DriveProbe, url: str, *, scene: str, camera: str, seconds: float
 ) -> dict[str, Any]:
-    """Lag with the worker idle and under load, seen from both sides.
+    """Event loop lag with the worker idle and under load, measured by client and worker.
 
-    ``ping``: round trips of WebSocket pings [ms] of a lean probe, which the loop answers by itself;
-    they hold the client's own wake-ups too. ``own``: the worker's histogram of how late its loop
-    runs.
+    ``ping`` has round trips of WebSocket pings [ms], which the event loop answers; they include the
+    wake-up of the client. ``own`` has the worker's histogram of loop lag.
     """
     idle = _pings(probe, IDLE_SECONDS)
     before = _buckets(url)
@@ -101,7 +100,7 @@ def loop_lag(
 
 
 def _pings(probe: DriveProbe, seconds: float) -> list[float]:
-    """Milliseconds of ping round trips."""
+    """Ping round trip times [ms]."""
     trips = []
     end = time.perf_counter() + seconds
     while time.perf_counter() < end:
@@ -116,7 +115,7 @@ def _buckets(url: str) -> dict[str, float]:
 
 
 def _quantile_bound(buckets: dict[str, float], fraction: float) -> float | None:
-    """Milliseconds of the first bucket that holds ``fraction`` of all samples."""
+    """Upper bound of the first bucket that covers ``fraction`` of all samples [ms]."""
     total = buckets.get("+Inf", 0.0)
     for le, count in buckets.items():
         if total and count >= fraction * total:
@@ -129,24 +128,24 @@ def _spread(values: list[float]) -> dict[str, float]:
     return {"count": len(values), "p50": p50, "p95": p95, "p99": p99, "max": max(values)}
 
 
-# Pauses of the machine itself: the floor of every latency.
+# Pauses of the machine: a lower bound of every latency.
 
 MIN_PAUSE_S = 1e-3
-"""Shorter ones are the ordinary ticks of a kernel."""
+"""Minimum pause; shorter ones are ordinary kernel ticks."""
 START_S = 1.0
-"""Long enough that no program that is up already takes the place of one that starts."""
+"""Time for all processes to start, so that each occupies a core [s]."""
 
 
 def pauses(seconds: float) -> dict[str, Any]:
-    """What happens to a program that only reads the clock, one on every core.
+    """Measure the pauses of processes that only read the clock, one per core.
 
     Returns:
-        ``cores``; ``per_second``: pauses above 1 ms of one core; ``longest_ms``.
+        ``cores``; ``per_second``: pauses above 1 ms per core and second; ``longest_ms``.
     """
     cores = os.cpu_count() or 1
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(cores, mp_context=spawn) as pool:
-        # Nobody reads before all have started, which keeps every core busy.
+        # Wait until all processes have started, so that all cores are busy.
         list(pool.map(time.sleep, [START_S] * cores))
         found = list(pool.map(_read_the_clock, [seconds] * cores))
     pauses_seen = [pause for of_core in found for pause in of_core]
@@ -183,7 +182,7 @@ BY_STAGE = ("no_sensors", "one_raw_camera", "real_time")
 
 
 def print_report(console: Console, figures: Mapping[str, Any]) -> None:
-    """Print latencies, stages, lag of the event loop, memory and the machine's own pauses."""
+    """Print latencies, stages, event loop lag, memory and pauses of the machine."""
     console.print(_latencies(figures))
     for name in BY_STAGE:
         console.print(_stages(TITLES[name], figures[name]))
@@ -239,29 +238,29 @@ CAMERA = "front"
 SHORT_STEP_US = 1_000
 CAMERA_STEP_US = 50_000
 REAL_TIME = "demo_street"
-"""300,000 Gaussians, objects that repeat the log, three cameras of 480x320: to run at 10 Hz."""
+"""Scene of the 10 Hz benchmark: 300,000 Gaussians, log replay, three cameras of 480x320."""
 REAL_TIME_STEP_US = 100_000
 DEVICE_STAGES = ("render", "physics")
-"""What a step is for; all else is overhead."""
+"""Stages that are the purpose of a step; all others are overhead."""
 WARM_UP_STEPS = 20
 SESSIONS = 10
 CROWD, CROWD_WIDTH = 3, 4096
-"""Clients that render beside a drive, and the width of their pictures [px]."""
+"""Number of clients that render during a drive, and the width of their images [px]."""
 
 Figures = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class ServeBenchOptions:
-    """How much is measured.
+    """Size of the benchmark.
 
     Attributes:
-        gaussians: of the scene.
-        width, height: of its camera [px].
-        steps, camera_steps: measured, without sensors and with one raw camera.
-        heavy_seconds: how long large pictures are drawn while the event loop is watched.
-        real_time_steps: measured on the demo's street with its three cameras; see ``REAL_TIME``.
-        pause_seconds: how long the machine itself is watched, with nothing else running.
+        gaussians: Gaussians of the scene.
+        width, height: image size of its camera [px].
+        steps, camera_steps: steps without sensors, and with one raw camera.
+        heavy_seconds: duration of the event loop measurement under load [s].
+        real_time_steps: steps on the demo street with its three cameras; see ``REAL_TIME``.
+        pause_seconds: duration of the pause measurement on the idle machine [s].
     """
 
     gaussians: int = 200_000
@@ -305,7 +304,7 @@ def _measure(console: Console, options: ServeBenchOptions, *, url: str, pid: int
             info = client.wait_ready()
         setup = {"device": info.device.model_dump(), "cores": os.cpu_count(), **vars(options)}
         figures: Figures = {"setup": setup}
-        # First, as long as the worker has no freed memory to fill again.
+        # First, before the worker has freed memory that it could reuse.
         with console.status(f"memory of {SESSIONS} sessions"):
             figures["memory"] = _memory(client, raw, pid)
         with console.status("drive steps without sensors"):
@@ -324,7 +323,7 @@ def _measure(console: Console, options: ServeBenchOptions, *, url: str, pid: int
 
 
 def _real_time(client: real2sim.Client, steps: int) -> Figures:
-    """All cameras of the demo's street, and the share of steps that came within 100 ms."""
+    """Measure all cameras of the demo street, and the fraction of steps within 100 ms."""
     info = client.scenes.load(REAL_TIME)
     sensors = [{"camera": camera.name, "codec": "raw"} for camera in info.cameras]
     figures, latencies = _drive(client, sensors, steps, REAL_TIME_STEP_US, scene=REAL_TIME)
@@ -336,7 +335,7 @@ def _real_time(client: real2sim.Client, steps: int) -> Figures:
 def _crowded(
     client: real2sim.Client, url: str, sensors: Sequence[Mapping[str, Any]], steps: int
 ) -> Figures:
-    """Steps with one raw camera alone, and at once afterwards beside clients that render."""
+    """Measure steps with one raw camera alone, then immediately with rendering clients."""
     alone, _ = _drive(client, sensors, steps, CAMERA_STEP_US)
     with large_renders(url, SCENE, CAMERA, width=CROWD_WIDTH, clients=CROWD) as pictures:
         beside, _ = _drive(client, sensors, steps, CAMERA_STEP_US)
@@ -358,7 +357,7 @@ def _drive(
     *,
     scene: str = SCENE,
 ) -> tuple[Figures, list[float]]:
-    """Latency from the action's bytes to the observation's, its parts, and all latencies."""
+    """Latency from sending an action to receiving the observation: summary, and all values."""
     info = client.sessions.create(scene=scene)
     latencies, stages = [], []
     try:
@@ -377,8 +376,8 @@ def _drive(
 
 
 def _parts(latencies: Sequence[float], stages: Sequence[Mapping[str, float]]) -> Figures:
-    """Milliseconds by stage, of what is in no stage, and of all that is neither render nor physics;
-    and the median share of a step that is not render."""
+    """Milliseconds by stage, outside stages, and of overhead (neither render nor physics), and the
+    median fraction of a step outside render."""
     total = np.array(latencies)
     by_stage = {name: np.array([s.get(name, 0.0) for s in stages]) for name in stages[-1]}
     device = sum(
@@ -419,7 +418,7 @@ def _event_loop(client: real2sim.Client, url: str, seconds: float) -> Figures:
 def _memory(
     client: real2sim.Client, sensors: Sequence[Mapping[str, Any]], pid: int
 ) -> Figures | None:
-    """What a session adds to the worker, driven with sensors; None where there is no /proc."""
+    """Memory of a driven session with sensors in the worker; None without /proc."""
     if not Path(f"/proc/{pid}/statm").exists():
         return None
     infos, resident = [], []
@@ -440,13 +439,13 @@ def _memory(
 
 
 def resident_bytes(pid: int) -> int:
-    """Resident memory of a process, by /proc."""
+    """Resident memory of a process from /proc [bytes]."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def percentiles(values: Sequence[float]) -> Figures:
-    """Count, least, p50, p95, p99 and largest of ``values``."""
+    """Count, minimum, p50, p95, p99 and maximum of ``values``."""
     p50, p95, p99 = np.percentile(values, [50, 95, 99]).tolist()
     spread = {"min": min(values), "p50": p50, "p95": p95, "p99": p99, "max": max(values)}
     return {"count": len(values), **spread}

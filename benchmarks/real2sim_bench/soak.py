@@ -1,7 +1,7 @@
-"""``real2sim bench soak``: many sessions side by side for a long time, misbehaving planners among
-them; do all steps get their answer, and does the worker's memory stay what it was?
+"""``real2sim bench soak``: many concurrent sessions for a long time, with misbehaving planners.
 
-Half of the sessions drive properly, the others take turns in misbehaving. Half have a camera.
+Checks that all steps are answered and that the worker's memory does not grow. Half of the sessions
+behave properly; the others cycle through the kinds of misbehaviour. Half have a camera.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from .serve import percentiles, resident_bytes
 
 DEADLINE_MS = 100
 PUSHED_WITHIN_S = 30.0
-"""However busy the machine, a missed deadline is told by then."""
+"""Maximum time until the worker reports a missed deadline, even on a busy machine [s]."""
 FAULT_PERIOD = 10
-"""Steps from one time to the next."""
+"""Steps between faults."""
 
 Obs = dict[str, Any]
 
 
 class SoakError(AssertionError):
-    """An answer that is not as the protocol says."""
+    """A reply that violates the protocol."""
 
 
 class SoakPlanner:
-    """One controller of one session.
+    """Controller of a session.
 
     Args:
-        info: of its session.
+        info: the session.
         behaviour: key of ``BEHAVIOURS``.
-        sensors: of its episodes.
-        dt_us: step of the clock.
+        sensors: sensors of its episodes.
+        dt_us: time step [us].
 
     Attributes:
-        steps: answered so far.
-        faults: so far, each answered as it should be.
-        latencies_ms: of proper steps.
+        steps: number of answered steps.
+        faults: number of faults that were handled correctly.
+        latencies_ms: latencies of proper steps [ms].
     """
 
     def __init__(
@@ -79,10 +79,10 @@ class SoakPlanner:
         self._probe.__exit__(*raised)
 
     def step(self) -> None:
-        """One step further, after a misdeed where one is due.
+        """Advance by one step, with a fault if one is due.
 
         Raises:
-            SoakError: not answered as the protocol says.
+            SoakError: the reply violates the protocol.
         """
         if self._obs["terminated"] or self._obs["truncated"]:
             self._reset()
@@ -101,7 +101,7 @@ class SoakPlanner:
     def _go_on(self) -> None:
         answer, seconds = self._probe.ask(action(self._obs))
         if answer["type"] == "error" and self.behaviour in {"hangs", "late"}:
-            # A busy machine may make any planner miss a deadline; the clock went on without it.
+            # On a busy machine any planner may miss a deadline; the clock has advanced without it.
             self._require(answer, "STALE_STEP")
             self._catch_up()
             return
@@ -127,15 +127,15 @@ class SoakPlanner:
         if answer["type"] != "error" or answer["code"] != code or answer["fatal"]:
             raise SoakError(f"{self.behaviour}: {code} expected, got {_short(answer)}")
 
-    # --- misdeeds ---------------------------------------------------------------------------
+    # --- Faults -----------------------------------------------------------------------------
 
     def hang(self) -> None:
-        """Say nothing for several deadlines; the clock goes on and says so."""
+        """Stay silent for several deadlines; the clock advances and observations are pushed."""
         self._probe.listen(4 * DEADLINE_MS / 1e3, until_pushed=PUSHED_WITHIN_S)
         self._catch_up()
 
     def be_late(self) -> None:
-        """Answer after the deadline; the plan is stale."""
+        """Send a plan after the deadline; it is stale."""
         asked = action(self._obs)
         self._probe.listen(2 * DEADLINE_MS / 1e3, until_pushed=PUSHED_WITHIN_S)
         answer, _ = self._probe.ask(asked)
@@ -143,7 +143,7 @@ class SoakPlanner:
         self._catch_up()
 
     def answer_twice(self) -> None:
-        """The same again gets the same again; another plan is a conflict."""
+        """Repeat an action, which repeats the reply; then send another plan: a conflict."""
         asked = action(self._obs)
         self._go_on()
         again, _ = self._probe.ask(asked)
@@ -154,7 +154,7 @@ class SoakPlanner:
         self._require(self._probe.ask(other)[0], "STEP_CONFLICT")
 
     def answer_out_of_order(self) -> None:
-        """Steps that are over, and steps that have not come."""
+        """Send actions for future and past steps."""
         for step, code in (
             (self._obs["step"] + 2, "BAD_STEP"),
             (self._obs["step"] - 2, "STALE_STEP"),
@@ -163,21 +163,21 @@ class SoakPlanner:
         self._go_on()
 
     def answer_nan(self) -> None:
-        """A plan with a hole in it."""
+        """Send a plan with NaN."""
         asked = action(self._obs)
         asked["plan"]["poses"][3][1] = math.nan
         self._require(self._probe.ask(asked)[0], "BAD_MESSAGE")
         self._go_on()
 
     def answer_too_short(self) -> None:
-        """More times than poses."""
+        """Send a plan with more times than poses."""
         asked = action(self._obs)
         asked["plan"]["poses"].pop()
         self._require(self._probe.ask(asked)[0], "BAD_MESSAGE")
         self._go_on()
 
     def drop(self) -> None:
-        """Leave in the midst of a step, come back, and ask for it again."""
+        """Disconnect within a step, reconnect, and repeat the action."""
         asked, token = action(self._obs), self._probe.resume_token
         self._probe.send(asked)
         self._probe.socket.socket.close()
@@ -201,7 +201,7 @@ BEHAVIOURS: dict[str, Callable[[SoakPlanner], None] | None] = {
     "wrong length": SoakPlanner.answer_too_short,
     "drops": SoakPlanner.drop,
 }
-"""What planners do once in ten steps."""
+"""Fault of each behaviour, injected every FAULT_PERIOD steps."""
 
 
 SCENE = "street"
@@ -210,20 +210,20 @@ CAMERA = {"camera": "front", "codec": "raw", "modalities": ["rgb"]}
 WARM_UP_SHARE = 0.2
 SAMPLE_PERIOD_S = 2.0
 GROWTH_MB = 16.0
-"""Memory at the end may be this much above that after warming up; allocators waver that much."""
+"""Allowed growth of memory after warm-up [MB]; allocators fluctuate by this much."""
 
 Figures = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class SoakOptions:
-    """How much is soaked.
+    """Size of the soak test.
 
     Attributes:
-        sessions: side by side.
-        minutes: in all, the first fifth of it warming up.
-        rate_hz: steps each session asks for in a second, at most.
-        gaussians, width: of the scene and its camera.
+        sessions: number of concurrent sessions.
+        minutes: total duration; the first fifth is warm-up [min].
+        rate_hz: maximum steps per second of each session.
+        gaussians, width: Gaussians of the scene, and image width of its camera [px].
     """
 
     sessions: int = 16
@@ -241,7 +241,7 @@ class Memory:
     mb: list[float] = field(default_factory=list)
 
     def figures(self, warm_s: float) -> Figures:
-        """At the start, after warming up, at the end, and the slope in between [MB/min]."""
+        """Memory at the start, after warm-up and at the end [MB], and the slope [MB/min]."""
         seconds, mb = np.array(self.seconds), np.array(self.mb)
         warm = seconds >= warm_s
         slope = np.polyfit(seconds[warm] / 60, mb[warm], 1)[0] if warm.sum() > 1 else float("nan")
@@ -256,9 +256,9 @@ class Memory:
 
 
 def run(options: SoakOptions | None = None) -> Figures:
-    """Soak a worker of its own; print a table and return its figures.
+    """Run the soak test on a new worker; print a table and return its figures.
 
-    ``failures`` names what was not as the protocol says; ``grows`` whether memory grew.
+    ``failures`` lists violations of the protocol; ``grows`` is whether memory grew.
     """
     options = options or SoakOptions()
     console = Console()
@@ -308,7 +308,7 @@ def _soak(console: Console, client: real2sim.Client, options: SoakOptions, *, pi
 
 
 def behaviours(sessions: int) -> list[str]:
-    """Of each session: every other one is proper, the others take turns in misbehaving."""
+    """Behaviour of each session: every second one is proper, the others cycle through faults."""
     bad = [name for name, inject_fault in BEHAVIOURS.items() if inject_fault is not None]
     return [
         "proper" if k % 4 in {0, 1} else bad[(k // 4 * 2 + k % 4) % len(bad)]

@@ -6,7 +6,7 @@ import taichi as ti
 
 from .peers import CELLS, PeerBlock, PeerRun
 
-# Taichi reads annotations as they stand, so they must not become strings.
+# Taichi evaluates annotations, so they must not become strings.
 
 
 POLAR_STEPS = 4
@@ -29,17 +29,17 @@ class TaichiSolver:
         self.v = ti.Vector.field(3, ti.f32, n)
         self.C = ti.Matrix.field(3, 3, ti.f32, n)
         self.F = ti.Matrix.field(3, 3, ti.f32, n)
-        # Momentum and mass beside each other, as that is one cache line.
+        # Momentum and mass in one vector, so that a node needs a single memory access.
         self.grid = ti.Vector.field(4, ti.f32, (CELLS, CELLS, CELLS))
         self.x.from_numpy(block.positions)
         self.v.from_numpy(block.velocities)
-        # Plain numbers of self become constants of the kernels.
+        # Numeric attributes of self become kernel constants.
         self.mass, self.volume, self.mu, self.lam = block.mass, block.volume, block.mu, block.lam
         self.dx, self.dt, self.gravity = block.dx, block.dt, block.gravity
         self.reset()
 
     def advance(self, steps: int) -> None:
-        """Make substeps."""
+        """Run substeps."""
         for _ in range(steps):
             self.grid.fill(0)
             self.scatter()
@@ -48,14 +48,14 @@ class TaichiSolver:
 
     @ti.kernel
     def reset(self):
-        """No deformation, no gradient."""
+        """Reset deformation and velocity gradient."""
         for p in self.x:
             self.F[p] = ti.Matrix.identity(ti.f32, 3)
             self.C[p] = ti.Matrix.zero(ti.f32, 3, 3)
 
     @ti.kernel
     def scatter(self):
-        """Deform particles and give their momentum to the grid."""
+        """Update deformation and transfer momentum from particles to the grid."""
         ti.loop_config(block_dim=256)
         for p in self.x:
             base = ti.cast(self.x[p] / self.dx - 0.5, ti.i32)
@@ -81,7 +81,7 @@ class TaichiSolver:
 
     @ti.kernel
     def gather(self):
-        """Momentum to velocity, and velocities back to the particles."""
+        """Compute grid velocities and transfer them to the particles."""
         for node in ti.grouped(self.grid):
             m = self.grid[node][3]
             if m > 0:

@@ -1,8 +1,8 @@
-"""MLS-MPM in Warp, as fast as its CPU device goes.
+"""MLS-MPM in Warp, parallelised on its CPU device.
 
-A launch on the CPU uses one thread, but lets go of the interpreter's lock: particles are cut into
-slabs across x, and even slabs, then odd ones, are launched from a pool of threads. Slabs are wider
-than the stencil, so that no two of one colour write to the same node.
+A CPU launch uses one thread but releases the GIL. Particles are divided into slabs along x; a
+thread pool launches even slabs, then odd slabs. Slabs are wider than the stencil, so no two slabs
+of one colour write to the same node.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import warp as wp
 
 from .peers import CELLS, PeerBlock, PeerRun
 
-# Warp reads annotations as they stand, so they must not become strings nor mean types to mypy.
+# Warp evaluates annotations, so they must not become strings; mypy cannot read them as types.
 # ruff: noqa: PLR0917
 # mypy: ignore-errors
 
 
 SLAB = 4
-"""Cells; a particle may leave by one before slabs of one colour meet."""
+"""Width of a slab [cells]; particles may leave it by one cell before slabs of one colour meet."""
 POLAR_STEPS = wp.constant(4)
 SIDE = wp.constant(CELLS)
 
 
 @wp.struct
 class WarpParameters:
-    """Numbers that hold for a run."""
+    """Constants of a run."""
 
     mass: wp.float32
     volume: wp.float32
@@ -42,7 +42,7 @@ class WarpParameters:
 
 @wp.func
 def polar_rotation(F: wp.mat33):
-    """Rotation of the polar decomposition, by Newton's iteration."""
+    """Rotation of the polar decomposition, by Newton iteration."""
     R = F
     for _ in range(POLAR_STEPS):
         R = 0.5 * (R + wp.transpose(wp.inverse(R)))
@@ -59,7 +59,7 @@ def scatter(
     grid: wp.array(dtype=wp.vec4),
     params: WarpParameters,
 ):
-    """Deform particles and give their momentum to the grid."""
+    """Update deformation and transfer momentum from particles to the grid."""
     p = first + wp.tid()
     at = x[p] / params.dx
     bx = int(at[0] - 0.5)
@@ -97,7 +97,7 @@ def scatter(
 
 @wp.kernel
 def move_grid(first: int, grid: wp.array(dtype=wp.vec4), params: WarpParameters):
-    """Momentum to velocity, with gravity."""
+    """Compute grid velocities from momentum, and add gravity."""
     node = first + wp.tid()
     g = grid[node]
     if g[3] > 0.0:
@@ -116,7 +116,7 @@ def gather(
     grid: wp.array(dtype=wp.vec4),
     params: WarpParameters,
 ):
-    """Velocities of the grid to the particles."""
+    """Transfer grid velocities to the particles."""
     p = first + wp.tid()
     at = x[p] / params.dx
     bx = int(at[0] - 0.5)
@@ -177,7 +177,7 @@ class WarpSolver:
         wp.load_module(device="cpu")
 
     def advance(self, steps: int) -> None:
-        """Make substeps."""
+        """Run substeps."""
         particles = [self.x, self.v, self.C]
         for _ in range(steps):
             self.grid.zero_()
@@ -189,7 +189,7 @@ class WarpSolver:
             self._launch(gather, slices, [*particles, self.grid, self.params])
 
     def positions(self) -> Any:
-        """[N, 3] in the block's order [m]."""
+        """Positions [N, 3] in the order of the block [m]."""
         out = np.empty((len(self.order), 3), np.float32)
         out[self.order] = self.x.numpy()
         return out

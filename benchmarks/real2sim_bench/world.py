@@ -1,7 +1,7 @@
-"""``real2sim bench world``: what a step of the world costs by itself, without pictures, socket or
-log, and how much more where nothing of it is compiled.
+"""``real2sim bench world``: time of a world step without images, sockets or log, compiled and
+uncompiled.
 
-The uncompiled steps are made by a process of their own, this module as a program.
+Uncompiled steps run in a subprocess, with this module as the program.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ CASES: Mapping[str, Mapping[str, Any]] = {
     "contact": {"on_collision": "continue"},
     "contact, idm": {"on_collision": "continue", "agents": {"default": "idm"}},
 }
-"""What is reset to; where nothing is said, a kinematic car among 18 objects that repeat the log."""
+"""Reset specs by case; the default is a kinematic car among 18 objects that replay the log."""
 
 HALVES = ("move", "evaluate", "observe")
 EPISODES, EPISODES_UNCOMPILED = 5, 1
 
 
 def run() -> Figures:
-    """Microseconds of a step by case, and as a multiple where nothing is compiled."""
+    """Microseconds per step by case, and the ratio of uncompiled to compiled steps."""
     console = Console()
     with console.status("compiled"):
         compiled = measured(EPISODES)
@@ -64,7 +64,7 @@ def run() -> Figures:
 
 
 def measured(episodes: int) -> Figures:
-    """Microseconds of the halves of a step, and of all of it, by case."""
+    """Microseconds of both halves of a step and of the whole step, by case."""
     warm_up()
     scene = read_packed(SHIPPED)
     return {name: _case(scene, spec, episodes) for name, spec in CASES.items()}
@@ -78,7 +78,7 @@ def _case(scene: Scene, spec: Mapping[str, Any], episodes: int) -> Figures:
 
 
 def _episode(scene: Scene, spec: ResetSpec) -> Iterator[tuple[float, float, float]]:
-    """Seconds of the halves of each step, as a session makes them."""
+    """Times of both halves of each step, as run by a session [s]."""
     world = World(scene, ScenarioState.of(scene), spec)
     while not world.over:
         plan = TrajectoryPlan.model_validate(straight_on(world.t_us))

@@ -1,4 +1,4 @@
-"""The plain torch rasterizer: slow, simple and differentiable; the oracle for other backends.
+"""The plain torch rasterizer: slow, simple and differentiable; the reference for other backends.
 
 Semantics are those of gsplat 1.5.3 ``rasterization`` (classic EWA splatting, Zwicker et al. 2001;
 Kerbl et al. 2023), except that depths are compared after rounding the float64 depth to float32.
@@ -43,7 +43,7 @@ from .types import Instance, RenderError, RenderOutput
 
 
 class Blended(Protocol):
-    """N splats from front to back."""
+    """N splats, front to back."""
 
     @property
     def colors(self) -> Tensor:
@@ -65,9 +65,9 @@ def blend(splats: Blended, alpha: Tensor, size: tuple[int, ...]) -> tuple[Tensor
     """Colour [*size, 3], opacity, depth, instance and median depth [*size] of pixels.
 
     Args:
-        splats: N of them, from front to back.
-        alpha: [N, pixels], of each at each pixel.
-        size: of the image of these pixels.
+        splats: N splats, front to back.
+        alpha: [N, pixels], alpha of each splat at each pixel.
+        size: shape of the output.
     """
     dtype = alpha.dtype
     after = torch.cumprod(1 - alpha, dim=0)
@@ -91,19 +91,19 @@ def blend(splats: Blended, alpha: Tensor, size: tuple[int, ...]) -> tuple[Tensor
 STEP = 1e-5
 """Step of finite differences, relative to the distance."""
 ROUNDS = 4
-"""In which the row of a centre and its time settle."""
+"""Iterations for the row and the exposure time of a centre."""
 ROWS = 8
-"""Rows of pixels that are blended at once."""
+"""Pixel rows blended at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class RaySplats:
-    """V Gaussians in the camera's frame in the middle of the read-out.
+    """V Gaussians in the mid-readout camera frame.
 
     Attributes:
-        roots: [V, 3, 3] inverse Cholesky roots of their covariances.
-        centres, ways: [V, 3] where they are, and how far they go over the read-out before the
-            camera [m].
+        roots: [V, 3, 3] inverse Cholesky factors of their covariances.
+        centres, ways: [V, 3] positions, and displacements relative to the camera over the readout
+            [m].
         opacities, depths: [V].
         colors: [V, 3].
         depth_key: [V] float32.
@@ -120,7 +120,7 @@ class RaySplats:
     instance_ids: Tensor
 
     def select(self, index: Tensor) -> RaySplats:
-        """Some of them, in that order."""
+        """The splats ``index``, in that order."""
         return RaySplats(*(tensor[index] for tensor in vars(self).values()))
 
 
@@ -131,7 +131,7 @@ def blend_rays(
     dtype: torch.dtype,
 ) -> tuple[Tensor, ...]:
     """RGB without background, alpha, depth, instance and median depth of the request's camera, and
-    which of its pixels see anything."""
+    the mask of pixels inside the lens."""
     optics = request.optics
     if optics is None:
         raise RenderError("a request without optics has no rays")
@@ -156,7 +156,7 @@ def blend_rays(
 
 
 def _pixel_times(optics: LensView) -> NDArray[np.float64]:
-    """Time [H, W] of every pixel, -0.5 to 0.5 over the read-out."""
+    """Time [H, W] of every pixel, -0.5 to 0.5 over the readout."""
     camera = optics.camera
     times = np.zeros((camera.height, camera.width))
     if camera.shutter.rolls:
@@ -168,7 +168,7 @@ def _pixel_times(optics: LensView) -> NDArray[np.float64]:
 def _splats(
     request: RasterRequest, placement: Placement, index: int, covars: Tensor, dtype: torch.dtype
 ) -> RaySplats:
-    """Gaussians of one instance that are between the planes."""
+    """Gaussians of one instance between the near and far plane."""
     optics, instance, options = request.optics, request.instances[index], request.options
     assert optics is not None
     cloud, camera = instance.cloud, optics.camera
@@ -202,8 +202,10 @@ def _splats(
 
 
 def _ways(instance: Instance, optics: LensView, own: Tensor) -> Tensor:
-    """How far centres go over the read-out as the camera sees it, ``own`` [N, 3] from the origin of
-    their instance."""
+    """Displacement of centres relative to the camera over the readout [m].
+
+    ``own`` [N, 3] are the centres relative to the origin of their instance.
+    """
     ways = torch.zeros_like(own) - torch.from_numpy(optics.shift)
     if instance.twist is None or not optics.moves:
         return ways
@@ -214,8 +216,8 @@ def _ways(instance: Instance, optics: LensView, own: Tensor) -> Tensor:
 
 
 def _derivatives(optics: LensView, centres: Float, ways: Float) -> tuple[Tensor, Tensor]:
-    """Derivatives [N, 2, 3] of image positions, in the frame of the middle of the read-out, and
-    positions [N, 3] in that of the time at which the camera sees them."""
+    """Derivatives [N, 2, 3] of image positions, in the mid-readout camera frame, and positions
+    [N, 3] in the camera frame at the exposure time of each centre."""
     camera = optics.camera
     position = continued(camera, tables_of(camera).reach)
     turns = np.broadcast_to(np.eye(3), (len(centres), 3, 3))
@@ -234,15 +236,15 @@ def _derivatives(optics: LensView, centres: Float, ways: Float) -> tuple[Tensor,
 
 
 def _line_times(optics: LensView, positions: Float) -> Float:
-    """When the rows or columns of image positions [N, 2] are taken, -0.5 to 0.5."""
+    """Exposure time of image positions [N, 2], -0.5 to 0.5 over the readout."""
     axis = 1 if optics.camera.shutter.by_row else 0
     lines = optics.lines()
     return np.interp(positions[:, axis] - 0.5, np.arange(len(lines)), lines)
 
 
 def _blur(axes: Tensor, centres: Tensor, eps2d: float) -> Tensor:
-    """Covariances [N, 3, 3] of a pixel's blur at the centres: as wide as ``eps2d`` across the ray,
-    and about as much along it."""
+    """Covariances [N, 3, 3] of the pixel blur at the centres: ``eps2d`` across the ray, and about
+    the same along it."""
     square = axes @ axes.mT
     square = square + 1e-12 * torch.eye(2, dtype=axes.dtype)
     inverse = torch.linalg.inv(square)
@@ -277,8 +279,8 @@ class ReferenceBackend:
     """Plain torch on the CPU, made differentiable by torch itself.
 
     Args:
-        dtype: float32 or float64 of everything after placement.
-        image_dtype: of the images given out; float64 for finite differences.
+        dtype: float32 or float64, dtype of computations after placement.
+        image_dtype: dtype of output images; float64 for finite differences.
     """
 
     name = "reference"
@@ -356,9 +358,9 @@ class ReferenceBackend:
 
 @dataclass(frozen=True, eq=False)
 class _Splats:
-    """Gaussians on the image plane: V of them, in the order of blending once sorted.
+    """V Gaussians on the image plane; in blending order after sorting.
 
-    ``owners`` [V, 2] int64 are the index of the instance and of the Gaussian in it.
+    ``owners`` [V, 2] int64 has the indices of the instance and of the Gaussian in it.
     """
 
     means2d: Tensor
@@ -438,7 +440,7 @@ def _project(
 
 
 def _covariances(instance: Instance, dtype: torch.dtype) -> Tensor:
-    """Covariances [N, 3, 3] in the cloud's frame."""
+    """Covariances [N, 3, 3] in the cloud frame."""
     if instance.covars is not None:
         covars = instance.covars.to(dtype)
         return (covars + covars.mT) / 2
@@ -475,7 +477,7 @@ def _jacobian(means: Tensor, z: Tensor, K: Tensor, width: int, height: int) -> T
 def _blend_image(
     splats: _Splats, width: int, height: int, watch: ScreenWatch | None
 ) -> tuple[Tensor, ...]:
-    """RGB without background, alpha, depth, instance and median depth of the whole image, from
+    """RGB without background, alpha, depth, instance and median depth of the image, blended in
     square tiles."""
     rows = []
     for y0 in range(0, height, TILE):
@@ -499,7 +501,7 @@ def _overlaps(splats: _Splats, axis: int, low: int, high: int) -> Tensor:
 
 
 def _offsets(means2d: Tensor, x0: int, x1: int, y0: int, y1: int) -> tuple[Tensor, Tensor]:
-    """From V centres to the pixel centres of [y0, y1) x [x0, x1): dx and dy [V, pixels]."""
+    """Offsets dx, dy [V, pixels] from V centres to the pixel centres of [y0, y1) x [x0, x1)."""
     dtype = means2d.dtype
     py, px = torch.meshgrid(
         torch.arange(y0, y1, dtype=dtype) + 0.5,

@@ -29,13 +29,13 @@ from .types import (
 )
 
 ALPHA_MAX = 0.999
-"""No single Gaussian covers a pixel more than this, so that transmittance stays above 0."""
+"""Maximum alpha of a Gaussian at a pixel, so that transmittance stays above 0."""
 ALPHA_MIN = 1.0 / 255.0
 """Contributions below this are skipped; it also bounds the extent of a Gaussian on screen."""
 TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished when the next Gaussian would bring its transmittance to this or below."""
 CLAMP_MARGIN = 0.3
-"""x/z and y/z of the projection Jacobian may leave the image by this times tan(fov / 2)."""
+"""Margin around the image for x/z and y/z in the Jacobian, in units of tan(fov / 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ class RasterRequest:
         width, height: size of all images [px].
         sky: sky behind everything, or None for ``options.background``.
         options: all other options.
-        optics: lens, shutter and motion of a single camera, whose viewmat is that of the middle of
-            the read-out; None for pinhole cameras.
+        optics: lens, shutter and motion of a single camera, whose viewmat is that at mid-readout;
+            None for pinhole cameras.
         between: callback between pieces of work of about 10 ms each, on the calling thread. It may
             rasterize with the same backend. If None, the work is not interrupted.
     """
@@ -184,7 +184,7 @@ def draws_lens(backend: Backend) -> bool:
 
 
 def no_lens(backend: Backend, camera: Camera) -> str:
-    """Message why ``backend`` cannot draw a camera, with a suggestion."""
+    """Error message that ``backend`` cannot draw a camera, with a suggestion."""
     kind = "pinhole" if camera.lens is None else camera.lens.model
     return (
         f"the backend {backend.name!r} draws pinhole cameras with a global shutter, not camera "

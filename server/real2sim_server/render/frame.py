@@ -37,7 +37,7 @@ from .rasterize import DEFAULT_OPTIONS, MAX_INSTANCE_ID, checked_request
 from .select import select_backend
 from .types import Instance, LabelOutput, RasterOptions, RenderError, RenderOutput, Sky, Window
 
-# Uncertainty is a pass with uncertainties instead of colours, so a pixel is the mean over its
+# Uncertainty is a pass with uncertainties instead of colours. A pixel is the mean over its
 # Gaussians, weighted by their contribution. Merged Gaussians of small images have the mean of their
 # members. Backends treat it as a colour.
 
@@ -46,9 +46,9 @@ UNCERTAINTY = "uncertainty"
 WITHOUT = (
     "this scene has no uncertainties; train it again, or run `real2sim fit-uncertainty SCENE LOG`"
 )
-"""Why a scene has no such images."""
+"""Error message for scenes without uncertainty."""
 
-# Clouds and skies are immutable and shared, and backends keep what they prepare of each.
+# Clouds and skies are immutable and shared, and backends cache data derived from them.
 _clouds: WeakKeyDictionary[GaussianCloud, GaussianCloud] = WeakKeyDictionary()
 _skies: WeakKeyDictionary[Sky, Sky] = WeakKeyDictionary()
 
@@ -165,7 +165,7 @@ class RigView:
     Attributes:
         instances: instances of its world.
         cameras: cameras on the vehicle.
-        T_world_vehicle: [4, 4] pose of the vehicle, in the middle of a read-out.
+        T_world_vehicle: [4, 4] pose of the vehicle at mid-readout.
         sky: sky behind everything.
         twist: [6] velocity of the vehicle's origin [m/s] and angular velocity [rad/s], world frame,
             for cameras with a rolling shutter; None if stationary.
@@ -207,7 +207,7 @@ def render_cameras(
         twist: twist of the vehicle, see RigView.
 
     Raises:
-        RenderError: as rasterize(); also for a vehicle pose that is not rigid, and for an unknown
+        RenderError: see rasterize(); also for a vehicle pose that is not rigid, and for an unknown
             modality.
     """
     view = RigView(instances, cameras, T_world_vehicle, sky, twist)
@@ -235,7 +235,7 @@ def render_rigs(
         waits: whether to wait until images are complete; else call ``ready`` of each frame.
 
     Raises:
-        RenderError: as :func:`render_cameras`, for any of them; nothing is drawn.
+        RenderError: see :func:`render_cameras`; nothing is drawn if any vehicle fails.
     """
     if modalities is None:
         modalities = modalities_drawn(options)
@@ -367,7 +367,7 @@ def _drawn(
 def _drawn_in_colour(
     requests: Sequence[RasterRequest], modalities: Sequence[str], backend: Backend
 ) -> Iterator[_Drawn]:
-    """By the passes that draw colours."""
+    """The output of each request except uncertainty."""
     if requests and isinstance(backend, FrameBackend) and draws_together(backend, modalities):
         start = time.perf_counter()
         started = backend.start_frames(requests, modalities)
@@ -410,7 +410,7 @@ def _rasterized(requests: Sequence[RasterRequest], backend: Backend) -> Iterator
 def _taken_apart(
     output: RenderOutput, cameras: Sequence[int], numbers: Sequence[int]
 ) -> Iterator[tuple[int, RenderOutput]]:
-    """Outputs of requests that were drawn in one call, by index."""
+    """Outputs of requests that were drawn in one call, with the index of each request."""
     first = 0
     for number, count in zip(numbers, cameras, strict=True):
         part = slice(first, first + count)
@@ -562,7 +562,7 @@ def label_cameras(
         backend: renderer backend.
 
     Raises:
-        RenderError: as rasterize().
+        RenderError: see rasterize().
     """
     frames: dict[int, LabelledFrame] = {}
     for members in alike(cameras):

@@ -35,13 +35,13 @@ from .types import RenderError
 # JPEG by libjpeg-turbo, or by nvJPEG on the GPU that drew the image
 
 JpegEncoder = Callable[[NDArray[np.uint8], int], bytes]
-"""Bytes of an image [H, W, 3] uint8, C order, at a quality of 1 to 100; on any thread."""
+"""Encodes an image [H, W, 3] uint8, C order, at a quality of 1 to 100; thread-safe."""
 
 CPU_ONLY: Final = -99999
-"""Device by which nvImageCodec works without a GPU, by libjpeg-turbo."""
+"""Device id with which nvImageCodec uses the CPU (libjpeg-turbo)."""
 PROOF_QUALITY = 95
 PROOF_LEVELS = 12
-"""Of 255, by which no channel of the smooth sample may differ after decoding."""
+"""Maximum channel error of the decoded sample image, of 255."""
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ class NvjpegEncoder:
     thread-safe.
 
     Args:
-        device: number of the GPU, or CPU_ONLY.
+        device: index of the GPU, or CPU_ONLY.
 
     Raises:
         ImportError: nvImageCodec is not installed.
@@ -159,8 +159,8 @@ DEPTH_PNG_UNIT = 1 / 256
 UNCERTAINTY_PNG_UNIT = 1 / 65535
 """Step of one level of an uncertainty png."""
 PNG_COMPRESSION = 1
-"""zlib level; higher ones are several times slower and shrink pictures little more. With runs alone
-and one filter for all rows (Paeth's) pictures take two thirds of the time, and less room."""
+"""zlib level. Higher levels are several times slower for little gain in size. Run-length encoding
+with the Paeth filter for all rows takes 2/3 of the time and is smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,11 +280,11 @@ def _png(image: NDArray[Any]) -> bytes:
 # Quantization of blended floats, one pass each
 
 SOLID_ALPHA = 0.5
-"""A pixel below this alpha counts as nothing hit."""
+"""Minimum alpha of a hit; pixels below it have no depth."""
 
 
 PIECE = 1 << 21
-"""Numbers that are converted in one go: a few milliseconds."""
+"""Values converted per piece of work; takes a few milliseconds."""
 
 
 def to_uint8(rgb: Tensor, *, between: Callable[[], object] | None = None) -> NDArray[np.uint8]:
@@ -473,11 +473,11 @@ FOURCC_BY_SUFFIX = {".webm": "VP80", ".mp4": "mp4v"}
 MATROSKA_DOCTYPE = b"\x42\x82\x88matroska"
 MATROSKA_SEGMENT = b"\x18\x53\x80\x67"
 WEBM_DOCTYPE = b"\x42\x82\x88webm\0\0\0\0"
-"""An EBML string may be padded by zeros (RFC 8794, 7.4)."""
+"""DocType element; an EBML string may be padded with zeros (RFC 8794, 7.4)."""
 
 
 WAITING_FRAMES = 16
-"""Frames that may wait for the encoder; whoever adds another waits for the first of them."""
+"""Maximum length of the encoder queue; adding a frame to a full queue blocks."""
 
 
 class VideoError(OSError):
@@ -545,7 +545,7 @@ class VideoFile:
             raise
 
     def discard(self) -> None:
-        """Stop and delete the file."""
+        """Stop encoding and delete the file."""
         for frame in self._waiting:
             frame.cancel()
         self._finish()
@@ -595,7 +595,7 @@ def _check_whole(file: Path) -> None:
     the length of the contents last.
 
     Raises:
-        OSError: the file is incomplete; with the system's reason, or EIO if writes work again.
+        OSError: the file is incomplete; has the system's reason, or EIO if writes work again.
     """
     with file.open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
@@ -618,7 +618,7 @@ def _end_of_matroska(opened: BinaryIO) -> int | None:
     header = opened.read(256)
     at = header.find(MATROSKA_SEGMENT)
     start = at + len(MATROSKA_SEGMENT) + 8
-    # FFmpeg writes the length in eight bytes; the first of them, 1, marks that form.
+    # FFmpeg writes the length in eight bytes, marked by a first byte of 1.
     if at < 0 or len(header) < start or header[start - 8] != 1:
         return None
     return start + int.from_bytes(header[start - 7 : start], "big")

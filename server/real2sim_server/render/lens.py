@@ -22,20 +22,20 @@ from ..scene.camera import CameraMotion
 from .types import weak_cache
 
 CELLS = 96
-"""Cells along the edge of a face of the directory."""
+"""Cells along the edge of a directory face."""
 NODE = 8
-"""Numbers of a node of it."""
+"""Numbers per node of the directory."""
 STEADY = 18 / CELLS
-"""The bend of a node holds this far around it, on a face."""
+"""Distance on a face within which the ``bend`` of a node is valid."""
 BEYOND = np.radians(5.0)
-"""Positions further outside the image are extrapolated linearly."""
+"""Angle outside the image beyond which positions are extrapolated linearly [rad]."""
 STEP = 1e-4
-"""Step of finite differences, on a face."""
+"""Step of finite differences on a face."""
 
 
 @dataclass(frozen=True, eq=False)
 class LensView:
-    """A camera with a lens or a rolling shutter, and its motion during a read-out.
+    """A camera with a lens or a rolling shutter, and its motion during a readout.
 
     Attributes:
         camera: the camera; its pose on the vehicle is ignored.
@@ -47,37 +47,37 @@ class LensView:
 
     @property
     def seconds(self) -> float:
-        """Read-out time of an image [s]."""
+        """Readout time of an image [s]."""
         return self.camera.shutter.readout_us * 1e-6
 
     @property
     def viewmat(self) -> Float:
-        """``T_camera_world`` [4, 4] in the middle of the read-out."""
+        """``T_camera_world`` [4, 4] at mid-readout."""
         return invert_transform(self.middle)
 
     @functools.cached_property
     def middle(self) -> Float:
-        """``T_world_camera`` [4, 4] in the middle of the read-out."""
+        """``T_world_camera`` [4, 4] at mid-readout."""
         return self.motion.middle()
 
     @functools.cached_property
     def moves(self) -> bool:
-        """Whether the pose of the camera changes during the read-out."""
+        """Whether the pose of the camera changes during the readout."""
         return self.camera.shutter.rolls
 
     def lines(self) -> Float:
-        """Time of each row (or column), -0.5 to 0.5 over the read-out."""
+        """Time of each row (or column), -0.5 to 0.5 over the readout."""
         return self.camera.shutter.line_times(self.camera.width, self.camera.height) - 0.5
 
     @functools.cached_property
     def shift(self) -> Float:
-        """[3] displacement of the camera over the read-out, in its frame in the middle [m]."""
+        """[3] displacement of the camera over the readout, mid-readout camera frame [m]."""
         way: Float = self.motion.end[:3, 3] - self.motion.start[:3, 3]
         return way @ self.middle[:3, :3]
 
     @functools.cached_property
     def turn(self) -> Float:
-        """[3] rotation vector of the camera over the read-out, in its own frame [rad]."""
+        """[3] rotation vector of the camera over the readout, camera frame [rad]."""
         relative = self.motion.start[:3, :3].T @ self.motion.end[:3, :3]
         axis = np.array(
             [
@@ -91,10 +91,7 @@ class LensView:
         return axis / (2 * sine) * angle if sine > 1e-12 else axis / 2
 
     def rays(self) -> NDArray[np.float32]:
-        """[H, W, 3] ray directions, camera frame in the middle of the read-out; not normalised.
-
-        0 outside the lens.
-        """
+        """[H, W, 3] ray directions, mid-readout camera frame; unnormalised, 0 outside the lens."""
         table = tables_of(self.camera).rays
         turn = self.turn
         if not self.moves or not turn.any():
@@ -136,7 +133,7 @@ class LensTables:
 
 @weak_cache
 def tables_of(camera: Camera) -> LensTables:
-    """Tables of a camera, cached; takes a fifth of a second."""
+    """Tables of a camera, cached; the first call takes 0.2 s."""
     width, height = camera.width, camera.height
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays, seen = camera.unproject(np.stack([x, y], -1))
@@ -170,7 +167,7 @@ def continued(camera: Camera, reach: float) -> Callable[[Float], Float]:
         length = np.hypot(directions[..., 0], directions[..., 1])
         angle = np.arctan2(length, directions[..., 2])
         across = directions[..., :2] / np.where(length > 0, length, 1.0)[..., None]
-        # Straight behind the camera, any direction will do.
+        # Straight behind the camera, the direction is arbitrary.
         across = np.where((length > 0)[..., None], across, [1.0, 0.0])
         found = at(np.minimum(angle, last), across)
         edge = np.full_like(angle, last)
@@ -228,7 +225,7 @@ def _precision(
 
 
 def _largest_around(cells: Float, reach: float) -> Float:
-    """At nodes [6, CELLS + 1, CELLS + 1] the largest of the cells within ``reach`` on a face."""
+    """Maximum over the cells within ``reach`` of each node, [6, CELLS + 1, CELLS + 1]."""
     size = 2 * (round(reach * CELLS / 2) + 1)
     padded = np.pad(cells, ((0, 0), *((size // 2, size // 2),) * 2), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(1, 2))
@@ -245,7 +242,7 @@ TOLERANCE = 0.15
 def back_projected(
     depth: NDArray[np.float32], K: Float, T_world_camera: Float
 ) -> NDArray[np.float32]:
-    """World points [H, W, 3] [m] of a depth image [H, W] along the camera's z axis [m]."""
+    """World points [H, W, 3] [m] of a depth image [H, W] along the camera z axis [m]."""
     height, width = depth.shape
     x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
     y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
@@ -269,7 +266,7 @@ def with_ground(
         semantic: [H, W], with the ground as ``static``.
         depth: [H, W] median depth of the same pass, as defined by the camera's lens [m].
         camera: the camera.
-        T_world_camera: [4, 4], in the middle of a read-out.
+        T_world_camera: [4, 4] pose at mid-readout.
         ground: ground of the scene.
     """
     found = semantic.copy()

@@ -27,7 +27,7 @@ from .images import (
 from .types import RasterOptions, RenderError, RenderOutput
 
 SWITCHES = ("depth", "instance", "median_depth")
-"""Fields of RasterOptions that turn an image of the pass on."""
+"""Fields of RasterOptions that enable an image of the pass."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def modality_names() -> tuple[str, ...]:
 
 
 def modality_of(name: str) -> SensorModality:
-    """The modality of that name. Raises RenderError, which lists the known ones."""
+    """The modality with a name. Raises a RenderError that lists the known names."""
     found = _registry.get(name)
     if found is None:
         allowed = ", ".join(repr(known) for known in _registry)
@@ -104,7 +104,7 @@ def modality_of(name: str) -> SensorModality:
 
 
 def options_for(names: Iterable[str], options: RasterOptions) -> RasterOptions:
-    """``options`` with the switches of these modalities set."""
+    """``options`` with the switches of the named modalities set."""
     wanted = {modality_of(name).switch for name in names}
     return replace(
         options,

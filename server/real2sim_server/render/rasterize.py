@@ -69,7 +69,7 @@ def rasterize(
 
     Gaussians are projected by the local affine approximation (EWA, Zwicker et al. 2001), sorted
     by the depth of their centres (ties keep list order) and blended front to back
-    (Kerbl et al. 2023). Pixel centres lie at +0.5.
+    (Kerbl et al. 2023). Pixel centres are at +0.5.
 
     Args:
         instances: clusters with their poses; the first of two at the same depth is in front.
@@ -84,9 +84,9 @@ def rasterize(
             clouds in every call.
         between: callback between pieces of work, see RasterRequest.
         optics: lens, shutter and motion of a single camera; pass its ``optics.viewmat`` and the K
-            and size of its camera. Gaussians are not projected affinely then: the response is
-            evaluated at its maximum along each pixel's ray (Moenne-Loccoz et al. 2024), and depths
-            are ranges if the camera defines them so.
+            and size of its camera. With optics, Gaussians are evaluated at their maximum along
+            each pixel's ray (Moenne-Loccoz et al. 2024) instead of being projected, and depths are
+            ranges if the camera defines them so.
 
     Raises:
         RenderError: for invalid arguments and for optics that the backend cannot draw; nothing is
@@ -162,7 +162,7 @@ def rasterize_batch(
         backend: see :func:`rasterize`.
 
     Raises:
-        RenderError: as :func:`rasterize`, and for an empty list of views.
+        RenderError: see :func:`rasterize`; also for an empty list of views.
     """
     if not views:
         raise RenderError("rasterize_batch() needs at least one view")
@@ -203,10 +203,10 @@ def rasterize_worlds(
     options: RasterOptions = SMALL_IMAGES,
     backend: str | Backend = "auto",
 ) -> RenderOutput:
-    """Draw many worlds made of the same things: [W C] images, by world, then by camera.
+    """Draw many worlds with the same instances: [W C] images, by world, then by camera.
 
     The images are bitwise equal to those of :func:`rasterize_batch`. Backends that support it
-    prepare small images once per thing instead of once per image.
+    prepare instances once for all small images instead of once per image.
 
     Args:
         worlds: at least one world and one camera.
@@ -214,7 +214,7 @@ def rasterize_worlds(
         sky, options, backend: see :func:`rasterize_batch`.
 
     Raises:
-        RenderError: as :func:`rasterize_batch`.
+        RenderError: see :func:`rasterize_batch`.
     """
     like = RasterRequest(
         instances=worlds.things,
@@ -248,7 +248,7 @@ def views_of(worlds: WorldViews) -> list[View]:
 
 
 def _check_worlds(worlds: WorldViews, like: RasterRequest) -> None:
-    """Validate things and cameras like any request, and the poses of shown things."""
+    """Validate instances and cameras like any request, and the poses of shown instances."""
     _check_request(like, check_values=True)
     viewmats = _float64(worlds.viewmats.reshape(-1, 4, 4), "viewmats", (4, 4))
     _check_cameras(

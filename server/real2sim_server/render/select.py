@@ -45,7 +45,7 @@ class RegisteredBackend:
     """A backend that can be selected by name.
 
     Attributes:
-        status: function that returns whether it can be used here; must be fast.
+        status: function that returns the BackendStatus; must be fast.
         make: function that creates the backend; called once, and only if it is usable.
         preference: ``auto`` selects the usable backend with the highest value; 0 is never selected.
     """
@@ -175,13 +175,14 @@ BACKENDS: dict[str, RegisteredBackend] = {
         lambda: BackendStatus("reference", True, "plain torch, slow"), _make_reference
     ),
 }
-"""By name. Modules are imported when their backend is made: each needs libraries of its own."""
+"""Backends by name. Their modules are imported on creation, because each needs different
+libraries."""
 
 
 # Levels of detail
 
 LEVELS_SHARE = 0.8
-"""Memory of levels over that of their cloud, a little more than measured."""
+"""Memory of levels relative to that of their cloud; an upper estimate."""
 
 SMALL_IMAGE_KERNELS = 5
 """Number of kernels that :func:`warm_up_small_images` compiles."""
@@ -223,13 +224,13 @@ def without_levels(things: Iterable[Instance]) -> list[Instance]:
 
 
 def make_levels(things: Iterable[Instance]) -> None:
-    """Build the levels of all things: about a second per million Gaussians. Thread-safe."""
+    """Build the levels of all instances: about a second per million Gaussians. Thread-safe."""
     for thing in without_levels(things):
         hierarchy_of(thing.cloud, thing.colour)
 
 
 def levels_estimate(things: Iterable[Instance]) -> int:
-    """Estimated memory of the levels of ``things`` [bytes], counting each cloud once."""
+    """Estimated memory of the levels of all instances [bytes], counting each cloud once."""
     clouds = {(id(t.cloud), id(t.colour)): t for t in things}
     sizes = (
         t.cloud.nbytes + (t.colour.nbytes if t.colour is not None else 0) for t in clouds.values()
@@ -243,7 +244,7 @@ def levels_bytes() -> int:
 
 
 def scene_levels_bytes(scene: Scene) -> int:
-    """Memory of the levels of a scene's own clouds [bytes], released with the scene."""
+    """Memory of the levels of a scene's clouds [bytes], released with the scene."""
     clouds = [(scene.background, None), *((o.cloud, o.colour) for o in scene.objects.values())]
     known = {known_hierarchy(cloud, colour) for cloud, colour in clouds}
     return sum(hierarchy.nbytes for hierarchy in known if hierarchy is not None)

@@ -35,7 +35,7 @@ class Instance:
             tensor (float32 or float64) that requires grad receives the gradient of the pose.
         instance_id: value in instance images, 0 (background) to 65535.
         scale: [3] scales the cloud about its origin along its own axes.
-        covars: [N, 3, 3] float32, covariances in the cloud's frame that replace quats and scales
+        covars: [N, 3, 3] float32, covariances in the cloud frame that replace quats and scales
             (deformed clouds), or None.
         colour: time-dependent colours of the cloud, or None.
         t_us: time at which ``colour`` is evaluated [us].
@@ -57,12 +57,12 @@ class Instance:
 
 @dataclass(frozen=True, eq=False)
 class WorldViews:
-    """C cameras in W worlds that are made of the same K things.
+    """C cameras in W worlds with the same K instances.
 
     Attributes:
-        things: K instances; their own poses and times are ignored.
+        things: K instances; their poses and times are ignored.
         poses: [W, K, 4, 4] float64, ``T_world_object``.
-        shown: [W, K] bool, whether each thing is present.
+        shown: [W, K] bool, whether each instance is present.
         times_us: [W] int64, times at which colours are evaluated [us].
         viewmats: [W, C, 4, 4] float64, ``T_camera_world``.
         Ks: [C, 3, 3] float64 [px].
@@ -142,9 +142,9 @@ class RenderOutput:
         depth: [C, H, W] float32, expected depth along the camera z axis [m], that is
             sum(w z) / sum(w); 0 where alpha is 0. None if not requested.
         instance: [C, H, W] uint16, instance_id of the Gaussian at which transmittance first falls
-            to 0.5 or below; 0 where it never does. None if not requested.
-        median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 where there is none. Has no
-            gradients. None if not requested.
+            to 0.5 or below; 0 if it never does. None if not requested.
+        median_depth: [C, H, W] float32, depth of that Gaussian [m]; 0 if none. Has no gradients.
+            None if not requested.
         uncertainty: [C, H, W] float32, see :mod:`.frame`; None if not requested.
         classes: [65536] uint8, class by instance id; None if not requested.
         behind: class of pixels whose transmittance stays above 0.5.
@@ -194,9 +194,9 @@ class LabelOutput:
 
     Attributes:
         rgb: [H, W, 3] float32, as in RenderOutput.
-        depth: [H, W] float32 depth of each pixel's front along the camera's z axis [m], 0 without.
+        depth: [H, W] float32 depth of each pixel's front along the camera z axis [m], 0 if none.
         instance: [H, W] uint16, instance id of the front; 0 for background or without front.
-        alone: by window, depths [h, w] float32 of the object's own fronts, ignoring occluders.
+        alone: by window, depths [h, w] float32 of the object without occluders [m].
         timing_ms: milliseconds by stage.
     """
 
@@ -214,7 +214,7 @@ Made = TypeVar("Made")
 
 
 def weak_cache(make: Callable[[Source], Made]) -> Callable[[Source], Made]:
-    """``make`` with its results cached by weak reference to the source."""
+    """Cache the results of ``make`` by weak reference to the source."""
     kept: weakref.WeakKeyDictionary[Source, Made] = weakref.WeakKeyDictionary()
 
     @functools.wraps(make)

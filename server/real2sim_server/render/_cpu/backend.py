@@ -1,6 +1,6 @@
 """The CPU backend: Numba kernels on all cores.
 
-Cameras are drawn one at a time: clusters are projected in place, records are sorted by depth,
+Cameras are drawn one at a time: clusters are projected in place, then records are sorted by depth,
 assigned to tiles and blended. Work space grows on demand and is reused.
 
 Interruptible requests are processed in pieces; requests drawn in between use a separate work space.
@@ -36,11 +36,11 @@ from .records import Images
 from .small_images import SmallImages
 
 PICTURE_KERNELS = 9
-"""That :meth:`CpuBackend.warm_up` makes ready."""
+"""Number of kernels that :meth:`CpuBackend.warm_up` compiles or loads."""
 
 
 class CpuBackend:
-    """Rasterizer for any CPU. One call at a time; those of other threads wait."""
+    """Rasterizer for any CPU. Calls from several threads are serialised."""
 
     name = "cpu"
     draws_lenses = True
@@ -85,12 +85,12 @@ class CpuBackend:
         return _output(request, (rgb, alpha, depth, instance, median), timing)
 
     def rasterize_batch(self, requests: Sequence[RasterRequest]) -> RenderOutput:
-        """Draw small images of many requests at once, see SmallImages."""
+        """Draw small images of many requests, see SmallImages."""
         with self._lock:
             return self._small.draw(requests)
 
     def rasterize_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
-        """Draw small images of many worlds of the same things at once, see SmallImages."""
+        """Draw small images of many worlds with the same instances, see SmallImages."""
         with self._lock:
             return self._small.draw_worlds(worlds, like)
 
@@ -102,20 +102,22 @@ class CpuBackend:
         level: float,
         along_rays: bool = True,
     ) -> list[LabelOutput]:
-        """Pictures and labels in one walk, see LabelBackend."""
+        """Draw images and labels in one pass, see LabelBackend."""
         with self._work_space() as space, torch.no_grad():
             return draw_labels(request, windows, space, level=level, along_rays=along_rays)
 
     def warm_up(self) -> None:
-        """Compile the kernels of a first picture, or load them from the disk cache: all but those
-        of small images and of clouds of few Gaussians."""
+        """Compile the kernels of a first image, or load them from the disk cache.
+
+        Excludes the kernels for small images and for clouds of few Gaussians.
+        """
         made.expect(PICTURE_KERNELS)
         for request in picture_requests():
             self.rasterize(request)
 
     @contextmanager
     def _work_space(self) -> Iterator[Workspace]:
-        """Work space for this block alone, even if another request interrupts it."""
+        """Work space for exclusive use in the block, even if another request interrupts it."""
         with self._lock:
             space = self._idle_spaces.pop() if self._idle_spaces else Workspace()
             try:
@@ -127,7 +129,7 @@ class CpuBackend:
 def _output(
     request: RasterRequest, images: Sequence[NDArray[Any]], timing: dict[str, float]
 ) -> RenderOutput:
-    """What is given out of RGB, alpha, depth, instance and median depth."""
+    """RenderOutput of the requested images, from RGB, alpha, depth, instance and median depth."""
     options = request.options
     rgb, alpha, depth, instance, median = map(torch.from_numpy, images)
     return RenderOutput(

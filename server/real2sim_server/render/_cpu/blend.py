@@ -1,9 +1,9 @@
-"""Blending of image tiles on the CPU: sorted records, tile lists, the blend itself.
+"""Blending of image tiles on the CPU: depth order, tile lists and blending.
 
 Records are sorted by depth and listed for each 16x16 tile; tiles are then blended front to back.
-All work is split in a fixed pattern, so any number of threads gives the same bits.
+All work is split in a fixed pattern, so results are bitwise independent of the number of threads.
 
-The innermost step is explicit vector code over eight pixels. Their state is PLANES vectors:
+The inner loop is explicit vector code over eight pixels. Their state is PLANES vectors:
 transmittance (negative once finished), red, green, blue, depth, instance, median depth.
 """
 
@@ -58,9 +58,10 @@ PLANES = 7
 
 
 def _exponential_coefficients(degree: int) -> list[float]:
-    """Coefficients, constant first, of a polynomial near exp(-u) on [0, EXPONENT_LIMIT].
+    """Coefficients, constant first, of a polynomial approximation of exp(-u) on [0,
+    EXPONENT_LIMIT].
 
-    Interpolates at Chebyshev nodes; with degree 4 the sixteenth power is right to 2e-6.
+    Interpolates at Chebyshev nodes. For degree 4, the error of the sixteenth power is 2e-6.
     """
     nodes = np.cos((2 * np.arange(degree + 1) + 1) / (2 * degree + 2) * np.pi)
     nodes = (nodes + 1) / 2 * EXPONENT_LIMIT
@@ -82,7 +83,7 @@ def exponential(exponent: Lanes) -> Lanes:
 
 
 def _build_blend(builder: ir.IRBuilder, state: Planes, scalars: list[Any], extras: int) -> Any:
-    """Emit the blending of one record; returns eight bits, set where a pixel goes on."""
+    """Emit the blending of one record; returns eight bits, set for unfinished pixels."""
     sharpness, offset, rest, *values = (splat(builder, scalar) for scalar in scalars)
     distance = (lane_numbers(builder) + offset) * sharpness
     return blend_exponent(builder, state, distance.fused(distance, rest), values, extras)
@@ -94,14 +95,14 @@ def blend_exponent(
     """Emit the blending of one record whose alpha is exp(-EXPONENT_UNIT exponent).
 
     Args:
-        builder: of the kernel.
-        state: of eight pixels.
-        exponent: of these pixels; NaN or above EXPONENT_LIMIT where it shows nothing.
+        builder: IR builder of the kernel.
+        state: eight pixels.
+        exponent: exponents at these pixels; NaN or above EXPONENT_LIMIT contributes nothing.
         values: red, green, blue, depth, instance.
         extras: see _blend_intrinsic.
 
     Returns:
-        Eight bits, set where a pixel goes on.
+        Eight bits, set for unfinished pixels.
     """
     alpha = exponential(exponent)
     alpha = alpha.where(alpha.compare("<", ALPHA_MAX), ALPHA_MAX)
@@ -113,8 +114,8 @@ def blend_exponent(
     goes_on = after.compare(">", TRANSMITTANCE_MIN)
     blended = builder.and_(touched, goes_on)
     finished = builder.and_(touched, builder.not_(goes_on))
-    # Sums and sign bits, since a choice between old and new value would become a masked store,
-    # which is slow on many processors.
+    # Sums and sign bits instead of a select: LLVM would emit a masked store, which is slow on many
+    # processors.
     weight = weight.where(blended, 0.0)
     new = (before - weight).negative_where(finished)
     state.store(0, new)
@@ -134,7 +135,7 @@ def _blend_intrinsic(extras: int) -> Any:
     """The intrinsic for RGB (0), with depth (+1), with instance (+2), with median depth (+4).
 
     In kernels: blend(pixels, half, sharpness, offset, rest, red, green, blue, depth, instance)
-    with exponent = (sharpness (lane + offset))^2 + rest; returns zero when all are finished.
+    with exponent = (sharpness (lane + offset))^2 + rest; returns 0 when all pixels are finished.
     """
 
     def blend(typingctx, pixels, half, sharpness, offset, rest, red, green, blue, depth, instance):
@@ -159,7 +160,7 @@ blend_all = _blend_intrinsic(7)
 def touched_halves(typingctx, x, y, sharpness, slope, falloff, level):
     """Bits of the half rows of a 16x16 tile that one record may touch: 16 left ones, 16 right.
 
-    ``x``, ``y`` is the first pixel centre of the tile as seen from the record's centre [px].
+    ``x``, ``y`` is the first pixel centre of the tile relative to the record's centre [px].
     """
 
     def generate(context, builder, signature, arguments):
@@ -189,7 +190,7 @@ def touched_halves(typingctx, x, y, sharpness, slope, falloff, level):
 
 
 TASKS = 64
-"""Tiles are dealt to this many tasks in turn, which spreads dense parts of an image."""
+"""Number of tasks. Tiles are assigned round-robin, which spreads dense parts of an image."""
 LOOK_AHEAD = 6
 HALVES = TILE // LANES
 F32 = np.float32
@@ -203,7 +204,7 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
     Args:
         values: [M, RECORD] float32.
         lists: record indices by tile, near to far.
-        starts: [tiles + 1] int64, where the list of each tile starts.
+        starts: [tiles + 1] int64, start of each tile's list.
         background: [3] float32.
     """
     extras = (1 if images.depth.shape[0] else 0) + (2 if images.instance.shape[0] else 0)
@@ -225,9 +226,9 @@ def blend_tiles(values, lists, starts, tiles_x, first_tile, last_tile, backgroun
 def open_tile(pixels, planes, x0, y0, shape):
     """Clear the state and finish pixels outside the image.
 
-    Half rows of eight pixels are numbered down the left half of the tile, then down the right one;
-    each has ``planes`` of them, the first is its transmittance.
-    Returns a bit for each that has something to draw.
+    Half rows of eight pixels are numbered down the left half of the tile, then down the right half.
+    Each has ``planes`` vectors, the first of which is its transmittance.
+    Returns a bit per half row, set if it has unfinished pixels.
     """
     pixels[:] = 0
     alive = np.int64(0)
@@ -241,7 +242,7 @@ def open_tile(pixels, planes, x0, y0, shape):
 
 @inlined()
 def blend_tile(values, lists, first, last, x0, y0, pixels, alive, extras):
-    """Blend lists[first:last], near to far, until it ends or every pixel is finished."""
+    """Blend lists[first:last], near to far, until all pixels are finished."""
     for position in range(first, last):
         prefetch(values, np.int64(lists[min(position + LOOK_AHEAD, last - 1)]))
         record = values[lists[position]]
@@ -263,7 +264,7 @@ def blend_tile(values, lists, first, last, x0, y0, pixels, alive, extras):
 
 @inlined()
 def blend_half(pixels, half, record, start, rest, extras):
-    """Blend one record over eight pixels; zero when all of them are finished."""
+    """Blend one record over eight pixels; returns 0 when all of them are finished."""
     sharpness, depth, instance = record[SHARPNESS], record[DEPTH], record[INSTANCE]
     red, green, blue = record[RED], record[GREEN], record[BLUE]
     if extras >= 4:
@@ -281,7 +282,7 @@ def blend_half(pixels, half, record, start, rest, extras):
 
 @inlined()
 def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median):
-    """Put the background behind the tile and write it to the images."""
+    """Composite the tile over the background and write it to the images."""
     height, width = alpha.shape
     for row in range(min(TILE, height - y0)):
         for column in range(min(TILE, width - x0)):
@@ -301,7 +302,7 @@ def write_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median):
                 median[y, x] = pixels[p + 6 * LANES]
 
 
-# Tile lists: records are counted in depth order, then scattered by chunks with own cursors.
+# Tile lists: records are counted in depth order, then scattered by chunk, each with its cursors.
 
 
 TILE_CHUNKS = 8
@@ -314,7 +315,7 @@ def count_tiles(values, footprints, order, tiles_x, ordered_footprints, counts):
     """Count the records of each chunk in each tile.
 
     Args:
-        values, footprints: of Records.
+        values, footprints: see Records.
         order: [N] uint64, record indices in the low 32 bits, near to far.
         tiles_x: tiles in a row of the image.
         ordered_footprints: [N] int64, written: footprints in the order of ``order``.
@@ -338,7 +339,7 @@ def count_tiles(values, footprints, order, tiles_x, ordered_footprints, counts):
 
 @kernel()
 def tile_starts(counts, first_tile, last_tile, starts):
-    """Turn counts of tiles [first_tile, last_tile) into cursors of each chunk and tile starts."""
+    """Convert counts of tiles [first_tile, last_tile) to cursors per chunk and tile starts."""
     position = 0
     for tile in range(first_tile, last_tile):
         starts[tile] = position
@@ -367,7 +368,7 @@ def scatter_tiles(values, ordered_footprints, order, tiles_x, first_row, last_ro
                     cursors[chunk, tile] += 1
 
 
-# Depth order: one stable LSD radix sort; ties keep the order of instances and of their Gaussians.
+# Depth order: a stable LSD radix sort; ties keep the order of instances and of their Gaussians.
 
 DIGIT_BITS = 11
 SORT_CHUNKS = 8
@@ -378,10 +379,10 @@ def sort_records(records: Records, regions: int, pairs: Pairs, scratch: Pairs) -
     """Depth order of the records in the first ``regions`` regions.
 
     Args:
-        pairs, scratch: [M] uint64 work space, M at least the number of records in use.
+        pairs, scratch: [M] uint64 work space, M at least the number of used records.
 
     Returns:
-        Part of one of the two arrays: record indices in the low 32 bits, from near to far.
+        View of one of the two arrays: record indices in the low 32 bits, near to far.
     """
     ends = np.cumsum(records.counts[:regions])
     total = int(ends[-1]) if regions else 0
@@ -401,7 +402,7 @@ def sort_records(records: Records, regions: int, pairs: Pairs, scratch: Pairs) -
 def gather_pairs(keys, counts, ends, pairs):
     """Pack (key - smallest key) and record index; return the smallest and largest key.
 
-    Keys are the bits of depths, which sort like depths since these are positive.
+    Keys are the bits of the depths. Depths are positive, so their bits sort like them.
     """
     lows = np.full(ends.shape[0], 0xFFFFFFFF, np.uint32)
     highs = np.zeros(ends.shape[0], np.uint32)
@@ -422,7 +423,7 @@ def gather_pairs(keys, counts, ends, pairs):
 
 @kernel(parallel=PARALLEL_LOOPS)
 def radix_pass(source, target, total, shift, width):
-    """Stable counting sort of ``source[:total]`` by ``width`` bits from ``shift`` on."""
+    """Stable counting sort of ``source[:total]`` by ``width`` bits starting at bit ``shift``."""
     size = 1 << width
     mask, low = np.uint64(size - 1), np.uint64(shift)
     step = (total + SORT_CHUNKS - 1) // SORT_CHUNKS

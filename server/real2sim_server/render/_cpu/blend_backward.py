@@ -1,14 +1,14 @@
 """Backward blending: from the loss gradients of pixels to the gradients of records.
 
-The walk goes front to back like the forward pass and repeats its arithmetic bit for bit, so it
-stops at the same Gaussians without stored notes. Let v be colour, depth and 1 weighted by the loss
-gradient of a pixel: the pixel's part of the loss is the sum of w v over its Gaussians. ``REST``
-holds the remaining part of this sum, which gives the gradient by alpha: T v - REST / (1 - alpha).
+The backward pass traverses the Gaussians front to back and repeats the forward arithmetic bit for
+bit, so it stops at the same Gaussians without stored state. Let v be colour, depth and 1 weighted
+by the loss gradient of a pixel. The pixel's share of the loss is the sum of w v over its Gaussians.
+``REST`` is the remaining part of this sum; the gradient by alpha is T v - REST / (1 - alpha).
 
-The innermost step is explicit vector code: one record over one tile. Gradients by the exponent are
-gathered as moments over the pixels about the centre of the tile. Eight lanes keep sums over the
-rows and are summed once at the end. Each entry of a tile list writes to a slot of its own, so any
-number of threads gives the same bits.
+The inner loop is explicit vector code for one record over one tile. It accumulates gradients by the
+exponent as moments about the centre of the tile, per lane over the rows, and sums the lanes at the
+end. Each entry of a tile list has its own output slot, so results are bitwise independent of the
+number of threads.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -58,14 +58,16 @@ from .records import (
 )
 
 LEFT, REST, BY_RED, BY_GREEN, BY_BLUE, BY_DEPTH, BY_ALPHA = range(7)
-"""Planes of eight pixels: transmittance (negative once finished), what is still to come of the sum
-of w v, and the loss gradients by the sums of w times red, green, blue, depth and 1."""
+"""Planes of eight pixels: transmittance (negative once finished), the remaining sum of w v, and the
+loss gradients by the sums of w times red, green, blue, depth and 1."""
 BACKWARD_PLANES = 7
 
 SUM_1, SUM_X, SUM_XX, SUM_Y, SUM_XY, SUM_YY, ABS_X, ABS_Y = range(8)
-"""Sums over pixels of dL/dalpha alpha times powers of x and y from the centre of the tile [px],
-and of its absolute value times |dx'| and times |sharpness^2 slope dx' - falloff dy|, where
-dx' = dx - slope dy."""
+"""Sums over pixels of dL/dalpha alpha times powers of x and y from the centre of the tile [px].
+
+The last two are sums of its absolute value times |dx'| and |sharpness^2 slope dx' - falloff dy|,
+where dx' = dx - slope dy.
+"""
 SUM_RED, SUM_GREEN, SUM_BLUE, SUM_DEPTH = range(8, 12)
 """Loss gradients by the record's colour and depth."""
 SUMS = 16
@@ -77,7 +79,7 @@ Vectors = list[Lanes]
 
 @dataclass(frozen=True, eq=False)
 class _Splat:
-    """Scalars of one record and the vectors made of them."""
+    """Scalars of one record and the vectors derived from them."""
 
     x: Any
     y: Any
@@ -107,18 +109,18 @@ def blend_backward(
     depth,
     sums,
 ):
-    """Walk one record over the half rows ``touched`` of a tile.
+    """Accumulate the gradients of one record over the half rows ``touched`` of a tile.
 
     Args:
         pixels: float32 state, BACKWARD_PLANES vectors for each of the 32 half rows of each tile.
         tile: index of the tile in ``pixels``.
-        touched: bit for each half row, 16 left ones, then 16 right ones.
-        x, y: the tile's first pixel centre as seen from the record's centre [px].
-        sharpness, slope, falloff, level, red, green, blue, depth: of the record.
+        touched: bit per half row: 16 left ones, then 16 right ones.
+        x, y: the tile's first pixel centre relative to the record's centre [px].
+        sharpness, slope, falloff, level, red, green, blue, depth: fields of the record.
         sums: [SUMS] float32, written.
 
     Returns:
-        Bits of the half rows of which all pixels are finished.
+        Bits of the half rows whose pixels are all finished.
     """
 
     def generate(context, builder, signature, arguments):
@@ -150,7 +152,7 @@ def _splat_of(builder: ir.IRBuilder, scalars: list[Any]) -> _Splat:
 def _build(
     builder: ir.IRBuilder, data: Any, tile: Any, touched: Any, record: _Splat, target: Any
 ) -> Any:
-    """Emit both halves of the tile, the sums over lanes, and the mask of what is finished."""
+    """Emit both halves of the tile, the sums over lanes, and the mask of finished half rows."""
     first_half = builder.mul(tile, I64(2 * TILE))
     finished = cgutils.alloca_once_value(builder, I64(0))
     moments = [_zero(builder) for _ in range(6)]
@@ -188,7 +190,7 @@ def _build(
 
 
 class _Variable:
-    """A vector that a loop changes; LLVM turns it into a register."""
+    """A vector updated in a loop; LLVM promotes it to a register."""
 
     def __init__(self, builder: ir.IRBuilder) -> None:
         self.builder = builder
@@ -210,7 +212,7 @@ def _zero(builder: ir.IRBuilder) -> Lanes:
 
 
 def _for_each_bit(builder: ir.IRBuilder, mask: Any, body: Callable[[Any], None]) -> None:
-    """Emit a loop over the positions of the bits that are set, from the lowest."""
+    """Emit a loop over the positions of the set bits, from the lowest."""
     left = cgutils.alloca_once_value(builder, mask)
     test = builder.append_basic_block("bits.test")
     step = builder.append_basic_block("bits.step")
@@ -235,10 +237,10 @@ def _build_half(
     columns: list[_Variable],
     rest: list[_Variable],
 ) -> Any:
-    """Emit eight pixels; returns a bit, set when all of them are finished.
+    """Emit eight pixels; returns a bit, set if all of them are finished.
 
-    ``columns`` gather the gradient times 1, y, y^2; ``rest`` the absolute ones, then colour and
-    depth.
+    ``columns`` accumulates the gradient times 1, y, y^2. ``rest`` accumulates the absolute
+    gradients, then colour and depth.
     """
     row_number = builder.uitofp(row, FLOAT)
     dy = builder.fadd(record.y, row_number)
@@ -290,7 +292,7 @@ def _build_half(
 
 
 def _sum_lanes(builder: ir.IRBuilder, eight: Vectors) -> Lanes:
-    """One vector that holds the sums over the lanes of eight vectors."""
+    """Sums over the lanes of eight vectors, as one vector."""
 
     def fold(left: Lanes, right: Lanes, first: list[int], second: list[int]) -> Lanes:
         def pick(order: list[int]) -> Lanes:
@@ -320,12 +322,12 @@ TWO = F32(2)
 CENTRE = F32(MIDDLE)
 HALVES = 2 * TILE
 SLOT = 12
-"""float32 values of a slot: the sums of SUM_1 to SUM_DEPTH, x and y there from the record's centre
-along its axes: dx' = dx - slope dy, and dy."""
+"""float32 values of a slot: the sums SUM_1 to SUM_DEPTH, with x = dx - slope dy and y = dy relative
+to the record's centre."""
 
 
 class Losses(NamedTuple):
-    """Loss gradients by the images of one camera; [0, 0] (rgb: [0, 0, 0]) where there is none."""
+    """Loss gradients by the images of one camera; [0, 0] (rgb: [0, 0, 0]) if absent."""
 
     rgb: NDArray[np.float32]
     alpha: NDArray[np.float32]
@@ -334,7 +336,7 @@ class Losses(NamedTuple):
 
 @kernel(parallel=PARALLEL_LOOPS)
 def open_pixels(images, losses, behind, tiles_x, pixels):
-    """Write the state from which the walk backwards starts.
+    """Write the initial state of the backward pass.
 
     With A the accumulated opacity and g the loss gradients, the loss changes by g_rgb · d(sum w c)
     + g_depth / A · d(sum w z) + (g_alpha - g_rgb · behind - g_depth depth / A) · d(sum w).
@@ -342,7 +344,7 @@ def open_pixels(images, losses, behind, tiles_x, pixels):
     Args:
         images: Images of the forward pass, after the sky.
         losses: Losses.
-        behind: [H, W, 3] float32, or [1, 1, 3] where it is one colour: seen behind everything.
+        behind: [H, W, 3] float32 colour behind everything; [1, 1, 3] if constant.
         tiles_x: tiles in a row of the image.
         pixels: [tiles * HALVES * BACKWARD_PLANES * LANES] float32, written.
     """
@@ -362,7 +364,7 @@ def open_pixels(images, losses, behind, tiles_x, pixels):
 
 @inlined()
 def open_pixel(images, losses, behind, y, x, pixels, place):
-    """The state of one pixel."""
+    """Write the initial state of one pixel."""
     total = images.alpha[y, x]
     by_alpha = losses.alpha[y, x] if losses.alpha.shape[0] else ZERO
     rest = total * by_alpha
@@ -388,17 +390,17 @@ def open_pixel(images, losses, behind, y, x, pixels, place):
 
 @kernel(parallel=PARALLEL_LOOPS)
 def blend_tiles_backward(values, lists, slots, starts, tiles_x, shape, pixels, gradients, used):
-    """Walk all tiles and write the gradients of each record in each tile to its slot.
+    """Traverse all tiles and write the gradients of each record in each tile to its slot.
 
     Args:
         values: [M, RECORD] float32.
-        lists, slots: [L] int32, record and slot at each place, by tile, near to far.
-        starts: [tiles + 1] int64, where the list of each tile starts.
+        lists, slots: [L] int32, record and slot of each entry, by tile, near to far.
+        starts: [tiles + 1] int64, start of each tile's list.
         tiles_x: tiles in a row of the image.
         shape: height and width of the image [px].
-        pixels: from open_pixels; used up.
-        gradients: [L, SLOT] float32, written where the record touched a pixel.
-        used: [L] uint8, written: whether it did.
+        pixels: state from open_pixels; overwritten.
+        gradients: [L, SLOT] float32, written for records that touch a pixel.
+        used: [L] uint8, written: whether the record touches a pixel.
     """
     height, width = shape
     for task in prange(TASKS):
@@ -426,14 +428,14 @@ def blend_tiles_backward(values, lists, slots, starts, tiles_x, shape, pixels, g
 
 @inlined()
 def halves_inside(rows, columns):
-    """Bits of the half rows that have a pixel inside the image."""
+    """Bits of the half rows with a pixel inside the image."""
     bits = (np.int64(1) << min(rows, TILE)) - 1
     return bits | bits << TILE if columns > LANES else bits
 
 
 @inlined()
 def walk(pixels, tile, touched, x, y, record, sums):
-    """One record over one tile; see blend_backward."""
+    """Accumulate one record over one tile; see blend_backward."""
     return blend_backward(
         pixels,
         tile,
@@ -454,7 +456,7 @@ def walk(pixels, tile, touched, x, y, record, sums):
 
 @inlined()
 def write_slot(sums, x, y, slope, out):
-    """Shift the moments from the tile's centre to the record's centre and axes."""
+    """Write the moments, shifted from the tile's centre to the record's centre and axes."""
     down = y + CENTRE
     across = x + CENTRE - slope * down
     one, by_x, by_y = sums[SUM_1], sums[SUM_X], sums[SUM_Y]

@@ -1,13 +1,13 @@
 """Levels of detail of a cloud: merged Gaussians for small images, built once and cached.
 
 Space is divided into cells along a Z curve, so cells of every size are contiguous ranges of one
-order. Each block of cells selects its level independently; level 0 is the cloud itself, without a
+order. Each block of cells selects its level independently. Level 0 is the cloud itself, without a
 copy. A Gaussian larger than the cells of a level is not merged there.
 
 The Gaussians of a cell merge into one with the same moments. Each has the weight ``tau area``,
 where tau = -ln(1 - opacity) is its optical depth and ``area`` its cross section averaged over all
-directions. The merged one has the mean centre, the covariance about it and the mean colour; its
-optical depth is the sum of the weights divided by its own area.
+directions. The merged Gaussian has the weighted mean centre and colour, and the covariance about
+that centre. Its optical depth is the sum of the weights divided by its own area.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -38,11 +38,11 @@ from .lanes import inlined, kernel
 OPACITY_MIN = 1.0 / 255.0
 OPACITY_MAX = 0.999
 OPAQUE = 2.0
-"""Largest opacity of merged Gaussians."""
+"""Largest opacity of a merged Gaussian."""
 EDGE = 0.5 / math.log(2.0)
-"""Opacity over optical depth so that half of the light comes through at the same distance."""
+"""Opacity per optical depth for which transmittance is 0.5 at the same distance from the centre."""
 MOMENTS = 11
-"""Numbers that are summed of a cell: weight, centre, upper half of the covariance, count."""
+"""Sums over a cell: weight, centre, upper half of the covariance, count."""
 
 
 @kernel()
@@ -72,16 +72,16 @@ def upper_half(quats, scales, out):
 
 @kernel(parallel=PARALLEL_LOOPS)
 def count_merged(codes, order, sizes, opacities, block_starts, shift, largest, counts):
-    """How many Gaussians each block has at a level.
+    """Count the Gaussians of each block at a level.
 
     Args:
-        codes: [N] int64, places along a Z curve, increasing.
-        order: [N] int64, the Gaussian at each place.
+        codes: [N] int64, ascending positions along a Z curve.
+        order: [N] int64, index of the Gaussian at each position.
         sizes: [N] float32, largest standard deviations [m].
         opacities: [N] float32.
-        block_starts: [B + 1] int64, where blocks begin in ``codes``.
+        block_starts: [B + 1] int64, starts of the blocks in ``codes``.
         shift: bits of a code within a cell of the level.
-        largest: standard deviation above which a Gaussian stays as it is [m].
+        largest: standard deviation above which a Gaussian is not merged [m].
         counts: [B] int64, written.
     """
     for block in prange(counts.shape[0]):
@@ -117,10 +117,10 @@ def merge_level(
     out_opacities,
     out_features,
 ):
-    """Write the Gaussians of a level; arguments as of count_merged.
+    """Write the Gaussians of a level. Further arguments as for count_merged.
 
     Args:
-        firsts: [B] int64, where each block writes first.
+        firsts: [B] int64, first output row of each block.
         means, covars, opacities, features: [N, 3], [N, 6], [N] and [N, F], the originals.
         out_means, out_covars, out_opacities, out_features: [M, 3], [M, 3, 3], [M], [M, F] float32.
     """
@@ -159,7 +159,7 @@ def merge_level(
 
 @inlined()
 def covered_area(xx, xy, xz, yy, yz, zz):
-    """Product of the two larger standard deviations [m^2] of what is flat; near it for others."""
+    """Product of the two larger standard deviations [m^2]: exact if flat, else approximate."""
     minors = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
     return math.sqrt(max(minors, 1e-24))
 
@@ -188,7 +188,7 @@ def add_one(i, means, covars, opacities, features, origin, moments, colour):
 
 @inlined()
 def close_cell(moments, colour, origin, slot, out_means, out_covars, out_opacities, out_features):
-    """Write the Gaussian that has the moments of a cell."""
+    """Write the Gaussian with the moments of a cell."""
     weight = max(moments[0], 1e-30)
     x, y, z = moments[1] / weight, moments[2] / weight, moments[3] / weight
     xx, xy = moments[4] / weight - x * x, moments[5] / weight - x * y
@@ -205,10 +205,10 @@ def close_cell(moments, colour, origin, slot, out_means, out_covars, out_opaciti
 
 @inlined()
 def merged_opacity(depth, several):
-    """Opacity of what has an optical depth in its centre.
+    """Opacity of a merged Gaussian from the optical depth at its centre.
 
-    Many opaque ones beside each other have no peak but an edge, as has one of an opacity above 1,
-    of which blending cuts the top off. From half of it on, their edges are at the same place.
+    Several opaque Gaussians next to each other have a plateau and an edge. An opacity above 1,
+    which blending clips, reproduces both: the point of half transmittance is the same.
     """
     opacity = min(-math.expm1(-depth), OPACITY_MAX)
     if several:
@@ -220,7 +220,7 @@ def merged_opacity(depth, several):
 def copy_one(
     i, slot, means, covars, opacities, features, out_means, out_covars, out_opacities, out_features
 ):
-    """Write Gaussian ``i`` as it is."""
+    """Copy Gaussian ``i``."""
     for k in range(3):
         out_means[slot, k] = means[i, k]
     c = covars[i]
@@ -242,15 +242,15 @@ def write_covariance(out, slot, xx, xy, xz, yy, yz, zz):
 # Levels of a cloud
 
 LEVELS = 4
-"""Merged ones; each has cells twice as large as the one before."""
+"""Number of merged levels; each has cells twice as large as the previous one."""
 BLOCK_SHIFT = LEVELS - 1
-"""A block is a cell of the last level: there, one Gaussian is left of it."""
+"""A block is a cell of the last level, where a single merged Gaussian represents it."""
 BITS = 21
-"""Of a place along the Z curve, by axis."""
+"""Bits of a position along the Z curve, per axis."""
 BANDS = 4
-"""Coefficients of the spherical harmonics that merged Gaussians keep: those up to degree 1."""
+"""Spherical harmonics coefficients of merged Gaussians: up to degree 1."""
 FINEST_CELL = 2.0
-"""Cells of the first level, in the median size (largest standard deviation) of the Gaussians."""
+"""Side of the cells of level 1, relative to the median of the largest standard deviations."""
 
 Longs = NDArray[np.int64]
 Floats = NDArray[np.float32]
@@ -258,19 +258,18 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Hierarchy:
-    """A cloud in levels of detail.
+    """A cloud with its levels of detail.
 
     Attributes:
-        cloud: level 0, as it is.
-        coefficients: [N, F, 3] of its TimeColour; F is 0 where there is none.
+        cloud: level 0, the cloud itself.
+        coefficients: [N, F, 3] of its TimeColour; F is 0 without one.
         order: [N] int64, Gaussians of level 0 by block.
-        starts: [1 + LEVELS, B + 1] int64, where blocks begin: in ``order`` and in the
-            arrays below.
+        starts: [1 + LEVELS, B + 1] int64, starts of the blocks: row 0 in ``order``, the others in
+            the merged arrays.
         low, high: [B, 3] float64, boxes around the centres of a block [m].
         sigmas: [B] float64, largest standard deviation in a block [m].
-        cell: side of the cells of level 1 [m]; 0 where there are merged Gaussians alone, all of
-            them in level 1.
-        means, covars, opacities, sh, merged_coefficients: merged levels, one after the other.
+        cell: side of the cells of level 1 [m]; 0 if all Gaussians are merged ones of level 1.
+        means, covars, opacities, sh, merged_coefficients: concatenated merged levels.
     """
 
     cloud: CloudArrays
@@ -289,13 +288,13 @@ class Hierarchy:
 
     @property
     def nbytes(self) -> int:
-        """Memory beside that of the cloud itself [bytes]."""
+        """Memory in addition to that of the cloud [bytes]."""
         held = (getattr(self, field.name) for field in fields(self)[2:])
         return sum(v.nbytes for v in held if isinstance(v, np.ndarray))
 
 
 _making = threading.Lock()
-"""One at a time is merged; who asks for levels that are there does not wait for it."""
+"""Serialises merging. Lookups of existing levels do not wait for it."""
 _keeping = threading.Lock()
 _plain: weakref.WeakKeyDictionary[GaussianCloud, Hierarchy] = weakref.WeakKeyDictionary()
 _coloured: weakref.WeakKeyDictionary[TimeColour, tuple[weakref.ref[GaussianCloud], Hierarchy]] = (
@@ -304,7 +303,7 @@ _coloured: weakref.WeakKeyDictionary[TimeColour, tuple[weakref.ref[GaussianCloud
 
 
 def hierarchy_of(cloud: GaussianCloud, colour: TimeColour | None = None) -> Hierarchy:
-    """The levels of a cloud; made at the first call: about a second for a million Gaussians."""
+    """Levels of a cloud, built on the first call: about a second per million Gaussians."""
     known = known_hierarchy(cloud, colour)
     if known is not None:
         return known
@@ -322,7 +321,7 @@ def hierarchy_of(cloud: GaussianCloud, colour: TimeColour | None = None) -> Hier
 
 
 def known_hierarchy(cloud: GaussianCloud, colour: TimeColour | None = None) -> Hierarchy | None:
-    """The levels of a cloud, if they are made already."""
+    """Levels of a cloud if they exist, else None."""
     with _keeping:
         if colour is None:
             return _plain.get(cloud)
@@ -331,7 +330,7 @@ def known_hierarchy(cloud: GaussianCloud, colour: TimeColour | None = None) -> H
 
 
 def held_bytes() -> int:
-    """Memory of the levels of all clouds that are alive [bytes]."""
+    """Memory of the levels of all live clouds [bytes]."""
     with _keeping:
         held = [*_plain.values(), *(hierarchy for _, hierarchy in _coloured.values())]
     return sum(hierarchy.nbytes for hierarchy in held)
@@ -340,7 +339,7 @@ def held_bytes() -> int:
 def deformed_hierarchy(
     cloud: GaussianCloud, covars: Tensor, colour: TimeColour | None
 ) -> Hierarchy:
-    """A cloud with covariances of its own, as if it had been merged into itself."""
+    """Wrap a cloud with ``covars`` [N, 3, 3] as a single merged level, without merging."""
     arrays, matrices = arrays_of(cloud), array_of(covars)
     coefficients = NO_COEFFICIENTS if colour is None else array_of(colour.coefficients)
     starts = np.zeros((1 + LEVELS, 2), np.int64)
@@ -432,14 +431,14 @@ def _finest_cell(sizes: Floats) -> float:
 
 
 def _codes(means: Floats, cell: float) -> Longs:
-    """Places [N] of the finest cells along a Z curve; what is too far out shares the outermost."""
+    """Positions [N] of the finest cells along a Z curve; outliers go to the outermost cells."""
     cells = np.floor(means.astype(np.float64) / cell) + 2 ** (BITS - 1)
     held = np.clip(cells, 0, 2**BITS - 1).astype(np.int64)
     return spread(held[:, 0]) | spread(held[:, 1]) << 1 | spread(held[:, 2]) << 2
 
 
 def spread(values: Longs) -> Longs:
-    """Two zero bits between any two of the lowest 21 bits."""
+    """Insert two zero bits between neighbouring bits of the lowest 21."""
     masks = (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -455,7 +454,10 @@ def spread(values: Longs) -> Longs:
 def _block_bounds(
     means: Floats, sizes: Floats, starts: Longs
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Boxes around the centres of blocks, and their largest sizes; all are given by block."""
+    """Boxes around the centres of blocks, and their largest sizes.
+
+    ``means`` and ``sizes`` are sorted by block.
+    """
     if len(starts) == 1:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     low = np.minimum.reduceat(means, starts[:-1], axis=0).astype(np.float64)
@@ -463,19 +465,19 @@ def _block_bounds(
     return low, high, np.maximum.reduceat(sizes, starts[:-1]).astype(np.float64)
 
 
-# Arrays of many clouds for one kernel: a table of addresses, since Numba compiles a kernel anew for
-# each number of arrays, and copying clouds together costs more than a small image.
+# Arrays of many clouds for one kernel: a table of addresses. Numba would compile a kernel for each
+# number of arrays, and concatenating clouds costs more than a small image.
 
 FIELDS = (
     *("means", "quats", "scales", "opacities", "sh", "coefficients", "order", "starts"),
     *("low", "high", "sigmas"),
     *("merged_means", "merged_covars", "merged_opacities", "merged_sh", "merged_coefficients"),
 )
-"""Columns of the table that are addresses."""
+"""Columns of the table that hold addresses."""
 COUNT, MERGED, BLOCKS, BANDS_FIELD, MERGED_BANDS_FIELD, TONES, CELL = range(
     len(FIELDS), len(FIELDS) + 7
 )
-"""Columns with sizes; the last one has the side of the finest merged cells in micrometres."""
+"""Columns that hold sizes; the last is the side of the finest merged cells [um]."""
 COLUMNS = len(FIELDS) + 7
 
 
@@ -483,7 +485,7 @@ _rows: weakref.WeakKeyDictionary[Hierarchy, NDArray[np.int64]] = weakref.WeakKey
 
 
 def table_of(hierarchies: Sequence[Hierarchy]) -> NDArray[np.int64]:
-    """[H, COLUMNS] int64; right as long as the hierarchies are held."""
+    """Table [H, COLUMNS] int64; valid while the hierarchies are alive."""
     table = np.empty((len(hierarchies), COLUMNS), np.int64)
     for row, hierarchy in zip(table, hierarchies, strict=True):
         known = _rows.get(hierarchy)
@@ -513,7 +515,7 @@ def _row(held: Hierarchy) -> NDArray[np.int64]:
 
 @intrinsic
 def pointer_to(typingctx: Any, address: Any) -> Any:
-    """An address as the pointer that ``carray`` takes."""
+    """Cast an address to a pointer for ``carray``."""
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], cgutils.voidptr_t)

@@ -1,8 +1,8 @@
 """One pinhole camera on the CPU: visible chunks, kernel inputs, and drawing in pieces.
 
 Neighbours in memory are mostly neighbours in space, so whole chunks of CHUNK Gaussians are behind a
-camera or outside its image. Bounding boxes of their centres are computed once per cloud. Skipped
-chunks only have Gaussians that the projection would drop, so images are bitwise unchanged.
+camera or outside its image. Bounding boxes of their centres are computed once per cloud. Culling
+skips only Gaussians that the projection would drop, so images are bitwise unchanged.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from .records import CHUNK, RECORD, TILE, CameraParameters, Cluster, Images, Rec
 from .sky import add_sky
 
 SLACK = 0.1
-"""Images are widened by this [px] against rounding."""
+"""Margin of the image against rounding [px]."""
 RELATIVE_SLACK = 1e-3
-"""Gaussians are enlarged by this share, and near and far planes moved, for the same reason."""
+"""Relative margin of Gaussian sizes and of the near and far planes against rounding."""
 
 Chunks = NDArray[np.int64]
 
 
 class CloudArrays(NamedTuple):
-    """The parts of a cloud where they lie: as in GaussianCloud, float32 and contiguous."""
+    """Views of the arrays of a GaussianCloud, float32 and contiguous."""
 
     means: NDArray[np.float32]
     quats: NDArray[np.float32]
@@ -47,10 +47,10 @@ class CloudArrays(NamedTuple):
 
 
 class ChunkBounds(NamedTuple):
-    """What the chunks of a cloud fill.
+    """Bounding boxes of the chunks of a cloud.
 
     Attributes:
-        centres, halves: [chunks, 3] float64, boxes around the centres in the cloud's frame [m].
+        centres, halves: [chunks, 3] float64, boxes around the Gaussian centres, cloud frame [m].
         sigmas: [chunks] float64, largest standard deviation [m].
     """
 
@@ -61,7 +61,7 @@ class ChunkBounds(NamedTuple):
 
 @weak_cache
 def arrays_of(cloud: GaussianCloud) -> CloudArrays:
-    """Arrays of a cloud; made once, since clouds are immutable."""
+    """Arrays of a cloud, cached because clouds are immutable."""
     parts = (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
     return CloudArrays(*(part.detach().cpu().contiguous().numpy() for part in parts))
 
@@ -76,14 +76,14 @@ def bounds_of(cloud: GaussianCloud) -> ChunkBounds:
 
 
 def all_chunks(request: RasterRequest) -> list[Chunks]:
-    """Every chunk of every instance."""
+    """All chunks of all instances."""
     return [np.arange(-(-len(i.cloud) // CHUNK)) for i in request.instances]
 
 
 def seen_chunks(
     request: RasterRequest, placement: Placement, views: Sequence[CameraParameters]
 ) -> list[list[Chunks]]:
-    """Numbers of the chunks that may be seen, by camera and instance."""
+    """Indices of the potentially visible chunks, by camera and instance."""
     if not request.instances:
         return [[] for _ in views]
     bounds = [bounds_of(instance.cloud) for instance in request.instances]
@@ -113,13 +113,13 @@ def seen_chunks(
 def _planes(
     view: CameraParameters,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Six half spaces of the camera frame outside of which nothing is seen.
+    """Six half spaces of the camera frame that contain every visible Gaussian.
 
-    What place_eight tests, times depth: for x + reach > 0 that is
-    ``fx X + (cx + reach blur) Z + reach fx (1 + |tx|) sigma > 0``, linear in the centre.
+    These are the tests of place_eight times depth. The test x + reach > 0, for example, becomes
+    ``fx X + (cx + reach blur) Z + reach fx (1 + |tx|) sigma > 0``, which is linear in the centre.
 
     Returns:
-        normals [6, 3], offsets [6] and factors [6] of sigma; a Gaussian may be seen where
+        normals [6, 3], offsets [6] and factors [6] of sigma; a Gaussian is potentially visible if
         ``normals @ centre + offsets + factors sigma > 0`` for all six.
     """
     fx, fy, cx, cy, width, height, left, right, top, bottom = (float(v) for v in view[:10])
@@ -145,7 +145,7 @@ def _planes(
 def bound_chunks(
     means: NDArray[np.float32], scales: NDArray[np.float32], bounds: NDArray[np.float64]
 ) -> None:
-    """Write centre and half size of each chunk's box, and its largest scale, to ``bounds``."""
+    """Write centre, half size and largest scale of each chunk to ``bounds``."""
     for chunk in prange(bounds.shape[0]):
         start, stop = chunk * CHUNK, min(means.shape[0], (chunk + 1) * CHUNK)
         sigma = np.float32(0)
@@ -167,13 +167,13 @@ NO_TONES = np.zeros(0, np.float32)
 
 
 class Workspace:
-    """Uninitialised arrays by name, which grow on demand and are reused."""
+    """Named uninitialised arrays that grow on demand and are reused."""
 
     def __init__(self) -> None:
         self._held: dict[str, NDArray[Any]] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-        """The array of that name, its values left over from the last use."""
+        """Array with that name; its values are undefined."""
         size = int(np.prod(shape))
         held = self._held.get(name)
         if held is None or held.size < size:
@@ -188,7 +188,7 @@ def project(
     chunks: Sequence[Chunks],
     space: Workspace,
 ) -> tuple[Records, int]:
-    """Records of the given chunks of all instances, and the number of regions they fill."""
+    """Project the given chunks of all instances; returns records and the number of regions."""
     total = sum(map(len, chunks))
     records = Records(
         space.array("values", (total * CHUNK, RECORD), np.float32),
@@ -209,7 +209,7 @@ def project(
 
 
 class Places(NamedTuple):
-    """The part of a Placement that one camera needs, contiguous."""
+    """Placement of the instances relative to one camera, contiguous."""
 
     linear: NDArray[np.float64]
     offset: NDArray[np.float64]
@@ -218,7 +218,7 @@ class Places(NamedTuple):
 
 
 def places_of(placement: Placement, camera: int) -> Places:
-    """Where all instances stand before one camera."""
+    """Placement of all instances relative to one camera."""
     return Places(
         linear=np.ascontiguousarray(placement.linear[camera].numpy()),
         offset=np.ascontiguousarray(placement.offset[camera].numpy()),
@@ -228,7 +228,7 @@ def places_of(placement: Placement, camera: int) -> Places:
 
 
 def cluster_of(instance: Instance, places: Places, index: int) -> Cluster:
-    """The arrays of one instance as one camera needs them; nothing large is copied."""
+    """Kernel input of one instance for one camera; large arrays are not copied."""
     cloud, colour = arrays_of(instance.cloud), instance.colour
     return Cluster(
         *cloud,
@@ -244,12 +244,12 @@ def cluster_of(instance: Instance, places: Places, index: int) -> Cluster:
 
 
 def array_of(tensor: torch.Tensor) -> NDArray[np.float32]:
-    """View of a CPU tensor; a copy only where it lies elsewhere or is not contiguous."""
+    """NumPy view of a tensor; a copy if it is not on the CPU or not contiguous."""
     return tensor.detach().cpu().contiguous().numpy()
 
 
 def view_of(request: RasterRequest, camera: int) -> CameraParameters:
-    """Camera and options as the kernels take them."""
+    """Camera and options as kernel input."""
     options, width, height = request.options, request.width, request.height
     K = request.Ks[camera].detach().cpu().numpy()
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -283,21 +283,21 @@ def timed(timing: dict[str, float], stage: str) -> Iterator[None]:
     timing[stage] = timing.get(stage, 0.0) + (time.perf_counter() - start) * 1e3
 
 
-# Drawing in pieces, between which others may draw
+# Drawing in pieces; other requests may be drawn in between
 
 LIST_BUDGET = 1 << 26
-"""Entries of tile lists held at once; larger pictures are made in bands of tile rows."""
+"""Maximum number of tile list entries in memory; larger images are drawn in bands of tile rows."""
 PIECE_PIXELS = 1 << 18
-"""Pixels blended, or given a sky, in one piece of work, where a request may be interrupted."""
+"""Pixels per piece of blending or sky when a request may be interrupted."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """One camera of a request on its way to ``images``.
+    """Draws one camera of a request into ``images``.
 
     Attributes:
-        space: to work in.
-        timing: gets milliseconds by stage.
+        space: work space.
+        timing: receives milliseconds by stage.
     """
 
     request: RasterRequest
@@ -321,12 +321,12 @@ class Drawing:
             self._add_sky(self.request.sky)
 
     def _pause(self) -> None:
-        """The end of a piece."""
+        """End a piece: call ``between`` if there is one."""
         if self.request.between is not None:
             self.request.between()
 
     def _project(self, placement: Placement, chunks: Sequence[Chunks]) -> tuple[Records, int]:
-        """Records, and the number of regions that they fill."""
+        """Records, and the number of regions in use."""
         return project(self.request, placement, self.camera, chunks, self.space)
 
     def _blend_tiles(
@@ -373,15 +373,14 @@ class Drawing:
                 add_sky(array_of(sky.faces), matrix, first, images.rgb[rows], images.alpha[rows])
 
     def _rows(self, height: int) -> int:
-        """Rows of that height [px] in one piece; all of them where nobody interrupts."""
+        """Number of rows of ``height`` [px] per piece; all rows without interruption."""
         if self.request.between is None:
             return -(-self.request.height // height)
         return max(1, PIECE_PIXELS // (self.request.width * height))
 
 
 def _bands(row_totals: NDArray[np.int64], most: int) -> Iterator[tuple[int, int]]:
-    """Ranges of at most ``most`` tile rows whose lists fit LIST_BUDGET together, at least one row
-    each."""
+    """Ranges of 1 to ``most`` tile rows whose lists fit LIST_BUDGET, if more than one row."""
     first, held = 0, 0
     for row, total in enumerate(row_totals):
         if row > first and (held + total > LIST_BUDGET or row - first >= most):

@@ -60,13 +60,13 @@ from .sky import add_sky, sample_sky, sky_backward
 
 @kernel(parallel=PARALLEL_LOOPS)
 def scatter_slots(values, footprints, order, tiles_x, first_slots, cursors, lists, slots, spans):
-    """Like scatter_tiles for the whole picture, and number the places by record.
+    """Like scatter_tiles for the whole image; also numbers the entries by record.
 
     Args:
         values, footprints, order, tiles_x, cursors: as for scatter_tiles.
-        first_slots: [TILE_CHUNKS] int64, number of places in the chunks before.
-        lists: [L] int32, written: record at each place.
-        slots: [L] int32, written: slot of each place.
+        first_slots: [TILE_CHUNKS] int64, number of entries in the preceding chunks.
+        lists: [L] int32, written: record of each entry.
+        slots: [L] int32, written: slot of each entry.
         spans: [M, 2] int32, written for each record in ``order``: its slots [first, last).
     """
     total = order.shape[0]
@@ -90,17 +90,17 @@ def scatter_slots(values, footprints, order, tiles_x, first_slots, cursors, list
             spans[index, 1] = slot
 
 
-# The forward pass of one camera, which keeps what the backward pass needs
+# Forward pass of one camera, with state for the backward pass
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPass:
-    """What the way back needs of one camera.
+    """State of one camera for the backward pass.
 
     Attributes:
-        records: Records with the number of its regions.
+        records: Records, and the number of regions in use.
         lists, slots, spans: see scatter_slots.
-        starts: [tiles + 1] int64, where the list of each tile starts.
+        starts: [tiles + 1] int64, start of each tile's list.
     """
 
     records: Records
@@ -118,7 +118,7 @@ def draw_camera(
     images: Images,
     space: Workspace,
 ) -> CameraPass:
-    """Draw one camera and keep what was made on the way; adds to ``timing`` [ms] by stage."""
+    """Draw one camera and return its state; adds to ``timing`` [ms] by stage."""
     with timed(timing, "project"):
         records, regions = project(request, placement, camera, all_chunks(request), space)
     with timed(timing, "sort"):
@@ -173,7 +173,7 @@ def _make_lists(
 
 
 def constant_behind(request: RasterRequest) -> NDArray[np.float32]:
-    """The colour that blending puts behind the picture."""
+    """Colour over which the image is composited."""
     color = (0.0, 0.0, 0.0) if request.sky is not None else request.options.background
     return np.array(color, np.float32)
 
@@ -181,7 +181,7 @@ def constant_behind(request: RasterRequest) -> NDArray[np.float32]:
 def note_radii(
     request: RasterRequest, seen: CameraPass, screen: ScreenStatistics, camera: int
 ) -> None:
-    """Write the largest extents [px] of what ``seen`` shows to ``screen``."""
+    """Write the screen radii [px] of the drawn Gaussians to ``screen``."""
     values, counts = seen.records.values, seen.records.counts
     region = 0
     for index, instance in enumerate(request.instances):
@@ -203,11 +203,11 @@ NO_MEDIAN = np.zeros((0, 0), np.float32)
 
 
 class TrainingPass:
-    """One rasterize() call on its way forward and back.
+    """State of one rasterize() call for the forward and backward pass.
 
     Attributes:
-        placement: of all instances, detached.
-        cameras: filled by the forward pass.
+        placement: placement of all instances, detached.
+        cameras: state by camera, filled by the forward pass.
     """
 
     def __init__(self, request: RasterRequest, placement: Placement) -> None:
@@ -223,10 +223,10 @@ class TrainingPass:
 
 
 class TrainingPasses:
-    """Runs the passes that carry gradients, one at a time, with work space that is used again.
+    """Runs passes with gradients, one at a time, with a reused work space.
 
     Args:
-        lock: held while kernels run; shared with the passes that carry none.
+        lock: held while kernels run; shared with passes without gradients.
     """
 
     def __init__(self, lock: threading.RLock) -> None:
@@ -235,7 +235,7 @@ class TrainingPasses:
         self._idle: list[Workspace] = []
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
-        """Draw the request so that torch can go back through it."""
+        """Draw the request as a differentiable torch operation."""
         placement = place_instances(request.instances, request.viewmats.cpu())
         fixed = Placement(*(tensor.detach() for tensor in vars(placement).values()))
         training = TrainingPass(request, fixed)
@@ -289,7 +289,7 @@ class TrainingPasses:
     def backward(
         self, training: TrainingPass, images: tuple[Tensor, ...], losses: tuple[Tensor | None, ...]
     ) -> BackwardResult:
-        """Gradients by placements, sky and clouds from those by RGB, alpha and depth."""
+        """Gradients by placements, sky and clouds, from the gradients by RGB, alpha and depth."""
         result = BackwardResult(training.request)
         with self.lock:
             for camera in range(training.request.cameras):
@@ -307,12 +307,12 @@ class TrainingPasses:
 
 
 class BackwardResult:
-    """Loss gradients of one pass, zero at first.
+    """Loss gradients of one pass, initially zero.
 
     Attributes:
         placements: [C, I, PLACEMENT] float64.
-        faces: [6, R, R, 3] float32, or None without a sky or where it needs none.
-        clusters: of each instance.
+        faces: [6, R, R, 3] float32; None without a sky or if the sky requires no gradient.
+        clusters: gradients of each instance.
     """
 
     def __init__(self, request: RasterRequest) -> None:
@@ -336,7 +336,7 @@ class BackwardResult:
         return Gradients(**parts, covars=covars, screen=self.screen[index])
 
     def tensors(self) -> list[Tensor | None]:
-        """In the order of the inputs of the autograd function."""
+        """Gradients in the order of the inputs of the autograd function."""
         sums = torch.from_numpy(self.placements)
         linear, offset, position = sums.split((9, 3, 3), dim=-1)
         gradients: list[Tensor | None] = [linear.unflatten(-1, (3, 3)), offset, position]
@@ -348,7 +348,7 @@ class BackwardResult:
 
 
 class _Rasterization(torch.autograd.Function):
-    """The link between torch and the kernels; inputs after the first two are differentiable."""
+    """Autograd function of the kernels; inputs after the first two are differentiable."""
 
     @staticmethod
     def forward(
@@ -357,7 +357,8 @@ class _Rasterization(torch.autograd.Function):
         images = passes.forward(training)
         ctx.set_materialize_grads(False)
         ctx.passes, ctx.training = passes, training
-        # Inputs are read again through the request; saving them lets torch see in-place changes.
+        # The backward pass reads inputs through the request. Saving them lets torch detect in-place
+        # changes.
         ctx.save_for_backward(*images, *inputs)
         if not training.request.options.depth:
             ctx.mark_non_differentiable(images[2])
@@ -392,7 +393,7 @@ def _camera_image(images: Tensor | None, camera: int) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class _BackwardPass:
-    """The way back through one camera."""
+    """Backward pass of one camera."""
 
     training: TrainingPass
     camera: int
@@ -401,7 +402,7 @@ class _BackwardPass:
     space: Workspace
 
     def add_to(self, result: BackwardResult) -> None:
-        """Add all gradients that come through this camera."""
+        """Add the gradients of this camera to ``result``."""
         timing = self.training.timing
         with timed(timing, "sky_backward"):
             behind = self._through_sky(result)
@@ -411,7 +412,7 @@ class _BackwardPass:
             self._through_projection(slots, result)
 
     def _through_sky(self, result: BackwardResult) -> NDArray[np.float32]:
-        """What is behind the picture; on the way, the gradient by the faces of the sky."""
+        """Return the colour behind the image, and add the gradient by the sky faces."""
         request = self.training.request
         if request.sky is None or not self.losses.rgb.shape[0]:
             return constant_behind(request)[None, None]

@@ -1,9 +1,9 @@
 """Colours and labels of one camera in one pass over the tiles.
 
-In addition to its colour, each pixel gets the record of its front and, within the windows of
-objects, the front of each object without occluders. After a pixel is finished, the pass continues
-with the records of objects only. Depth, object and class are derived from the front, once per
-pixel. Colours use the same operations as :mod:`.blend` and are bitwise equal.
+Besides its colour, each pixel gets the record of its front. Within the window of an object, each
+pixel also gets the front of that object without occluders. Once a pixel is finished, the pass
+continues with the records of watched objects only. Depth, object and class are derived from the
+front, once per pixel. Colours are bitwise equal to those of :mod:`.blend`.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -50,15 +50,20 @@ from .records import (
 )
 
 LABEL_PLANES = 5
-"""Transmittance (negative once finished), red, green, blue, and the front: one more than the number
-of the record that brings the transmittance to the asked level or below; where none does, of the one
-that brings it to a half, 0 where none does that either."""
+"""Transmittance (negative once finished), red, green, blue and the front.
+
+The front is 1 + the index of the first record that brings the transmittance to the requested level
+or below. If no record does, it is that of the record that brings it to 0.5, else 0.
+"""
 OWN_PLANES = 2
-"""Transmittance and front of what an object shows by itself."""
+"""Transmittance and front of an object without occluders."""
 
 
 def _alpha(builder: ir.IRBuilder, scalars: list[Any]) -> tuple[Lanes, Any]:
-    """Alpha of one record, and the mask of pixels that it touches; sharpness, offset and rest."""
+    """Emit the alpha of one record and the mask of the pixels that it touches.
+
+    ``scalars`` are sharpness, offset and rest of the exponent.
+    """
     sharpness, offset, rest = (splat(builder, scalar) for scalar in scalars)
     distance = (lane_numbers(builder) + offset) * sharpness
     exponent = distance.fused(distance, rest)
@@ -74,14 +79,14 @@ def _blend(
     colours: list[Any],
     asked: list[Any],
 ) -> Any:
-    """Emit the blending of one record; returns eight bits, set where a pixel goes on.
+    """Emit the blending of one record. Returns eight bits, set for unfinished pixels.
 
     Args:
-        builder: of the kernel.
-        state: of eight pixels; the front is the plane after the colours.
-        seen: alpha, and where it is touched.
-        colours: red, green and blue, or none.
-        asked: front and level.
+        builder: IR builder of the kernel.
+        state: eight pixels; the front is the plane after the colours.
+        seen: alpha, and the mask of touched pixels.
+        colours: red, green and blue, or empty.
+        asked: front (index + 1) and level.
     """
     alpha, touched = seen
     front, level = (splat(builder, scalar) for scalar in asked)
@@ -106,13 +111,13 @@ def _blend(
 
 
 def _crossed(before: Lanes, after: Lanes, level: Lanes | float) -> Any:
-    """Where the transmittance goes from above a level to it or below."""
+    """Mask of pixels whose transmittance falls to ``level`` or below in this step."""
     return before.builder.and_(before.compare(">", level), after.compare("<=", level))
 
 
 @intrinsic
 def blend_label(typingctx, pixels, half, sharpness, offset, rest, red, green, blue, front, level):
-    """Colours and front of eight pixels; zero when all of them are finished."""
+    """Blend colours and front of eight pixels; returns 0 when all of them are finished."""
 
     def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -125,7 +130,7 @@ def blend_label(typingctx, pixels, half, sharpness, offset, rest, red, green, bl
 
 @intrinsic
 def blend_own(typingctx, own, place, sharpness, offset, rest, front, level):
-    """Front of eight pixels among the records of one object; zero when all are finished."""
+    """Blend the front of one object in eight pixels; returns 0 when all are finished."""
 
     def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -140,7 +145,10 @@ def blend_own(typingctx, own, place, sharpness, offset, rest, front, level):
 def blend_both(
     typingctx, pixels, half, own, place, sharpness, offset, rest, red, green, blue, front, level
 ):
-    """Both of these at the price of one alpha; the bits of the own pixels are eight higher."""
+    """:func:`blend_label` and :func:`blend_own` with one alpha.
+
+    The bits of the object are shifted left by eight.
+    """
 
     def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -163,12 +171,12 @@ def blend_both(
 F32 = np.float32
 HALF = F32(0.5)
 OWN = TILE * HALVES * OWN_PLANES * LANES
-"""Numbers of one object in a tile."""
+"""float32 values of one object in a tile."""
 LEFT, TOP, RIGHT, BOTTOM, FIRST = 0, 1, 2, 3, 4
-"""Of a window [px], and where its pixels start."""
+"""Columns of a window: its edges [px], and the index of its first pixel."""
 ELSEWHERE, UNSEEN = -1, -2
-"""In place of the half rows that an object goes on in: none of its window is in the tile, or none
-of its records was met there."""
+"""Values in place of an object's unfinished half rows: its window is outside the tile, or the tile
+has had none of its records yet."""
 NO_RECORD = np.int64(1) << 62
 
 
@@ -189,8 +197,8 @@ def blend_labels(
     """Blend tiles [first_tile, last_tile) into RGB and alpha of Images, and find fronts.
 
     Args:
-        values, lists, starts, background: as of blend_tiles.
-        level: transmittance at which a pixel's front lies.
+        values, lists, starts, background: see blend_tiles.
+        level: transmittance that defines a pixel's front.
         objects: Objects.
         fronts: FirstHits.
     """
@@ -217,14 +225,14 @@ def blend_labels(
 
 @inlined()
 def meets(window, x0, y0):
-    """Whether a window has pixels of a tile."""
+    """Whether a window overlaps a tile."""
     across = window[LEFT] < x0 + TILE and window[RIGHT] > x0
     return across and window[TOP] < y0 + TILE and window[BOTTOM] > y0
 
 
 @inlined()
 def watch(own_alive, windows, x0, y0):
-    """Note the objects whose windows meet the tile; whether there are any."""
+    """Mark the objects whose windows overlap the tile; returns whether there are any."""
     watched = False
     for slot in range(windows.shape[0]):
         own_alive[slot] = ELSEWHERE
@@ -247,8 +255,10 @@ def open_own(own, slot):
 def label_tile(
     values, lists, first, last, x0, y0, pixels, alive, own, own_alive, slots, first_record, level
 ):
-    """Blend lists[first:last], near to far; records from ``first_record`` on may be of objects that
-    are watched."""
+    """Blend lists[first:last], near to far.
+
+    Records before ``first_record`` belong to no watched object.
+    """
     inside = alive
     for position in range(first, last):
         index = np.int64(lists[position])
@@ -279,7 +289,7 @@ def label_tile(
 
 @inlined()
 def blend_record(record, front, x0, y0, pixels, alive, own, slot, wanted, level):
-    """Blend one record; returns the half rows that go on, of the picture and of its object."""
+    """Blend one record; returns the unfinished half rows of the image and of its object."""
     x, y = x0 + HALF - record[MEAN_X], y0 + HALF - record[MEAN_Y]
     sharpness, slope = record[SHARPNESS], record[SLOPE]
     falloff, lowest = record[FALLOFF], record[LEVEL]
@@ -311,7 +321,7 @@ def blend_record(record, front, x0, y0, pixels, alive, own, slot, wanted, level)
 
 @inlined()
 def write_colours(pixels, x0, y0, background, rgb, alpha, fronts, used):
-    """Put the background behind the tile and write it to the images."""
+    """Composite the tile over the background and write it to the images."""
     height, width = alpha.shape
     for row in range(min(TILE, height - y0)):
         for column in range(min(TILE, width - x0)):
@@ -328,7 +338,7 @@ def write_colours(pixels, x0, y0, background, rgb, alpha, fronts, used):
 
 @inlined()
 def write_own(own, own_alive, windows, x0, y0, shape, alone, used):
-    """Write the fronts of objects that are watched in the tile."""
+    """Write the fronts of the objects watched in the tile."""
     for slot in range(windows.shape[0]):
         if own_alive[slot] < 0:
             continue
@@ -343,26 +353,25 @@ def write_own(own, own_alive, windows, x0, y0, shape, alone, used):
                 used[front] = 1
 
 
-# Depth of a pixel's front: where its ray meets that Gaussian most. The centre may lie decimetres
-# before or behind: discs on a road reach far along the view. The response peaks where the ray is
-# nearest to the centre in the Gaussian's own metric (Moenne-Loccoz et al. 2024), with its image's
-# blur.
+# Depth of a pixel's front: the point on its ray where the Gaussian's response peaks. That is the
+# point nearest to the centre in the Gaussian's own metric (Moenne-Loccoz et al. 2024), with the
+# image blur. The depth of the centre can be off by decimetres, e.g. for discs on a road.
 
 
 SHAPE = 16
-"""Centre in the camera's frame [m], inverse of the covariance, xx, yy, zz, xy, xz, yz, and the
-object: one cache line."""
+"""float32 values of a shape, one cache line: centre in the camera frame [m], inverse covariance
+(xx, yy, zz, xy, xz, yz), object."""
 OBJECT = 9
 
 
 @kernel(parallel=PARALLEL_LOOPS)
 def shape_fronts(cluster, view, base, chunks, values, counts, used, shapes):
-    """Write the shapes of those records of one Cluster that are a front.
+    """Write the shapes of the records of one Cluster that are a front.
 
     Args:
-        cluster, view, base, chunks: as of project_cluster.
-        values, counts: of Records.
-        used: [1 + M] uint8, not 0 where record m is a front, at 1 + m.
+        cluster, view, base, chunks: see project_cluster.
+        values, counts: see Records.
+        used: [1 + M] uint8, nonzero at 1 + m if record m is a front.
         shapes: [M, SHAPE] float32, written.
     """
     for k in prange(chunks.shape[0]):
@@ -376,12 +385,12 @@ def shape_fronts(cluster, view, base, chunks, values, counts, used, shapes):
 
 @inlined()
 def write_shape(cluster, view, i, out):
-    """The shape of Gaussian ``i`` in the camera's frame."""
+    """Write the shape of Gaussian ``i`` in the camera frame."""
     a, mean = cluster.linear, cluster.means[i]
     xx, yy, zz, xy, xz, yz = covariance_of(cluster, i)
     for k in range(3):
         out[k] = F32(a[k, 0] * mean[0] + a[k, 1] * mean[1] + a[k, 2] * mean[2] + cluster.offset[k])
-    # As much as the image is blurred, so that discs seen from the side have a depth too.
+    # The image blur, so that discs seen edge-on also have a depth.
     blur = np.float64(view.blur) * out[2] / np.float64(view.fx)
     blur *= blur
     cxx = along(a, 0, 0, xx, yy, zz, xy, xz, yz) + blur
@@ -399,7 +408,7 @@ def write_shape(cluster, view, i, out):
 
 @inlined()
 def along(a, r, s, xx, yy, zz, xy, xz, yz):
-    """Entry (r, s) of a covariance carried by ``a``."""
+    """Entry (r, s) of ``a @ covariance @ a.T``."""
     x = a[s, 0] * xx + a[s, 1] * xy + a[s, 2] * xz
     y = a[s, 0] * xy + a[s, 1] * yy + a[s, 2] * yz
     z = a[s, 0] * xz + a[s, 1] * yz + a[s, 2] * zz
@@ -408,7 +417,7 @@ def along(a, r, s, xx, yy, zz, xy, xz, yz):
 
 @inlined()
 def covariance_of(cluster, i):
-    """Covariance of Gaussian ``i`` in its cloud's frame: xx, yy, zz, xy, xz, yz."""
+    """Covariance of Gaussian ``i`` in the cloud frame: xx, yy, zz, xy, xz, yz."""
     if cluster.covars.shape[0] > 0:
         c = cluster.covars[i]
         return (
@@ -434,9 +443,9 @@ def read_fronts(fronts, left, top, view, values, shapes, depth, instance):
     """Write depth [m] and object of the fronts of a window [h, w] of the image.
 
     Args:
-        fronts: [h, w] int32, one more than numbers of records, 0 for none.
-        left, top: of the window in the image [px].
-        shapes: [M, SHAPE]; [0, SHAPE] for the depths of centres.
+        fronts: [h, w] int32, 1 + index of a record, 0 for none.
+        left, top: position of the window in the image [px].
+        shapes: [M, SHAPE]; if [0, SHAPE], the depth is that of the centre.
     """
     inverse_x, inverse_y = F32(1) / view.fx, F32(1) / view.fy
     for row in prange(fronts.shape[0]):
@@ -459,7 +468,7 @@ def read_fronts(fronts, left, top, view, values, shapes, depth, instance):
 
 @inlined()
 def depth_along(shape, u, v, nearest):
-    """Depth of the largest response along the ray (u, v, 1)."""
+    """Depth of the largest response along the ray (u, v, 1), at least ``nearest`` [m]."""
     x, y, z = shape[0] - shape[2] * u, shape[1] - shape[2] * v, shape[2]
     # The inverse covariance times the ray.
     a = shape[3] * u + shape[6] * v + shape[7]
@@ -468,7 +477,7 @@ def depth_along(shape, u, v, nearest):
     return max(z + (a * x + b * y) / (a * u + b * v + c), nearest)
 
 
-# One camera from Gaussians to a picture with labels
+# One camera, from Gaussians to an image with labels
 
 MAX_ID = 65_535
 NO_SHAPES = np.zeros((0, SHAPE), np.float32)
@@ -476,12 +485,12 @@ NOT_ASKED = np.zeros((0, 0), np.float32)
 
 
 class Objects(NamedTuple):
-    """Objects that are also asked for alone.
+    """Objects to draw also without occluders.
 
     Attributes:
-        windows: [K, 5] int64, left, top, right, bottom [px], and where its pixels start.
-        slots: [65536] int16, which of them an instance id is, -1 for none.
-        first_record: before which no record is of one of them.
+        windows: [K, 5] int64: left, top, right, bottom [px], and the index of the first pixel.
+        slots: [65536] int16, index of the window by instance id, -1 for none.
+        first_record: Records before this index belong to none of these objects.
     """
 
     windows: NDArray[np.int64]
@@ -490,12 +499,12 @@ class Objects(NamedTuple):
 
 
 class FirstHits(NamedTuple):
-    """Numbers of records plus one, 0 where there is none.
+    """Fronts as 1 + index of a record, 0 for none.
 
     Attributes:
         pixels: [H, W] int32.
-        alone: [P] int32, of the windows of objects one after the other.
-        used: [1 + M] uint8, not 0 for each number that is in one of these.
+        alone: [P] int32, objects without occluders, window by window.
+        used: [1 + M] uint8, nonzero for each front in ``pixels`` or ``alone``.
     """
 
     pixels: NDArray[np.int32]
@@ -505,13 +514,13 @@ class FirstHits(NamedTuple):
 
 @dataclass
 class LabelPass:
-    """What one camera asks for, and what its walk has found.
+    """Label options of one camera, and the results of its pass.
 
     Attributes:
-        windows: of objects alone.
-        level: transmittance at which a pixel's front lies.
-        along_rays: whether depth is that along each pixel's ray, or that of the front's centre.
-        objects, fronts, records: of the walk, once it has begun.
+        windows: windows of the objects to draw without occluders.
+        level: transmittance that defines a pixel's front.
+        along_rays: if true, depth is taken along the ray of the pixel, else at the front's centre.
+        objects, fronts, records: set when the pass begins.
     """
 
     windows: Sequence[Window]
@@ -524,14 +533,18 @@ class LabelPass:
 
 @dataclass(frozen=True, eq=False)
 class LabelDrawing(Drawing):
-    """A Drawing that also finds fronts; it is not interrupted."""
+    """A Drawing that also finds fronts. It cannot be interrupted."""
 
     walk: LabelPass = field(default_factory=lambda: LabelPass((), 0.5, along_rays=True))
 
     def label(
         self, placement: Placement, chunks: Sequence[Chunks]
     ) -> tuple[NDArray[np.float32], NDArray[np.uint16], list[NDArray[np.float32]]]:
-        """Draw; depth and object [H, W], and depths [h, w] of the windows."""
+        """Draw the image.
+
+        Returns:
+            Depth [m] and object, both [H, W], and the depth [h, w] [m] of each window.
+        """
         self._prepare(chunks)
         self.draw(placement, chunks)
         walk, view = self.walk, view_of(self.request, self.camera)
@@ -554,7 +567,7 @@ class LabelDrawing(Drawing):
         return depth, instance, alone
 
     def _prepare(self, chunks: Sequence[Chunks]) -> None:
-        """Lay out the windows; what is found starts empty."""
+        """Lay out the windows and clear the fronts."""
         windows = np.zeros((len(self.walk.windows), 5), np.int64)
         slots = np.full(MAX_ID + 1, -1, np.int16)
         pixels = 0
@@ -602,7 +615,7 @@ class LabelDrawing(Drawing):
         )
 
     def _shapes(self, placement: Placement, chunks: Sequence[Chunks]) -> NDArray[np.float32]:
-        """Of the records that are a front; others hold what was there before."""
+        """Shapes [M, SHAPE] of the records that are a front; other rows are undefined."""
         walk, request = self.walk, self.request
         assert walk.records is not None
         assert walk.fronts is not None
@@ -629,7 +642,7 @@ def draw_labels(
     level: float,
     along_rays: bool,
 ) -> list[LabelOutput]:
-    """Pictures and labels of all cameras of a request, one after the other."""
+    """Draw images and labels of all cameras of a request, one camera after the other."""
     placement = place_instances(request.instances, request.viewmats.detach().cpu())
     views = [view_of(request, c) for c in range(request.cameras)]
     seen = seen_chunks(request, placement, views)

@@ -1,9 +1,9 @@
-"""Vectors of eight numbers for kernel construction, with operators for readable formulas.
+"""Vectors of eight numbers for building kernels, with operators for readable formulas.
 
-LLVM's loop vectoriser needs checks for overlapping arrays that cost more than a row of pixels, so
-the eight lanes are spelled out as LLVM vectors. They run as one AVX register, or as two SSE or NEON
-registers, and give the same bits on every machine with fused multiply-add. The module also holds
-small vectors and matrices of lanes, and the options of the renderer's kernels.
+LLVM's loop vectoriser checks arrays for overlap, which costs more than a row of pixels, so kernels
+use explicit LLVM vectors. They compile to one AVX register, or two SSE or NEON registers, and are
+bitwise equal on all machines with fused multiply-add. The module also has small vectors and
+matrices of lanes, and the options of the renderer's kernels.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Lanes:
         return Lanes(self.builder, self.builder.fneg(self.value))
 
     def fused(self, factor: Lanes | Real, addend: Lanes | Real) -> Lanes:
-        """self * factor + addend, rounded once where the machine can."""
+        """self * factor + addend, rounded once if the machine has fused multiply-add."""
         return self._call("llvm.fmuladd", self._lift(factor), self._lift(addend))
 
     def magnitude(self) -> Lanes:
@@ -81,11 +81,11 @@ class Lanes:
         return Lanes(self.builder, self.builder.fdiv(self._lift(1.0), self.value))
 
     def floor(self) -> Lanes:
-        """Next whole number below."""
+        """Largest integer not above self."""
         return self._call("llvm.floor")
 
     def ceiling(self) -> Lanes:
-        """Next whole number above."""
+        """Smallest integer not below self."""
         return self._call("llvm.ceil")
 
     def at_least(self, limit: Lanes | Real) -> Lanes:
@@ -97,7 +97,7 @@ class Lanes:
         return self.where(self.compare("<", limit), limit)
 
     def negative_where(self, mask: Any) -> Lanes:
-        """Self with the sign bit set where ``mask`` holds."""
+        """Self with the sign bit set where ``mask`` is true."""
         sign = ir.Constant(INTEGERS, [-(2**31)] * LANES)
         chosen = self.builder.and_(self.builder.sext(mask, INTEGERS), sign)
         merged = self.builder.or_(self.builder.bitcast(self.value, INTEGERS), chosen)
@@ -129,11 +129,11 @@ class Lanes:
         return Lanes(self.builder, self.builder.fptrunc(self.value, VECTOR))
 
     def integers(self) -> Integers:
-        """As int32, towards zero; any number for what does not fit."""
+        """As int32, rounded towards zero; undefined if out of range."""
         return Integers(self.builder, self.builder.fptosi(self.value, INTEGERS))
 
     def bits(self) -> Integers:
-        """The bits of float32 numbers as int32."""
+        """Bit patterns of float32 numbers as int32."""
         return Integers(self.builder, self.builder.bitcast(self.value, INTEGERS))
 
 
@@ -182,16 +182,16 @@ class Integers:
         return Lanes(self.builder, self.builder.sitofp(self.value, VECTOR))
 
     def as_bits(self) -> Lanes:
-        """The float32 numbers that have these bits."""
+        """Float32 numbers with these bit patterns."""
         return Lanes(self.builder, self.builder.bitcast(self.value, VECTOR))
 
     def longs(self) -> Integers:
-        """As int64; for numbers that are not negative."""
+        """As int64; numbers must not be negative."""
         return Integers(self.builder, self.builder.zext(self.value, LONGS))
 
 
 class Planes:
-    """Groups of float32 vectors in memory, ``planes`` in a row; this is group number ``group``."""
+    """Group ``group`` of float32 vectors in memory; each group has ``planes`` vectors."""
 
     def __init__(self, builder: ir.IRBuilder, data: Any, group: Any, *, planes: int) -> None:
         self.builder = builder
@@ -203,17 +203,17 @@ class Planes:
         return self.builder.bitcast(plane, VECTOR.as_pointer())
 
     def load(self, index: int) -> Lanes:
-        """Vector of a plane."""
+        """Load the vector of a plane."""
         value = self.builder.load(self._plane(index), typ=VECTOR, align=4)
         return Lanes(self.builder, value)
 
     def store(self, index: int, lanes: Lanes) -> None:
-        """Write a plane."""
+        """Store the vector of a plane."""
         self.builder.store(lanes.value, self._plane(index), align=4)
 
 
 def logarithm(number: Lanes) -> Lanes:
-    """Natural logarithm of positive, normal float32 numbers, to 2e-7 of it or of 1."""
+    """Natural logarithm of positive, normal float32 numbers; error 2e-7, relative or absolute."""
     bits = number.bits()
     exponent = (bits - ROOT_HALF) >> MANTISSA_BITS
     mantissa = (bits - (exponent << MANTISSA_BITS)).as_bits()
@@ -225,7 +225,7 @@ def logarithm(number: Lanes) -> Lanes:
 
 
 def splat(builder: ir.IRBuilder, scalar: Any) -> Lanes:
-    """One scalar in all lanes."""
+    """Broadcast a scalar to all lanes."""
     undefined = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
     single = builder.insert_element(undefined, scalar, I32(0))
     mask = ir.Constant(INTEGERS, [0] * LANES)
@@ -243,7 +243,7 @@ def mask_bits(builder: ir.IRBuilder, mask: Any) -> Any:
 
 
 def mask_of(builder: ir.IRBuilder, bits: Any) -> Any:
-    """The mask whose bits an int64 holds."""
+    """The mask from the low eight bits of an int64."""
     vector = ir.VectorType(ir.IntType(1), LANES)
     return builder.bitcast(builder.trunc(bits, ir.IntType(LANES)), vector)
 
@@ -251,12 +251,12 @@ def mask_of(builder: ir.IRBuilder, bits: Any) -> Any:
 # Kernel options; ``_numba`` caches kernels on disk.
 
 kernel: Any = functools.partial(cached_kernel, nogil=True)
-"""For entry points: they take long enough to let other threads of Python run."""
+"""For entry points. They release the GIL."""
 
 inlined: Any = functools.partial(func, forceinline=True, _nrt=False)
-"""For what kernels call for each Gaussian; may not allocate.
+"""For functions called once per Gaussian; they must not allocate.
 
-Without ``_nrt=False`` each array that is passed or sliced is counted up and down by atomic
+Without ``_nrt=False``, Numba counts references of each array that is passed or sliced with atomic
 instructions, which take several times as long as the work itself.
 """
 
@@ -273,7 +273,7 @@ def dot(a: Sequence[Lanes], b: Sequence[Lanes], addend: Lanes | None = None) -> 
 
 
 def dot_all(a: Sequence[Lanes], b: Sequence[Lanes]) -> Lanes:
-    """Scalar product of any count of numbers, first to last."""
+    """Scalar product of any number of components, summed first to last."""
     total = a[0] * b[0]
     for left, right in zip(a[1:], b[1:], strict=True):
         total = left.fused(right, total)
@@ -286,7 +286,7 @@ def cross(a: Sequence[Lanes], b: Sequence[Lanes]) -> Vector:
 
 
 def turn_columns(quaternion: Sequence[Lanes]) -> list[Vector]:
-    """Columns of the turns of quaternions w, x, y, z of any length but 0."""
+    """Columns of the rotations of quaternions (w, x, y, z) of any nonzero length."""
     w, x, y, z = quaternion
     norm = w.fused(w, x.fused(x, y.fused(y, z * z))).reciprocal() * 2.0
     nx, ny, nz = x * norm, y * norm, z * norm
@@ -301,8 +301,8 @@ def turn_columns(quaternion: Sequence[Lanes]) -> list[Vector]:
 
 
 def cholesky(upper: Sequence[Lanes], least: float) -> Vector:
-    """Roots (xx, yx, zx, yy, zy, zz), float32, of covariances (xx, xy, xz, yy, yz, zz), float64,
-    with pivots of at least ``least``."""
+    """Cholesky factors (xx, yx, zx, yy, zy, zz) float32 of covariances (xx, xy, xz, yy, yz, zz)
+    float64, with pivots of at least ``least``."""
     xx, xy, xz, yy, yz, zz = upper
     a = xx.at_least(least).root()
     b, c = xy / a, xz / a
@@ -314,9 +314,10 @@ def cholesky(upper: Sequence[Lanes], least: float) -> Vector:
 
 def whitening(rows: Sequence[Vector], least: Lanes | float) -> Vector:
     """Inverses of the lower triangles L with L L^T = rows rows^T, by rows, for three rows of any
-    length; by Gram and Schmidt, which keeps the digits of flat Gaussians that a covariance loses.
+    length.
 
-    Squares of lengths are at least ``least``.
+    Uses Gram-Schmidt, which stays precise for flat Gaussians where the covariance cancels. Squared
+    lengths are clamped to at least ``least``.
     """
     first, second, third = rows
     l11 = dot_all(first, first).at_least(least).root()
@@ -337,7 +338,7 @@ def whitening(rows: Sequence[Vector], least: Lanes | float) -> Vector:
 
 
 def whitened(w: Sequence[Lanes], v: Sequence[Lanes]) -> Vector:
-    """A lower triangle by rows times a vector."""
+    """Product of a lower triangle, by rows, and a vector."""
     return [
         w[0] * v[0],
         w[1].fused(v[0], w[2] * v[1]),
@@ -347,7 +348,7 @@ def whitened(w: Sequence[Lanes], v: Sequence[Lanes]) -> Vector:
 
 @intrinsic
 def lowest_bit(typingctx, mask):  # type: ignore[no-untyped-def]
-    """Position of the lowest bit that is set; ``mask`` int64, not 0."""
+    """Position of the lowest set bit; ``mask`` int64, nonzero."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return builder.cttz(arguments[0], ir.IntType(1)(1))
@@ -357,7 +358,7 @@ def lowest_bit(typingctx, mask):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
-    """Ask for the cache line of ``array[index]`` (its first axis) without waiting for it."""
+    """Prefetch the cache line of ``array[index]`` (first axis)."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         values = context.make_array(signature.args[0])(context, builder, arguments[0])

@@ -3,7 +3,7 @@
 The cluster is not copied: each visible Gaussian becomes one record, eight at a time. Chunks of
 fixed size write to separate regions, so the result does not depend on the number of threads.
 
-The steps are explicit vector code. Eight Gaussians lie in PROJECTION planes of eight float32
+The steps are explicit vector code. Eight Gaussians occupy PROJECTION planes of eight float32
 numbers: the fields of a record, then properties of the Gaussian, then intermediate values. Each
 step takes a bit mask of active lanes and returns the lanes that remain.
 """
@@ -69,31 +69,31 @@ from .records import (
 )
 
 MEAN, OPACITY, SHAPE = RECORD, RECORD + 3, RECORD + 4
-"""First planes of the centre, of the opacity, and of quaternion and scales; or, where a cluster
-has covariances, of the upper half of one by rows."""
+"""First planes of centre, opacity and shape. The shape is quaternion and scales, or the upper half
+of the covariance by rows if the cluster has covariances."""
 TANGENT = RECORD + 11
-"""First of two planes: x/z and y/z, within their bounds."""
+"""First of two planes: x/z and y/z, clamped to their bounds."""
 PROJECTION = RECORD + 13
 
 LOG_255 = math.log(255.0)
 REACH_MAX = math.sqrt(2 * LOG_255)
 COVARIANCE_MAX = 1e30
-"""Larger than any picture [px^2]; beyond it float32 gives out."""
+"""Larger than any image [px^2]; float32 fails beyond it."""
 HALF_UNIT = 0.5 / EXPONENT_UNIT
 
 
 class Named:
-    """A named tuple of the kernel: its numbers and those of its arrays, each in all lanes."""
+    """Access to a named tuple in a kernel; numbers are broadcast to all lanes."""
 
     def __init__(self, context: Any, builder: ir.IRBuilder, kind: Any, value: Any) -> None:
         self._context, self._builder, self._kind, self._value = context, builder, kind, value
 
     def number(self, name: str) -> Lanes:
-        """A number."""
+        """A scalar field."""
         return splat(self._builder, self._field(name)[1])
 
     def three(self, name: str, *, row: int = 0) -> Vector:
-        """Three neighbours of an array: a row where it has rows."""
+        """First three numbers of an array, or of its row ``row``."""
         element = DOUBLE if self._field(name)[0].dtype == types.float64 else FLOAT
         data = self.data(name)
         numbers = []
@@ -103,7 +103,7 @@ class Named:
         return numbers
 
     def data(self, name: str) -> Any:
-        """Where an array begins."""
+        """Pointer to the start of an array."""
         kind, value = self._field(name)
         return self._context.make_array(kind)(self._context, self._builder, value).data
 
@@ -113,12 +113,12 @@ class Named:
 
 
 def eight_step(build: Callable[[Planes, Named, Named], Any], *, count: int) -> Any:
-    """The intrinsic ``step(planes, lanes, view, cluster)`` that emits what ``build`` says.
+    """The intrinsic ``step(planes, lanes, view, cluster)`` whose code is emitted by ``build``.
 
     Args:
-        build: gets ``count`` planes of eight numbers, and the named tuples of the viewer and of
-            the cluster that is looked at; gives the mask of the lanes that remain.
-        count: of the planes.
+        build: function of ``count`` planes of eight numbers and the named tuples of view and
+            cluster; returns the mask of the remaining lanes.
+        count: number of planes.
     """
 
     def step(typingctx, planes, lanes, view, cluster):
@@ -138,9 +138,9 @@ def eight_step(build: Callable[[Planes, Named, Named], Any], *, count: int) -> A
 
 
 def _place(eight: Planes, view: Named, cluster: Named, *, deformed: bool) -> Any:
-    """Put the centres on the image; there remain those of which something may be seen.
+    """Project the centres; keeps potentially visible Gaussians.
 
-    Centres are summed in float64 so that rounding cannot change the order by depth.
+    Centres are summed in float64 so that rounding cannot change the depth order.
     """
     mean = [eight.load(MEAN + k).doubles() for k in range(3)]
     offset = cluster.three("offset")
@@ -170,7 +170,7 @@ def _place(eight: Planes, view: Named, cluster: Named, *, deformed: bool) -> Any
 
 
 def largest_sigma(eight: Planes, cluster: Named, *, deformed: bool) -> Lanes:
-    """Upper bound of the standard deviation along any direction of the world [m]."""
+    """Upper bound of the standard deviation in any direction, world scale [m]."""
     a, b, c = cluster.three("scale")
     largest = a.at_least(b).at_least(c)
     if deformed:
@@ -181,7 +181,7 @@ def largest_sigma(eight: Planes, cluster: Named, *, deformed: bool) -> Lanes:
 
 
 def on_image(view: Named, x: Lanes, y: Lanes, reach_x: Lanes, reach_y: Lanes) -> list[Any]:
-    """Masks: a box about (x, y) meets the image; false for what is not finite."""
+    """Masks whether a box about (x, y) meets the image; false for non-finite values."""
     return [
         (x + reach_x).compare(">", 0.0),
         (x - reach_x).compare("<", view.number("width")),
@@ -191,7 +191,7 @@ def on_image(view: Named, x: Lanes, y: Lanes, reach_x: Lanes, reach_y: Lanes) ->
 
 
 def _shape(eight: Planes, view: Named, cluster: Named, *, deformed: bool) -> Any:
-    """Write the ellipses to the planes of a record; there remain those that meet the image."""
+    """Write the ellipses to the record planes; keeps those that meet the image."""
     across, down = _image_axes(eight, view, cluster)
     covariance = _deformed_covariance if deformed else _covariance
     cxx, cxy, cyy, sharp = covariance(eight, across, down)
@@ -235,7 +235,7 @@ def _shape(eight: Planes, view: Named, cluster: Named, *, deformed: bool) -> Any
 
 
 def _image_axes(eight: Planes, view: Named, cluster: Named) -> tuple[Vector, Vector]:
-    """Rows of the map from the cluster's frame to the image [px/m]: the projection's Jacobian."""
+    """Rows of the Jacobian of the projection from the cluster frame to the image [px/m]."""
     linear = [[number.floats() for number in cluster.three("linear", row=k)] for k in range(3)]
     inverse = eight.load(DEPTH).reciprocal()
     rows = []
@@ -249,7 +249,7 @@ def _image_axes(eight: Planes, view: Named, cluster: Named) -> tuple[Vector, Vec
 def _covariance(eight: Planes, across: Vector, down: Vector) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     """Covariance (xx, xy, yy) [px^2] on the image before blur, and its determinant, float64.
 
-    The turn is float64 too: gradients of needles hang on its last digits.
+    The rotation is also float64: gradients of needles depend on its last digits.
     """
     columns = turn_columns([eight.load(SHAPE + k).doubles() for k in range(4)])
     scales = [eight.load(SHAPE + 4 + k).doubles() for k in range(3)]
@@ -258,7 +258,7 @@ def _covariance(eight: Planes, across: Vector, down: Vector) -> tuple[Lanes, Lan
         [scale * dot(row, column) for scale, column in zip(scales, columns, strict=True)]
         for row in rows
     )
-    # Lagrange's identity: |u|^2 |v|^2 - (u v)^2 without the cancellation that ruins needles.
+    # Lagrange's identity: |u|^2 |v|^2 - (u v)^2 without cancellation for needles.
     normal = [u[i] * v[j] - u[j] * v[i] for i, j in ((1, 2), (2, 0), (0, 1))]
     return dot(u, u), dot(u, v), dot(v, v), dot(normal, normal)
 
@@ -266,7 +266,7 @@ def _covariance(eight: Planes, across: Vector, down: Vector) -> tuple[Lanes, Lan
 def _deformed_covariance(
     eight: Planes, across: Vector, down: Vector
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Like _covariance, from the upper half of a covariance."""
+    """Like _covariance, from the upper half of a 3D covariance."""
     a, b = [number.doubles() for number in across], [number.doubles() for number in down]
     xx, xy, xz, yy, yz, zz = (eight.load(SHAPE + k).doubles() for k in range(6))
     matrix = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
@@ -281,10 +281,10 @@ shape_eight = eight_step(partial(_shape, deformed=False), count=PROJECTION)
 shape_eight_deformed = eight_step(partial(_shape, deformed=True), count=PROJECTION)
 
 
-# Footprints: the tiles that a record may touch. A footprint is one int64: from the lowest bit the
-# tiles x0, x1, y0, y1 of the half-open box around it, FIELD bits each, then one bit for each tile
-# of a box of at most SMALL x SMALL tiles, row by row. It is complete, so tile lists need no
-# records, which would not fit a cache.
+# Footprints: the tiles that a record may touch, as one int64. From the lowest bit: tiles x0, x1,
+# y0, y1 of the half-open bounding box, FIELD bits each, then one bit per tile for boxes of at most
+# SMALL x SMALL tiles, row by row. Tile lists of small boxes need no records, which would not fit a
+# cache.
 
 F32 = np.float32
 ZERO = F32(0)
@@ -292,7 +292,7 @@ HALF = F32(0.5)
 ONE = F32(1)
 LIMIT, PER_TILE = F32(EXPONENT_LIMIT), F32(1.0 / TILE)
 SLACK = F32(0.01)
-"""Boxes and ranges are widened by this [px] against rounding; the blending decides exactly."""
+"""Margin of boxes and ranges against rounding [px]; blending tests pixels exactly."""
 FIELD = 12
 FIELD_MASK = (1 << FIELD) - 1
 SMALL = 4
@@ -300,7 +300,7 @@ ROW_MASK = (1 << SMALL) - 1
 
 LOWEST_BITS = np.uint64(sum((b & -b).bit_length() - 1 << 4 * b for b in range(1, 16)))
 BIT_LENGTHS = np.uint64(sum(b.bit_length() << 4 * b for b in range(1, 16)))
-"""Answers for the sixteen values of a row of bits, four bits each."""
+"""Lookup table for the sixteen values of a row of bits, four bits each."""
 
 
 @intrinsic
@@ -309,11 +309,11 @@ def footprints_of_eight(typingctx, planes, lanes, view, found):
 
     Args:
         planes: PROJECTION planes, see the module.
-        lanes: bits of those that are in question.
+        lanes: bits of the active lanes.
         view: CameraParameters.
 
     Returns:
-        Bits of those that may touch a tile.
+        Bits of the lanes that may touch a tile.
     """
 
     def generate(context, builder, signature, arguments):
@@ -329,7 +329,7 @@ def footprints_of_eight(typingctx, planes, lanes, view, found):
 
 
 def _footprints(eight: Planes, view: Named) -> tuple[Integers, Any]:
-    """Emit the footprints of eight records, and the mask of those that touch a tile."""
+    """Emit the footprints of eight records, and the mask of records that touch a tile."""
     x0, x1 = _tile_range(eight.load(MEAN_X), eight.load(EXTENT_X), view.number("width"))
     y0, y1 = _tile_range(eight.load(MEAN_Y), eight.load(EXTENT_Y), view.number("height"))
     columns, rows = x1 - x0, y1 - y0
@@ -359,7 +359,7 @@ def _tile_range(centre: Lanes, reach: Lanes, size: Lanes) -> tuple[Integers, Int
 def _row_columns(
     eight: Planes, row: Integers, columns: tuple[Integers, Integers]
 ) -> tuple[Integers, Integers]:
-    """Part of the tile columns where the ellipses meet pixel centres of a row of tiles."""
+    """Range of tile columns where the ellipses meet pixel centres of a row of tiles."""
     first, last = columns
     top = row.floats() * TILE + 0.5 - eight.load(MEAN_Y)
     centre, tip = eight.load(MEAN_X) - 0.5, eight.load(TIP_Y)
@@ -371,7 +371,7 @@ def _row_columns(
 
 
 def _side_reach(eight: Planes, top: Lanes, tip: Lanes, side: int) -> Lanes:
-    """Outermost dx of the ellipses on one side (±1) within the row of tiles from ``top`` on."""
+    """Outermost dx of the ellipses on one side (±1) within the row of tiles starting at ``top``."""
     reach = eight.load(EXTENT_Y)
     dy = tip.at_least(top).at_most(top + (TILE - 1)).at_least(-reach).at_most(reach)
     room = (-(dy * dy)).fused(eight.load(FALLOFF), -eight.load(LEVEL) + EXPONENT_LIMIT)
@@ -381,7 +381,7 @@ def _side_reach(eight: Planes, top: Lanes, tip: Lanes, side: int) -> Lanes:
 
 @inlined()
 def in_one_tile(footprint: Any) -> Any:
-    """Whether the box around it is a single tile: nothing is left to ask of rows and columns."""
+    """Whether the bounding box is a single tile."""
     columns = ((footprint >> FIELD) - footprint) & FIELD_MASK
     rows = ((footprint >> 3 * FIELD) - (footprint >> 2 * FIELD)) & FIELD_MASK
     return columns == 1 and rows == 1
@@ -389,7 +389,7 @@ def in_one_tile(footprint: Any) -> Any:
 
 @inlined()
 def only_tile(footprint: Any, tiles_x: Any) -> Any:
-    """Number of that tile."""
+    """Index of the tile of a footprint with a single tile."""
     return ((footprint >> 2 * FIELD) & FIELD_MASK) * tiles_x + (footprint & FIELD_MASK)
 
 
@@ -416,7 +416,7 @@ def tile_columns(values: Any, footprint: Any, index: Any, row: Any) -> Any:
 
 @inlined()
 def ellipse_columns(record: Any, row: Any, first: Any, last: Any) -> Any:
-    """Part of the tile columns [first, last) where the ellipse meets pixel centres of a row."""
+    """Range within [first, last) of tile columns where the ellipse meets pixel centres of a row."""
     y0 = F32(row * TILE) + HALF - record[MEAN_Y]
     y1 = y0 + F32(TILE - 1)
     centre = record[MEAN_X] - HALF
@@ -442,18 +442,19 @@ TWO = F32(2)
 FIELDS = tuple(
     field for field in range(RECORD) if field not in {RED, GREEN, BLUE, INSTANCE, MEMBER}
 )
-"""Fields of a record that come from the planes of eight."""
+"""Fields of a record that are copied from the planes."""
 FASTMATH = {"contract", "nsz", "arcp"}
 
 
 @kernel(parallel=PARALLEL_LOOPS, fastmath=FASTMATH)
 def project_cluster(cluster, view, base, chunks, records):
-    """Write records of those Gaussians of one Cluster that a CameraParameters may see.
+    """Write records of the potentially visible Gaussians of a Cluster.
 
     Args:
+        view: CameraParameters.
         base: first record of this cluster, a multiple of CHUNK.
-        chunks: [K] int64, numbers of the chunks to look at.
-        records: Records, K regions from ``base`` on are written.
+        chunks: [K] int64, indices of the chunks to project.
+        records: Records; K regions starting at ``base`` are written.
     """
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
     values, footprints = records.values, records.footprints
@@ -469,7 +470,7 @@ def project_cluster(cluster, view, base, chunks, records):
 
 @kernel(fastmath=FASTMATH)
 def project_small_cluster(cluster, view, base, chunks, records):
-    """Like project_cluster for one chunk, where waking threads would take longer than the work."""
+    """Like project_cluster for a single chunk, without threads, whose start would take longer."""
     values, footprints, depths = records.values, records.footprints, records.depths
     start = chunks[0] * CHUNK
     planes = np.empty(PROJECTION * LANES, np.float32)
@@ -481,13 +482,13 @@ def project_small_cluster(cluster, view, base, chunks, records):
 
 @inlined(fastmath=FASTMATH)
 def project_chunk(cluster, view, start, planes, found, values, footprints, depths, first):
-    """Write the records of CHUNK Gaussians from ``start`` on to the region from ``first`` on.
+    """Write the records of CHUNK Gaussians starting at ``start`` to the region at ``first``.
 
     Args:
         planes, found: work space, see the module and footprints_of_eight.
 
     Returns:
-        Records written.
+        Number of records written.
     """
     slot = first
     stop = min(cluster.means.shape[0], start + CHUNK)
@@ -510,7 +511,7 @@ def project_chunk(cluster, view, start, planes, found, values, footprints, depth
 
 @inlined()
 def project_eight(cluster, view, first, count, planes, found):
-    """Project ``count`` Gaussians from ``first`` on; returns bits of those to be recorded."""
+    """Project ``count`` Gaussians starting at ``first``; returns bits of those to record."""
     gather_eight(cluster, first, count, planes)
     lanes = np.int64((1 << count) - 1)
     if cluster.covars.shape[0] > 0:
@@ -528,14 +529,14 @@ def project_eight(cluster, view, first, count, planes, found):
 
 @inlined()
 def gather_eight(cluster, first, count, planes):
-    """Lay ``count`` Gaussians side by side in the planes."""
+    """Gather ``count`` Gaussians into the planes."""
     for lane in range(count):
         gather_lane(cluster, first + lane, lane, planes)
 
 
 @inlined()
 def gather_lane(cluster, i, lane, planes):
-    """Lay Gaussian ``i`` into a lane of the planes."""
+    """Gather Gaussian ``i`` into a lane of the planes."""
     for k in range(3):
         planes[(MEAN + k) * LANES + lane] = cluster.means[i, k]
     planes[OPACITY * LANES + lane] = cluster.opacities[i]
@@ -544,8 +545,11 @@ def gather_lane(cluster, i, lane, planes):
 
 @inlined()
 def gather_shape(cluster, i, first, lane, planes):
-    """Lay the shape of Gaussian ``i`` into a lane of the planes from ``first`` on: the upper half
-    of its covariance by rows, or where the cluster has none quaternion and scales."""
+    """Gather the shape of Gaussian ``i`` into a lane of the planes starting at ``first``.
+
+    The shape is the upper half of its covariance by rows, or quaternion and scales if the cluster
+    has no covariances.
+    """
     if cluster.covars.shape[0] > 0:
         covar, plane = cluster.covars[i], first * LANES + lane
         for row in range(3):

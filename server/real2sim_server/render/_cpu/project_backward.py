@@ -1,9 +1,9 @@
 """Backward projection: from the gradients of records to those of Gaussians and their placement.
 
-One fused pass over the records of a cluster: sum the slots, chain through the projection and the
-spherical harmonics, write. Intermediate numbers are float64, since the covariances of needles
-cancel. Each chunk sums the gradients of the placement on its own, in a fixed order for any number
-of threads.
+One fused pass over the records of a cluster sums the slots, applies the chain rule through
+projection and spherical harmonics, and writes the gradients. Intermediate numbers are float64,
+because covariances of needles cancel. Each chunk sums the gradients of the placement separately, so
+the order is fixed for any number of threads.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -51,7 +51,7 @@ def color_backward(cluster, i, r, g, b, out):
     """Add the gradients by the coefficients of Gaussian ``i`` to ``out`` [K, 3].
 
     Args:
-        r, g, b: loss gradient by its colour before the offset.
+        r, g, b: loss gradient by the colour before the offset.
 
     Returns:
         Gradient by ``scale * mean - camera_position``, three numbers.
@@ -83,7 +83,7 @@ def color_backward(cluster, i, r, g, b, out):
 
 @inlined(fastmath=FASTMATH)
 def square_backward(sh, x, y, z, r, g, b, out):
-    """Degree 2: coefficients 4 to 8."""
+    """Add the gradients by the coefficients of degree 2: 4 to 8."""
     add_coefficient(out, 4, C2 * x * y, r, g, b)
     add_coefficient(out, 5, -C2 * y * z, r, g, b)
     add_coefficient(out, 6, C20 * z * z - C21, r, g, b)
@@ -100,7 +100,7 @@ def square_backward(sh, x, y, z, r, g, b, out):
 
 @inlined(fastmath=FASTMATH)
 def cubic_backward(sh, x, y, z, r, g, b, out):
-    """Degree 3: coefficients 9 to 15."""
+    """Add the gradients by the coefficients of degree 3: 9 to 15."""
     xx, yy, zz = x * x, y * y, z * z
     add_coefficient(out, 9, C30 * y * (THREE * xx - yy), r, g, b)
     add_coefficient(out, 10, C31 * x * y * z, r, g, b)
@@ -127,7 +127,7 @@ def cubic_backward(sh, x, y, z, r, g, b, out):
 
 @inlined(fastmath=FASTMATH)
 def add_coefficient(out, k, basis, r, g, b):
-    """Gradient by coefficient ``k``."""
+    """Add the gradient by coefficient ``k``."""
     out[k, 0] += basis * r
     out[k, 1] += basis * g
     out[k, 2] += basis * b
@@ -144,16 +144,18 @@ def weigh(sh, k, r, g, b):
 
 F64 = np.float64
 PLACEMENT = 15
-"""Numbers of a placement: ``linear`` by rows, ``offset``, ``camera_position``."""
+"""Number of values of a placement: ``linear`` by rows, ``offset``, ``camera_position``."""
 UNIT = EXPONENT_UNIT
 
 
 class Gradients(NamedTuple):
-    """Loss gradients by the parts of one cluster, added to; ``covars`` replaces ``quats`` and
-    ``scales`` where the cluster has them and is [0, 3, 3] where it has not.
+    """Accumulated loss gradients by the arrays of one cluster.
+
+    If the cluster has covariances, ``covars`` replaces ``quats`` and ``scales``; else it is
+    [0, 3, 3].
 
     Attributes:
-        screen: [N, 2], see ScreenStatistics.gradients; [0, 2] where it is not asked for.
+        screen: [N, 2], see ScreenStatistics.gradients; [0, 2] if not requested.
     """
 
     means: NDArray[np.float32]
@@ -166,7 +168,7 @@ class Gradients(NamedTuple):
 
 
 class SlotSums(NamedTuple):
-    """What the tiles have written; see blend_tiles_backward and scatter_slots."""
+    """Gradients written by the tiles; see blend_tiles_backward and scatter_slots."""
 
     gradients: NDArray[np.float32]
     used: NDArray[np.uint8]
@@ -178,7 +180,7 @@ def project_backward(cluster, view, base, records, slots, screen_scale, out, pla
     """Add the gradients of one cluster as seen by one camera.
 
     Args:
-        cluster, view, base, records: as given to and filled by project_cluster.
+        cluster, view, base, records: arguments and result of project_cluster.
         slots: SlotSums.
         screen_scale: factors on the gradients by x and y [px] in ``out.screen``.
         out: Gradients.
@@ -192,7 +194,7 @@ def project_backward(cluster, view, base, records, slots, screen_scale, out, pla
 
 @kernel(fastmath=FASTMATH)
 def project_small_backward(cluster, view, base, records, slots, screen_scale, out, placement):
-    """Like project_backward for one chunk, where waking threads would take longer than the work."""
+    """Like project_backward for a single chunk, without threads, whose start would take longer."""
     total = np.empty(SLOT, np.float64)
     sums = placement[0]
     chunk_backward(cluster, view, base, 0, records, slots, screen_scale, out, total, sums)
@@ -200,7 +202,7 @@ def project_small_backward(cluster, view, base, records, slots, screen_scale, ou
 
 @inlined(fastmath=FASTMATH)
 def chunk_backward(cluster, view, base, chunk, records, slots, screen_scale, out, total, sums):
-    """The records of one chunk; ``total`` [SLOT] is work space, ``sums`` [PLACEMENT] is written."""
+    """Process one chunk; ``total`` [SLOT] is work space, ``sums`` [PLACEMENT] is written."""
     first = base + chunk * CHUNK
     sums[:] = 0
     for index in range(first, first + records.counts[first // CHUNK]):
@@ -212,7 +214,7 @@ def chunk_backward(cluster, view, base, chunk, records, slots, screen_scale, out
 
 @inlined()
 def sum_slots(slots, index, total):
-    """Sum the slots of one record; whether any was used."""
+    """Sum the slots of one record; returns whether any was used."""
     any_used = False
     total[:] = 0
     for slot in range(slots.spans[index, 0], slots.spans[index, 1]):
@@ -225,7 +227,7 @@ def sum_slots(slots, index, total):
 
 @inlined(fastmath=FASTMATH)
 def gaussian_backward(cluster, view, i, record, total, screen_scale, out, placement):
-    """Chain the gradients of one record through its projection."""
+    """Apply the chain rule through the projection to the gradients of one record."""
     m, t = cluster.linear, cluster.offset
     mean = F64(cluster.means[i, 0]), F64(cluster.means[i, 1]), F64(cluster.means[i, 2])
     x, y, z = (
@@ -283,10 +285,10 @@ def gaussian_backward(cluster, view, i, record, total, screen_scale, out, placem
 
 @inlined(fastmath=FASTMATH)
 def shape_backward(cluster, view, i, a, b, total, screen_scale, out):
-    """From the sums of one record to its opacity, size and turn.
+    """Add the gradients by opacity, scales and rotation of one record.
 
     Args:
-        a, b: rows of the map from the cluster's frame to the image.
+        a, b: rows of the map from the cluster frame to the image.
 
     Returns:
         Gradients by the centre on the image (x, y), by ``a`` and by ``b``.
@@ -335,14 +337,14 @@ def shape_backward(cluster, view, i, a, b, total, screen_scale, out):
 
 @inlined(fastmath=FASTMATH)
 def conic_backward(cluster, view, i, xx, xy, yy, sharp, total, screen_scale, out):
-    """From the sums of one record to its opacity and its covariance before blur.
+    """Gradients by the opacity of one record and its covariance before blur.
 
     Args:
         xx, xy, yy, sharp: covariance on the image [px^2] and its determinant before blur.
 
     Returns:
-        Gradients by xx, xy, yy and the determinant as if these were four variables, and by the
-        centre on the image (x, y).
+        Gradients by xx, xy, yy and the determinant, treated as four independent variables, and by
+        the centre on the image (x, y).
     """
     eps = F64(view.eps2d)
     determinant = sharp + eps * (xx + yy) + eps * eps
@@ -378,7 +380,7 @@ def conic_backward(cluster, view, i, xx, xy, yy, sharp, total, screen_scale, out
 
 @inlined(fastmath=FASTMATH)
 def rotation_of(quat):
-    """Rotation of a quaternion wxyz of any length, by rows, and the quaternion's length."""
+    """Rotation matrix of a quaternion (w, x, y, z) of any length, and the quaternion's length."""
     w, x, y, z = F64(quat[0]), F64(quat[1]), F64(quat[2]), F64(quat[3])
     square = w * w + x * x + y * y + z * z
     n = 2.0 / square
@@ -397,7 +399,7 @@ def rotation_of(quat):
 
 @inlined(fastmath=FASTMATH)
 def quaternion_backward(quat, norm, a, b, by_p, by_q, out):
-    """Add the gradient by a quaternion of length ``norm``.
+    """Add the gradient by a quaternion with length ``norm``.
 
     The gradient by the rotation is ``a by_p^T + b by_q^T``.
     """
@@ -450,7 +452,7 @@ def turn_back(r, v):
 
 @inlined(fastmath=FASTMATH)
 def multiply(s, v):
-    """S v for a symmetric S [3, 3], of which the upper half is read."""
+    """S v for a symmetric S [3, 3]; only the upper half is read."""
     return (
         F64(s[0, 0]) * v[0] + F64(s[0, 1]) * v[1] + F64(s[0, 2]) * v[2],
         F64(s[0, 1]) * v[0] + F64(s[1, 1]) * v[1] + F64(s[1, 2]) * v[2],

@@ -1,8 +1,8 @@
-"""Drawing of cameras with a lens or a rolling shutter: like pinholes, but with rays, not conics.
+"""Drawing of cameras with a lens or a rolling shutter, with rays instead of conics.
 
-Compiled when the first such camera is drawn. The innermost step is explicit vector code
+The kernels are compiled when the first such camera is drawn. The inner loop is explicit vector code
 over eight pixels. Their state is RAY_PLANES vectors: those of the pinhole, then the ray x, y, z and
-its time, -0.5 to 0.5 over the read-out.
+its time, -0.5 to 0.5 over the readout.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -64,10 +64,11 @@ VALUES = (RED, GREEN, BLUE, DEPTH, INSTANCE)
 
 
 def _still_exponent(state: Planes, record: _Record) -> Lanes:
-    """Emit the exponents of eight rays from one place; NaN or beyond the limit behind it.
+    """Emit the exponents of eight rays from one point; NaN or above the limit behind it.
 
-    In the space where the Gaussian is a unit sphere and its centre at the distance D on the third
-    axis, a ray along (a, b, c) passes it at D^2 (a^2 + b^2) / (a^2 + b^2 + c^2), squared.
+    In the space where the Gaussian is a unit sphere with its centre at distance D on the third
+    axis, a ray along (a, b, c) has the squared distance D^2 (a^2 + b^2) / (a^2 + b^2 + c^2) from
+    it.
     """
     x, y, z = (state.load(RAY + k) for k in range(3))
     rows = [[record.number(FRAME + 3 * row + k) for k in range(3)] for row in range(3)]
@@ -79,11 +80,10 @@ def _still_exponent(state: Planes, record: _Record) -> Lanes:
 
 
 def _moving_exponent(state: Planes, record: _Record) -> Lanes:
-    """Emit the exponents of eight rays from many places.
+    """Emit the exponents of eight rays from different points.
 
-    In the space where the Gaussian is a unit sphere about 0, a ray from o along d passes it at the
-    distance |o x d| / |d|. The cross product keeps its digits where |o|^2 - (o d)^2 / |d|^2 has
-    none left.
+    In the space where the Gaussian is a unit sphere about 0, a ray from o along d has the distance
+    |o x d| / |d| from it. The cross product stays precise where |o|^2 - (o d)^2 / |d|^2 cancels.
     """
     x, y, z, time = (state.load(RAY + k) for k in range(4))
     w = [record.number(WHITENING + k) for k in range(6)]
@@ -102,22 +102,21 @@ def _moving_exponent(state: Planes, record: _Record) -> Lanes:
 
 
 class _Record:
-    """Numbers of a record in memory, each in all lanes."""
+    """A record in memory; numbers are broadcast to all lanes."""
 
     def __init__(self, builder: ir.IRBuilder, data: Any) -> None:
         self._builder, self._data = builder, data
 
     def number(self, field: int) -> Lanes:
-        """A number."""
+        """Value of a field."""
         place = self._builder.gep(self._data, [I64(field)], source_etype=FLOAT)
         return splat(self._builder, self._builder.load(place, typ=FLOAT))
 
 
 def _ray_intrinsic(extras: int, *, moving: bool) -> Any:
-    """The intrinsic for what :func:`.blend._blend_intrinsic` says, of rays that start in one place
-    or (``moving``) in many.
+    """Like :func:`.blend._blend_intrinsic`, for rays from one point or (``moving``) from many.
 
-    In kernels: blend(pixels, half, record); returns zero when all are finished.
+    In kernels: blend(pixels, half, record); returns 0 when all pixels are finished.
     """
 
     def blend(typingctx, pixels, half, record):
@@ -157,9 +156,9 @@ def blend_ray_tiles(
     Args:
         values: [M, RAY_RECORD] float32.
         lists, starts, tiles_x, background: as in :func:`.blend.blend_tiles`.
-        rays: [H, W, 3] float32, 0 where nothing is seen.
-        lines: [H or W] float32, time of each row or column; [0] where all are taken at once.
-        by_row: whether they are rows.
+        rays: [H, W, 3] float32, 0 outside the lens.
+        lines: [H or W] float32, time of each row or column; [0] for a global shutter.
+        by_row: whether ``lines`` has rows.
     """
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
     rgb, alpha, depth, instance = images.rgb, images.alpha, images.depth, images.instance
@@ -181,7 +180,7 @@ def blend_ray_tiles(
 
 @inlined()
 def open_ray_tile(pixels, x0, y0, rays, lines, by_row):
-    """Like :func:`.blend.open_tile`; pixels that see nothing are finished, too."""
+    """Like :func:`.blend.open_tile`; also finishes pixels outside the lens."""
     pixels[:] = 0
     alive = np.int64(0)
     for row in range(min(TILE, rays.shape[0] - y0)):
@@ -202,7 +201,7 @@ def open_ray_tile(pixels, x0, y0, rays, lines, by_row):
 
 @inlined()
 def blend_ray_tile(values, halves_of, lists, first, last, x0, y0, pixels, alive, kind):
-    """Blend lists[first:last], near to far, until it ends or every pixel is finished."""
+    """Blend lists[first:last], near to far, until all pixels are finished."""
     for position in range(first, last):
         ahead = np.int64(lists[min(position + LOOK_AHEAD, last - 1)])
         prefetch(halves_of, 2 * ahead)
@@ -224,7 +223,7 @@ def blend_ray_tile(values, halves_of, lists, first, last, x0, y0, pixels, alive,
 
 @inlined()
 def blend_half_of_rays(pixels, half, record, kind):
-    """Blend one record over eight pixels; zero when all of them are finished."""
+    """Blend one record over eight pixels; returns 0 when all of them are finished."""
     if kind == 0:
         return blend_ray(pixels, half, record)
     if kind == 1:
@@ -236,7 +235,7 @@ def blend_half_of_rays(pixels, half, record, kind):
 
 @inlined()
 def write_ray_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, median):
-    """Write the tile to the images, with the background behind, black where nothing is seen."""
+    """Composite the tile over the background and write it; black outside the lens."""
     height, width = alpha.shape
     for row in range(min(TILE, height - y0)):
         for column in range(min(TILE, width - x0)):
@@ -244,7 +243,7 @@ def write_ray_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, medi
             y, x = y0 + row, x0 + column
             left = abs(pixels[p])
             total = F32(1) - left
-            # Finished before anything was drawn: sees nothing, not even what is behind.
+            # A pixel finished before drawing is outside the lens and shows no background.
             left = F32(0) if pixels[p] == F32(-1) else left
             alpha[y, x] = total
             for channel in range(3):
@@ -261,7 +260,7 @@ def write_ray_tile(pixels, x0, y0, background, rgb, alpha, depth, instance, medi
 # Drawing
 
 MARGIN = np.radians(2.0)
-"""By which the field of view is widened when chunks are left out."""
+"""Margin of the field of view for culling chunks [rad]."""
 NO_LINES = np.zeros(0, np.float32)
 
 
@@ -272,14 +271,14 @@ def draw_rays(
     space: Workspace,
     timing: dict[str, float],
 ) -> None:
-    """Draw the one camera of a request that has optics.
+    """Draw the camera of a request with optics.
 
     Args:
-        request: with ``optics``.
-        placement: of its instances before the camera in the middle of the read-out.
-        images: to draw into.
-        space: to work in.
-        timing: gets milliseconds by stage.
+        request: request with ``optics``.
+        placement: placement of its instances relative to the camera at mid-readout.
+        images: output images.
+        space: work space.
+        timing: receives milliseconds by stage.
     """
     optics = request.optics
     if optics is None:
@@ -301,12 +300,12 @@ def draw_rays(
 
 @dataclass(frozen=True, eq=False)
 class RayDrawing(Drawing):
-    """A drawing by rays.
+    """A Drawing by rays.
 
     Attributes:
         optics: the camera and its motion.
         rays: [H, W, 3] float32, see LensView.
-        tables: of the camera.
+        tables: lens tables of the camera.
     """
 
     optics: LensView
@@ -315,11 +314,11 @@ class RayDrawing(Drawing):
 
     @property
     def _widest(self) -> float:
-        """Angle from the axis beyond which nothing is seen, with room for blur [rad]."""
+        """Largest angle of a ray from the axis, including MARGIN [rad]."""
         return min(self.tables.reach + float(MARGIN), float(np.pi))
 
     def seen_chunks(self, placement: Placement) -> list[Chunks]:
-        """Numbers of the chunks of each instance that come near the field of view."""
+        """Indices of the chunks of each instance near the field of view."""
         reach = self._widest
         way = float(np.linalg.norm(self.optics.shift))
         turn = float(np.linalg.norm(self.optics.turn))
@@ -360,7 +359,7 @@ class RayDrawing(Drawing):
         return records, total
 
     def _view(self) -> RayParameters:
-        """Camera and options as the kernels take them."""
+        """Camera and options as kernel input."""
         request, options, optics = self.request, self.request.options, self.optics
         tables, blur = self.tables, float(np.sqrt(options.eps2d))
         return RayParameters(
@@ -431,7 +430,8 @@ def _line(optics: LensView) -> NDArray[np.float32]:
 
 
 def _drift(instance: Instance, optics: LensView) -> NDArray[np.float64]:
-    """[2, 3] way and rotation vector of an instance over the read-out, in the camera's frame."""
+    """[2, 3] displacement [m] and rotation vector [rad] of an instance over the readout, in the
+    camera frame."""
     if instance.twist is None or not optics.moves:
         return np.zeros((2, 3))
     turn = optics.middle[:3, :3]

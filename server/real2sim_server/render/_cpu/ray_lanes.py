@@ -1,12 +1,12 @@
 """Projection of eight Gaussians at a time onto the image of a camera with a lens.
 
-The eight are stored in RAY_PROJECTION planes of eight numbers: those of a pinhole projection, the
-second half of a record, and intermediate values. Each step takes a bit mask of active lanes and
+The eight Gaussians occupy RAY_PROJECTION planes of eight numbers: those of a pinhole projection,
+the second half of a record, and intermediate values. Each step takes a bit mask of active lanes and
 returns the lanes that remain.
 
-The pixels that a Gaussian may touch are bounded by the ellipse of the lens derivative, enlarged by
-the nonlinearity of perspective and lens over its extent. The map of the Gaussian to a unit sphere,
-which rays use, is exact.
+The ellipse of the lens derivative, enlarged by the nonlinearity of perspective and lens over the
+Gaussian's extent, bounds the pixels that a Gaussian may touch. Rays use the exact map of the
+Gaussian to a unit sphere.
 """
 
 from __future__ import annotations
@@ -72,44 +72,44 @@ from .records import (
 )
 
 SECOND = PROJECTION
-"""First of the planes of a record's second half."""
+"""First plane of a record's second half."""
 AXES = SECOND + RECORD
-"""First of nine: columns of a root of the covariance, in the frame of the cluster."""
+"""First of nine: columns of a square root of the covariance, in the cluster frame."""
 CENTRE = AXES + 9
-"""First of three: in the camera's frame in the middle of the read-out [m]."""
+"""First of three: centre in the camera frame at mid-readout [m]."""
 WAY = CENTRE + 3
-"""First of three: over the read-out as the camera sees it [m]."""
+"""First of three: displacement relative to the camera over the readout [m]."""
 TURN = WAY + 3
-"""First of nine, by rows: into the camera's frame when it looks at the centre."""
+"""First of nine, by rows: rotation into the camera frame at the time the centre is exposed."""
 SEEN = TURN + 9
-"""First of three: the centre there."""
+"""First of three: centre in that frame [m]."""
 PLACE = SEEN + 3
-"""First of NODE: what the directory says of this direction."""
+"""First of NODE: entry of the lens directory in this direction."""
 ROOT = PLACE + NODE
-"""First of six: the map that makes the Gaussian a unit sphere, its lower triangle by rows."""
+"""First of six: map of the Gaussian to a unit sphere, lower triangle by rows."""
 REACH = ROOT + 6
-"""Standard deviations up to alpha = 1/255."""
+"""Standard deviations from the centre to alpha = 1/255."""
 LARGE = REACH + 1
-"""1 where the ellipse bounds nothing, since lens and perspective bend too much; else 0."""
+"""1 if lens and perspective are too nonlinear for the ellipse to be a bound, else 0."""
 RAY_PROJECTION = LARGE + 1
 
 ROUNDS = 2
-"""In which the row of a centre and its time settle, each to some hundredths of what was left; what
-is exact is left to rays."""
+"""Iterations for the row and the exposure time of a centre; each leaves a few percent of the error.
+Rays are exact."""
 SMALL_ANGLE = 0.5
-"""Gaussians that lens and perspective bend by less than this share are small."""
+"""Largest relative nonlinearity of lens and perspective over a small Gaussian."""
 BENT = 0.6
-"""Share of the change of slope over an extent by which its end may be off, with some to spare."""
+"""Bound for the error at the end of an extent, as a fraction of the change of slope over it."""
 TINY = 1e-20
 
 Parts = tuple[Lanes, Lanes, Lanes, Lanes]
 """Covariance xx, xy, yy on the image [px^2], and its determinant."""
 Ellipse = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
-"""The same, and the middle as seen from where the centre is [px]."""
+"""The same, and the offset of the ellipse's middle from the projected centre [px]."""
 
 
 def _place(eight: Planes, view: Named, cluster: Named, *, moving: bool) -> Any:
-    """Write centres and ways; there remain those whose ball comes into the cone of all rays."""
+    """Write centres and displacements; keeps Gaussians whose ball meets the cone of all rays."""
     mean = [eight.load(MEAN + k).doubles() for k in range(3)]
     own = [dot(cluster.three("linear", row=k), mean) for k in range(3)]
     x, y, z = ((a + b).floats() for a, b in zip(own, cluster.three("offset"), strict=True))
@@ -129,7 +129,7 @@ def _place(eight: Planes, view: Named, cluster: Named, *, moving: bool) -> Any:
 
 
 def _see(eight: Planes, view: Named, cluster: Named, *, moving: bool) -> Any:
-    """Write where centres are seen; there remain those near the image and between the planes."""
+    """Write projected centres; keeps those near the image and between near and far plane."""
     centre = _read(eight, CENTRE, 3)
     seen = centre
     place = _look_up(view, seen)
@@ -164,7 +164,7 @@ def _see(eight: Planes, view: Named, cluster: Named, *, moving: bool) -> Any:
 
 
 def _axes(eight: Planes, view: Named, cluster: Named) -> Any:
-    """Write columns of roots of covariances from quaternions and scales."""
+    """Write columns of square roots of covariances from quaternions and scales."""
     for k, column in enumerate(turn_columns([eight.load(SHAPE + i) for i in range(4)])):
         scale = eight.load(SHAPE + 4 + k)
         _write(eight, AXES + 3 * k, [value * scale for value in column])
@@ -172,7 +172,7 @@ def _axes(eight: Planes, view: Named, cluster: Named) -> Any:
 
 
 def _shape(eight: Planes, view: Named, cluster: Named, *, moving: bool) -> Any:
-    """Write ellipses and what rays need; there remain those that meet the image, and large ones."""
+    """Write ellipses and ray data; keeps Gaussians that meet the image, and LARGE ones."""
     builder = eight.builder
     seen, centre, place = _read(eight, SEEN, 3), _read(eight, CENTRE, 3), _read(eight, PLACE, NODE)
     across, down = _image_axes(eight, seen, place, moving=moving)
@@ -208,10 +208,10 @@ def _shape(eight: Planes, view: Named, cluster: Named, *, moving: bool) -> Any:
 
 
 def _look_up(view: Named, seen: Vector) -> Vector:
-    """Emit what the directory says of directions, between its nodes; see LensTables.
+    """Emit the bilinear interpolation of the lens directory; see LensTables.
 
-    The numbers of a node lie side by side, so each lane reads its four nodes as vectors, and the
-    answers are turned from lanes to planes.
+    The numbers of a node are contiguous: each lane loads its four nodes as vectors, and the result
+    is transposed from lanes to planes.
     """
     builder = seen[0].builder
     by_z, by_x = _main_axis(seen)
@@ -241,7 +241,7 @@ def _look_up(view: Named, seen: Vector) -> Vector:
 
 
 def _cell(place: Lanes) -> tuple[Integers, Lanes]:
-    """Emit the number of a cell along an edge, and where in it."""
+    """Emit the index of a cell along an edge, and the position in the cell, 0 to 1."""
     first = place.at_least(0.0).floor().at_most(CELLS - 1.0)
     return first.integers(), (place - first).at_least(0.0).at_most(1.0)
 
@@ -252,13 +252,13 @@ def _times(numbers: Integers, factor: int) -> Integers:
 
 
 def _spread(lanes: Lanes, lane: int) -> Lanes:
-    """Emit one lane in all lanes."""
+    """Emit a broadcast of one lane to all lanes."""
     mask = ir.Constant(INTEGERS, [lane] * LANES)
     return Lanes(lanes.builder, lanes.builder.shuffle_vector(lanes.value, lanes.value, mask))
 
 
 def _transposed(rows: Vector) -> Vector:
-    """Emit eight vectors whose n-th lanes are those of the n-th of eight."""
+    """Emit the transpose of eight vectors."""
     for width in (1, 2, 4):
         swapped: list[Any] = [None] * LANES
         for low in range(LANES):
@@ -275,7 +275,7 @@ def _transposed(rows: Vector) -> Vector:
 
 
 def _main_axis(seen: Vector) -> tuple[Any, Any]:
-    """Emit masks: a direction lies on the faces across z; on those across x."""
+    """Emit the masks of directions whose largest component is z, and x."""
     builder = seen[0].builder
     x, y, z = (part.magnitude() for part in seen)
     by_z = builder.and_(z.compare(">=", x), z.compare(">=", y))
@@ -283,13 +283,13 @@ def _main_axis(seen: Vector) -> tuple[Any, Any]:
 
 
 def _largest(vector: Vector) -> Lanes:
-    """Emit the largest magnitude of three."""
+    """Emit the largest magnitude of three components, at least TINY."""
     x, y, z = (part.magnitude() for part in vector)
     return x.at_least(y).at_least(z).at_least(TINY)
 
 
 def _line_time(view: Named, place: Vector) -> Lanes:
-    """Emit when rows or columns of image positions are taken, -0.5 to 0.5."""
+    """Emit the exposure time of image positions within the readout, -0.5 to 0.5."""
     a, b, c = view.three("line")
     return place[0].fused(a, place[1].fused(b, c)).at_least(-0.5).at_most(0.5)
 
@@ -297,10 +297,10 @@ def _line_time(view: Named, place: Vector) -> Lanes:
 def _seen_at(
     view: Named, time: Lanes, centre: Vector, way: Vector
 ) -> tuple[tuple[Vector, Vector, Vector], Vector]:
-    """Emit the turn into the camera's frame at ``time``, by rows, and where centres are in it."""
+    """Emit the rotation into the camera frame at ``time``, by rows, and the centres in it."""
     rx, ry, rz = (-(time * part.floats()) for part in view.three("turn"))
     square = dot([rx, ry, rz], [rx, ry, rz])
-    # Rodrigues; series serve better than divisions, since turns within an image are small.
+    # Rodrigues' formula as a series: rotations within an image are small, and divisions are slow.
     s = -(square * (1 / 6)) * (-(square * (1 / 20)) + 1.0) + 1.0
     c = -(square * (1 / 24)) * (-(square * (1 / 30)) + 1.0) + 0.5
     xx, yy, zz = c * rx * rx, c * ry * ry, c * rz * rz
@@ -316,40 +316,40 @@ def _seen_at(
 
 
 def _face_reach(radius: Lanes, distance: Lanes, main: Lanes) -> Lanes:
-    """Emit how far balls of ``radius`` [m] reach on a face of the directory, at most."""
+    """Emit an upper bound for the extent of balls of ``radius`` [m] on a directory face."""
     share = (radius / main).at_most(0.9)
     return share * (distance / main) / (-share + 1.0)
 
 
 def _face_extent(centre: Vector, rows: list[Vector]) -> tuple[Vector, Lanes]:
-    """Emit the row along the axis of a face of roots of covariances, over the distance along it,
-    and the largest standard deviation on the face."""
+    """Emit the row of the covariance roots along the face's axis, divided by the distance along
+    that axis, and the largest standard deviation on the face."""
     x, y, z = rows
     by_z, by_x = _main_axis(centre)
     inverse = centre[2].where(by_z, centre[0].where(by_x, centre[1])).reciprocal()
     deep = [c.where(by_z, a.where(by_x, b)) * inverse for a, b, c in zip(x, y, z, strict=True)]
     squares = []
     for part, row in zip(centre, rows, strict=True):
-        # Along the axis itself nothing is left.
+        # Zero along the axis itself.
         off = [(-part).fused(along, own) for own, along in zip(row, deep, strict=True)]
         squares.append(dot_all(off, off))
     return deep, (squares[0] + squares[1] + squares[2]).root() * inverse.magnitude()
 
 
 def _bend(view: Named, place: Vector, reach: Lanes) -> Lanes:
-    """Emit how much slopes may change over a reach on a face, relative to them, a unit of it."""
+    """Emit a bound for the relative change of the lens slope per unit of reach on a face."""
     return place[NODE - 2].where(reach.compare("<", STEADY), view.number("bend"))
 
 
 def _is_small(view: Named, place: Vector, reach: Lanes) -> Any:
-    """Mask: lens and perspective bend little over a reach on a face."""
+    """Emit the mask of reaches on a face over which lens and perspective are nearly linear."""
     return ((_bend(view, place, reach) + 1.0) * reach).compare("<", SMALL_ANGLE)
 
 
 def _image_axes(
     eight: Planes, seen: Vector, place: Vector, *, moving: bool
 ) -> tuple[Vector, Vector]:
-    """Emit rows of the derivative of image positions [px/m], in the frame of the middle."""
+    """Emit rows of the derivative of image positions [px/m], in the mid-readout camera frame."""
     by_z, by_x = _main_axis(seen)
     u = seen[0].where(by_z, seen[1].where(by_x, seen[2]))
     v = seen[1].where(by_z, seen[2].where(by_x, seen[0]))
@@ -372,28 +372,28 @@ def _image_axes(
 
 
 def _camera_axes(eight: Planes, cluster: Named) -> list[Vector]:
-    """Emit columns of roots of covariances in the camera's frame."""
+    """Emit columns of square roots of covariances in the camera frame."""
     linear = [[number.floats() for number in cluster.three("linear", row=k)] for k in range(3)]
     columns = (_read(eight, AXES + 3 * k, 3) for k in range(3))
     return [[dot(row, column) for row in linear] for column in columns]
 
 
 def _blur(view: Named, centre: Vector, across: Vector, down: Vector) -> list[Vector]:
-    """Emit columns of a root of the blur that a pinhole adds on the image: the pixel's own extent
-    at the Gaussian, J^T (J J^T)^-1, and about as much along the ray."""
+    """Emit columns of a square root of the image blur of a pinhole camera: the pixel's extent at
+    the Gaussian, J^T (J J^T)^-1, and about the same extent along the ray."""
     a, b, c = dot(across, across), dot(across, down), dot(down, down)
     inverse = (a * c - b * b).at_least(TINY).reciprocal()
     scale = view.number("eps2d").root()
     p, q, r = scale * c * inverse, -(scale * b * inverse), scale * a * inverse
     first = [p.fused(i, q * j) for i, j in zip(across, down, strict=True)]
     second = [q.fused(i, r * j) for i, j in zip(across, down, strict=True)]
-    # Rays are told in the frame of the middle, where the Gaussian is seen along its centre.
+    # Rays use the mid-readout frame, where the viewing direction is that of the centre.
     deep = scale * (inverse.root() / dot(centre, centre)).root()
     return [first, second, [deep * part for part in centre]]
 
 
 def _write_still(eight: Planes, root: Vector, centre: Vector) -> None:
-    """Emit what rays from one place need: rows of a map that puts the centre on the third axis,
+    """Write the data for rays from one point: rows of a map that puts the centre on the third axis,
     and the square of its distance there."""
     o = whitened(root, centre)
     square = dot(o, o)
@@ -420,7 +420,7 @@ def _write_still(eight: Planes, root: Vector, centre: Vector) -> None:
 
 
 def _write_moving(eight: Planes, root: Vector, centre: Vector) -> None:
-    """Emit what rays from many places need: the map, and where they start in its space."""
+    """Write the data for rays from many points: the map, and the ray origins in its space."""
     _write(eight, SECOND - RECORD + WHITENING, root)
     _write(eight, SECOND - RECORD + ORIGIN, [-part for part in whitened(root, centre)])
     way = _read(eight, WAY, 3)
@@ -430,14 +430,15 @@ def _write_moving(eight: Planes, root: Vector, centre: Vector) -> None:
 def _in_perspective(
     ellipse: Parts, lean_x: Lanes, lean_y: Lanes, share: Lanes, reach: Lanes
 ) -> Ellipse:
-    """Emit the outline of an ellipsoid on a plane at right angles to an axis: exact, where the
-    derivative alone shows what is nearer too small.
+    """Emit the exact outline of an ellipsoid on a plane perpendicular to an axis.
+
+    The derivative alone underestimates the nearer part.
 
     Args:
-        ellipse: covariance by the derivative.
-        lean_x, lean_y: covariance of image positions with distances along the axis [px], over the
-            distance of the centre.
-        share: how far the ellipsoid reaches along the axis, over that distance.
+        ellipse: covariance from the derivative.
+        lean_x, lean_y: covariance of image positions with distances along the axis [px], divided
+            by the distance of the centre.
+        share: extent of the ellipsoid along the axis, divided by that distance.
         reach: standard deviations of the outline.
     """
     xx, xy, yy, determinant = ellipse
@@ -457,9 +458,8 @@ def _in_perspective(
 
 
 def _rolled(eight: Planes, view: Named, ellipse: Ellipse, image: tuple[Vector, Vector]) -> Ellipse:
-    """Emit ellipses as a rolling shutter shows them: rows farther down are taken later, when
-    everything has moved on."""
-    # Turning moves what is seen at p by -turn x p.
+    """Emit ellipses distorted by a rolling shutter: later rows see later positions."""
+    # A rotation of the camera displaces a point p by -turn x p.
     swing = cross(_read(eight, CENTRE, 3), [part.floats() for part in view.three("turn")])
     motion = [step + turned for step, turned in zip(_read(eight, WAY, 3), swing, strict=True)]
     a, b, _ = view.three("line")
@@ -481,8 +481,11 @@ def _rolled(eight: Planes, view: Named, ellipse: Ellipse, image: tuple[Vector, V
 
 
 def _bound(eight: Planes, view: Named, ellipse: Ellipse, on_face: Lanes, reach: Lanes) -> Any:
-    """Emit ellipses enlarged by what the lens bends ``on_face``, as far as Gaussians reach on a
-    face of the directory, and which are LARGE; the mask of those that meet the image."""
+    """Write ellipses enlarged by the lens nonlinearity, and LARGE.
+
+    ``on_face`` is the extent of the Gaussians on a face of the directory. Returns the mask of
+    ellipses that meet the image.
+    """
     place = _read(eight, PLACE, NODE)
     large = _filled(reach, 1.0)
     eight.store(LARGE, _filled(reach, 0.0).where(_is_small(view, place, on_face), large))

@@ -1,7 +1,7 @@
 """Projection of one cluster of Gaussians onto the image of a camera with a lens.
 
-Like :mod:`.project`, with the steps of :mod:`.ray_lanes`. The pixels that a large Gaussian may
-touch are bounded by its visible outline.
+Like :mod:`.project`, with the steps of :mod:`.ray_lanes`. The visible outline bounds the pixels
+that a large Gaussian may touch.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -57,23 +57,23 @@ from .records import (
 )
 
 called = functools.partial(func, _nrt=False)
-"""Left to the compiler whether it is inlined: one large Gaussian takes long enough for a call."""
+"""For functions that the compiler may inline or call: the work outweighs a call."""
 F32 = np.float32
 OUTLINE = 24
-"""Places on the outline of a large one."""
+"""Number of points on the outline of a large Gaussian."""
 COSINES = np.cos(2 * np.pi * np.arange(OUTLINE) / OUTLINE)
 SINES = np.sin(2 * np.pi * np.arange(OUTLINE) / OUTLINE)
 
 
 @kernel(parallel=PARALLEL_LOOPS)
 def project_rays(cluster, view, base, chunks, records):
-    """Write records of those Gaussians of one Cluster that may be seen.
+    """Write records of the potentially visible Gaussians of a Cluster.
 
     Args:
         view: RayParameters.
         base: first record of this cluster, a multiple of CHUNK.
-        chunks: [K] int64, numbers of the chunks to look at.
-        records: Records of RAY_RECORD values each, K regions from ``base`` on are written.
+        chunks: [K] int64, indices of the chunks to project.
+        records: Records of RAY_RECORD values each; K regions starting at ``base`` are written.
     """
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
     values, footprints = records.values, records.footprints
@@ -110,7 +110,7 @@ def color_of(cluster, i, out):
 
 @inlined()
 def project_eight(cluster, view, first, count, planes, found):
-    """Project ``count`` Gaussians from ``first`` on; returns bits of those to be recorded."""
+    """Project ``count`` Gaussians starting at ``first``; returns bits of those to record."""
     gather(cluster, first, count, planes)
     lanes = np.int64((1 << count) - 1)
     if view.rolls:
@@ -135,8 +135,10 @@ def project_eight(cluster, view, first, count, planes, found):
 
 @inlined()
 def gather(cluster, first, count, planes):
-    """Lay ``count`` Gaussians side by side in the planes; those that are deformed with a root of
-    their covariance, and as scales an upper bound of all."""
+    """Gather ``count`` Gaussians into the planes.
+
+    Deformed Gaussians have a Cholesky factor of their covariance, and an upper bound as scales.
+    """
     for lane in range(count):
         i = first + lane
         for k in range(3):
@@ -150,7 +152,7 @@ def gather(cluster, first, count, planes):
 
 @called
 def root_of(covar, lane, planes):
-    """Lay the lower triangle whose product with its transpose is a covariance into the planes."""
+    """Write the Cholesky factor of a covariance to a lane of the planes."""
     xx, xy, xz = np.float64(covar[0, 0]), np.float64(covar[0, 1]), np.float64(covar[0, 2])
     yy, yz, zz = np.float64(covar[1, 1]), np.float64(covar[1, 2]), np.float64(covar[2, 2])
     least = 1e-14 * (xx + yy + zz)
@@ -167,7 +169,7 @@ def root_of(covar, lane, planes):
 
 @inlined()
 def bound_large_ones(view, lanes, planes):
-    """Bound those lanes that are LARGE; returns bits of all that meet the image."""
+    """Bound the LARGE Gaussians; returns bits of all lanes that meet the image."""
     remaining = lanes
     while lanes != 0:
         lane = lowest_bit(lanes)
@@ -179,7 +181,7 @@ def bound_large_ones(view, lanes, planes):
 
 @called
 def bound_large(view, lane, planes):
-    """Write an ellipse about the box of the outline; whether it meets the image."""
+    """Write an ellipse around the box of the outline; returns whether it meets the image."""
     centre, way = vector_of(planes, CENTRE, lane), vector_of(planes, WAY, lane)
     low, high = vector_of(planes, ROOT, lane), vector_of(planes, ROOT + 3, lane)
     root = (low[0], low[1], low[2], high[0], high[1], high[2])
@@ -210,7 +212,7 @@ def bound_large(view, lane, planes):
 
 @inlined()
 def vector_of(planes, first, lane):
-    """Three numbers of a lane."""
+    """Three numbers of a lane, from plane ``first``."""
     return (
         np.float64(planes[first * LANES + lane]),
         np.float64(planes[(first + 1) * LANES + lane]),
@@ -220,7 +222,7 @@ def vector_of(planes, first, lane):
 
 @called
 def outline(view, centre, way, root, reach, time):
-    """Box of what the camera sees of the Gaussian at ``time``: left, top, right, bottom [px].
+    """Bounding box of the Gaussian's outline at ``time``: left, top, right, bottom [px].
 
     In the space where the Gaussian is a sphere of radius ``reach``, the outline is a circle.
     """
@@ -254,10 +256,10 @@ def outline(view, centre, way, root, reach, time):
 
 @called
 def see_at(view, time, centre, way):
-    """The turn into the camera's frame at ``time``, by rows, and where the centre is in it."""
+    """Rotation into the camera frame at ``time``, by rows, and the centre in that frame."""
     rx, ry, rz = -time * view.turn[0], -time * view.turn[1], -time * view.turn[2]
     square = rx * rx + ry * ry + rz * rz
-    # Rodrigues; series serve better than divisions, since turns within an image are small.
+    # Rodrigues' formula as a series: rotations within an image are small, and divisions are slow.
     s = 1 - square / 6 * (1 - square / 20)
     c = 0.5 - square / 24 * (1 - square / 30)
     turn = (
@@ -290,7 +292,7 @@ def look_up(view, seen):
 
 @inlined()
 def face_of(seen):
-    """Number of the face of the directory, and coordinates on it."""
+    """Index of the directory face, and coordinates on it."""
     x, y, z = seen
     ax, ay, az = abs(x), abs(y), abs(z)
     if az >= ax and az >= ay:
@@ -305,7 +307,7 @@ def face_of(seen):
 
 @called
 def behind_is_inside(turn, root, reach, o):
-    """Whether the outline holds the direction straight behind, about which images close up."""
+    """Whether the outline contains the direction straight behind the camera."""
     d = whitened(root, (-turn[2][0], -turn[2][1], -turn[2][2]))
     along = dot(o, d)
     beside = dot(o, o) - along * along / dot(d, d)

@@ -9,43 +9,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 CHUNK = 2048
-"""Gaussians that one task projects; also the size of a chunk's region of records."""
+"""Gaussians per projection task; also the size of a chunk's region of records."""
 TILE = 16
 """Edge length of a tile [px]."""
 RECORD = 16
-"""float32 values of a record: one cache line for each Gaussian that may be seen."""
+"""float32 values of a record: one cache line per potentially visible Gaussian."""
 
 MEAN_X, MEAN_Y = 0, 1
 """Centre on the image [px]."""
 SHARPNESS, SLOPE, FALLOFF = 2, 3, 4
 """exponent = (SHARPNESS (x - MEAN_X - SLOPE dy))^2 + FALLOFF dy^2 + LEVEL with dy = y - MEAN_Y.
 
-The Cholesky form of the conic: a sum of squares keeps its precision for needles, where
-a dx^2 + 2 b dx dy + c dy^2 loses all digits.
+This is the Cholesky form of the conic. A sum of squares stays precise for needles, where
+a dx^2 + 2 b dx dy + c dy^2 cancels.
 """
 LEVEL = 5
 """-ln(opacity) in EXPONENT_UNIT."""
 RED, GREEN, BLUE, DEPTH, INSTANCE = 6, 7, 8, 9, 10
-"""Colour, depth of the centre [m], instance id as a float."""
+"""Colour, depth of the centre [m], instance id as a float32."""
 EXTENT_Y, TIP_Y = 11, 12
-"""Of the ellipse alpha >= 1/255: largest dy, and dy of its rightmost point [px]."""
+"""Ellipse alpha >= 1/255: largest dy, and dy of its rightmost point [px]."""
 
 EXTENT_X = 13
-"""Of the same ellipse: largest dx [px]."""
+"""Largest dx of the same ellipse [px]."""
 MEMBER = 14
-"""Which Gaussian of its chunk a record is, as a float: 0 to CHUNK - 1."""
+"""Index of the Gaussian within its chunk, 0 to CHUNK - 1, as a float32."""
 
 EXPONENT_UNIT = 16.0
-"""Exponents are stored over this: exp(-s) = polynomial(s / 16)^16."""
+"""Divisor of stored exponents: exp(-s) = polynomial(s / 16)^16."""
 EXPONENT_LIMIT = math.log(255.0) / EXPONENT_UNIT
-"""Beyond this alpha is below 1/255."""
+"""Exponent above which alpha is below 1/255."""
 
 
 class Cluster(NamedTuple):
-    """Arrays of one cloud, all contiguous; ``covars`` is [0, 3, 3] where not given.
+    """Arrays of one cloud, all contiguous; ``covars`` is [0, 3, 3] if absent.
 
-    ``coefficients`` [N, F, 3] times ``tones`` [F] are added to ``sh[:, 0]``; F is 0 where colours
-    do not change over time.
+    ``coefficients`` [N, F, 3] times ``tones`` [F] is added to ``sh[:, 0]``; F is 0 for colours that
+    are constant over time.
     """
 
     means: NDArray[np.float32]
@@ -67,8 +67,8 @@ class CameraParameters(NamedTuple):
     """Camera and options as float32 numbers.
 
     Attributes:
-        fx, fy, cx, cy, width, height: of the camera [px].
-        left, right, top, bottom: bounds of x/z and y/z in the projection's Jacobian.
+        fx, fy, cx, cy, width, height: pinhole intrinsics and image size [px].
+        left, right, top, bottom: bounds of x/z and y/z in the Jacobian of the projection.
         near_plane, far_plane, eps2d, radius_clip, antialiased: see RasterOptions.
         blur: square root of ``eps2d`` [px].
     """
@@ -96,9 +96,9 @@ class Records(NamedTuple):
 
     Attributes:
         values: [M, RECORD] float32.
-        footprints: [M] int64, see :mod:`.project`; they fit a cache where the records do not.
+        footprints: [M] int64, see :mod:`.project`. Separate, so that they fit a cache.
         depths: [M] float32, depth of the centres [m].
-        counts: [M / CHUNK] int64, records in use of each region.
+        counts: [M / CHUNK] int64, used records of each region.
     """
 
     values: NDArray[np.float32]
@@ -108,14 +108,14 @@ class Records(NamedTuple):
 
 
 class Images(NamedTuple):
-    """Pictures of one camera; ``depth`` and those after it are [0, 0] where not asked for.
+    """Images of one camera; ``depth``, ``instance`` and ``median`` are [0, 0] if not requested.
 
     Attributes:
         rgb: [H, W, 3] float32.
         alpha: [H, W] float32.
         depth: [H, W] float32 [m].
         instance: [H, W] uint16.
-        median: [H, W] float32, depth of the Gaussian that takes half of the light [m].
+        median: [H, W] float32, depth of the Gaussian at which transmittance falls to 0.5 [m].
     """
 
     rgb: NDArray[np.float32]
@@ -128,40 +128,41 @@ class Images(NamedTuple):
 # Cameras with lenses
 
 RAY_RECORD = 2 * RECORD
-"""float32 values of a record: two cache lines. The first is that of a pinhole, whose ellipse holds
-what the Gaussian may touch; what it does touch is decided by rays."""
+"""float32 values of a record: two cache lines. The first is that of a pinhole; its ellipse bounds
+the pixels that the Gaussian may touch. Rays decide which ones it does touch."""
 FRAME = RECORD
-"""First of nine, for rays from one place: the rows of a map of directions to a space where the
-Gaussian is a unit sphere and its centre lies on the third axis."""
+"""First of nine, for rays from one point: rows of the map of directions to a space where the
+Gaussian is a unit sphere with its centre on the third axis."""
 SQUARE = RECORD + 9
-"""Of the distance to the centre there, over twice EXPONENT_UNIT."""
+"""Squared distance of the centre in that space, over twice EXPONENT_UNIT."""
 
 WHITENING = RECORD
-"""First of six, for rays from many places: the lower triangle, by rows, of the map that makes the
-Gaussian a unit sphere."""
+"""First of six, for rays from many points: map of the Gaussian to a unit sphere, lower triangle by
+rows."""
 ORIGIN = RECORD + 6
-"""First of three: the camera seen from the centre, in that space, in the middle of the read-out."""
+"""First of three: camera position relative to the centre, in that space, at mid-readout."""
 DRIFT = RECORD + 9
-"""First of three: how far it goes there over the read-out."""
+"""First of three: displacement of the camera in that space over the readout."""
 
 
 class RayParameters(NamedTuple):
-    """Camera and options for the kernels of lenses.
+    """Camera and options for the lens kernels.
 
     Attributes:
-        width, height: of the image [px].
+        width, height: image size [px].
         near_plane, far_plane, eps2d, radius_clip, antialiased: see RasterOptions.
-        ranges: 1 where depths are distances from the camera, 0 where they are along z.
-        rolls: whether lines are taken one after the other.
+        ranges: 1 if depth is the distance from the camera, 0 if it is along z.
+        rolls: whether the camera has a rolling shutter.
         bend, slack: see LensTables.
-        edge: how far small things reach on the image beyond their size [px].
-        cosine, sine: of the angle from the axis that no ray exceeds.
-        turned: length of ``turn``.
+        edge: extent of small Gaussians on the image beyond their size [px].
+        cosine, sine: cosine and sine of the largest angle between a ray and the axis.
+        turned: length of ``turn`` [rad].
         directory: see LensTables.
-        line: [3] float32; x, y, 1 times these, within -0.5 to 0.5, is the time of a position.
-        shift, turn: [3] float64, of the camera over the read-out, see LensView.
-        drift: [2, 3] float64, of the cluster over the read-out: way of its origin [m] and rotation
-            vector [rad], in the camera's frame.
+        line: [3] float32; the dot product with (x, y, 1), clipped to -0.5 to 0.5, is the exposure
+            time of an image position.
+        shift, turn: [3] float64, camera motion over the readout, see LensView.
+        drift: [2, 3] float64, cluster motion over the readout: displacement of its origin [m] and
+            rotation vector [rad], in the camera frame.
     """
 
     width: np.float32

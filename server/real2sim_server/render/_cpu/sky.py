@@ -1,7 +1,7 @@
 """The sky behind an image, forward and backward: Sky.sample in Numba.
 
-The backward pass distributes texel rows over tasks. Each task scans all pixels for its rows in the
-same order, so no two threads add to the same texel.
+The backward pass distributes texel rows over tasks. Each task scans all pixels in the same order
+for its rows, so no two threads add to the same texel.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -22,11 +22,11 @@ ZERO = F32(0)
 ONE = F32(1)
 HALF = F32(0.5)
 CLEAR = F32(1e-5)
-"""Nothing of the sky is seen through less than this."""
+"""Transmittance below which the sky is skipped."""
 TASKS = 16
-"""Rows are dealt to this many tasks in turn; rows of open sky cost more than others.
+"""Number of tasks. Rows are assigned round-robin, because rows of open sky cost more.
 
-A power of two, so that the owner of a row is its lowest bits.
+A power of two: the low bits of a row are its task.
 """
 
 
@@ -37,15 +37,14 @@ def add_sky(faces, matrix, first, rgb, alpha):
     Args:
         faces: [6, R, R, 3] float32 in C order, as in Sky.
         matrix: [3, 3] float32 ``R_world_camera K^-1``, maps (x, y, 1) [px] to directions.
-        first: row of the image that the given rows begin with.
+        first: image row of the first row of ``rgb``.
         rgb: [H, W, 3] float32, added to.
         alpha: [H, W] float32.
     """
     height, width = alpha.shape
     texels = faces.reshape(-1)
     for task in prange(TASKS):
-        # Where a row looks first and where in there, in two passes: the first has no branches and
-        # becomes vector code.
+        # Two passes: the first computes texel positions without branches, so that it vectorises.
         corners = np.empty(width, np.int32)
         columns, rows = np.empty(width, np.float32), np.empty(width, np.float32)
         for row in range(task, height, TASKS):
@@ -62,7 +61,7 @@ def add_sky(faces, matrix, first, rgb, alpha):
 
 @inlined()
 def pixel_direction(matrix, x, y):
-    """World direction through (x, y) [px]."""
+    """World direction of the ray through (x, y) [px]."""
     return (
         x * matrix[0, 0] + y * matrix[0, 1] + matrix[0, 2],
         x * matrix[1, 0] + y * matrix[1, 1] + matrix[1, 2],
@@ -72,7 +71,7 @@ def pixel_direction(matrix, x, y):
 
 @inlined()
 def texel_corner(direction, size):
-    """First number of the texel above and left, and the shares of the ones below and right."""
+    """Offset of the upper left texel, and the weights of the lower and right texels."""
     face, row, column = texel_coordinates(direction, size)
     last = np.int32(max(size - 2, 0))
     r0, c0 = min(np.int32(row), last), min(np.int32(column), last)
@@ -95,7 +94,7 @@ def add_sample(texels, size, corner, down, right, weight, out):
 
 @inlined()
 def texel_coordinates(direction, size):
-    """Face index, and row and column in texels of its ``size``, held inside their centres."""
+    """Face index, and row and column in texels, clamped to the texel centres."""
     face, u, v = face_coordinates(direction)
     limit = F32(size - 1)
     column = min(max((u + ONE) / F32(2) * F32(size) - HALF, ZERO), limit)
@@ -105,7 +104,7 @@ def texel_coordinates(direction, size):
 
 @inlined()
 def bilinear(face, row, column, k):
-    """Channel ``k`` of a face [R, R, 3] between its texels."""
+    """Bilinear sample of channel ``k`` of a face [R, R, 3]."""
     c0, r0 = np.int64(math.floor(column)), np.int64(math.floor(row))
     c1, r1 = min(c0 + 1, face.shape[0] - 1), min(r0 + 1, face.shape[0] - 1)
     fc, fr = column - F32(c0), row - F32(r0)
@@ -136,19 +135,19 @@ def face_coordinates(direction):
 
 @kernel(parallel=PARALLEL_LOOPS)
 def add_ray_sky(faces, turn, rays, rgb, alpha):
-    """Add ``(1 - alpha) * sky`` to ``rgb``, except where nothing is seen.
+    """Add ``(1 - alpha) * sky`` to ``rgb``, except outside the lens.
 
     Args:
         faces: [6, R, R, 3] float32 in C order, as in Sky.
-        turn: [3, 3] float32, maps rays to the world.
-        rays: [H, W, 3] float32, 0 where nothing is seen.
+        turn: [3, 3] float32, rotation of rays to the world frame.
+        rays: [H, W, 3] float32, 0 outside the lens.
         rgb: [H, W, 3] float32, added to.
         alpha: [H, W] float32.
     """
     height, width = alpha.shape
     texels = faces.reshape(-1)
     for task in prange(TASKS):
-        # As in add_sky, where a row looks comes first: it has no branches.
+        # As in add_sky, the first pass has no branches.
         corners = np.empty(width, np.int32)
         columns, rows = np.empty(width, np.float32), np.empty(width, np.float32)
         line = np.empty((3, width), np.float32)
@@ -184,13 +183,13 @@ OWNER = I32(TASKS - 1)
 
 @kernel(parallel=PARALLEL_LOOPS)
 def sample_sky(faces, matrix, behind, rows, places):
-    """Colour of the sky at all pixels, and where on the faces they look.
+    """Sample the sky at all pixels, and write the colours and sample positions.
 
     Args:
         faces: [6, R, R, 3] float32, as in Sky.
         matrix: [3, 3] float32, as for add_sky.
         behind: [H, W, 3] float32, written: colours.
-        rows: [H, W] int32, written: the upper texel row, all faces below each other.
+        rows: [H, W] int32, written: upper texel row, with the faces stacked vertically.
         places: [H, W, 2] float32, written: fraction towards the lower row, and column in texels.
     """
     height, width = rows.shape
@@ -208,12 +207,12 @@ def sample_sky(faces, matrix, behind, rows, places):
 
 @kernel(parallel=PARALLEL_LOOPS)
 def sky_backward(rows, places, alpha, by_rgb, gradient):
-    """Add the gradients of one camera's picture by the faces.
+    """Add the gradients of one camera's image by the faces.
 
     Args:
         rows, places: from sample_sky.
         alpha: [H, W] float32.
-        by_rgb: [H, W, 3] float32, loss gradients by the picture.
+        by_rgb: [H, W, 3] float32, loss gradients by the image.
         gradient: [6, R, R, 3] float32, added to.
     """
     height, width = alpha.shape
@@ -233,7 +232,7 @@ def sky_backward(rows, places, alpha, by_rgb, gradient):
 
 @inlined()
 def add_texels(gradient, row, column, weight, by_rgb):
-    """Add to two neighbouring texels of one row."""
+    """Add to two neighbouring texels of a row."""
     size = gradient.shape[1]
     c0 = np.int64(math.floor(column))
     c1 = min(c0 + 1, size - 1)

@@ -1,8 +1,8 @@
-"""Small images in parallel, one per core, from the level of detail that fits the pixels.
+"""Small images in parallel, one per core, from the level of detail that matches the pixel size.
 
-An image of some thousand pixels is too little work for several cores, so whole images are
-distributed instead. Each image depends on its own request only, so results are bitwise independent
-of the number of threads and of the other images.
+An image of a few thousand pixels is too little work for several cores, so whole images are
+distributed. Each image depends only on its own request: results are bitwise independent of the
+number of threads and of the other images.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -79,20 +79,20 @@ def draw_images(
 
     Args:
         table: see table_of.
-        tones: [D, F] float32, of the draws whose colours change over time.
-        draws: [D, 2] int64, row of ``table`` and instance id of what is drawn, by image.
-        linear, offset: [D, 3, 3], [D, 3] float64, from a cloud's frame to the camera's.
-        camera_position: [D, 3] float32, camera in the cloud's unscaled frame [m].
+        tones: [D, F] float32, time basis of the draws with time-dependent colours.
+        draws: [D, 2] int64, row of ``table`` and instance id of each draw, by image.
+        linear, offset: [D, 3, 3], [D, 3] float64, cloud frame to camera frame.
+        camera_position: [D, 3] float32, camera in the unscaled cloud frame [m].
         scale: [D, 3] float32.
-        first_draws: [M + 1] int64, where the draws of each image begin.
+        first_draws: [M + 1] int64, index of the first draw of each image.
         views: [M, 16] float32, CameraParameters.
-        cell_pixels: how large merged cells may be on the image [px].
-        background: [3] float32, where there is no sky.
-        faces: [6, R, R, 3] float32, or R 0.
+        cell_pixels: largest size of merged cells on the image [px].
+        background: [3] float32, used without a sky.
+        faces: [6, R, R, 3] float32; R is 0 without a sky.
         sky_matrices: [M, 3, 3] float32, pixels to directions.
-        work: values [S, G, RECORD] float32, footprints [S, G] int64, depths [S, G] float32,
-            pairs [2, S, G] uint64 and chosen [S, G] int64; G Gaussians of the largest image, for
-            each of S threads.
+        work: arrays for S threads and the G Gaussians of the largest image: values [S, G, RECORD]
+            float32, footprints [S, G] int64, depths [S, G] float32, pairs [2, S, G] uint64 and
+            chosen [S, G] int64.
         rgb, alpha: [M, H, W, 3] and [M, H, W], written.
         depth, instance, median: [M, H, W], written, or [M, 0, 0].
     """
@@ -144,9 +144,9 @@ def project_draw(
     row, instance_id, tones, linear, offset, camera_position, scale, view, cell_pixels,
     planes, found, chosen, values, footprints, depths, count
 ):  # fmt: skip
-    """Write records of what one cloud shows, after the first ``count``; returns their new number.
+    """Append the records of one cloud after the first ``count``; returns the new number of records.
 
-    Gaussians of level 0 are listed from the beginning of ``chosen``, merged ones from its end.
+    ``chosen`` lists Gaussians of level 0 from its start and merged ones from its end.
     """
     f32, f64, i64 = np.float32, np.float64, np.int64
     gaussians, merged = row[COUNT], row[MERGED]
@@ -196,7 +196,7 @@ def choose_levels(
     order, starts, low, high, sigmas, cell, linear, offset, camera_position, scale, view,
     cell_pixels, chosen
 ):  # fmt: skip
-    """List what is drawn of each block that may be seen.
+    """Choose a level for each potentially visible block and list its Gaussians in ``chosen``.
 
     Returns:
         End of the Gaussians of level 0 in ``chosen``, and start of the merged ones.
@@ -231,7 +231,7 @@ def choose_levels(
 
 @inlined()
 def in_view(low, high, sigma, linear, offset, view):
-    """Whether something of a box may be seen: the planes of :mod:`.drawing`, one box."""
+    """Whether a box may be visible; tests the planes of :mod:`.drawing` for one box."""
     reach = REACH_MAX * SLACK_SIZE
     edge = reach * view.blur + SLACK_PIXELS
     x = y = z = 0.0
@@ -300,7 +300,7 @@ def project_listed(
 
 @inlined()
 def gather_listed(cluster, chosen, first, size, ahead, planes):
-    """Lay ``size`` Gaussians side by side in the planes; like gather_eight, from a list."""
+    """Gather ``size`` listed Gaussians into the planes; see gather_eight."""
     prefetch(cluster.means, chosen[ahead])
     for lane in range(size):
         gather_lane(cluster, chosen[first + lane], lane, planes)
@@ -308,7 +308,7 @@ def gather_listed(cluster, chosen, first, size, ahead, planes):
 
 @kernel()
 def sort_pairs(keys, count, pairs, scratch):
-    """Sort (key, index) pairs by key, stable; returns 0 where they end up in ``pairs``, else 1."""
+    """Stable sort of (key, index) pairs by key; returns 0 if the result is in ``pairs``, else 1."""
     if count == 0:
         return 0
     low, high = keys[0], keys[0]
@@ -344,7 +344,7 @@ def sort_pairs(keys, count, pairs, scratch):
 
 @kernel()
 def tile_lists(values, footprints, order, shape):
-    """Records by tile, near to far, and where the list of each tile begins."""
+    """Records by tile, near to far, and the start of each tile's list."""
     tiles_x, tiles_y = (shape[2] + TILE - 1) // TILE, (shape[1] + TILE - 1) // TILE
     starts = np.zeros(tiles_x * tiles_y + 2, np.int64)
     for index in range(order.shape[0]):
@@ -394,7 +394,7 @@ def blend_image(
 
 @inlined()
 def sky_image(faces, matrix, rgb, alpha):
-    """Add the sky behind an image, see add_sky."""
+    """Add the sky behind an image; see add_sky."""
     texels, size = faces.reshape(-1), faces.shape[1]
     for row in range(alpha.shape[0]):
         for x in range(alpha.shape[1]):
@@ -405,29 +405,31 @@ def sky_image(faces, matrix, rgb, alpha):
                 add_sample(texels, size, np.uint64(corner), down, right, weight, rgb[row, x])
 
 
-# Requests of small images, alone or many at once
+# Single and batched requests of small images
 
 CELL_PIXELS = 2.5
-"""Merged cells are at most this large on the image [px]. It takes a seventh less time than 2 and is
-0.7 dB farther from a large image scaled down; 3 takes a fifth less, and is 1.4 dB farther."""
+"""Largest size of merged cells on the image [px].
+
+Relative to 2 px, it takes 1/7 less time and loses 0.7 dB PSNR against a downscaled large image.
+3 px would take 1/5 less time and lose 1.4 dB.
+"""
 PIXEL_VARIANCE = 0.1
-"""Blur of a pixel, little more than that of its own square (1/12) [px^2]. With the usual 0.3 and no
-opacity taken back, Gaussians smaller than a pixel grow together: 8 dB farther from a large image
-scaled down."""
+"""Variance of the pixel blur, slightly more than that of a pixel's square (1/12) [px^2].
+
+With the usual 0.3 and without opacity compensation, Gaussians smaller than a pixel merge visually,
+which costs 8 dB PSNR against a downscaled large image.
+"""
 NO_SKY = np.zeros((6, 0, 0, 3), np.float32)
 
 
 class SmallImages:
-    """Draws small images, one call at a time; keeps work space."""
+    """Draws small images with a reused work space. Calls are not thread-safe."""
 
     def __init__(self) -> None:
         self._space = Workspace()
 
     def draw(self, requests: Sequence[RasterRequest]) -> RenderOutput:
-        """All images of the requests, which are of one size, one sky and the same options.
-
-        Images are drawn side by side, each on one core; it says nothing of what others show.
-        """
+        """Draw all images of requests that share size, sky and options, one image per core."""
         timing: dict[str, float] = {}
         with timed(timing, "project"):
             draws = _draws(requests)
@@ -435,7 +437,7 @@ class SmallImages:
             return self._drawn(requests[0], draws, timing)
 
     def draw_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
-        """All images of worlds of the same things; sizes, sky and options are those of ``like``."""
+        """Draw all images of worlds with the same instances; ``like`` has size, sky and options."""
         timing: dict[str, float] = {}
         with timed(timing, "project"):
             draws = _world_draws(worlds, like)
@@ -493,9 +495,11 @@ class SmallImages:
 
 @dataclass(frozen=True, eq=False)
 class _Draws:
-    """Arguments of draw_images; ``gaussians`` is how many an image may show at most.
+    """Arguments of draw_images.
 
-    ``held`` keeps alive what the table points to.
+    Attributes:
+        held: keeps the arrays alive that ``table`` points to.
+        gaussians: largest number of Gaussians in an image.
     """
 
     held: Sequence[Hierarchy]
@@ -575,7 +579,7 @@ def _draws(requests: Sequence[RasterRequest]) -> _Draws:
 
 
 def _world_draws(worlds: WorldViews, like: RasterRequest) -> _Draws:
-    """The same of worlds of the same things: one row of the table and one hierarchy each."""
+    """Like :func:`_draws`, for worlds with the same instances."""
     filled = np.array([len(thing.cloud) > 0 for thing in worlds.things], np.bool_)
     held = [_hierarchy(thing) for thing in worlds.things if len(thing.cloud)]
     rows = np.cumsum(filled) - 1
@@ -609,7 +613,7 @@ def _world_draws(worlds: WorldViews, like: RasterRequest) -> _Draws:
 def _tones(
     worlds: WorldViews, thing_of: NDArray[np.int64], times_us: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Of each draw [D, F]."""
+    """Time basis [D, F] of each draw."""
     counts = [
         0 if thing.colour is None else int(thing.colour.coefficients.shape[1])
         for thing in worlds.things
@@ -624,7 +628,7 @@ def _tones(
 
 
 class _Places(TypedDict):
-    """Where draws stand before their cameras, see draw_images."""
+    """Poses of draws relative to their cameras, see draw_images."""
 
     linear: NDArray[np.float64]
     offset: NDArray[np.float64]

@@ -31,8 +31,10 @@ from .launcher import (
 
 
 class DeviceScene:
-    """Addresses on the device. What lies elsewhere is copied there once, and kept while the
-    original lives."""
+    """Device addresses of clouds, colours and skies.
+
+    Tensors on other devices are copied once, and cached for the lifetime of the original.
+    """
 
     def __init__(self, launcher: Launcher) -> None:
         self._launcher = launcher
@@ -41,8 +43,8 @@ class DeviceScene:
         )
 
     def cloud(self, cloud: GaussianCloud) -> tuple[int, ...]:
-        """Addresses of means, quats, scales, opacities and harmonics; how many Gaussians, and how
-        many harmonics each has."""
+        """Addresses of means, quats, scales, opacities and sh; number of Gaussians, and of
+        spherical harmonics coefficients per Gaussian."""
         held = self._held.get(cloud)
         if held is not None:
             return held[0]
@@ -70,24 +72,24 @@ class DeviceScene:
         return numbers
 
 
-# Tables that the kernels read: one pass over the requests, the rest is arrays.
+# Tables for the kernels: one pass over the requests, then array operations.
 
 IDENTITY = np.eye(4)
 CLOUD_COLUMNS = ("means", "quats", "scales", "opacities", "sh", "count", "functions")
-"""What DeviceScene.cloud gives."""
+"""Fields returned by DeviceScene.cloud."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tables:
-    """A frame of C cameras and I objects, each drawn by cameras that follow one another.
+    """A frame of C cameras and I objects, each drawn by consecutive cameras.
 
     Attributes:
-        objects: [I] OBJECT; ``tones`` are places in the array of that name.
-        placements: one for each object and camera, PLACEMENT.
+        objects: [I] OBJECT; the field ``tones`` is an index into ``tones``.
+        placements: PLACEMENT of each pair of object and camera.
         cameras: [C] CAMERA.
-        tones: [T] float32, basis functions of colours that change over time.
-        pieces, entries, tiles, pixels: of the whole frame.
-        moved: tensors that were copied to the device for this frame alone.
+        tones: [T] float32, basis functions of time-dependent colours.
+        pieces, entries, tiles, pixels: totals of the frame.
+        moved: tensors copied to the device only for this frame.
     """
 
     objects: NDArray[np.void]
@@ -103,7 +105,7 @@ class Tables:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """An instance, and the cameras that draw it."""
+    """An instance and the range of cameras that draw it."""
 
     instance: Instance
     first_camera: int
@@ -115,8 +117,8 @@ def tables_of(
 ) -> Tables:
     """Tables of all cameras of ``requests``, in their order.
 
-    Instances with which all requests begin, such as the background of sessions on one scene, are
-    listed once and looked at once for all cameras.
+    Instances shared at the start of all requests, such as the background of sessions on one scene,
+    are listed and processed once for all cameras.
     """
     drawn = _drawn(requests)
     viewmats = np.concatenate([request.viewmats.detach().cpu().numpy() for request in requests])
@@ -140,7 +142,7 @@ def tables_of(
 
 
 def _drawn(requests: Sequence[RasterRequest]) -> list[_Drawn]:
-    """Instances and their cameras, those that all requests begin with first."""
+    """Instances and their cameras; instances shared by all requests come first."""
     first, others = requests[0].instances, requests[1:]
     total = sum(request.cameras for request in requests)
     shared = min((_shared(first, request.instances) for request in others), default=len(first))
@@ -153,7 +155,7 @@ def _drawn(requests: Sequence[RasterRequest]) -> list[_Drawn]:
 
 
 def _shared(first: Sequence[Instance], second: Sequence[Instance]) -> int:
-    """How many instances two worlds have in common before they part."""
+    """Length of the common prefix of two worlds."""
     if first is second:
         return len(first)
     pairs = zip(first, second, strict=False)
@@ -207,7 +209,7 @@ def _cameras(
 def _objects(
     drawn: Sequence[_Drawn], device_scene: DeviceScene, launcher: Launcher
 ) -> tuple[NDArray[np.void], NDArray[np.float32], list[Tensor]]:
-    """Table of objects, the tones of their colours, and what was moved for this frame."""
+    """Table of objects, their tones, and the tensors copied for this frame."""
     table = np.zeros(len(drawn), OBJECT)
     if not drawn:
         return table, np.zeros(0, np.float32), []
@@ -241,7 +243,7 @@ def _objects(
 def _placements(
     drawn: Sequence[_Drawn], objects: NDArray[np.void], viewmats: NDArray[np.float64]
 ) -> NDArray[np.void]:
-    """Where objects stand before their cameras, worked out in float64."""
+    """Placements of objects relative to their cameras, computed in float64."""
     counts = objects["cameras"].astype(np.int64)
     table = np.zeros(int(counts.sum()), PLACEMENT)
     if not len(table):
@@ -282,19 +284,19 @@ def _sums_before(counts: NDArray[np.integer]) -> NDArray[np.int64]:
 ALIGNMENT = 256
 REPORT_BYTES = COUNTERS * 4
 SORT_BLOCKS = 512
-"""Maximum number of blocks that share a sorted list."""
+"""Maximum number of blocks that sort a list."""
 MAX_PAIRS = 1 << 31
 PAIRS_PER_SPLAT = 4
-"""Room for tiles of each splat, to begin with."""
+"""Initial capacity for tiles per splat."""
 
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """Where the images of a frame lie, behind a report of REPORT_BYTES.
+    """Device memory of a frame's images, after a report of REPORT_BYTES.
 
     Attributes:
         memory: [bytes] uint8 on the device.
-        places: first byte, and bytes, of each image.
+        places: offset and size of each image [bytes].
     """
 
     memory: Tensor
@@ -302,7 +304,7 @@ class Images:
 
 
 class FrameMemory:
-    """Work space that grows on demand and is reused; for one frame at a time."""
+    """Work space for one frame at a time; grows on demand and is reused."""
 
     def __init__(self, launcher: Launcher) -> None:
         self._launcher = launcher
@@ -313,10 +315,10 @@ class FrameMemory:
         self.pair_capacity = 0
 
     def reserve(self, seen: int, pairs: int) -> None:
-        """Make room for splats, and for the tiles that they touch.
+        """Reserve memory for ``seen`` splats and ``pairs`` of splat and tile.
 
         Raises:
-            RenderError: more than a frame can have.
+            RenderError: above the limits of a frame.
         """
         if pairs > MAX_PAIRS or seen > MAX_PAIRS:
             raise RenderError(
@@ -328,11 +330,11 @@ class FrameMemory:
 
     @property
     def sort_blocks(self) -> int:
-        """Blocks that share a list."""
+        """Number of blocks that sort a list."""
         return min(SORT_BLOCKS, max(1, self.pair_capacity // (4 * PIECE)))
 
     def images(self, names: Sequence[str], pixels: int) -> Images:
-        """New memory for images of all cameras."""
+        """Allocate memory for images of all cameras."""
         places, used = {}, _aligned(REPORT_BYTES)
         for name in names:
             dtype, channels = IMAGES[name]
@@ -343,7 +345,7 @@ class FrameMemory:
         return Images(memory, places)
 
     def upload(self, tables: Tables, images: Images, options: RasterOptions) -> int:
-        """Copy the tables and the Frame over, in one copy; the address of the Frame."""
+        """Copy the tables and the Frame to the device in one copy; return the Frame's address."""
         parts = (tables.objects, tables.placements, tables.cameras, tables.tones)
         sizes = [FRAME.itemsize, *(part.nbytes for part in parts)]
         starts = [0, *np.cumsum([_aligned(size) for size in sizes]).tolist()]
@@ -404,7 +406,7 @@ class FrameMemory:
 
 
 def tile_passes(tiles: int) -> int:
-    """Passes of eight bits that sort by tile."""
+    """Number of 8-bit passes of the sort by tile."""
     return max(1, -(-(tiles - 1).bit_length() // 8))
 
 

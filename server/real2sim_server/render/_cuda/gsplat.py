@@ -1,7 +1,7 @@
-"""The CUDA backend: gsplat behind the same call.
+"""The CUDA backend: gsplat behind the common interface.
 
-The device transforms objects into world means and covariances and evaluates their colours in their
-own frames, then gsplat blends them. This module is imported only where CUDA is requested.
+The device transforms objects to world means and covariances and evaluates their colours in their
+own frames, then gsplat blends them. This module is imported only if CUDA is requested.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .needs import kernels_for_device
 
 @dataclass(frozen=True, eq=False)
 class GsplatStatistics(ScreenStatistics):
-    """Keeps gsplat's centres alive, on which it leaves the absolute gradients."""
+    """Keeps gsplat's centres alive, whose attribute ``absgrad`` has the absolute gradients."""
 
     means2d: Tensor | None = None
 
@@ -43,11 +43,11 @@ class GsplatStatistics(ScreenStatistics):
 def track_screen(
     request: RasterRequest, meta: dict[str, Any] | None, device: torch.device
 ) -> ScreenStatistics:
-    """Statistics on the device: radii at once, gradients when backward comes by.
+    """Statistics on the device: radii immediately, gradients during backward.
 
     Args:
-        meta: what ``gsplat.rasterization(packed=True, absgrad=True)`` returned last; None where
-            there was nothing to draw.
+        meta: ``meta`` of ``gsplat.rasterization(packed=True, absgrad=True)``; None if nothing was
+            drawn.
     """
     empty = empty_statistics(request, device)
     if meta is None:
@@ -66,7 +66,7 @@ def track_screen(
     if not means2d.requires_grad:
         return statistics
 
-    # The hook lives on the centres and would keep them alive for ever if it held them.
+    # The centres own the hook, so a strong reference would be a cycle that is never freed.
     held_weakly = weakref.ref(statistics)
     scale = torch.tensor(screen_scale(request), device=device)
 
@@ -90,11 +90,11 @@ def track_screen(
 class StageTimes:
     """Times stages without waiting for each.
 
-    Where the device has events its own times are read, after all stages were queued. Elsewhere, and
-    while pictures carry gradients, it is the time that queuing took: training waits for nothing.
+    On CUDA devices, device events are read after all stages have been queued. On other devices, or
+    if ``waits`` is false, the times are those of queuing: training never waits.
 
     Args:
-        device: on which the stages run.
+        device: device of the stages.
         waits: whether :meth:`read` may wait for the device.
     """
 
@@ -106,7 +106,7 @@ class StageTimes:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """The stage ``name`` is queued within."""
+        """Context in which the stage ``name`` is queued."""
         if self._has_events:
             events = (
                 torch.cuda.Event(enable_timing=True),
@@ -122,7 +122,7 @@ class StageTimes:
         self._queued_ms[name] = (time.perf_counter() - start) * 1e3
 
     def read(self) -> dict[str, float]:
-        """Milliseconds by stage; waits once for the last of them."""
+        """Milliseconds by stage; waits for the last stage."""
         if not self._events:
             return dict(self._queued_ms)
         list(self._events.values())[-1][1].synchronize()
@@ -133,9 +133,9 @@ class StageTimes:
 
 
 class CudaBackend:
-    """Rasterizer for an NVIDIA GPU; images stay on it. Gradients flow as through gsplat.
+    """Rasterizer for an NVIDIA GPU, with gsplat's gradients. Images stay on the GPU.
 
-    Clouds that lie elsewhere are copied to the device once and kept while they live.
+    Clouds on other devices are copied once and cached for their lifetime.
     """
 
     name = "cuda"
@@ -184,7 +184,7 @@ class CudaBackend:
         )
 
     def warm_up(self) -> None:
-        """Compile the instance kernel, and let gsplat reserve what it needs."""
+        """Compile the instance kernel, and let gsplat reserve memory."""
         for request in warm_up_requests():
             self.rasterize(request)
 
@@ -285,7 +285,7 @@ def _moved(request: RasterRequest, device: torch.device) -> RasterRequest:
 def _blend(
     request: RasterRequest, world: _World
 ) -> tuple[Tensor, Tensor, Tensor | None, dict[str, Any] | None]:
-    """RGB without background, alpha, depth, and what gsplat says about its tiles."""
+    """RGB without background, alpha, depth, and gsplat's ``meta``."""
     options, shape = request.options, (request.cameras, request.height, request.width)
     if len(world.means) == 0:
         empty = torch.zeros(shape, device=world.means.device)

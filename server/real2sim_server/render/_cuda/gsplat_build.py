@@ -1,14 +1,14 @@
-"""Compiling gsplat's kernels from wheels alone, and finding compiled ones.
+"""Compiling gsplat's kernels from wheels, and finding compiled ones.
 
-PyPI's gsplat has no compiled kernels and compiles them on first use, for minutes and with the
-compiler it happens to find. Here that is a separate step, ``real2sim doctor --build-gpu``: the
-``cuda`` extra brings the compiler in the version that torch was built with. The result is cached
-by the versions of gsplat, torch and Python and by the architectures.
+gsplat on PyPI has no compiled kernels. It compiles them on first use, which takes minutes, with
+whichever compiler it finds. Here this is a separate step, ``real2sim doctor --build-gpu``, with the
+compiler version that torch was built with, from the ``cuda`` extra. The result is cached by the
+versions of gsplat, torch and Python and by the architectures.
 
-Only what the CUDA backend calls is compiled: packed projection, covariances, spherical harmonics,
-tile intersection and blending of three and four channels, forward and backward. This saves minutes
-and keeps the function names, so gsplat's own wrapper finds them. As a program, the module compiles
-these sources: ``<folder of gsplat> <folder to work in>``.
+To save minutes, only functions that the CUDA backend calls are compiled: packed projection,
+covariances, spherical harmonics, tile intersection and blending of three and four channels, forward
+and backward. They keep their names, so gsplat's own wrapper finds them. Run as a program with the
+arguments ``<folder of gsplat> <work folder>``, the module compiles these sources.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ..._nvrtc import kernels_folder
 from ..types import RenderError
 
 CHANNELS = ("3", "4")
-"""Numbers of channels that are blended: RGB, and RGB with depth."""
+"""Supported numbers of channels: RGB, and RGB with depth."""
 FUNCTIONS = (
     "quat_scale_to_covar_preci_fwd",
     "quat_scale_to_covar_preci_bwd",
@@ -64,11 +64,11 @@ FUNCTION_START = re.compile(r"^(?=(?:std::tuple<|at::Tensor |void ))", re.MULTIL
 
 
 def write_slim_sources(package: Path, folder: Path) -> list[Path]:
-    """Write the sources to ``folder``; the paths of what is to be compiled.
+    """Write the sources to ``folder``; return the paths of the files to compile.
 
     Args:
         package: folder of the installed gsplat 1.5.
-        folder: exists.
+        folder: existing folder.
     """
     written = []
     for name in SOURCES:
@@ -85,13 +85,13 @@ def write_slim_sources(package: Path, folder: Path) -> list[Path]:
 
 
 def _without_channels(text: str) -> str:
-    """Without the instances of templates for other numbers of channels."""
+    """Remove template instances for other numbers of channels."""
     instance = re.compile(r"^[ \t]*(?:__INS__|__LAUNCH_KERNEL__)\((\d+)\)[ \t]*\n", re.MULTILINE)
     return instance.sub(lambda found: found[0] if found[1] in CHANNELS else "", text)
 
 
 def _without_functions(text: str) -> str:
-    """Without the functions that are not called; what precedes and closes them stays."""
+    """Remove functions that are not called; text before and after them stays."""
     body, closing, rest = text.rpartition("} // namespace gsplat")
     head, *functions = FUNCTION_START.split(body)
     kept = [part for part in functions if _name_of(part) in FUNCTIONS]
@@ -112,7 +112,7 @@ def _without_bindings(text: str) -> str:
 
 
 def compile_gsplat(package: Path, work: Path) -> None:
-    """Leave ``csrc.so`` in ``work``."""
+    """Compile ``csrc.so`` in ``work``."""
     from torch.utils import cpp_extension
 
     sources = work / "sources"
@@ -146,24 +146,25 @@ BUILD_TIMEOUT_S = 3600.0
 
 @dataclass(frozen=True)
 class BuiltKernels:
-    """Compiled kernels on the disk.
+    """Compiled kernels on disk.
 
     Attributes:
-        library: the extension module.
-        architectures: compute capabilities it has code for, such as ``9.0``.
+        library: path of the extension module.
+        architectures: its compute capabilities, such as ``9.0``.
     """
 
     library: Path
     architectures: tuple[str, ...]
 
     def serves(self, capability: tuple[int, int]) -> bool:
-        """Whether a device of that compute capability can run it: same major, no later minor."""
+        """Whether a device with that compute capability can run it: same major, same or higher
+        minor version."""
         pairs = [tuple(map(int, name.split("."))) for name in self.architectures]
         return any(major == capability[0] and minor <= capability[1] for major, minor in pairs)
 
 
 def built_kernels() -> list[BuiltKernels]:
-    """All that were compiled for this gsplat, torch, CUDA and Python."""
+    """All kernels compiled for this gsplat, torch, CUDA and Python."""
     found = []
     for record in sorted(kernels_folder().glob(f"{_key()}-*/{RECORD}")):
         names = json.loads(record.read_text(encoding="ascii"))["architectures"]
@@ -172,7 +173,7 @@ def built_kernels() -> list[BuiltKernels]:
 
 
 def load_kernels(kernels: BuiltKernels) -> None:
-    """Let gsplat find ``kernels`` as its own; before it calls any.
+    """Make gsplat use ``kernels``; call before gsplat's first use.
 
     Raises:
         RenderError: the library cannot be loaded.
@@ -196,10 +197,10 @@ def load_kernels(kernels: BuiltKernels) -> None:
 
 
 def build_kernels(architectures: Sequence[str]) -> tuple[BuiltKernels, float]:
-    """Compile for ``architectures`` (``9.0``, ``8.6`` ...); the result and the seconds it took.
+    """Compile for ``architectures`` (``9.0``, ``8.6`` ...); returns the kernels and the seconds.
 
     Raises:
-        RenderError: something it needs is missing, or the compiler failed.
+        RenderError: a requirement is missing, or the compiler failed.
     """
     home, package = cuda_home(), gsplat_package()
     if package is None:
@@ -226,12 +227,12 @@ def build_kernels(architectures: Sequence[str]) -> tuple[BuiltKernels, float]:
 
 
 def _compile(folder: Path, home: Path, package: Path, architectures: Sequence[str]) -> None:
-    """Compile in a process of its own: torch reads where CUDA is when it is imported."""
+    """Compile in a subprocess, because torch determines the CUDA folder on import."""
     work = folder / "work"
     links = work / "lib"
     links.mkdir(parents=True)
     for library in sorted((home / "lib").glob("libcudart.so.*")):
-        # The wheel has the library under its versioned name alone, and the linker asks for this.
+        # The wheel only has the versioned name; the linker needs the unversioned one.
         (links / "libcudart.so").symlink_to(library)
         break
     variables = {
@@ -258,13 +259,13 @@ def _compile(folder: Path, home: Path, package: Path, architectures: Sequence[st
 
 
 def cuda_home() -> Path | None:
-    """The CUDA toolkit of the version that torch was built with: the wheels', or the system's."""
+    """CUDA toolkit with the version that torch was built with, from wheels or the system."""
     wanted = torch.version.cuda
     return next((p for p in cuda_folders() if wanted and _compiler_version(p) == wanted), None)
 
 
 def cuda_folders() -> list[Path]:
-    """Where a CUDA toolkit may be: the folder of the wheels first."""
+    """Candidate folders of a CUDA toolkit; that of the wheels is first."""
     spec = importlib.util.find_spec("nvidia")
     wheels = (spec.submodule_search_locations or ()) if spec else ()
     major = (torch.version.cuda or "13").split(".")[0]
@@ -275,7 +276,7 @@ def cuda_folders() -> list[Path]:
 
 
 def _compiler_version(home: Path) -> str | None:
-    """Version of the compiler there, such as ``13.0``; None without a compiler."""
+    """Version of the compiler in ``home``, such as ``13.0``; None without a compiler."""
     compiler = home / "bin" / "nvcc"
     if not compiler.is_file():
         return None

@@ -1,8 +1,6 @@
 """Instance and median depth images on the GPU, from gsplat's tile lists.
 
-gsplat has no mode for them.
-
-Needs numba-cuda. The kernel also runs in Numba's CUDA simulator, where it is tested.
+gsplat has no mode for them. Requires numba-cuda; tests run the kernel in Numba's CUDA simulator.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -30,9 +28,8 @@ def instance_image(
     """Instance images [C, H, W] uint16 on the device.
 
     Args:
-        meta: what ``gsplat.rasterization(packed=True)`` returned last; None where there was nothing
-            to draw.
-        instance_ids: [N] int32, of each Gaussian given to gsplat.
+        meta: ``meta`` of ``gsplat.rasterization(packed=True)``; None if nothing was drawn.
+        instance_ids: [N] int32, instance id of each Gaussian passed to gsplat.
         shape: C, H, W.
     """
     if meta is None:
@@ -43,18 +40,22 @@ def instance_image(
 def median_depth_image(
     meta: dict[str, Any] | None, shape: tuple[int, int, int], device: torch.device
 ) -> Tensor:
-    """Median depths [C, H, W] float32 [m] on the device, 0 where no Gaussian takes half of the
-    light; arguments as of :func:`instance_image`."""
+    """Median depths [C, H, W] float32 [m] on the device, 0 where transmittance stays above 0.5.
+
+    Arguments as for :func:`instance_image`.
+    """
     if meta is None:
         return torch.zeros(shape, device=device)
-    # Whose bits are the kernel's numbers; those of 0 are 0.
+    # The kernel writes the bit patterns of the depths as ids; that of 0.0 is 0.
     bits = meta["depths"].detach().float().contiguous().view(torch.int32)
     return _numbers_image(meta, bits, shape).view(torch.float32)
 
 
 def _numbers_image(meta: dict[str, Any], ids: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """[C, H, W] int32: of ``ids`` [V], one for each projected Gaussian, that of the one which takes
-    half of the light; 0 where there is none."""
+    """Id [C, H, W] int32 of the Gaussian at which transmittance falls to 0.5 or below; 0 if none.
+
+    ``ids`` [V] has the id of each projected Gaussian.
+    """
     image = torch.zeros(shape, dtype=torch.int32, device=ids.device)
     arrays = (meta["means2d"], meta["conics"], meta["opacities"], ids)
     lists = (meta["isect_offsets"].reshape(shape[0], -1).int(), meta["flatten_ids"].int())
@@ -69,7 +70,7 @@ def _numbers_image(meta: dict[str, Any], ids: Tensor, shape: tuple[int, int, int
 
 
 def instance_signature() -> Any:
-    """Types of the arguments of :func:`find_instances`, for compiling it ahead."""
+    """Argument types of :func:`find_instances`, for ahead-of-time compilation."""
     from numba import types
 
     floats = [types.Array(types.float32, dims, "C") for dims in (2, 2, 1)]
@@ -81,13 +82,13 @@ def instance_signature() -> Any:
 def find_instances(
     means2d, conics, opacities, ids, offsets, members, image, tile_size, tiles_x
 ):  # pragma: no cover - runs on a GPU or in the simulator of another process
-    """For each pixel, the id of the Gaussian at which transmittance falls to 0.5 or below.
+    """Find the id of the Gaussian at which each pixel's transmittance falls to 0.5 or below.
 
     Args:
         means2d, conics, opacities, ids: [V, 2], [V, 3], [V] float32 and [V] int32.
-        offsets: [C, tiles] int32, where each tile's list starts.
+        offsets: [C, tiles] int32, start of each tile's list.
         members: [M] int32 records by tile, near to far.
-        image: [C, H, W] int32, written where there is such a Gaussian.
+        image: [C, H, W] int32, written at pixels with such a Gaussian.
         tile_size: edge length of a tile [px].
         tiles_x: tiles in a row.
     """

@@ -21,17 +21,17 @@ from ..types import RenderError
 
 THREADS = 256
 PIECE = 1024
-"""Gaussians, or splats, that one block works on."""
+"""Gaussians or splats per block."""
 WORDS = PIECE // 32
 DIGITS = 256
 TILE = 16
 MAX_CAMERAS = 64
 COUNTERS = 16
 SEEN_WANTED, PAIRS_WANTED = 2, 3
-"""Places of counters in the report."""
+"""Indices of counters in the report."""
 
 SPLAT_BYTES = 48
-"""Three float4, see ``store`` in ``kernels/seen.h``."""
+"""Size of a splat: three float4, see ``store`` in ``kernels/seen.h``."""
 
 _POINTER, _FLOAT, _COUNT = np.uint64, np.float32, np.uint32
 
@@ -89,7 +89,7 @@ IMAGES: dict[str, tuple[type, tuple[int, ...]]] = {
     "semantic": (np.uint8, ()),
     "bytes": (np.uint8, (3,)),
 }
-"""Images that a pass can write: dtype of a number, and channels."""
+"""Images that a pass can write: dtype and channels."""
 FRAME = _structure(
     (
         *("objects", "placements", "cameras", "seen_masks", "entry_starts", "splats", "boxes"),
@@ -117,10 +117,10 @@ _PATTERN = re.compile(
     re.DOTALL,
 )
 REGISTERS = 65_536
-"""Of a multiprocessor, handed out to warps in steps of REGISTER_STEP."""
+"""Registers of a multiprocessor, allocated to warps in units of REGISTER_STEP."""
 REGISTER_STEP = 256
 BLOCK_SHARED = 1024
-"""Shared memory that every block takes besides its own [bytes]."""
+"""Shared memory reserved per block by the system [bytes]."""
 MULTIPROCESSORS = {
     "sm_75": (1024, 64 << 10),
     "sm_80": (2048, 164 << 10),
@@ -130,18 +130,18 @@ MULTIPROCESSORS = {
     "sm_100": (2048, 228 << 10),
     "sm_120": (1536, 100 << 10),
 }
-"""Threads and shared memory [bytes] of one, from the CUDA programming guide."""
+"""Threads and shared memory [bytes] of a multiprocessor, from the CUDA programming guide."""
 
 
 @dataclass(frozen=True)
 class Usage:
-    """What a compiled kernel takes.
+    """Resource usage of a compiled kernel.
 
     Attributes:
-        registers: of each thread.
-        shared: memory of each block [bytes].
-        stack: of each thread [bytes].
-        spilled: what registers did not hold, written and read [bytes].
+        registers: registers per thread.
+        shared: shared memory per block [bytes].
+        stack: stack per thread [bytes].
+        spilled: register spill stores and loads [bytes].
     """
 
     registers: int
@@ -150,10 +150,10 @@ class Usage:
     spilled: int
 
     def occupancy(self, architecture: str, of_block: int = THREADS) -> float:
-        """Occupancy: share of a multiprocessor's threads active with blocks of this size.
+        """Occupancy: fraction of a multiprocessor's threads active with blocks of this size.
 
         Raises:
-            KeyError: for an architecture that MULTIPROCESSORS does not know.
+            KeyError: the architecture is not in MULTIPROCESSORS.
         """
         threads, shared = MULTIPROCESSORS[architecture]
         of_warp = -(-self.registers * 32 // REGISTER_STEP) * REGISTER_STEP
@@ -166,7 +166,7 @@ class Usage:
 
 
 def usage_of(log: str) -> dict[str, Usage]:
-    """What each kernel takes, from the words of ptxas."""
+    """Resource usage of each kernel, from the log of ptxas."""
     return {
         found["kernel"]: Usage(
             registers=int(found["registers"]),
@@ -205,16 +205,16 @@ KERNELS = (
 
 
 def compiled_kernels(architecture: str) -> bytes:
-    """The cubin for an architecture (``sm_90``), from the disk where it was compiled before.
+    """The cubin for an architecture (``sm_90``), cached on disk.
 
     Raises:
-        RenderError: it does not compile; the message has NVRTC's words.
+        RenderError: compilation failed; the message includes NVRTC's log.
     """
     return _source().kept(architecture)
 
 
 def compile_kernels(architecture: str) -> tuple[bytes, dict[str, Usage]]:
-    """Cubin, which is kept on the disk, and what each kernel takes.
+    """The cubin, cached on disk, and the resource usage of each kernel.
 
     Raises:
         RenderError: see :func:`compiled_kernels`.
@@ -224,7 +224,7 @@ def compile_kernels(architecture: str) -> tuple[bytes, dict[str, Usage]]:
 
 
 def cubin_path(architecture: str) -> Path:
-    """Where the cubin is kept."""
+    """Path of the cached cubin."""
     return _source().path(architecture)
 
 
@@ -234,7 +234,7 @@ def _source() -> KernelSource:
         kept_as="serving",
         text=SOURCE.read_text(encoding="ascii"),
         folder=FOLDER,
-        # Sums and products are rounded one by one, as on the CPU; fmaf stands where it is wanted.
+        # Round each sum and product, as on the CPU. The sources call fmaf explicitly.
         fma=False,
         error=RenderError,
     )
@@ -244,43 +244,43 @@ def _source() -> KernelSource:
 
 
 class Launcher(Protocol):
-    """A device that runs the kernels, one after the other.
+    """A device that runs the kernels in order.
 
     Attributes:
-        device: on which its memory lies.
+        device: torch device of its memory.
     """
 
     device: torch.device
 
     def launch(self, kernel: str, blocks: int, frame: int, argument: int = 0) -> None:
-        """Queue ``kernel`` for that many blocks.
+        """Queue a launch of ``kernel``.
 
         Args:
-            kernel: one of its kernels.
-            blocks: at least one.
-            frame: address of what the kernel is given, on the device.
-            argument: see the kernel.
+            kernel: name of a kernel.
+            blocks: number of blocks, at least one.
+            frame: device address of the kernel's input.
+            argument: second argument, see the kernel.
         """
         ...
 
     def pointer(self, tensor: Tensor) -> int:
-        """Address of what a contiguous tensor on the device holds."""
+        """Address of the data of a contiguous tensor on the device."""
         ...
 
     def host_memory(self, nbytes: int) -> Tensor:
-        """[nbytes] uint8 that the device can copy from and to without help."""
+        """[nbytes] uint8 of pinned host memory."""
         ...
 
     def wait(self) -> None:
-        """Return when all launches, and copies queued with them, are done."""
+        """Wait for all queued launches and copies."""
         ...
 
     def copy_out(self, source: Tensor, target: Tensor) -> Callable[[], object]:
-        """Copy a tensor of the device to host memory once all launches up to now are done, beside
-        those to come.
+        """Copy a device tensor to host memory after all queued launches, concurrently with later
+        ones.
 
         Returns:
-            Waits for the copy, on any thread.
+            A function that waits for the copy; thread-safe.
         """
         ...
 
@@ -289,11 +289,12 @@ class CudaLauncher:
     """The current CUDA device of torch, on torch's current stream.
 
     Args:
-        kernels: names of those to be launched.
-        compiled: gives the cubin that has them for an architecture; that of serving if None.
+        kernels: names of the kernels to launch.
+        compiled: function that returns their cubin for an architecture; default: the serving
+            kernels.
 
     Raises:
-        RenderError: the kernels do not compile for it.
+        RenderError: the kernels do not compile for the device.
     """
 
     def __init__(
@@ -305,7 +306,7 @@ class CudaLauncher:
 
         index = torch.cuda.current_device()
         self.device = torch.device("cuda", index)
-        torch.cuda.synchronize(self.device)  # torch makes the context that all share.
+        torch.cuda.synchronize(self.device)  # Makes torch create the shared context.
         Device(index).set_current()
         major, minor = torch.cuda.get_device_capability(index)
         code = ObjectCode.from_cubin((compiled or compiled_kernels)(f"sm_{major}{minor}"))
@@ -319,14 +320,14 @@ class CudaLauncher:
         from cuda.core import Device, LaunchConfig, launch
 
         if not getattr(self._threads, "ready", False):
-            # A driver's context is one of a thread.
+            # The driver's current context is per thread.
             Device(self.device.index).set_current()
             self._threads.ready = True
         config = LaunchConfig(grid=blocks, block=THREADS)
         try:
             launch(self._stream(), config, self._kernels[kernel], frame, np.uint32(argument))
         except Exception as error:
-            # In the words of torch, by which a worker knows that its device is lost.
+            # Worded like torch's errors, by which a worker detects that its device is lost.
             raise RuntimeError(f"CUDA error at the launch of {kernel}: {error}") from error
 
     def pointer(self, tensor: Tensor) -> int:
@@ -335,7 +336,7 @@ class CudaLauncher:
         return int(tensor.data_ptr())
 
     def host_memory(self, nbytes: int) -> Tensor:
-        """See Launcher; torch keeps what is given back for the next frame."""
+        """See Launcher. torch caches freed memory for the next frame."""
         return torch.empty(nbytes, dtype=torch.uint8, pin_memory=True)
 
     def wait(self) -> None:
@@ -347,10 +348,10 @@ class CudaLauncher:
         self._copying.wait_stream(torch.cuda.current_stream(self.device))
         with torch.cuda.stream(self._copying):
             target.copy_(source, non_blocking=True)
-            # Who waits for it sleeps; it may be one of several threads that encode.
+            # Waiting threads sleep: several threads may be encoding.
             copied = torch.cuda.Event(blocking=True)
             copied.record(self._copying)
-        # Its memory is not given to the next frame before.
+        # Keeps the memory from being reused before the copy is done.
         source.record_stream(self._copying)
         return copied.synchronize
 
@@ -359,7 +360,7 @@ class CudaLauncher:
 
         handle = torch.cuda.current_stream(self.device).cuda_stream
         if handle not in self._streams:
-            # torch calls the default stream 0, which is no handle.
+            # torch's handle of the default stream is 0, which is not a valid handle here.
             known = Stream.from_handle(handle) if handle else LEGACY_DEFAULT_STREAM
             self._streams[handle] = known
         return self._streams[handle]

@@ -1,7 +1,7 @@
-"""Requirements of the CUDA backends, their state on this machine, and how to meet the rest.
+"""Requirements of the CUDA backends, their state on this machine, and how to meet missing ones.
 
-Answers load no gsplat and compile nothing, so they are cheap enough for every start;
-:func:`try_without_device` tests as much as a machine without a GPU can.
+The checks neither load gsplat nor compile anything, so they are fast enough for every start.
+:func:`try_without_device` tests everything that needs no GPU.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ DRIVER = (
 )
 BUILD = "real2sim doctor --build-gpu"
 GSPLAT = ((1, 5), (1, 6))
-"""gsplat from, and below: 1.6 calls spherical_harmonics otherwise."""
+"""Supported gsplat versions, end-exclusive: 1.6 changes the call of spherical_harmonics."""
 
 
 @dataclass(frozen=True)
 class Need:
-    """Something that the backend needs.
+    """A requirement of a backend.
 
     Attributes:
-        name: what it is.
-        met: whether it is here.
-        found: what was found, or what is wrong.
+        name: name of the requirement.
+        met: whether it is met.
+        found: the version or device found, or the problem.
         remedy: how to meet it; empty if it is met.
-        of_device: whether only a machine with a GPU can have it.
+        of_device: whether it requires a GPU.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Need:
 
 
 def cuda_needs() -> list[Need]:
-    """All needs, in the order in which they are to be mended."""
+    """All requirements of the gsplat backend, in the order in which to fix them."""
     return [torch_need(), device_need(), _gsplat(), _numba_cuda(), _nvvm(), _kernels()]
 
 
@@ -61,7 +61,7 @@ def unmet_gsplat_need(*, without_device: bool = False) -> Need | None:
     """The first requirement that is not met, or None if the backend is usable.
 
     Args:
-        without_device: leave out what only a machine with a GPU can have.
+        without_device: ignore requirements that need a GPU.
     """
     for need in cuda_needs():
         if not need.met and not (without_device and need.of_device):
@@ -70,7 +70,7 @@ def unmet_gsplat_need(*, without_device: bool = False) -> Need | None:
 
 
 def kernels_for_device() -> BuiltKernels | None:
-    """Compiled kernels for the GPU of this machine; those made last where there is none."""
+    """Compiled kernels for the GPU of this machine; without a GPU, the latest ones."""
     built = built_kernels()
     if torch.cuda.is_available():
         capability = torch.cuda.get_device_capability()
@@ -79,11 +79,11 @@ def kernels_for_device() -> BuiltKernels | None:
 
 
 def try_without_device() -> None:
-    """Load gsplat's kernels and compile the instance kernel, which needs a driver only to run.
+    """Load gsplat's kernels and compile the instance kernel; neither requires a driver.
 
     Raises:
         RenderError: the kernels cannot be loaded.
-        Exception: whatever the compiler of Numba raises.
+        Exception: any error of Numba's compiler.
     """
     from numba import cuda
 
@@ -97,7 +97,7 @@ def try_without_device() -> None:
 
 
 def torch_need() -> Need:
-    """A torch that is built for CUDA."""
+    """A torch build with CUDA."""
     version = torch.version.cuda
     if version is None:
         return Need("torch", False, f"torch {torch.__version__} is built for CPU only", CUDA_TORCH)
@@ -105,7 +105,7 @@ def torch_need() -> Need:
 
 
 def device_need() -> Need:
-    """A GPU that torch sees."""
+    """A GPU that torch can use."""
     if not torch.cuda.is_available():
         return Need("device", False, "torch sees no CUDA device", DRIVER, of_device=True)
     major, minor = torch.cuda.get_device_capability()
@@ -149,7 +149,7 @@ def _numba_cuda() -> Need:
 
 
 def _nvvm() -> Need:
-    """Numba compiles instance images and physics with it."""
+    """NVVM, with which Numba compiles instance images and physics."""
     library = next(_nvvm_libraries(), None)
     if library is None:
         return Need("libnvvm", False, "libnvvm is not installed", INSTALL)
@@ -174,12 +174,12 @@ def installed_version(distribution: str) -> str | None:
 
 
 def nvrtc_needs() -> list[Need]:
-    """All needs, in the order in which they are to be mended."""
+    """All requirements of the NVRTC backend, in the order in which to fix them."""
     return [torch_need(), device_need(), *compiler_needs()]
 
 
 def compiler_needs() -> list[Need]:
-    """What compiling the kernels needs, with a GPU or without."""
+    """Requirements for compiling the kernels, with or without a GPU."""
     return [_cuda_core(), _nvrtc()]
 
 

@@ -1,7 +1,7 @@
 """The backend that draws frames for serving: tables, launches, images.
 
-Cameras of several requests (one size per request) and images of several sessions on one scene are
-drawn together. The number of launches and copies does not depend on the number of objects.
+Cameras of several requests (one size per request) and of several sessions on one scene are drawn
+together. The number of launches and copies does not depend on the number of objects.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from .frame_memory import (
 from .launcher import IMAGES, MAX_CAMERAS, PAIRS_WANTED, PIECE, SEEN_WANTED, CudaLauncher, Launcher
 
 BY_TILE = 16
-"""Added to the number of a pass that sorts pairs by tile."""
+"""Added to the index of a sort pass that sorts pairs by tile."""
 DEPTH_PASSES = 4
 MAX_PIXELS = 1 << 30
-"""Of a frame: the kernels count them by 32 bits, and memory is limited."""
+"""Maximum number of pixels of a frame: kernels use 32-bit indices, and memory is limited."""
 SEEN_SHARE = 4
-"""The first estimate: one in this many Gaussians is visible to a camera."""
+"""Initial estimate: one in this many Gaussians is visible to a camera."""
 FINISHED = {
     "rgb": "bytes",
     "depth": "solid",
@@ -45,13 +45,13 @@ FINISHED = {
     "median_depth": "median",
     "semantic": "semantic",
 }
-"""Images as they leave the renderer, by modality."""
+"""Final images by modality."""
 OUTPUTS = {"depth": "depth", "instance": "instance", "median_depth": "median"}
-"""Images on the device, by the option that asks for them."""
+"""Images on the device, by the option that enables them."""
 
 
 class NvrtcBackend:
-    """Rasterizer for an NVIDIA GPU, without gradients. One call at a time; others wait."""
+    """Rasterizer for an NVIDIA GPU, without gradients. Calls are serialised across threads."""
 
     name = "nvrtc"
 
@@ -64,16 +64,16 @@ class NvrtcBackend:
 
     @property
     def modalities(self) -> frozenset[str]:
-        """Those of :meth:`frames`."""
+        """Modalities that :meth:`frames` supports."""
         return frozenset(FINISHED)
 
     def warm_up(self) -> None:
-        """Reserve memory, by a small frame."""
+        """Reserve memory by drawing a small frame."""
         for request in warm_up_requests():
             self.rasterize(request)
 
     def rasterize(self, request: RasterRequest) -> RenderOutput:
-        """Draw all cameras in one go. Images stay on the device.
+        """Draw all cameras in one pass. Images stay on the device.
 
         Raises:
             RenderError: the request needs gradients.
@@ -107,7 +107,7 @@ class NvrtcBackend:
         )
 
     def rasterize_worlds(self, worlds: WorldViews, like: RasterRequest) -> RenderOutput:
-        """Draw worlds of the same things together, see BatchBackend."""
+        """Draw worlds with the same instances together, see BatchBackend."""
         Ks = torch.from_numpy(worlds.Ks)
         requests = [
             replace(
@@ -128,7 +128,7 @@ class NvrtcBackend:
     def frames(
         self, requests: Sequence[RasterRequest], modalities: Sequence[str]
     ) -> list[dict[str, NDArray[Any]]]:
-        """Images of all requests as they leave the renderer, see FrameBackend."""
+        """Final images of all requests, see FrameBackend."""
         started = self.start_frames(requests, modalities)
         started.ready()
         return started.images
@@ -136,7 +136,7 @@ class NvrtcBackend:
     def start_frames(
         self, requests: Sequence[RasterRequest], modalities: Sequence[str]
     ) -> StartedFrames:
-        """As :meth:`frames`, returning when they are drawn, see FrameBackend."""
+        """Like :meth:`frames`, but returns once the images are drawn, see FrameBackend."""
         pieces = [(k, piece) for k, request in enumerate(requests) for piece in _pieces(request)]
         found: list[list[dict[str, NDArray[Any]]]] = [[] for _ in requests]
         copies = []
@@ -183,9 +183,9 @@ class NvrtcBackend:
         return StartedFrames(results, ready)
 
     def _draw(self, requests: Sequence[RasterRequest], names: Sequence[str]) -> Images:
-        """Images on the device, when they are whole.
+        """Draw images on the device.
 
-        Space is what frames before have needed; a frame that needs more is drawn again.
+        Memory is sized by previous frames. A frame that needs more is drawn again.
         """
         if any(needs_gradients(request) for request in requests):
             raise RenderError(
@@ -237,7 +237,7 @@ class NvrtcBackend:
 
 
 def _pieces(request: RasterRequest) -> Iterator[RasterRequest]:
-    """The request in parts of at most MAX_CAMERAS and, but for a single image, MAX_PIXELS."""
+    """Split a request into parts of at most MAX_CAMERAS and, except for one image, MAX_PIXELS."""
     step = max(1, min(MAX_CAMERAS, MAX_PIXELS // (request.width * request.height)))
     for first in range(0, request.cameras, step):
         last = min(first + step, request.cameras)
@@ -247,7 +247,7 @@ def _pieces(request: RasterRequest) -> Iterator[RasterRequest]:
 def _batches(
     pieces: Sequence[tuple[int, RasterRequest]],
 ) -> Iterator[list[tuple[int, RasterRequest]]]:
-    """Requests that are drawn together: of the same options, within the limits of a frame."""
+    """Group requests with the same options within the limits of a frame."""
     batch: list[tuple[int, RasterRequest]] = []
     cameras = pixels = 0
     for item in pieces:
@@ -265,12 +265,12 @@ def _batches(
 
 
 def _alike(a: RasterOptions, b: RasterOptions) -> bool:
-    """But for the background, which each camera has for itself."""
+    """Whether options are equal apart from the background, which is per camera."""
     return replace(a, background=b.background) == b
 
 
 def _tensor(images: Images, name: str, shape: tuple[int, int, int]) -> Tensor:
-    """An image [C, H, W, ...] of all cameras of a frame, on the device."""
+    """Images [C, H, W, ...] of all cameras of a frame, on the device."""
     start, nbytes = images.places[name]
     dtype, channels = IMAGES[name]
     flat = images.memory[start : start + nbytes]
@@ -280,7 +280,7 @@ def _tensor(images: Images, name: str, shape: tuple[int, int, int]) -> Tensor:
 def _section(
     memory: NDArray[np.uint8], images: Images, name: str, first: int, pixels: int
 ) -> NDArray[Any]:
-    """Numbers of ``pixels`` pixels from ``first`` on, in memory of the host."""
+    """Values of ``pixels`` pixels starting at ``first``, in host memory."""
     dtype, channels = IMAGES[name]
     each = np.dtype(dtype).itemsize * int(np.prod(channels))
     start = images.places[name][0] + first * each

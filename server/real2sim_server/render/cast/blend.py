@@ -1,8 +1,8 @@
-"""Following rays through the Gaussians of their tile, from near to far.
+"""Tracing rays through the Gaussians of their tile, from near to far.
 
-Tiles are dealt to tasks in a fixed pattern and share nothing, so any number of threads gives the
-same bits. The innermost step is explicit vector code: one Gaussian against eight rays. The state of
-eight rays is STATE vectors; rays are six vectors, origin and direction.
+Tiles are assigned to tasks in a fixed pattern and share nothing, so results are bitwise independent
+of the number of threads. The inner loop is explicit vector code for one Gaussian and eight rays.
+The state of eight rays is STATE vectors; the rays are six vectors, origin and direction.
 """
 
 # Kernels take arrays by position: Numba supports neither dataclasses nor keyword-only arguments.
@@ -54,12 +54,12 @@ from .types import ECHO_MIN, HALF_LIGHT, TRANSMITTANCE_MIN
 LIGHT, RANGES, REFLECTED, LOST = 0, 1, 2, 3
 """Transmittance, and sums of w tau, w reflectivity and w loss."""
 MEDIAN, OWNER, MEMBERS = 4, 5, 6
-"""Range, body and member where the light falls to a half."""
+"""Range, body and member at which transmittance falls to 0.5."""
 ECHO = 7
-"""Four: the echo that is still growing: its last range, sums of power, power tau and power
+"""Four planes of the open echo: its last range, and sums of power, power tau and power
 reflectivity."""
 FIRST, STRONGEST, LAST = 11, 14, 17
-"""Three each: range, power, reflectivity."""
+"""Three planes each: range, power, reflectivity."""
 STATE = 20
 RAY = 6
 
@@ -67,7 +67,7 @@ RAY = 6
 def _build(
     rays: Planes, state: Planes, record: list[Lanes], limits: list[Lanes], *, returns: bool
 ) -> Any:
-    """Emit the meeting of one record; returns bits of the rays that go on."""
+    """Emit the absorption by one record; returns bits of the unfinished rays."""
     builder = state.builder
     near, far, pulse = limits
     origin = [rays.load(k) for k in range(3)]
@@ -77,8 +77,8 @@ def _build(
     start = whitened(whitening, [o - m for o, m in zip(origin, mean, strict=True)])
     along = whitened(whitening, direction)
     inverse = dot(along, along).reciprocal()
-    # |start x along|^2 / |along|^2 keeps the digits that |start|^2 - (start along)^2 / |along|^2
-    # loses.
+    # |start x along|^2 / |along|^2 stays precise where |start|^2 - (start along)^2 / |along|^2
+    # cancels.
     off = [start[i] * along[j] - start[j] * along[i] for i, j in ((1, 2), (2, 0), (0, 1))]
     exponent = dot(off, off).fused(inverse, record[LEVEL])
     tau = -(dot(start, along) * inverse)
@@ -111,7 +111,7 @@ def _build(
 def _grow_echo(
     state: Planes, met: Any, tau: Lanes, power: Lanes, reflectivity: Lanes, pulse: Lanes
 ) -> None:
-    """Add to the echo of each ray, or close it and begin another where this lies apart."""
+    """Add a sample to the open echo of each ray; if it is too far away, start a new echo."""
     builder = state.builder
     total = state.load(ECHO + 1)
     apart = (tau - state.load(ECHO)).magnitude().compare(">", pulse)
@@ -126,7 +126,7 @@ def _grow_echo(
 
 
 def close_echo(state: Planes, ends: Any) -> None:
-    """Take the echoes of those rays as returns, where they are strong enough."""
+    """Close the echoes of the rays in ``ends``; record those that are strong enough as returns."""
     builder = state.builder
     power = state.load(ECHO + 1)
     is_return = builder.and_(ends, power.compare(">=", ECHO_MIN))
@@ -140,8 +140,10 @@ def close_echo(state: Planes, ends: Any) -> None:
 
 
 def _cast_intrinsic(*, returns: bool) -> Any:
-    """In kernels: cast(rays, state, group, values, index, near, far, pulse); bits of the rays of
-    the group that go on."""
+    """The intrinsic cast(rays, state, bank, group, values, index, near, far, pulse).
+
+    It returns the bits of the unfinished rays of the group.
+    """
 
     def cast(typingctx, rays, state, bank, group, values, index, near, far, pulse):
         def generate(context, builder, signature, arguments):
@@ -177,7 +179,7 @@ cast_returns = _cast_intrinsic(returns=True)
 
 @intrinsic
 def close_group(typingctx, state, group):
-    """Take the last echo of each ray of a group."""
+    """Close the last echo of each ray of a group."""
 
     def generate(context, builder, signature, arguments):
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -190,7 +192,7 @@ def close_group(typingctx, state, group):
 
 @intrinsic
 def met_groups(typingctx, lows, highs, low, high):
-    """Bits of the eight groups of a tile that reach into elevations from ``low`` to ``high``."""
+    """Bits of the eight groups of a tile that overlap elevations from ``low`` to ``high``."""
 
     def generate(context, builder, signature, arguments):
         bounds = []
@@ -206,8 +208,10 @@ def met_groups(typingctx, lows, highs, low, high):
 
 @intrinsic
 def place_rays(typingctx, directions, group, frame, rays, bank):
-    """Turn eight directions [8, 3, 8] of a tile by frames [8, 12], a row for each ray, and write
-    their origins and directions to ``rays``."""
+    """Write origins and directions of a group's rays to ``rays``.
+
+    Directions [8, 3, 8] of a tile are rotated by the frames [8, 12], one row per ray.
+    """
 
     def generate(context, builder, signature, arguments):
         def data(number: int) -> Any:
@@ -236,7 +240,7 @@ __all__ = [
 ]
 
 
-# Following the rays of a tile
+# Tracing the rays of a tile
 
 
 TASKS = 64
@@ -246,16 +250,16 @@ F32 = np.float32
 
 @kernel(parallel=PARALLEL_LOOPS)
 def follow_rays(values, lists, starts, layout, motions, origins, limits, modes, lights):
-    """Follow every ray of every tile.
+    """Trace all rays of all tiles.
 
     Args:
         values: [M, RECORD] float32.
         lists: [L] int32, record indices by tile, near to far.
         starts: [tiles + 1] int64.
-        motions: [bodies] int64, which of ``origins`` a body moves by; 0 stands still.
-        origins: [motions, S, 12] float32, from the sensor's frame to that of the sweep as this
-            motion has it, at each instant.
-        limits: [3] float32: near, far and pulse [m].
+        motions: [bodies] int64, index into ``origins`` of each body's motion; 0 is stationary.
+        origins: [motions, S, 12] float32, sensor frame to sweep frame for this motion, at each
+            instant.
+        limits: [3] float32: near, far and pulse length [m].
         modes: number of returns.
         lights: Lights, written.
     """
@@ -305,7 +309,7 @@ def follow_rays(values, lists, starts, layout, motions, origins, limits, modes, 
 
 @inlined()
 def open_rays(layout, tile, state):
-    """Clear the state; bits of the groups that hold rays."""
+    """Clear the state; returns bits of the groups that have rays."""
     state[:] = 0
     alive = np.int64(0)
     for ray in range(TILE_RAYS):
@@ -320,7 +324,7 @@ def open_rays(layout, tile, state):
 
 @inlined()
 def fill_bank(layout, tile, frames_of_motion, motion, frames, bank):
-    """Write the rays of a tile as a moving body meets them."""
+    """Write the rays of a tile relative to a moving body."""
     for group in range(GROUPS):
         for lane in range(LANES):
             frame = frames_of_motion[layout.slots[tile, group * LANES + lane]]
@@ -332,7 +336,7 @@ def fill_bank(layout, tile, frames_of_motion, motion, frames, bank):
 
 @inlined()
 def write_rays(rays, state, out, owners, several):
-    """Put what the rays of a tile met where their LiDAR has them."""
+    """Write the results of a tile's rays in the order of the LiDAR's rays."""
     for ray in range(TILE_RAYS):
         index = rays[ray]
         if index >= 0:
@@ -351,25 +355,23 @@ def write_rays(rays, state, out, owners, several):
                     several[index, k] = state[place + (FIRST + k) * LANES]
 
 
-# Lists of the Gaussians that each ray meets, for fitting to recorded sweeps
+# Lists of the Gaussians that each ray hits, for fitting to recorded sweeps
 
 
 @kernel(parallel=PARALLEL_LOOPS)
 def list_hits(
     values, lists, starts, layout, motions, origins, limits, firsts, reach, begins, members, shares
 ):
-    """Count the Gaussians that rays meet, or list them from near to far.
-
-    A ray is followed up to its reach [m], or where that is 0 until its light has gone.
+    """Count the Gaussians that rays hit, or list them from near to far.
 
     Args:
-        values, lists, starts, layout, motions, origins, limits: as of ``follow_rays``.
-        firsts: [bodies] int64, number of the first Gaussian of each.
-        reach: [R] float32.
-        begins: [R] int64; where ``members`` is empty counts are written here, else it holds where
-            each ray's hits begin.
-        members: [M] int32, written: numbers of Gaussians.
-        shares: [M, 2] float32, written: the part of arriving light that is stopped, and where [m].
+        values, lists, starts, layout, motions, origins, limits: as for ``follow_rays``.
+        firsts: [bodies] int64, index of the first Gaussian of each body.
+        reach: [R] float32, length of each ray [m]; 0 follows the ray until its light is absorbed.
+        begins: [R] int64; if ``members`` is empty, receives the counts; else the start of each
+            ray's hits.
+        members: [M] int32, written: indices of Gaussians.
+        shares: [M, 2] float32, written: absorbed fraction of the arriving light, and range [m].
     """
     near, far, pulse = limits[0], limits[1], limits[2]
     for task in prange(TASKS):
@@ -416,7 +418,7 @@ def list_hits(
 
 @inlined()
 def note_group(rays, group, state, light, found, member, reach, begins, members, shares):
-    """Count or list what the rays of a group have just met; whether any of them goes on."""
+    """Count or list the latest hits of a group's rays; returns whether any ray continues."""
     going = False
     for lane in range(LANES):
         spot, at = group * LANES + lane, group * STATE * LANES + lane
@@ -444,7 +446,7 @@ def note_group(rays, group, state, light, found, member, reach, begins, members,
 
 @inlined()
 def open_group(state, group, light):
-    """Full light and no sums for the rays of a group that go on, none for the others."""
+    """Reset the rays of a group: full light for those that continue, none for the others."""
     for lane in range(LANES):
         at = group * STATE * LANES + lane
         state[at + LIGHT * LANES] = F32(1) if light[group * LANES + lane] > 0 else F32(0)

@@ -40,7 +40,7 @@ class CpuCaster:
         self._space = Workspace()
 
     def cast(self, request: CastRequest) -> Echo:
-        """Follow every ray of the request."""
+        """Trace all rays of the request."""
         timing: dict[str, float] = {}
         with self._lock:
             with timed(timing, "prepare"):

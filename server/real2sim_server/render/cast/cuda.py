@@ -38,7 +38,7 @@ TABLES = (
     *("tile_lows", "tile_highs", "first_tiles", "first_bands", "last_bands"),
     *("rows_before", "rows_until", "slot_of"),
 )
-"""Arrays of a BeamLayout that lie on the device."""
+"""Arrays of a BeamLayout that are copied to the device."""
 BODY = np.dtype(
     [
         *(
@@ -117,7 +117,7 @@ MAX_GAUSSIANS = 1 << 29
 MAX_PAIRS = 1 << 31
 VALUES = 5
 PARTS = ("means", "quats", "scales", "opacities")
-"""Of clouds."""
+"""Arrays of a cloud that are copied to the device."""
 
 
 class CudaCaster:
@@ -140,7 +140,7 @@ class CudaCaster:
         )
 
     def cast(self, request: CastRequest) -> Echo:
-        """Follow every ray of the request.
+        """Trace all rays of the request.
 
         Raises:
             RenderError: too many Gaussians or tile entries to sort at once.
@@ -190,7 +190,7 @@ class CudaCaster:
     def _sweep(
         self, request: CastRequest, motions: Motion, layout: BeamLayout, held: _Held
     ) -> NDArray[np.void]:
-        """The structure of that name, with its tables on the device."""
+        """The Sweep structure, with its tables on the device."""
         lidar, sweep = request.lidar, np.zeros(1, SWEEP)
         total = sum(len(instance.cloud) for instance in request.instances)
         if total > MAX_GAUSSIANS:
@@ -291,11 +291,11 @@ class _Held:
     def space(
         self, sweep: NDArray[np.void], name: str, shape: tuple[int, ...], dtype: torch.dtype
     ) -> Tensor:
-        """New memory for a field of a Sweep; torch keeps what is given back for the next."""
+        """Allocate memory for a field of a Sweep; torch caches freed memory for the next sweep."""
         tensor = torch.empty(shape, dtype=dtype, device=self._launcher.device)
         self.write(sweep, name, tensor)
         return tensor
 
     def put(self, sweep: NDArray[np.void]) -> int:
-        """Address of a copy of the structure on the device."""
+        """Copy the structure to the device; return the address."""
         return self.pointer(self.moved(sweep.view(np.uint8).copy()))

@@ -17,10 +17,10 @@ SUFFIXES = (".ply", ".npz", ".png")
 TOP_SIZE = 800
 """Width and height of the view from above [px]."""
 ROW_HEIGHT = 3
-"""Of the range image [px]."""
+"""Height of a row of the range image [px]."""
 COLUMNS = 1600
 FAR = 80.0
-"""Ranges are drawn up to here [m]."""
+"""Largest range in images [m]."""
 
 Picture = NDArray[np.uint8]
 
@@ -28,8 +28,8 @@ Picture = NDArray[np.uint8]
 def write_sweep(sweep: Sweep, lidar: Lidar, path: Path) -> None:
     """Write ``sweep`` in the format of the suffix of ``path``, one of SUFFIXES.
 
-    ``.ply`` has the returned points, sensor frame at the time of each ray, with intensity, ring or
-    ray, instance and time. ``.npz`` has all arrays of the sweep and the angles.
+    ``.ply`` has the returned points, in the sensor frame at the time of each ray, with intensity,
+    ring or ray, instance and time. ``.npz`` has all arrays of the sweep and the angles.
     """
     suffix = path.suffix.lower()
     if suffix == ".ply":
@@ -82,7 +82,7 @@ def _arrays(sweep: Sweep, lidar: Lidar) -> dict[str, NDArray[Any]]:
 
 
 def sweep_picture(sweep: Sweep, lidar: Lidar) -> Picture:
-    """RGB image: top view (forward is up), range image and intensity image below each other."""
+    """RGB image: top view (forward is up), range image and intensity image, stacked vertically."""
     import cv2
 
     above = _from_above(sweep)

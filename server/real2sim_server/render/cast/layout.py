@@ -1,6 +1,6 @@
 """Tiles of a LiDAR's rays (bands of elevation, divided by azimuth) and their record lists.
 
-A tile has eight groups of eight rays. Groups differ in elevation, rays of a group in azimuth,
+A tile has eight groups of eight rays. Groups differ in elevation and rays of a group in azimuth,
 because objects on the road appear wide and low. Spinning sensors fill tiles of eight rows by eight
 columns; ray tables are divided by sorting. The layout is computed once per ``Beams``.
 """
@@ -21,34 +21,35 @@ from .._cpu.lanes import LANES, inlined, kernel, prefetch
 from ..types import weak_cache
 
 GROUPS = 8
-"""Groups of a tile."""
+"""Groups per tile."""
 TILE_RAYS = GROUPS * LANES
 AZIMUTH_BINS = 4096
 ELEVATION_BINS = 4096
 ELEVATION_BIN = np.pi / ELEVATION_BINS
 AZIMUTH_BIN = 2 * np.pi / AZIMUTH_BINS
 MAX_BANDS = 250
-"""Bands fit eight bits."""
+"""Maximum number of bands; fits eight bits."""
 
 
 class BeamLayout(NamedTuple):
     """Tiles of rays and lookup tables, in kernel form.
 
     Attributes:
-        rays: [T, 64] int32, index of each ray in the flat order of the beams; -1 fills up.
-        directions: [T, 8, 3, 8] float32, unit vectors in the sensor's frame.
+        rays: [T, 64] int32, index of each ray in the flat order of the beams; padded with -1.
+        directions: [T, 8, 3, 8] float32, unit vectors in the sensor frame.
         slots: [T, 64] int32, instant of each ray.
         lows, highs: [T, 8] float32, elevations of the groups [rad].
         sides: [T] int32, 1 for tiles of the first half of the sweep, 2 for the second.
         band_starts: [bands + 1] int64, first tile of each band.
-        tile_lows, tile_highs: [T] int32, first and last bin of azimuth of each tile.
-        first_tiles: [bands, AZIMUTH_BINS] int32, first tile of a band that ends at or behind a bin.
+        tile_lows, tile_highs: [T] int32, first and last azimuth bin of each tile.
+        first_tiles: [bands, AZIMUTH_BINS] int32, first tile of a band that ends at or after a bin.
         first_bands, last_bands: [ELEVATION_BINS] int32, bands at or above, at or below a bin.
-        rows_before, rows_until: [ELEVATION_BINS] int32, rows below a bin, and up to its end.
-        slot_of: [AZIMUTH_BINS] int32, instant at which the sensor looks there.
-        seam: azimuth at which the sweep begins and ends [rad]; beyond pi where it has none.
-        spread_us: how far the instants of rays are from those of ``slot_of`` [us].
-        rate: speed at which the sensor turns [rad/s]; 0 where it does not.
+        rows_before, rows_until: [ELEVATION_BINS] int32, number of rows below a bin, and up to its
+            end.
+        slot_of: [AZIMUTH_BINS] int32, instant at which the sensor scans a bin.
+        seam: azimuth at which the sweep begins and ends [rad]; above pi if there is none.
+        spread_us: largest difference of a ray's time from that of ``slot_of`` [us].
+        rate: angular speed of the sensor [rad/s]; 0 if it does not spin.
     """
 
     rays: NDArray[np.int32]
@@ -116,8 +117,10 @@ def layout_of(beams: Beams) -> BeamLayout:
 
 
 def _turning_tiles(beams: Beams) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Tiles [T, 64] of rows by columns, and the band of each; offsets of rows are taken out in
-    whole columns, so that a tile is a patch of the sky."""
+    """Tiles [T, 64] of a spinning sensor by rows and columns, and the band of each tile.
+
+    Azimuth offsets of rows are compensated in whole columns, so that a tile is compact.
+    """
     rows, columns = beams.shape
     order = np.argsort(beams.elevation[:, 0], kind="stable")
     step = 2 * np.pi / columns
@@ -142,8 +145,10 @@ def _turning_tiles(beams: Beams) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _table_tiles(beams: Beams) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Tiles [T, 64] of rays of a table, and the band of each: bands of equally many rays by
-    elevation, cut by azimuth into tiles about as high as wide."""
+    """Tiles [T, 64] of a ray table, and the band of each tile.
+
+    Bands of equally many rays by elevation are divided by azimuth into roughly square tiles.
+    """
     azimuth, elevation = beams.azimuth, beams.elevation
     order = np.argsort(elevation, kind="stable")
     high = max(float(np.ptp(elevation)), 1e-3)
@@ -302,34 +307,34 @@ def _difference(a: Float, b: Float) -> Float:
 # Data exchanged between kernels
 
 RECORD = 16
-"""float32 values of a record: one cache line for each Gaussian that a ray may meet."""
+"""float32 values of a record: one cache line per Gaussian that a ray may hit."""
 WHITENING = 0
-"""Six planes: the lower triangle W, by rows, with exponent = |W (x - mean)|^2 + LEVEL."""
+"""Six planes: lower triangle W by rows, with exponent = |W (x - mean)|^2 + LEVEL."""
 MEAN = 6
-"""Three: the centre in the frame of the sweep [m]."""
+"""Three planes: centre in the sweep frame [m]."""
 LEVEL = 9
 """-ln(opacity) in EXPONENT_UNIT."""
 LOW, HIGH = 10, 11
-"""Elevations between which the Gaussian is met [rad]."""
+"""Range of elevations at which rays may hit the Gaussian [rad]."""
 BODY = 12
-"""Which instance, as a float."""
+"""Index of the instance, as a float32."""
 MEMBER = 13
-"""Which Gaussian of it, as a float; exact up to 16 million."""
+"""Index of the Gaussian in its cloud, as a float32; exact up to 16 million."""
 REFLECTIVITY, LOSS = 14, 15
-"""Attributes for the LiDAR."""
+"""LiDAR attributes."""
 
 SHAPE = RECORD
-"""Seven: quaternion and scales, or the upper half of a covariance by rows."""
+"""Seven planes: quaternion and scales, or the upper half of a covariance by rows."""
 OPACITY = RECORD + 7
 FRAME = RECORD + 8
-"""Twelve: from the frame of the sweep to the sensor's at the instant that it looks there, by rows
-of three turns and a shift."""
+"""Twelve planes: transform from the sweep frame to the sensor frame when the sensor scans the
+centre; three rows of rotation and translation."""
 RANGE = RECORD + 20
 """Distance of the centre from the sensor at that instant [m]."""
 LEFT, RIGHT = RECORD + 21, RECORD + 22
-"""Azimuths between which the Gaussian is met, LEFT < RIGHT [rad]."""
+"""Range of azimuths at which rays may hit the Gaussian, LEFT < RIGHT [rad]."""
 GAIN = RECORD + 23
-"""How fast it moves as the sensor sees it, at most [rad/s]."""
+"""Upper bound of its angular speed relative to the sensor [rad/s]."""
 PREPARATION = RECORD + 24
 
 
@@ -337,13 +342,14 @@ class Body(NamedTuple):
     """Arrays of one instance, all contiguous.
 
     Attributes:
-        means, quats, scales, opacities: of the cloud.
-        covars: [N, 3, 3], or [0, 3, 3] where not given.
+        means, quats, scales, opacities: arrays of the cloud.
+        covars: [N, 3, 3], or [0, 3, 3] if absent.
         attributes: [N, 2] float32, or [0, 2].
-        linear, offset: [3, 3] and [3] float64, from the cloud's frame to that of the sweep.
-        frames: [S, 12] float32, from there to the sensor's at each instant.
-        speed, turn: of the sensor against this body, at most [m/s], [rad/s].
-        number: of the instance in the request.
+        linear, offset: [3, 3] and [3] float64, cloud frame to sweep frame.
+        frames: [S, 12] float32, sweep frame to sensor frame at each instant.
+        speed, turn: maximum speed [m/s] and angular speed [rad/s] of the sensor relative to the
+            body.
+        number: index of the instance in the request.
     """
 
     means: NDArray[np.float32]
@@ -366,9 +372,9 @@ class Sensor(NamedTuple):
     Attributes:
         near, far: bounds of returns [m].
         wide, high: standard deviations of a beam at a distance of one metre [m].
-        spread: how far the instants of rays are from that at which a place is looked at [s].
-        period: time in which the sensor turns by one radian [s]; 0 where it does not turn.
-        duration: of a sweep [s].
+        spread: largest difference of a ray's time from the scan time of its direction [s].
+        period: time in which the sensor rotates by one radian [s]; 0 if it does not spin.
+        duration: duration of a sweep [s].
     """
 
     near: np.float32
@@ -381,12 +387,12 @@ class Sensor(NamedTuple):
 
 
 class Lights(NamedTuple):
-    """Outputs of the blending, by ray; [0] if not requested.
+    """Outputs by ray; [0] if not requested.
 
     Attributes:
-        values: [R, 6] float32: median range, sum of w tau, sum of w, of w reflectivity, of w loss,
-            and the return modes after them.
-        owners: [R, 2] int32: body and member at the median, -1 where there is none.
+        values: [R, 6] float32: median range, sums of w tau, w, w reflectivity and w loss, and the
+            return modes after them.
+        owners: [R, 2] int32: body and member at the median, -1 if none.
         returns: [R, 9] float32: range, power and reflectivity of first, strongest and last.
     """
 
@@ -407,7 +413,7 @@ def count_rays(footprints, order, layout, ordered, counts):
     """Count the records of each chunk in each tile.
 
     Args:
-        footprints: of Records.
+        footprints: see Records.
         order: [N] uint64, record indices in the low 32 bits, near to far.
         ordered: [N] int64, written: footprints in that order.
         counts: [TILE_CHUNKS, tiles] int64, written.
@@ -426,7 +432,7 @@ def count_rays(footprints, order, layout, ordered, counts):
 
 @kernel(parallel=PARALLEL_LOOPS)
 def scatter_rays(ordered, order, layout, cursors, lists):
-    """Write record indices to ``lists`` int32, by the cursors [TILE_CHUNKS, tiles]."""
+    """Write record indices to ``lists`` int32 at the cursors [TILE_CHUNKS, tiles]."""
     total = order.shape[0]
     step = (total + TILE_CHUNKS - 1) // TILE_CHUNKS
     for chunk in prange(TILE_CHUNKS):
@@ -437,8 +443,7 @@ def scatter_rays(ordered, order, layout, cursors, lists):
 
 @inlined()
 def visit(footprint, layout, cursors, lists, index):
-    """Step the cursor of each tile that a footprint meets, and write ``index`` there where lists
-    are given."""
+    """Advance the cursor of each tile in a footprint; write ``index`` there if lists are given."""
     band, last_band = footprint & 255, (footprint >> 8) & 255
     first_bin, last_bin = (footprint >> 16) & 8191, (footprint >> 29) & 8191
     side = footprint >> 42
@@ -449,7 +454,7 @@ def visit(footprint, layout, cursors, lists, index):
         while begin <= end:
             tile = np.int64(layout.first_tiles[band, begin])
             if begin == 0 and first_bin > 0:
-                # Behind +-pi: tiles that the part before has met already are left out.
+                # Beyond +-pi, skip tiles that the first part has already visited.
                 tile_end = min(tile_end, np.int64(layout.first_tiles[band, first_bin]))
             while tile < tile_end and layout.tile_lows[tile] <= end:
                 met = side == 0 or layout.sides[tile] == side

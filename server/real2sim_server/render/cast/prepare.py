@@ -1,10 +1,10 @@
-"""From the Gaussians of one body to records of those that rays may meet, and at which angles.
+"""From the Gaussians of one body to records, with the range of angles at which rays may hit them.
 
 The sensor moves while it spins, so the time at which it scans each Gaussian is computed first. At
 the azimuth where the sweep starts and ends, Gaussians are scanned twice, one turn apart, and become
 two records, one for the tiles of each half of the sweep.
 
-Eight Gaussians are whitened and bounded at a time. Angles are exact tangents to the ellipsoid
+Eight Gaussians are processed at a time. The angles are exact tangents to the ellipsoid
 alpha = 1/255 at the scan time of its centre, widened by the sensor motion until its edges are
 scanned.
 """
@@ -68,18 +68,19 @@ from .layout import (
 
 HALF_UNIT_ROOT = math.sqrt(0.5 / EXPONENT_UNIT)
 SLACK = 2e-4
-"""Angles are widened by this [rad] against rounding and the series of the arc tangent."""
+"""Margin of angles for rounding and the arc tangent series [rad]."""
 NEARLY_INSIDE = 0.05
-"""A Gaussian whose depth takes all but this share of its squared distance may be anywhere."""
+"""If the Gaussian's squared extent along the ray leaves less than this fraction of its squared
+distance, it may be in any direction."""
 POLE = 1.5
-"""Beyond this elevation [rad] azimuths mean nothing."""
+"""Elevation beyond which azimuths are undefined [rad]."""
 ARC = (0.99997726, -0.33262347, 0.19354346, -0.11643287, 0.05265332, -0.01172120)
-"""Odd series of the arc tangent on [-1, 1], to 2e-6."""
+"""Odd series of the arc tangent on [-1, 1]; error 2e-6."""
 TINY = 1e-12
 
 
 def _prepare(eight: Planes, sensor: Named, body: Named, *, deformed: bool) -> Any:
-    """Write the planes of a record; there remain those that a ray may meet."""
+    """Write the planes of a record; keeps Gaussians that a ray may hit."""
     mean = [eight.load(MEAN + k) for k in range(3)]
     turn = [[eight.load(FRAME + 4 * row + k) for k in range(3)] for row in range(3)]
     x, y, z = (dot(turn[row], mean, eight.load(FRAME + 4 * row + 3)) for row in range(3))
@@ -119,12 +120,12 @@ def _prepare(eight: Planes, sensor: Named, body: Named, *, deformed: bool) -> An
 
 
 def sensor_gain(body: Named, nearest: Lanes) -> Lanes:
-    """How fast what is at least ``nearest`` away moves as seen from the sensor [rad/s]."""
+    """Upper bound of the angular speed [rad/s] of points at least ``nearest`` [m] away."""
     return body.number("speed") / nearest + body.number("turn")
 
 
 def _factors(eight: Planes, body: Named) -> list[Vector]:
-    """[3][3]: linear R diag(s), whose product with its transpose is the covariance."""
+    """Factor F = linear R diag(s), [3][3], of the covariance F F^T."""
     columns = turn_columns([eight.load(SHAPE + k) for k in range(4)])
     scales = [eight.load(SHAPE + 4 + k) for k in range(3)]
     linear = _linear(body)
@@ -132,7 +133,7 @@ def _factors(eight: Planes, body: Named) -> list[Vector]:
 
 
 def _deformed_factors(eight: Planes, body: Named) -> list[Vector]:
-    """The same from the upper half of a covariance: linear times its Cholesky factor."""
+    """The same from the upper half of a covariance: linear times the Cholesky factor."""
     upper = [eight.load(SHAPE + k).doubles() for k in range(6)]
     a, b, c, d, e, f = cholesky(upper, TINY)
     rows = []
@@ -146,7 +147,10 @@ def _linear(body: Named) -> list[Vector]:
 
 
 def _spread(direction: Vector, rows: Sequence[Vector], reach: Lanes) -> Vector:
-    """How far the ellipsoid reaches along a direction, as a vector whose products give all."""
+    """Vector whose length is the extent of the ellipsoid along a direction.
+
+    Products of such vectors are the covariances between directions.
+    """
     columns = zip(*rows, strict=True)
     return [dot(direction, column) * reach for column in columns]
 
@@ -154,8 +158,10 @@ def _spread(direction: Vector, rows: Sequence[Vector], reach: Lanes) -> Vector:
 def _angles(
     sensor: Named, seen: list[Vector], gain: Lanes, along: Lanes, z: Lanes, square: Lanes
 ) -> dict[str, Lanes | Any]:
-    """Bounds against the centre: ``left``, ``right``, ``down``, ``up`` [rad], how far they are
-    ``widened``, and the mask ``anywhere``."""
+    """Bounds relative to the centre: ``left``, ``right``, ``down``, ``up`` [rad].
+
+    Also the margin ``widened`` [rad], and the mask ``anywhere`` of Gaussians without bounds.
+    """
     radial, across, upward = seen
     flat = along * along
     left, right, near_axis = _tangents(
@@ -179,7 +185,7 @@ def _angles(
 
 def _tangents(square: Lanes, along: Lanes, mixed: Lanes, across: Lanes) -> tuple[Lanes, Lanes, Any]:
     """Angles of the two tangents from the origin to an ellipse at a squared distance, and whether
-    it is too near for that."""
+    the origin is inside it or too close."""
     free = square - along
     inside = free.compare("<=", square * NEARLY_INSIDE)
     free = free.at_least(square * NEARLY_INSIDE)
@@ -190,7 +196,7 @@ def _tangents(square: Lanes, along: Lanes, mixed: Lanes, across: Lanes) -> tuple
 def _store_bounds(eight: Planes, angles: dict[str, Any], azimuth: Lanes, elevation: Lanes) -> None:
     left, right, widened = angles["left"], angles["right"], angles["widened"]
     low, high = elevation + angles["down"], elevation + angles["up"]
-    # tan e = tan(tilt) cos(azimuth): a horizontal edge sinks towards the horizon on both sides.
+    # tan e = tan(tilt) cos(azimuth): a horizontal edge approaches the horizon on both sides.
     half = left.magnitude().at_least(right.magnitude())
     sunk = (half * half * -0.5 + 1.0).at_least(0.0)
     low, high = low.at_most(low * sunk) - widened, high.at_least(high * sunk) + widened
@@ -207,7 +213,7 @@ def _store_bounds(eight: Planes, angles: dict[str, Any], azimuth: Lanes, elevati
 
 
 def arc(tangent: Lanes) -> Lanes:
-    """Arc tangent, to 2e-6."""
+    """Arc tangent; error 2e-6."""
     size = tangent.magnitude()
     steep = size.compare(">", 1.0)
     ratio = size.reciprocal().where(steep, size)
@@ -217,7 +223,7 @@ def arc(tangent: Lanes) -> Lanes:
 
 
 def arc2(y: Lanes, x: Lanes) -> Lanes:
-    """Angle of (x, y), to 2e-6."""
+    """Angle of (x, y); error 2e-6."""
     ax, ay = x.magnitude(), y.magnitude()
     large, small = ax.at_least(ay).at_least(TINY), ax.at_most(ay)
     angle = _series(small / large)
@@ -245,18 +251,18 @@ F32 = np.float32
 PI, HALF_PI, TURN = F32(np.pi), F32(np.pi / 2), F32(2 * np.pi)
 A0, A1, A2, A3, A4, A5 = (F32(a) for a in ARC)
 ROUNDS = 2
-"""Times the instant at which a place is looked at is improved; each leaves a fiftieth."""
+"""Iterations for the scan time of a point; each leaves 1/50 of the error."""
 NO_SEAM = 3.5
 FIELDS = tuple(field for field in range(RECORD) if field not in {BODY, MEMBER, REFLECTIVITY, LOSS})
 
 
 @kernel(parallel=PARALLEL_LOOPS, fastmath={"contract", "nsz", "arcp"})
 def prepare_body(body, sensor, layout, base, records):
-    """Write records of those Gaussians of one Body that rays may meet.
+    """Write records of the Gaussians of one Body that rays may hit.
 
     Args:
-        base: first chunk of this body; each has two regions of CHUNK records.
-        records: Records of the rasterizer, written from region ``2 base`` on.
+        base: first chunk of this body; each chunk has two regions of CHUNK records.
+        records: Records of the rasterizer, written starting at region ``2 base``.
     """
     # Arrays written in a prange must be plain variables: writes through a NamedTuple are lost.
     values, footprints = records.values, records.footprints
@@ -294,7 +300,7 @@ def prepare_body(body, sensor, layout, base, records):
 
 @inlined()
 def gather(body, first, count, planes):
-    """Lay Gaussians side by side in the planes, their centres in the frame of the sweep."""
+    """Gather Gaussians into the planes, with centres in the sweep frame."""
     for lane in range(count):
         i = first + lane
         planes[OPACITY * LANES + lane] = body.opacities[i]
@@ -312,9 +318,9 @@ def gather(body, first, count, planes):
 
 @inlined()
 def look(body, layout, count, side, planes):
-    """Put the sensor's frame at the instant it looks at each centre into the planes.
+    """Write the sensor pose at the scan time of each centre to the planes.
 
-    ``side`` 1 looks only in the first half of the sweep, 2 in the second, 0 in both.
+    ``side`` is 1 for the first half of the sweep, 2 for the second, 0 for both.
     """
     slots = body.frames.shape[0]
     low = 0 if side != 2 else slots - slots // 2
@@ -345,7 +351,7 @@ def look(body, layout, count, side, planes):
 
 @inlined()
 def run(body, sensor, lanes, planes):
-    """Bits of the lanes that remain, see prepare_lanes."""
+    """Bits of the remaining lanes, see prepare_eight."""
     if body.covars.shape[0] > 0:
         return prepare_eight_deformed(planes, lanes, sensor, body)
     return prepare_eight(planes, lanes, sensor, body)
@@ -353,7 +359,7 @@ def run(body, sensor, lanes, planes):
 
 @inlined()
 def near_seam(layout, sensor, lanes, planes):
-    """Bits of those that may be met both where the sweep begins and where it ends."""
+    """Bits of the Gaussians that rays may hit both at the start and at the end of the sweep."""
     bits = np.int64(0)
     for lane in range(LANES):
         if (lanes >> lane) & 1:
@@ -369,7 +375,7 @@ def near_seam(layout, sensor, lanes, planes):
 
 @inlined()
 def write(body, layout, first, lanes, side, planes, values, footprints, depths, slot):
-    """Write the records of those lanes whose angles hold rays; the next free slot."""
+    """Write the records of lanes whose angles contain rays; returns the next free slot."""
     while lanes != 0:
         lane = lowest_bit(lanes)
         lanes &= lanes - 1
@@ -391,10 +397,10 @@ def write(body, layout, first, lanes, side, planes, values, footprints, depths, 
 
 @inlined()
 def footprint_of(layout, lane, planes, side):
-    """Bands, bins of azimuth and side as one number, or -1 where no ray passes.
+    """Bands, azimuth bins and side as one integer, or -1 if no ray passes.
 
-    From the low bits on: first and last band (8 bits each), first and last bin (13 bits each; the
-    last may lie beyond the end, which wraps), side (2 bits).
+    From the low bits: first and last band (8 bits each), first and last bin (13 bits each; the last
+    may exceed the number of bins, which wraps), side (2 bits).
     """
     low = elevation_bin(planes[LOW * LANES + lane])
     high = elevation_bin(planes[HIGH * LANES + lane])
@@ -421,14 +427,14 @@ def footprint_of(layout, lane, planes, side):
 
 @inlined()
 def elevation_bin(angle):
-    """Bin of an elevation; angles beyond the poles go to the last ones."""
+    """Bin of an elevation; angles beyond the poles are clamped."""
     bin_ = np.int64((angle + HALF_PI) * F32(1 / ELEVATION_BIN) + F32(1)) - 1
     return min(max(bin_, 0), ELEVATION_BINS - 1)
 
 
 @inlined()
 def angle_of(y, x):
-    """Angle of (x, y), to 2e-6."""
+    """Angle of (x, y); error 2e-6."""
     ax, ay = abs(x), abs(y)
     ratio = min(ax, ay) / max(ax, ay, F32(1e-12))
     s = ratio * ratio

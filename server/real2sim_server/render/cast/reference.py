@@ -1,4 +1,4 @@
-"""cast() in plain torch: every ray against every Gaussian, in float64; the oracle for tests.
+"""cast() in plain torch, as a reference for tests: every ray and every Gaussian, in float64.
 
 :func:`follow` is differentiable with torch.
 """
@@ -20,7 +20,7 @@ from ..types import Instance
 from .types import ECHO_MIN, HALF_LIGHT, TRANSMITTANCE_MIN, CastRequest, Echo, Return
 
 RAYS = 256
-"""Rays followed at once."""
+"""Number of rays traced at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class ReferenceCaster:
     name = "reference"
 
     def cast(self, request: CastRequest) -> Echo:
-        """Follow the rays of one instant after the other."""
+        """Trace all rays, instant by instant."""
         start = time.perf_counter()
         lidar = request.lidar
         directions = lidar.beams.directions.reshape(-1, 3)
@@ -81,9 +81,9 @@ def follow(
     """Samples along rays from the origin.
 
     Args:
-        directions: [R, 3] unit.
-        means: [N, 3] in the sensor's frame [m].
-        factors: [N, 3, 3], whose product with its transpose is the covariance.
+        directions: [R, 3] unit vectors.
+        means: [N, 3] sensor frame [m].
+        factors: [N, 3, 3]; the product with the transpose is the covariance.
         opacities: [N].
         limits: nearest and farthest sample [m].
         divergence: see Lidar [rad].
@@ -107,7 +107,7 @@ def follow(
 
 
 def _footprint(means: Tensor, divergence: tuple[float, float]) -> Tensor:
-    """Covariance [N, 3, 3] of the beam itself at each Gaussian."""
+    """Covariance [N, 3, 3] of the beam at each Gaussian."""
     x, y, z = means.unbind(-1)
     flat, distance = torch.hypot(x, y).clamp(min=1e-6), means.norm(dim=-1)
     across = torch.stack([-y / flat, x / flat, torch.zeros_like(x)], -1)
@@ -121,7 +121,7 @@ def _footprint(means: Tensor, divergence: tuple[float, float]) -> Tensor:
 
 
 def _placed(request: CastRequest, slot: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Centres, factors and opacities of all Gaussians in the sensor's frame at an instant."""
+    """Centres, factors and opacities of all Gaussians in the sensor frame at an instant."""
     T_lidar_world = invert_transform(request.T_world_lidar[slot])
     parts: list[tuple[Tensor, Tensor, Tensor]] = []
     for instance, poses in zip(request.instances, request.object_poses, strict=True):
@@ -157,7 +157,7 @@ def _rotations(quats: Tensor) -> Tensor:
 
 
 class _Results:
-    """Images that fill ray by ray."""
+    """Results of rays, filled incrementally."""
 
     def __init__(self, request: CastRequest) -> None:
         self.request = request
@@ -168,7 +168,7 @@ class _Results:
         self.attributes = _attribute_table(request)
 
     def take(self, rays: NDArray[np.int64], samples: Samples) -> None:
-        """Sum the samples of some rays."""
+        """Add the results of ``rays``."""
         weight, tau, order = samples.weight, samples.tau, samples.order
         stopped = weight.sum(1)
         share = torch.where(stopped > 0, 1 / stopped, 0.0)
@@ -199,7 +199,7 @@ class _Results:
                 self.returns[k, :, ray] = echo
 
     def echo(self, milliseconds: float) -> Echo:
-        """All rays together."""
+        """The Echo of all rays."""
         request, shape = self.request, self.request.lidar.shape
         counts = [len(instance.cloud) for instance in request.instances]
         ids = np.repeat([i.instance_id for i in request.instances], counts)

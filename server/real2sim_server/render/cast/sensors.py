@@ -29,7 +29,7 @@ from .types import CastRequest, Echo, Image, point_velocities
 GOLDEN, MIX_1, MIX_2 = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 WORD = (1 << 64) - 1
 LOST, ACROSS, AROUND = 0, 1, 2
-"""Draws of a ray."""
+"""Indices of a ray's random numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ def drop_probability(echo: Echo, lidar: Lidar) -> Image:
 
 
 def uniform(seed: int, count: int, draw: int) -> NDArray[np.float64]:
-    """Numbers [count] in [0, 1) of each ray (splitmix64 of seed, ray and draw)."""
+    """Uniform numbers [count] in [0, 1), one per ray (splitmix64 of seed, ray and draw)."""
     base = np.uint64((seed * MIX_1 + draw * MIX_2) & WORD)
     state = base + (np.arange(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(GOLDEN)
     state = (state ^ (state >> np.uint64(30))) * np.uint64(MIX_1)
@@ -118,7 +118,7 @@ def uniform(seed: int, count: int, draw: int) -> NDArray[np.float64]:
 
 
 def normal(seed: int, count: int) -> NDArray[np.float64]:
-    """Normal numbers [count] (Box and Muller)."""
+    """Standard normal numbers [count] (Box-Muller)."""
     radius = np.sqrt(-2 * np.log(1 - uniform(seed, count, ACROSS)))
     numbers: NDArray[np.float64] = radius * np.cos(2 * np.pi * uniform(seed, count, AROUND))
     return numbers
@@ -127,15 +127,15 @@ def normal(seed: int, count: int) -> NDArray[np.float64]:
 # Radar
 
 REFERENCE_RCS = 10.0
-"""[m^2], that of a car from behind."""
+"""RCS of a car from behind [m^2]."""
 LOBE = np.radians(12.0)
-"""Width of the lobe about the normal, standard deviation."""
+"""Standard deviation of the lobe around the normal [rad]."""
 FLOOR = 0.08
-"""Share of the lobe's peak that is left at grazing incidence."""
+"""RCS at grazing incidence, as a fraction of the lobe's peak."""
 GHOST_LOSS = 0.05
-"""Power of a ghost against that of the same target at its range."""
+"""Power of a ghost relative to a target at the same range."""
 CLUTTER_RCS = (-20.0, 5.0)
-"""Of detections of nothing: mean and standard deviation [dBsm]."""
+"""RCS of clutter detections: mean and standard deviation [dBsm]."""
 MAX_CLUTTER = 20_000
 
 REFLECTIVITY = {
@@ -153,11 +153,11 @@ REFLECTIVITY = {
     "traffic sign": 20.0,
     "static": 2.0,
 }
-"""RCS of a patch seen along its normal, per area; of classes that are not named DEFAULT."""
+"""RCS per area of a patch at normal incidence, by class; DEFAULT for other classes."""
 DEFAULT = 2.0
 
 CLUTTER, CLUTTER_PLACE, GHOST = 11, 12, 16
-"""Draws; a place takes four numbers."""
+"""Indices of random numbers; a position takes four."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +229,7 @@ def radar_detections(patches: Patches, radar: Radar, *, seed: int = 0) -> Detect
 
 
 def patch_rcs(patches: Patches, solid_angle: float) -> Float:
-    """RCS [P] [m^2] of the patch of each ray; ``solid_angle``: of a ray at the axis [sr]."""
+    """RCS [P] [m^2] of each ray's patch; ``solid_angle`` is that of a ray at the axis [sr]."""
     table = np.full(256, DEFAULT)
     for name, value in REFLECTIVITY.items():
         table[SEMANTIC_CLASSES[name]] = value
@@ -353,7 +353,7 @@ def _clutter(radar: Radar, seed: int) -> Detections:
 
 
 def poisson(mean: float, drawn: float) -> int:
-    """The number of mean ``mean`` at ``drawn`` in [0, 1) of the distribution."""
+    """Quantile ``drawn`` in [0, 1) of the Poisson distribution with mean ``mean``."""
     number, logarithm = 0, -mean
     total = np.exp(logarithm)
     while drawn >= total and number < MAX_CLUTTER:

@@ -13,11 +13,11 @@ from ...scene import Lidar
 from ..types import Instance
 
 TRANSMITTANCE_MIN = 1e-3
-"""A ray ends where so little of its light is left."""
+"""Transmittance at which a ray ends."""
 HALF_LIGHT = 0.5
-"""A ray has met a surface where its transmittance falls to this or below."""
+"""Transmittance that defines a surface: a ray hits it where it falls to this or below."""
 ECHO_MIN = 0.05
-"""Echoes with a smaller share of the light are no return."""
+"""Minimum fraction of the light for an echo to be a return."""
 
 Image = NDArray[np.float32]
 
@@ -114,7 +114,7 @@ class CastBackend(Protocol):
     name: str
 
     def cast(self, request: CastRequest) -> Echo:
-        """Follow every ray."""
+        """Trace all rays of the request."""
         ...
 
 
@@ -123,7 +123,7 @@ class CastBackend(Protocol):
 # a ray hits a body at its pose at the time of the ray.
 
 STILL = 1e-9
-"""Poses that differ by less are the same."""
+"""Poses that differ by less are considered equal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,10 +132,10 @@ class Motion:
 
     Attributes:
         of_body: index of the motion of each instance; 0 is relative to stationary bodies.
-        to_sensor: [ways, S, 4, 4], from the frame of the sweep to the sensor's at each instant.
-        speed, turn: [ways], maximum speed [m/s] and angular speed [rad/s].
-        linear, offset: for each instance [3, 3] and [3], from its cloud's frame to that of the
-            sweep, scale included.
+        to_sensor: [motions, S, 4, 4], sweep frame to sensor frame at each instant.
+        speed, turn: [motions], maximum speed [m/s] and angular speed [rad/s].
+        linear, offset: [3, 3] and [3] of each instance, cloud frame to sweep frame, including
+            scale.
     """
 
     of_body: list[int]
@@ -180,7 +180,7 @@ def _rates(to_sensor: Float, seconds: Float) -> tuple[Float, Float]:
     steps = np.maximum(np.diff(seconds), 1e-9)
     moved = np.linalg.norm(np.diff(places[..., :3, 3], axis=1), axis=-1)
     turned = places[:, 1:, :3, :3].swapaxes(-1, -2) @ places[:, :-1, :3, :3]
-    # |A - I| of a turn by a small angle is sqrt(2) times the angle.
+    # |A - I| of a small rotation is sqrt(2) times its angle.
     angle = np.linalg.norm(turned - np.eye(3), axis=(-2, -1)) / np.sqrt(2)
     speed, turn = (moved / steps).max(1), (angle / steps).max(1)
     return np.where(speed > 1e-6, speed, 0.0), np.where(turn > 1e-6, turn, 0.0)

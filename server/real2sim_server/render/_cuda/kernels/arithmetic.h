@@ -1,8 +1,9 @@
-// Functions whose bits are the same on every device: only operations that IEEE 754 rounds exactly,
-// compiled without contraction; fmaf where it is written.
+// Functions that are bitwise equal on all devices. They only use operations that IEEE 754 rounds
+// exactly, compiled without contraction; fmaf is explicit.
 #pragma once
 
-// e^-x for x in [0, 80], for those below 6 within 3e-7 of its value: 2^n by the exponent, the rest by a polynomial.
+// e^-x for x in [0, 80], with a relative error of 3e-7 for x < 6: 2^n by the exponent, the rest by a
+// polynomial.
 __device__ __forceinline__ float exp_negative(float x) {
     const float n = rintf(x * -1.44269504f);
     const float f = fmaf(x, -1.44269504f, -n);
@@ -16,7 +17,7 @@ __device__ __forceinline__ float exp_negative(float x) {
     return __uint_as_float(__float_as_uint(p) + (uint32(int(n)) << 23));
 }
 
-// Natural logarithm of x in [1, 1e6], within 2e-7 of its value: exponent, and the series of atanh.
+// Natural logarithm of x in [1, 1e6], relative error 2e-7, by the exponent and the series of atanh.
 __device__ __forceinline__ float log_of(float x) {
     int bits = __float_as_int(x) - 0x3f3504f3;
     const int n = bits >> 23;

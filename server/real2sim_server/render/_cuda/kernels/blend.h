@@ -1,5 +1,5 @@
-// Front-to-back blending of all images in one go, the sky behind them, and the numbers that leave
-// the renderer.
+// Front-to-back blending of all images in one launch, composited over the sky, and their final
+// pixel values.
 #pragma once
 
 #include "arithmetic.h"
@@ -8,14 +8,14 @@
 
 constexpr float ALPHA_MAX = 0.999f;
 constexpr float TRANSMITTANCE_MIN = 1e-4f;
-constexpr uint32 WARP_LINES = WARP / TILE;  // of pixels
+constexpr uint32 WARP_LINES = WARP / TILE;  // rows of pixels per warp
 
 struct Pixel {
     float rgb[3];
     float transmittance;
     float weighted_depth;
     float median;
-    uint32 ids;  // instance, and semantic above it
+    uint32 ids;  // instance in the low, semantic in the high 16 bits
 };
 
 __device__ __forceinline__ const Camera& camera_of(const Frame& frame, uint32 tile) {
@@ -52,7 +52,7 @@ __device__ __forceinline__ void sky_colour(const Camera& camera, float x, float 
     }
 }
 
-// Adds what is behind, and writes the images that are wanted.
+// Composites the pixel over sky or background and writes the requested images.
 __device__ __forceinline__ void write_pixel(
     const Frame& frame, const Camera& camera, const Pixel& pixel, uint32 x, uint32 y) {
     const size_t at = camera.first_pixel + size_t(y) * camera.width + x;
@@ -81,18 +81,18 @@ __device__ __forceinline__ void write_pixel(
         frame.semantic[at] = uint8(pixel.transmittance <= 0.5f ? pixel.ids >> 16 : camera.behind);
 }
 
-// Whether a splat can show on the pixels of a warp, of which the centres lie from (x_low, y_low) to
-// TILE - 1 further right and WARP_LINES - 1 further down. Takes some too many, for rounding.
+// Whether a splat may touch the pixels of a warp, whose centres extend from (x_low, y_low) by TILE - 1
+// to the right and by WARP_LINES - 1 down. Conservative because of rounding.
 __device__ __forceinline__ bool may_touch(float4 a, float4 b, float x_low, float y_low) {
     const float product = 4.0f * a.z * b.x;
-    const float determinant = product - a.w * a.w - 1e-6f * product;  // of the conic; not above it
+    const float determinant = product - a.w * a.w - 1e-6f * product;  // lower bound of that of the conic
     const float dx = fmaxf(fmaxf(x_low - a.x, a.x - (x_low + float(TILE - 1))), 0.0f);
     const float dy = fmaxf(fmaxf(y_low - a.y, a.y - (y_low + float(WARP_LINES - 1))), 0.0f);
     const float reach = 4.0f * b.z;
     return !(dx * dx * determinant > reach * b.x || dy * dy * determinant > reach * a.z);
 }
 
-// Blends a splat into a pixel; false where the pixel takes no more.
+// Blends a splat into a pixel; returns false if the pixel is finished.
 __device__ __forceinline__ bool add_splat(
     float4 a, float4 b, const float4& c, float px, float py, Pixel& pixel) {
     const float dx = px - a.x, dy = py - a.y;
@@ -115,7 +115,7 @@ __device__ __forceinline__ bool add_splat(
     return true;
 }
 
-// One block a tile of any camera, one thread a pixel.
+// One block per tile of any camera, one thread per pixel.
 extern "C" __global__ void __launch_bounds__(THREADS) blend(const Frame* given, uint32) {
     __shared__ float4 first[THREADS], second[THREADS], third[THREADS];
     const Frame& frame = *given;
@@ -149,7 +149,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) blend(const Frame* given, 
             if (!__ballot_sync(ALL_LANES, !done)) break;
             const uint32 mine = group + lane;
             const bool near = mine < count && may_touch(first[mine], second[mine], x_low, y_low);
-            // Each lane has looked at one splat for the whole warp.
+            // Each lane has tested one splat for the whole warp.
             for (uint32 left = __ballot_sync(ALL_LANES, near); left && !done; left &= left - 1) {
                 const uint32 j = group + __ffs(left) - 1;
                 done = !add_splat(first[j], second[j], third[j], px, py, pixel);

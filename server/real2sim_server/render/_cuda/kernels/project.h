@@ -1,5 +1,5 @@
-// From the cloud's frame to the image plane: EWA splatting (Zwicker et al. 2001) as in gsplat 1.5.3
-// and reference.py.
+// From the cloud frame to the image plane: EWA splatting (Zwicker et al. 2001) as in gsplat 1.5.3
+// and _reference.py.
 #pragma once
 
 #include "arithmetic.h"
@@ -18,9 +18,9 @@ struct Splat {
     float x, y;             // centre [px]
     float conic[3];         // inverse covariance: xx, xy, yy [px^-2]
     float opacity;
-    float limit;            // exponent beyond which it counts for nothing
+    float limit;            // exponent beyond which the splat is skipped
     float depth;            // [m]
-    uint32 first_tile;      // of the frame
+    uint32 first_tile;      // index within the frame
     uint32 tiles_x, tiles_y;
 };
 
@@ -60,12 +60,12 @@ __device__ __forceinline__ float dot3(const float* a, const float* b) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-// From the camera to the Gaussian, in the cloud's frame before scale.
+// Vector from the camera to the Gaussian, in the unscaled cloud frame.
 __device__ __forceinline__ void offset_from_eye(const Placement& at, const float* mean, float* out) {
     for (uint32 k = 0; k < 3; ++k) out[k] = (mean[k] - at.eye[k]) - at.eye_rest[k];
 }
 
-// Covariance on the image [px^2]: xx, xy, yy, and its determinant, before the blur.
+// Covariance on the image before blur [px^2]: xx, xy, yy, and its determinant.
 __device__ __forceinline__ void flatten(
     const Gaussian& g, bool is_covariance, const float* u, const float* v, float* flat) {
     float a[3], b[3];
@@ -92,7 +92,7 @@ __device__ __forceinline__ void flatten(
     flat[3] = p * p + q * q + r * r;
 }
 
-// Tiles of one axis that [centre - extent, centre + extent] touches; none: `count` is 0.
+// Tiles along one axis that [centre - extent, centre + extent] touches; `count` may be 0.
 __device__ __forceinline__ void touched_tiles(
     float centre, float extent, uint32 size, uint32 tiles, uint32& first, uint32& count) {
     count = 0;
@@ -102,7 +102,7 @@ __device__ __forceinline__ void touched_tiles(
     count = uint32(fminf(fmaxf(floorf((centre + extent) / float(TILE)), 0.0f), last)) - first + 1;
 }
 
-// The Gaussian as `camera` sees it; false where it shows nothing.
+// Projects the Gaussian for `camera`; returns false if it is not visible.
 __device__ __forceinline__ bool project(
     const Frame& frame, const Camera& camera, const Placement& at, const Gaussian& g,
     bool is_covariance, Splat& out) {
@@ -150,7 +150,8 @@ __device__ __forceinline__ bool project(
     return true;
 }
 
-// Colour along the line of sight: spherical harmonics and what time adds to their constant part.
+// Colour in the viewing direction: spherical harmonics, plus the time-dependent part of the
+// constant term.
 __device__ __forceinline__ void colour_of(
     const Object& object, const Placement& at, const float* mean, uint32 index, float* rgb) {
     float d[3];

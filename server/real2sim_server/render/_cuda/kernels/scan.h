@@ -1,9 +1,9 @@
-// Running sums over a block, and over a list by the block that comes last.
+// Prefix sums over a block, and over a list by the last block to finish.
 #pragma once
 
 #include "arithmetic.h"
 
-// Sum over the threads before this one; `total` is that of all.
+// Exclusive prefix sum over the threads of a block; `total` is the sum over all threads.
 __device__ __forceinline__ uint32 sum_before(uint32 value, uint32& total) {
     __shared__ uint32 of_warps[WARPS];
     const uint32 lane = threadIdx.x % WARP, warp = threadIdx.x / WARP;
@@ -25,7 +25,7 @@ __device__ __forceinline__ uint32 sum_before(uint32 value, uint32& total) {
     return before;
 }
 
-// Whether all other blocks of the launch are done, and what they wrote can be read by __ldcg.
+// Whether all other blocks of the launch are done; their output can then be read with __ldcg.
 __device__ __forceinline__ bool is_last_block(uint32* ticket) {
     __shared__ bool last;
     __threadfence();
@@ -38,7 +38,7 @@ __device__ __forceinline__ bool is_last_block(uint32* ticket) {
     return true;
 }
 
-// Replaces counts [length] by sums over those before; the sum of all goes to counts[length].
+// Replaces counts [length] with exclusive prefix sums; counts[length] receives the total.
 __device__ __forceinline__ uint32 sums_of_list(uint32* counts, uint32 length) {
     const uint32 each = (length + THREADS - 1) / THREADS;
     const uint32 first = min(threadIdx.x * each, length), last = min(first + each, length);

@@ -1,11 +1,11 @@
-// Which Gaussians each camera sees, and their splats one behind the other. Splats of a camera keep
-// the order of objects and Gaussians, which breaks ties of depth.
+// Visible Gaussians of each camera, and their splats as a compact list. Splats of a camera keep the
+// order of objects and Gaussians, which breaks depth ties.
 #pragma once
 
 #include "project.h"
 #include "scan.h"
 
-// The object to which a piece belongs.
+// The object of a piece.
 __device__ __forceinline__ const Object& object_of(const Frame& frame, uint32 piece) {
     uint32 low = 0, high = frame.object_count;
     while (high - low > 1) {
@@ -16,7 +16,7 @@ __device__ __forceinline__ const Object& object_of(const Frame& frame, uint32 pi
     return frame.objects[low];
 }
 
-// Marks what each camera sees of a piece, and counts it. One block a piece.
+// Marks and counts the Gaussians of a piece that each camera sees. One block per piece.
 extern "C" __global__ void __launch_bounds__(THREADS) find_seen(const Frame* given, uint32) {
     __shared__ uint32 seen[MAX_CAMERAS];
     const Frame& frame = *given;
@@ -72,7 +72,7 @@ __device__ __forceinline__ void store(
     frame.order[0][slot] = slot;
 }
 
-// Splats of what find_seen has marked. One block a piece.
+// Writes the splats of the Gaussians marked by find_seen. One block per piece.
 extern "C" __global__ void __launch_bounds__(THREADS) project_seen(const Frame* given, uint32) {
     __shared__ uint32 before[WORDS];
     const Frame& frame = *given;

@@ -1,6 +1,6 @@
-// The kernels that draw frames for serving, in the order in which they are launched.
+// Kernels that draw frames for serving, in launch order.
 //
-// Written so that it compiles as C++ as well: the tests run this very source on the CPU.
+// The source also compiles as C++: the tests run it on the CPU.
 #include "frame.h"
 
 #include "seen.h"

@@ -1,12 +1,12 @@
-// A stable radix sort by 8 bits a pass, of splats by depth and of pairs by tile. The number of what
-// is sorted is known to the device alone. Block b has the b-th part of the list; equal keys keep
-// their order, so the result is the same whatever the order in which blocks run.
+// A stable radix sort with 8 bits per pass, of splats by depth and of pairs by tile. Only the device
+// knows the length of the list. Block b sorts the b-th part of the list. Equal keys keep their order,
+// so the result does not depend on the order in which blocks run.
 #pragma once
 
 #include "frame.h"
 #include "scan.h"
 
-// What a pass reads and writes. The argument of a launch is the pass, + 16 for pairs by tile.
+// Inputs and outputs of a pass. The argument of a launch is the pass, + 16 for pairs by tile.
 struct Pass {
     const uint32 *keys, *values;
     uint32 *keys_out, *values_out;
@@ -30,13 +30,13 @@ __device__ __forceinline__ Pass pass_of(const Frame& frame, uint32 argument) {
     return pass;
 }
 
-// Lanes of the warp with the same digit as this one. Lanes without a key have a digit of their own.
+// Lanes of the warp with the same digit as this one. Lanes without a key have a separate digit.
 __device__ __forceinline__ uint32 same_digit(const Pass& pass, uint32 index, uint32& digit) {
     digit = index < pass.last ? pass.keys[index] >> pass.shift & (DIGITS - 1) : DIGITS;
     return __match_any_sync(ALL_LANES, digit);
 }
 
-// Counts digits by block; the last block turns counts into sums over the blocks before.
+// Counts digits by block; the last block replaces counts with prefix sums over the blocks.
 extern "C" __global__ void __launch_bounds__(THREADS) count_digits(
     const Frame* given, uint32 argument) {
     __shared__ uint32 counts[DIGITS];
@@ -64,7 +64,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) count_digits(
     frame.digit_starts[threadIdx.x] = sum_before(sum, total);
 }
 
-// Puts keys and values where count_digits says.
+// Scatters keys and values to the positions computed by count_digits.
 extern "C" __global__ void __launch_bounds__(THREADS) scatter_digits(
     const Frame* given, uint32 argument) {
     __shared__ uint32 next[DIGITS], starts[WARPS][DIGITS];

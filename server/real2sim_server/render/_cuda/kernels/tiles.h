@@ -1,5 +1,5 @@
-// The list of each tile: a pair for each tile that a splat touches, made in the order of depth and
-// then sorted by tile, which leaves each tile's list near to far.
+// The list of each tile. Each splat has a pair for each tile that it touches. Pairs are created in
+// depth order, then stably sorted by tile, so each tile's list is ordered near to far.
 #pragma once
 
 #include "frame.h"
@@ -10,7 +10,7 @@ __device__ __forceinline__ uint32 tiles_of(uint2 box) {
     return ((box.y & 1023u) + 1) * ((box.y >> 10 & 1023u) + 1);
 }
 
-// Sums tiles over pieces of sorted splats. One block a piece of the splats that there is room for.
+// Counts the tiles of each piece of sorted splats. One block per piece of the splat capacity.
 extern "C" __global__ void __launch_bounds__(THREADS) count_pairs(const Frame* given, uint32) {
     const Frame& frame = *given;
     uint32 sum = 0;
@@ -29,7 +29,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) count_pairs(const Frame* g
     }
 }
 
-// Makes the pairs. Threads share them evenly, however many tiles a single splat touches.
+// Writes the pairs, evenly distributed over threads even if one splat touches many tiles.
 extern "C" __global__ void __launch_bounds__(THREADS) make_pairs(const Frame* given, uint32) {
     __shared__ uint32 starts[PIECE];
     const Frame& frame = *given;
@@ -65,7 +65,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) make_pairs(const Frame* gi
     }
 }
 
-// Finds where the list of each tile begins and ends.
+// Finds the start and end of each tile's list.
 extern "C" __global__ void __launch_bounds__(THREADS) find_ranges(const Frame* given, uint32) {
     const Frame& frame = *given;
     const uint32 pairs = frame.counters[PAIRS];

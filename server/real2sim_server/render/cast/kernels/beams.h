@@ -1,4 +1,4 @@
-// What the kernels of cast() are given: the structures of records.py, field by field.
+// Inputs of the kernels of cast(); cast/cuda.py has the same structures as NumPy types.
 #pragma once
 
 typedef unsigned int uint32;
@@ -7,7 +7,7 @@ typedef long long int64;
 
 constexpr uint32 THREADS = 256;
 constexpr uint32 TILE_RAYS = 64;
-constexpr uint32 GROUP = 8;  // rays of one elevation in a tile
+constexpr uint32 GROUP = 8;  // rays of a group, at one elevation
 constexpr uint32 TILES_OF_BLOCK = THREADS / TILE_RAYS;
 constexpr int AZIMUTH_BINS = 4096, ELEVATION_BINS = 4096;
 constexpr uint32 ALL_LANES = 0xffffffffu;
@@ -16,20 +16,20 @@ constexpr float ALPHA_MIN = 1.0f / 255.0f, ALPHA_MAX = 0.999f;
 constexpr float LOG_255 = 5.54126355f;
 constexpr float LIGHT_MIN = 1e-3f, HALF_LIGHT = 0.5f, ECHO_MIN = 0.05f;
 
-// One Gaussian as a ray meets it: exponent = |W (x - mean)|^2 / 2 + level.
+// A Gaussian in the form used by rays: exponent = |W (x - mean)|^2 / 2 + level.
 struct alignas(16) Met {
     float whitening[6];  // lower triangle, by rows
-    float mean[3];       // in the frame of the sweep [m]
+    float mean[3];       // sweep frame [m]
     float level;         // -ln(opacity)
-    float low, high;     // elevations between which it is met [rad]
+    float low, high;     // range of elevations at which rays may hit it [rad]
     float reflectivity, loss;
     uint32 body, member;
 };
 
 struct Body {
     const float *means, *quats, *scales, *opacities;
-    const float* covars;      // null where shapes are quaternions and scales
-    const float* attributes;  // null where nobody knows them
+    const float* covars;      // null if shapes are quaternions and scales
+    const float* attributes;  // null if unknown
     double linear[9], offset[3];
     uint32 first, count, motion, unused;
     float speed, turn;
@@ -37,9 +37,9 @@ struct Body {
 
 struct Sweep {
     const Body* bodies;
-    const float* frames;   // [motions, slots, 12], from the frame of the sweep to the sensor's
+    const float* frames;   // [motions, slots, 12], sweep frame to sensor frame
     const float* origins;  // the inverses
-    const int* rays;       // [tiles, 64]; -1 fills up
+    const int* rays;       // [tiles, 64], padded with -1
     const float* directions;  // [tiles, 8, 3, 8]
     const int* slots;         // [tiles, 64]
     const float *lows, *highs;  // [tiles, 8]
@@ -47,13 +47,13 @@ struct Sweep {
     const int64* band_starts;
     const int *tile_lows, *tile_highs, *first_tiles, *first_bands, *last_bands;
     const int *rows_before, *rows_until, *slot_of;
-    Met* met;          // two for each Gaussian
-    int64* footprints;  // likewise; -1 where no ray passes
+    Met* met;          // two per Gaussian
+    int64* footprints;  // two per Gaussian; -1 if no ray passes
     float* depths;
-    int64* counts;      // tiles of each; to list them, where those of each end
+    int64* counts;      // tiles of each record; prefix sums when pairs are listed
     int64* keys;        // tile and depth of each pair
-    int* members;       // and what it is of
-    const int* lists;   // what each tile holds, from near to far
+    int* members;       // record of each pair
+    const int* lists;   // records of each tile, near to far
     const int64* starts;
     float* values;    // [rays, 5]
     int* owners;      // [rays, 2]

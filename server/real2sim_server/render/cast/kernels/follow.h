@@ -1,4 +1,4 @@
-// Following rays through what their tile lists, from near to far.
+// Tracing rays through the Gaussians of their tile, from near to far.
 #pragma once
 
 #include "beams.h"
@@ -11,7 +11,7 @@ struct Ray {
     float origin[3], direction[3];
 };
 
-// A ray of the sensor as a body that moves its own way meets it.
+// A ray of the sensor relative to a moving body.
 __device__ __forceinline__ void place(
     const Sweep& sweep, uint32 motion, int slot, const float* direction, Ray& ray) {
     const float* f = sweep.origins + 12ull * (size_t(motion) * sweep.slot_count + uint32(slot));
@@ -28,15 +28,15 @@ __device__ __forceinline__ void whitened(const float* w, const float* v, float* 
     out[2] = fmaf(w[3], v[0], fmaf(w[4], v[1], w[5] * v[2]));
 }
 
-// Share of the light that a Gaussian stops, and where; 0 where the ray does not meet it.
+// Fraction of the light that a Gaussian absorbs, and its range; 0 without a hit.
 __device__ __forceinline__ float meet(const Sweep& sweep, const Ray& ray, const Met& met, float& tau) {
     float off[3], start[3], along[3];
     for (uint32 k = 0; k < 3; ++k) off[k] = ray.origin[k] - met.mean[k];
     whitened(met.whitening, off, start);
     whitened(met.whitening, ray.direction, along);
     const float square = fmaf(along[0], along[0], fmaf(along[1], along[1], along[2] * along[2]));
-    // |start x along|^2 / |along|^2 keeps the digits that |start|^2 - (start along)^2 / |along|^2
-    // loses.
+    // |start x along|^2 / |along|^2 stays precise where |start|^2 - (start along)^2 / |along|^2
+    // cancels.
     const float x = start[1] * along[2] - start[2] * along[1];
     const float y = start[2] * along[0] - start[0] * along[2];
     const float z = start[0] * along[1] - start[1] * along[0];
@@ -46,7 +46,7 @@ __device__ __forceinline__ float meet(const Sweep& sweep, const Ray& ray, const 
     return fminf(expf(-exponent), ALPHA_MAX);
 }
 
-// Takes an echo as a return where it is strong enough: first, strongest and last.
+// Records an echo as first, strongest and last return if it is strong enough.
 __device__ __forceinline__ void close_echo(const Echo& echo, float* found) {
     if (!(echo.power >= ECHO_MIN)) return;
     const float values[3] = {echo.ranges / echo.power, echo.power, echo.shown / echo.power};
@@ -70,7 +70,7 @@ __device__ __forceinline__ void grow_echo(
     echo.shown = fmaf(power, reflectivity, echo.shown);
 }
 
-// One thread a ray; a warp follows half of a tile.
+// One thread per ray; a warp traces half of a tile.
 extern "C" __global__ void __launch_bounds__(THREADS) follow(const Sweep* given, uint32) {
     const Sweep& sweep = *given;
     const uint32 tile = blockIdx.x * TILES_OF_BLOCK + threadIdx.x / TILE_RAYS;

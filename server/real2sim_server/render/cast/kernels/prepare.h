@@ -1,18 +1,18 @@
-// What each Gaussian is to the rays, and between which angles they may meet it.
+// Whitening of each Gaussian, and the range of angles at which rays may hit it.
 #pragma once
 
 #include "beams.h"
 
-constexpr float SLACK = 2e-4f;           // angles are widened by this against rounding [rad]
+constexpr float SLACK = 2e-4f;           // margin of angles against rounding [rad]
 constexpr float NEARLY_INSIDE = 0.05f;   // see tangents
-constexpr float POLE = 1.5f;             // beyond it azimuths mean nothing [rad]
+constexpr float POLE = 1.5f;             // elevation beyond which azimuths are undefined [rad]
 constexpr float BEYOND = 4.0f;
 constexpr float NO_SEAM = 3.5f;
 constexpr double LEAST = 1e-24;
 
 struct Angles {
     float left, right, low, high;  // [rad]
-    float gain;                    // how fast it moves as the sensor sees it, at most [rad/s]
+    float gain;                    // upper bound of its angular speed relative to the sensor [rad/s]
     float distance;
 };
 
@@ -36,7 +36,7 @@ __device__ __forceinline__ float dot5(const float* a, const float* b) {
     return sum;
 }
 
-// Instant at which the sensor looks at a place; side 1 in the first half of the sweep, 2 in the second.
+// Scan time of a point; side is 1 for the first half of the sweep, 2 for the second, 0 for both.
 __device__ __forceinline__ uint32 instant_of(
     const Sweep& sweep, const Body& body, const float* mean, uint32 side) {
     const int count = int(sweep.slot_count);
@@ -58,7 +58,7 @@ __device__ __forceinline__ uint32 instant_of(
     return uint32(slot);
 }
 
-// Rows of a root of the covariance in the frame of the sweep.
+// Rows of a square root of the covariance in the sweep frame.
 __device__ __forceinline__ void factors_of(const Body& body, uint32 i, float rows[3][5]) {
     double root[9];
     if (body.covars) {
@@ -110,8 +110,8 @@ __device__ __forceinline__ void whiten(const float rows[3][5], float* out) {
     out[5] = float(1 / f);
 }
 
-// Angles of the two tangents from the origin to an ellipse at a squared distance; whether it is too
-// near for that.
+// Angles of the two tangents from the origin to an ellipse at a squared distance; returns whether
+// the origin is inside it or too close.
 __device__ __forceinline__ bool tangents(
     float square, float along, float mixed, float across, float& first, float& last) {
     float least = square * NEARLY_INSIDE, clear = square - along;
@@ -123,7 +123,7 @@ __device__ __forceinline__ bool tangents(
     return inside;
 }
 
-// Writes what rays need of a Gaussian; false where none of them meets it.
+// Writes the ray data of a Gaussian; returns false if no ray may hit it.
 __device__ __forceinline__ bool prepare_one(
     const Sweep& sweep, const Body& body, uint32 i, const float* mean, uint32 side, Met& met,
     Angles& angles) {
@@ -170,7 +170,7 @@ __device__ __forceinline__ bool prepare_one(
     const float widened = angles.gain * fmaf(side_reach, sweep.period, sweep.spread) + SLACK;
     left -= widened, right += widened;
     const float azimuth = atan2f(y, x), elevation = atan2f(z, along);
-    // tan e = tan(tilt) cos(azimuth): a horizontal edge sinks towards the horizon on both sides.
+    // tan e = tan(tilt) cos(azimuth): a horizontal edge approaches the horizon on both sides.
     const float half = fmaxf(fabsf(left), fabsf(right)), sunk = fmaxf(1.0f - 0.5f * half * half, 0.0f);
     const float bottom = elevation + down, top = elevation + above;
     angles.low = fminf(bottom, bottom * sunk) - widened;
@@ -183,7 +183,7 @@ __device__ __forceinline__ bool prepare_one(
     return true;
 }
 
-// Whether a Gaussian may be met both where the sweep begins and where it ends.
+// Whether rays may hit a Gaussian both at the start and at the end of the sweep.
 __device__ __forceinline__ bool near_seam(const Sweep& sweep, const Angles& angles) {
     const float middle = 0.5f * (angles.left + angles.right);
     const float half = 0.5f * (angles.right - angles.left) + angles.gain * sweep.duration;
@@ -196,7 +196,7 @@ __device__ __forceinline__ int elevation_bin(float angle) {
     return bin < 0 ? 0 : bin >= ELEVATION_BINS ? ELEVATION_BINS - 1 : bin;
 }
 
-// Bands (8 bits each), bins of azimuth (13 each) and side, or -1 where no ray passes.
+// Bands (8 bits each), azimuth bins (13 bits each) and side, or -1 if no ray passes.
 __device__ __forceinline__ int64 footprint_of(const Sweep& sweep, const Angles& angles, uint32 side) {
     const int low = elevation_bin(angles.low), high = elevation_bin(angles.high);
     if (sweep.rows_until[high] <= sweep.rows_before[low]) return -1;

@@ -1,9 +1,9 @@
-// Tiles of rays that each Gaussian may meet, and the lists of the tiles.
+// Tiles of rays that may hit each Gaussian, and the lists of the tiles.
 #pragma once
 
 #include "prepare.h"
 
-// Calls for every tile that a footprint meets, and returns how many those are.
+// Calls a function for every tile of a footprint, and returns the number of tiles.
 template <class Meet>
 __device__ __forceinline__ int64 visit(const Sweep& sweep, int64 footprint, Meet meet) {
     const int64 last_band = footprint >> 8 & 255;
@@ -15,7 +15,7 @@ __device__ __forceinline__ int64 visit(const Sweep& sweep, int64 footprint, Meet
         int64 stop = sweep.band_starts[band + 1];
         int begin = first, end = last < AZIMUTH_BINS ? last : AZIMUTH_BINS - 1;
         for (uint32 part = 0; part < 2 && end >= 0; ++part) {
-            // Behind +-pi: tiles that the part before has met already are left out.
+            // Beyond +-pi, skip tiles that the first part has already visited.
             if (part == 1 && first > 0 && first_tiles[first] < stop) stop = first_tiles[first];
             for (int64 tile = first_tiles[begin]; tile < stop && sweep.tile_lows[tile] <= end; ++tile)
                 if ((side == 0 || sweep.sides[tile] == side) && sweep.tile_highs[tile] >= begin)
@@ -26,7 +26,7 @@ __device__ __forceinline__ int64 visit(const Sweep& sweep, int64 footprint, Meet
     return met;
 }
 
-// One thread a Gaussian: its one or two records, and how many tiles each of them meets.
+// One thread per Gaussian: its one or two records, and the number of tiles of each.
 extern "C" __global__ void __launch_bounds__(THREADS, 2) prepare(const Sweep* given, uint32) {
     const Sweep& sweep = *given;
     const uint32 g = blockIdx.x * THREADS + threadIdx.x;
@@ -61,7 +61,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 2) prepare(const Sweep* gi
     }
 }
 
-// One thread a record: a pair for each tile that it meets. Counts are their sums by now.
+// One thread per record: a pair for each of its tiles. Counts are prefix sums by now.
 extern "C" __global__ void __launch_bounds__(THREADS) list_tiles(const Sweep* given, uint32) {
     const Sweep& sweep = *given;
     const size_t slot = size_t(blockIdx.x) * THREADS + threadIdx.x;
