@@ -163,7 +163,7 @@ def nearest_road(point: Any, rows: Any, heights: Any) -> Any:
 
 @func
 def spring_force(squeeze: Any, speed: Any, static_load: Any, tyres: Any) -> Any:
-    """Spring and damper force [N] of a wheel, from compression beyond rest [m] and its rate [m/s]."""
+    """Spring and damper force [N] of a wheel, by compression beyond rest [m] and its rate [m/s]."""
     omega = 2.0 * math.pi * tyres[FREQUENCY]
     carried = static_load / STATIC_GRAVITY
     if not squeeze > -STATIC_GRAVITY / (omega * omega):
