@@ -273,7 +273,7 @@ def braking(backend: str, *, speed: float = 10.0) -> list[Check]:
 
 
 def oblique_impact(backend: str) -> list[Check]:
-    """A block that hits a wall and slides: the wall's impulse is inclined by mu; delta-v matches."""
+    """A block hits a wall and slides: the impulse is inclined by mu, and delta-v agrees."""
     checks = []
     for mu in (0.1, 0.3):
         body = block(
