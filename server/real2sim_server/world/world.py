@@ -63,7 +63,7 @@ from .traffic import ObservedEgo, Surroundings, Traffic
 from .traffic.spawner import begin_spawner
 
 OFF_ROUTE_DISTANCE = 10.0
-"""Beyond this distance from the recorded path an event says so [m]; images get poor there."""
+"""Distance from the recorded path that triggers an event [m]; image quality drops beyond it."""
 
 
 class World:

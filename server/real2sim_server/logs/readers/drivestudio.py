@@ -33,7 +33,8 @@ from .waymo_common import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
 
 PERIOD_US = 100_000
 COLUMNS = 14
-"""origin 3, point 3, flow 3, flow class, ground, intensity, elongation, laser: float32."""
+"""Number of float32 columns: origin (3), point (3), flow (3), flow class, ground, intensity,
+elongation, laser."""
 ONLY_WAYMO = "only folders made of Waymo segments can be read"
 
 CATEGORIES = {"vehicle": "car", "pedestrian": "pedestrian", "cyclist": "cyclist", "sign": "sign"}
@@ -188,7 +189,7 @@ class _DrivestudioSource:
         return self.images.read(camera, frame)
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off or not of its camera's size."""
+        """Raise LogError if the image is truncated or has a wrong size."""
         self.images.check(camera, frame)
 
     def check_sweep(self, frame: int) -> int:
