@@ -122,7 +122,7 @@ class ParquetFile:
         self._groups: OrderedDict[tuple[int, str], Any] = OrderedDict()
         try:
             self._file = pq.ParquetFile(path)
-        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:  # A damaged name is not valid text.
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:  # Damaged name.
             raise LogError(f"{path}: cannot be read as Parquet ({_line(error)})") from error
         with _broken_named(f"{path}: the list of columns"):
             self.names = frozenset(self._file.schema_arrow.names)
