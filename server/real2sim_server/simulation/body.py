@@ -257,7 +257,7 @@ class DeformableBody:
         return gap, approach, hull[2] or shell[2]
 
     def _within_reach(self, solids: Sequence[Solid], within: float, ahead: float) -> list[Solid]:
-        """Solids so near the box of the body that their surfaces must be compared."""
+        """Solids close enough to the box of the body for an exact comparison of surfaces."""
         gaps, speeds = solid_gaps(*self.box(), solids)
         m = self.motion
         speed = float(np.linalg.norm(m.velocity))

@@ -138,7 +138,7 @@ def added_inertia(masses: Float, volumes: Float, *, cell: float) -> float:
 def best_rotation(rest: Float, now: Float, masses: Float) -> Float:
     """[3, 3] mass-weighted best-fit rotation from ``rest`` [N, 3] to ``now`` (Kabsch 1976).
 
-    Both sets are taken about their own centres of mass.
+    Positions are relative to the centres of mass of each set.
     """
     a = rest - masses @ rest / masses.sum()
     b = now - masses @ now / masses.sum()

@@ -208,7 +208,7 @@ class SimulateOptions:
     """Options of a rollout.
 
     Attributes:
-        preset: ``vehicle`` or ``paper``, see ``presets``.
+        preset: ``vehicle`` or ``paper``, see :mod:`.structure`.
         objects: simulated objects with their physical values; at least one.
         colliders: rigid colliders; those named in ``road`` support tyres.
         road: names of ground colliders.
@@ -221,7 +221,7 @@ class SimulateOptions:
         backend: solver backend.
         brake_after_hit: braked fraction of the wheels' grip after a vehicle is hit.
         background: whether obstacles of the scene's background (walls, poles, trees) are colliders,
-            see ``background``.
+            see :mod:`.background`.
         max_particles: maximum total number of particles; if exceeded, all objects are filled more
             coarsely than in the preset.
     """

@@ -93,7 +93,7 @@ class ContactLog:
         """All contacts, in the order they began.
 
         Args:
-            masses: of bodies [kg].
+            masses: masses of bodies [kg].
             gravity: [3] acceleration [m/s^2].
         """
         order = sorted(self._impulses, key=lambda key: (self._times[key][0], key))

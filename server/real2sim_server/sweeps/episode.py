@@ -279,8 +279,8 @@ def draw_frames(worlds: Sequence[World], camera: Camera) -> list[Frame]:
     """Images of a camera in several worlds of one scene, rendered in one call.
 
     Args:
-        worlds: at their current times; at least one.
-        camera: of the ego.
+        worlds: worlds at their current times; at least one.
+        camera: camera of the ego.
     """
     views = [View(w.instances(), camera.viewmat(w.T_world_body), camera.K) for w in worlds]
     drawn = rasterize_batch(
@@ -396,9 +396,9 @@ def drive_episode(
     As over the network, edits are applied at the start time, after the planner's first observation.
 
     Args:
-        scene: of the case.
+        scene: scene of the case.
         drive: the episode.
-        planner: as loaded.
+        planner: loaded planner.
         keep_entries: keep the entries for a recording.
         keep_worlds: keep the world of each step, to continue from it.
         on_world: called with the world at every time step.

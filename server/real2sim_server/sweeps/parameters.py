@@ -249,7 +249,7 @@ def values_at(parameters: Mapping[str, Parameter], point: Sequence[float]) -> di
     """Values of all parameters, by name.
 
     Args:
-        parameters: of the space.
+        parameters: parameters of the space.
         point: coordinates from 0 to 1 of the sampled parameters.
 
     Raises:

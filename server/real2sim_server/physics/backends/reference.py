@@ -311,7 +311,7 @@ def _resolve_collider_contact(
 def _distance_behind(
     solid: Collider, nodes: Tensor, moment: Tensor, dx: float
 ) -> tuple[Tensor, Tensor]:
-    """Distance [U] of nodes to the face that the body looks at, as ``resolve_node_collider``."""
+    """Distance [U] of nodes to the face on the body's side, as ``resolve_node_collider``."""
     volume = moment[:, 3:]
     out = dx * moment[:, :3] / torch.where(volume > 0, volume, torch.ones_like(volume))
     distance, n = collider_distance(solid, nodes + out)

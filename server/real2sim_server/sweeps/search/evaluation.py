@@ -261,8 +261,8 @@ class Watch:
     """Monitors the adversaries over an episode.
 
     Attributes:
-        names: their objects.
-        manners: of the log.
+        names: object ids of the adversaries.
+        manners: driving statistics of the log.
     """
 
     names: frozenset[str]
@@ -354,14 +354,14 @@ class Evaluation:
     Attributes:
         space: index of its space.
         point: coordinates from 0 to 1.
-        values: of the parameters.
+        values: values of the parameters.
         drive: the episode.
         score: higher is nearer to an avoidable failure; positive for one.
-        criticality: of the tested planner.
+        criticality: criticality of the tested planner's episode.
         implausibility: subtracted from it.
         at_fault: whether the planner caused a collision.
         avoided: whether the reference survived the same case; None if it did not drive.
-        cell: of the archive; None unless at fault.
+        cell: cell of the archive; None unless at fault.
         impact: columns of the collision.
     """
 
@@ -387,10 +387,10 @@ class Evaluator:
     """Drives points of spaces of one scene with one planner.
 
     Args:
-        scene: of all spaces.
-        spaces: that are searched.
-        planner: tested, by name.
-        seed: of the episodes.
+        scene: scene of all spaces.
+        spaces: spaces to search.
+        planner: name of the tested planner.
+        seed: seed of the episodes.
     """
 
     def __init__(

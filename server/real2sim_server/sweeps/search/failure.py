@@ -127,8 +127,8 @@ def write_scenario(
     """Write a failure's storyboard and its road network, read it, and drive it.
 
     Args:
-        path: in the folder of the search, without a suffix.
-        evaluate: of the search.
+        path: path in the folder of the search, without a suffix.
+        evaluate: evaluator of the search.
         found: the failure.
         driven: its episode.
         scene: name or path of the scene, for display.

@@ -89,7 +89,7 @@ class DamageHistory:
     _log: BreakageLog | None = field(default=None)
 
     def after(self, frames: Sequence[Float], impact: Impact, role: int) -> VehicleDamage:
-        """The damage after the first frames of an impact, one each ``crash.FRAME_S``.
+        """The damage after the first frames of an impact, with an interval of ``impact.FRAME_S``.
 
         Args:
             frames: displacements [N, 3] of the vehicle's particles, from first contact [m].

@@ -81,7 +81,7 @@ class MetricAccumulator:
         hit: objects in contact so far.
         lights: traffic light states and violations.
         ego: ego sample at the newest instant.
-        states: states of single metrics, by name; see :class:`.metric.Metric`.
+        states: states of single metrics, by name; see :class:`Metric`.
     """
 
     steps: int = 0

@@ -224,7 +224,7 @@ def coasting(actor: EntityState, h: float) -> EntityState:
 
 
 BESIDE = 8.0
-"""Maximum distance from a path of places along it [m]."""
+"""Maximum distance of places from a path for distances along it [m]."""
 
 CLOSED = 1e-9
 

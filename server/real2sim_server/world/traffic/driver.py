@@ -53,7 +53,7 @@ class ObservedEgo:
         x, y: centre of its box [m].
         yaw: heading [rad].
         speed: along its heading [m/s].
-        length, width: of its box [m].
+        length, width: size of its box [m].
         s: position of its rear axle along the route [m].
         offset: offset of its rear axle from the route, positive left [m].
         front: distance from the rear axle to the front end of its box [m].

@@ -110,7 +110,7 @@ class Launch(NamedTuple):
 
     Attributes:
         kernel: one of KERNELS.
-        blocks: of THREADS threads, at least one.
+        blocks: number of blocks of THREADS threads, at least one.
         argument: see the kernel.
     """
 
