@@ -306,7 +306,7 @@ def _inspected(findings: dict[str, str]) -> _Report:
 
 
 def _require_cuda(*, without_device: bool) -> None:
-    """Exit with an error if CUDA is not usable, or is missing more than the device."""
+    """Exit with an error if CUDA is not usable; ``without_device`` tolerates a missing device."""
     from ..render._cuda.needs import try_without_device, unmet_gsplat_need
 
     need = unmet_gsplat_need(without_device=without_device)

@@ -41,7 +41,7 @@ FRAME_SAMPLES = 2
 MAX_CRASH_TIME = 0.25
 """Maximum simulated duration of a crash [s]."""
 SETTLING_TIME = 0.015
-"""Time after separation over which shapes are averaged [s]."""
+"""Time to simulate after separation, in which shapes settle [s]."""
 TOUCHED, ENDED = 0.01, 0.002
 """Velocity changes at which a crash begins and continues, as fractions of the closing speed."""
 

@@ -170,8 +170,8 @@ MAX_ROUTE = 100_000.0
 """Maximum length of a route [m]."""
 
 FASTEST = 15.0
-"""Minimum speed for which the route is long enough [m/s]; or 1.5 times the recorded speed, if
-higher."""
+"""Minimum speed for which an extended route is long enough [m/s]; 1.5 times the highest recorded
+speed, if greater."""
 
 SHORTEST_LOOP = 20.0
 """Minimum length of a recorded drive for a loop [m]."""

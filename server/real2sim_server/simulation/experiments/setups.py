@@ -226,8 +226,8 @@ ASIDE = 0.8
 """Distance of the focus of a T-bone from the middle of the struck vehicle, towards the other [m].
 """
 TURNED_OVER = np.radians(158.0)
-"""Roll angle of a vehicle that falls on the edge of its roof (25 degrees from upside down in SAE
-J996)."""
+"""Roll angle of a vehicle that falls on the edge of its roof: 22 degrees from upside down (SAE J996
+has 25 degrees of roll)."""
 FALL = 0.4
 """Height of the lowest corner above the road at the start of a roof crash [m]; it is falling by
 then."""
