@@ -199,7 +199,7 @@ class BlockSimulation:
             if kept.size:
                 held[:] = kept
         self._totals = (saved.totals[0].copy(), saved.totals[1].copy())
-        # Saved states have no collider poses, so moving colliders rebuild the layout in the next step.
+        # Saved states have no collider poses, so moving colliders rebuild the layout.
         self._moved = np.inf
 
     def _load(self, start: ParticleArrays) -> None:
