@@ -174,8 +174,11 @@ def export(
     overwrite: Overwrite = False,
     json: JsonFile = None,
 ) -> None:
-    """Write a scene for other programs: one file per object, baked at a time, animated glTF, or
-    plain points (one .ply, or a folder with the background and each object)."""
+    """Write a scene for other programs.
+
+    Formats: one file per object, the whole scene baked at a time, animated glTF, or plain points
+    (one .ply, or a folder with the background and each object).
+    """
     from ..scene.io import export_scene, load_scene
     from ..scene.io.splats import FORMATS
 

@@ -399,8 +399,11 @@ def validate(
 
 
 def _run(backend: str, cases: str | None, report: Callable[[int, int], None]) -> list[CaseResult]:
-    """Run the requested cases; ``published`` selects all published crash figures, ``simulation``
-    all cases of tyres, mode changes and thin obstacles."""
+    """Run the requested cases.
+
+    ``published`` selects all published crash figures, ``simulation`` all cases of tyres, mode
+    changes and thin obstacles.
+    """
     from ..physics.validation import table
     from ..simulation.experiments.crash_tests import PUBLISHED, THEORY
 

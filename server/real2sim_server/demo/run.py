@@ -203,8 +203,7 @@ def _standing_cars(objects: Sequence[ObjectInfo], scene: SceneInfo) -> list[Obje
 
 
 def _moves(cars: Sequence[ObjectInfo]) -> Iterator[Operation]:
-    """Operations that move a car from its parking space into the adjacent lane, with unchanged
-    heading."""
+    """Operations that move a car from its parking space into the adjacent lane, same heading."""
     for car in cars:
         position = np.array(car.trajectory.positions[0]) if car.trajectory else np.zeros(3)
         inward = -np.sign(position[1]) * (car.size[1] + 0.9)

@@ -76,8 +76,9 @@ class LogCheck:
         return tuple(lines)
 
     def done(self) -> str:
-        """The checked parts, such as "headers of 120 images and 60 sweeps checked, contents of 3
-        sweeps read".
+        """The checked parts, in words.
+
+        For example "headers of 120 images and 60 sweeps checked, contents of 3 sweeps read".
         """
         headers = _listed((self.image_headers, "image"), (self.sweep_headers, "sweep"))
         contents = _listed((self.images, "image"), (self.sweeps, "sweep"))
@@ -585,8 +586,10 @@ def _compared_frames(log: DrivingLog) -> tuple[int, int] | None:
 
 
 def _standing_points(log: DrivingLog, frame: int) -> Float:
-    """Static points: outside boxes, and above the road and most traffic. Road points would match
-    under any motion."""
+    """Static points: outside boxes, and above the road and most traffic.
+
+    Road points would match under any motion.
+    """
     sweep = log.lidar(frame)
     points = sweep.points.astype(np.float64)
     away = np.linalg.norm(points - sweep.origin, axis=1)

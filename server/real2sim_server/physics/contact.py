@@ -144,8 +144,7 @@ def capsule_distance(radius: Any, half: Any, q: Any) -> Any:
 
 @device_function
 def mesh_distance(row: Any, data: Any, q: Any) -> Any:
-    """Signed distance to a closed mesh, or distance to a sheet; and the normal at the nearest
-    point."""
+    """Distance to a closed mesh (signed) or to a sheet, and the normal at the nearest point."""
     first, count = int(row[FIRST_NODE]), int(row[NODES])
     triangles = first + MESH_NODE * count
     best, found, part = math.inf, triangles, 0
@@ -579,8 +578,11 @@ def touch_of_surface(row: Any, heights: Any, at: Any, way: Any, half: Any) -> An
 
 @device_function
 def face_on(row: Any, way: Any, length: Any, n: Any, half: Any) -> Any:
-    """The normal ``n`` of a touch, turned against the motion for a round post thinner than the
-    particle spacing. Such a post stops the particle rows on both sides instead of parting them."""
+    """The normal ``n`` of a touch, turned against the motion for round posts thinner than the
+    spacing.
+
+    Such a post stops the particle rows on both sides instead of parting them.
+    """
     kind = int(row[KIND])
     if not CYLINDER <= kind <= CAPSULE or row[HALF_SIZE] >= half:
         return n

@@ -92,8 +92,11 @@ class Correction:
 
 @dataclass(eq=False)
 class _Impact:
-    """An ongoing impact: motions before it, impulse and moment on the body so far, its duration,
-    and the number of steps without impulse."""
+    """An ongoing impact.
+
+    Motions before it, impulse and moment on the body so far, its duration, and the number of steps
+    without impulse.
+    """
 
     before: tuple[RigidMotion, ...]
     impulse: Float = field(default_factory=lambda: np.zeros(3))

@@ -329,8 +329,11 @@ class Drive:
         return cls(planner, case.reset_for(seed), edits)
 
     def key(self, scene_hash: str) -> str:
-        """Hex key of the result: hash of scene, options, edits, planner with its files, and the
-        versions of program and scores."""
+        """Hex key of the result.
+
+        A hash of scene, options, edits, planner with its files, and the versions of program and
+        scores.
+        """
         name, _, argument = self.planner.partition("=")
         content = {
             "scene": scene_hash,

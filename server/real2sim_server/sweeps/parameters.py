@@ -305,8 +305,9 @@ def points_of(
 
 
 def spread(kind: str, count: int, dimensions: int, *, seed: int) -> Points:
-    """[count, dimensions] in [0, 1). The points are a prefix of longer sequences, except for Latin
-    hypercubes.
+    """Spread points [count, dimensions] in [0, 1).
+
+    The points are a prefix of longer sequences, except for Latin hypercubes.
     """
     from scipy.stats import qmc
 

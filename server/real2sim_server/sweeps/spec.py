@@ -508,7 +508,9 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _put(fields: dict[str, Any], path: str, value: Value) -> None:
-    """Set the value at a path: ``reset.agents.drivers.van_0.gap``, the same without ``reset``, or
+    """Set the value at a path.
+
+    For example ``reset.agents.drivers.van_0.gap``, the same without ``reset``, or
     ``operations.0.delta.1``.
     """
     parts = path.split(".")

@@ -237,8 +237,7 @@ def continued(path: LoggedPath, reach: float, ground: Ground) -> LoggedPath:
 
 
 def at_start_again(motion: Motion, near: PathPoint, route: LoggedPath, s: float) -> Motion:
-    """The motion transferred to route distance ``s``, with the offset and heading error at
-    ``near``."""
+    """The motion moved to route distance ``s``, with its offset and heading error at ``near``."""
     x, y, _, yaw = route.at(s)
     return motion._replace(
         x=x - near.offset * math.sin(yaw),

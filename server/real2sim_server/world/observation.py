@@ -213,8 +213,10 @@ class LanePiece(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Centre line points of all lanes [P, 4] as in :class:`LanePiece`, lane indices [P], and a
-    k-d tree of the points."""
+    """Centre line points of all lanes, with a k-d tree.
+
+    Points [P, 4] as in :class:`LanePiece`, lane indices [P], and the tree of the points.
+    """
 
     values: Float
     lane: NDArray[np.int64]

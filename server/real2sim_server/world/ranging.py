@@ -130,8 +130,7 @@ class MotionHistory:
         return _along(times_us, self.segments, [segment.ego for segment in self.segments])
 
     def object_poses(self, object_id: str, times_us: Float, *, t_us: int, now: Agents) -> Float:
-        """``T_world_object`` [S, 4, 4] of an object that is currently present, at ``times_us`` [S]
-        [us]."""
+        """``T_world_object`` [S, 4, 4] of a currently present object at ``times_us`` [S] [us]."""
         row = rows_of(now)[object_id]
         ends = [_ends(segment, object_id) for segment in self.segments]
         first = next((k for k, pair in enumerate(ends) if pair is not None), len(ends))

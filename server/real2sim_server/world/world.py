@@ -208,8 +208,10 @@ class World:
 
     @property
     def T_world_estimate(self) -> Float:
-        """[4, 4] float64, body pose as estimated by the ego; equals ``T_world_body`` if the
-        estimate has no errors."""
+        """[4, 4] float64, body pose as estimated by the ego.
+
+        Equals ``T_world_body`` if the estimate has no errors.
+        """
         if self._estimate_error is None:
             return self.T_world_body
         estimate = self._estimate_error.applied(self.motion)

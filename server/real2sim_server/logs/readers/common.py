@@ -311,11 +311,9 @@ class Lens:
         return self._zoomed(high)
 
     def camera(self, name: str, T_vehicle_camera: Float, shutter: Shutter = GLOBAL) -> Camera:
-        """The pinhole camera of the undistorted images, with the original lens and shutter. A lens
-        that folds inside the image is omitted, because it cannot be rendered.
+        """The pinhole camera of the undistorted images, with the original lens and shutter.
 
-        Raises:
-            SceneError: invalid camera values.
+        A lens that folds inside the image is omitted, because it cannot be rendered.
         """
         pinhole = Camera(name, self.width, self.height, self.pinhole_K, T_vehicle_camera)
         k1, k2, p1, p2, k3 = self.distortion

@@ -54,8 +54,7 @@ class DrivestudioReader:
         return (path / "ego_pose" / "000.txt").is_file() and not (path / "timestamps.json").exists()
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The drive in the folder ``path``; ``sequence`` is rejected, because a folder contains
-        one.
+        """The drive in the folder ``path``; ``sequence`` is rejected: a folder contains one.
 
         Raises:
             LogError: see :class:`LogReader`.

@@ -115,8 +115,7 @@ def calibration_from(entries: Mapping[str, Float], path: Path) -> KittiCalibrati
 
 
 def read_entries(path: Path, *, words: Sequence[str] = ()) -> dict[str, Float]:
-    """Lines ``key: numbers`` of a calibration file; ``words`` are keys with text, which are
-    skipped.
+    """Lines ``key: numbers`` of a calibration file; skips keys with text, given in ``words``.
 
     Raises:
         LogError: values that are not finite numbers; names the line.

@@ -86,8 +86,7 @@ def read_pickled_arrays(path: Path, name: str) -> dict[Any, NDArray[Any]]:
 
 
 def unpack_arrays(path: str, name: str, folder: str) -> list[int | str]:
-    """Write the arrays of a pickled dictionary as ``0.npy``, ``1.npy``, ...; return their keys in
-    order.
+    """Write the arrays of a pickled dictionary as ``0.npy``, ``1.npy``, ...; return their keys.
 
     Raises:
         LogError: as :func:`read_pickled_arrays`.
@@ -296,8 +295,7 @@ class StreetGaussiansReader:
         return (path / "ego_pose").is_dir() and (path / "timestamps.json").is_file()
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The drive in the folder ``path``; ``sequence`` is rejected, because a folder contains
-        one.
+        """The drive in the folder ``path``; ``sequence`` is rejected: a folder contains one.
 
         Raises:
             LogError: see :class:`LogReader`.

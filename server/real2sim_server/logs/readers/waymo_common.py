@@ -139,8 +139,10 @@ def merge_range_images(
 
 
 def pixel_points(image: RangeImage) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
-    """Rows [N], columns [N] and points [N, 3] float64 of all pixels with a return, row by row, in
-    the vehicle frame of their own instant."""
+    """Pixels with a return, row by row.
+
+    Rows [N], columns [N] and points [N, 3] float64, vehicle frame at the time of each pixel.
+    """
     height, width = image.values.shape[:2]
     inclination = image.laser.rows(height, image.where)
     azimuth = image.laser.azimuths(width)

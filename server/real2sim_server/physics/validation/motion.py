@@ -375,8 +375,7 @@ def collinear_bars(backend: str) -> list[Check]:
 
 
 def rest(backend: str) -> list[Check]:
-    """A block dropped on the ground comes to rest: no gap, no sinking, contact force equal to
-    weight."""
+    """A block dropped on the ground comes to rest: no gap, no sinking, force equal to weight."""
     body = block(RUBBER, size=(0.4, 0.4, 0.4), at=(0, 0, 0.3))
     solver = solve([body], [Plane(name="ground")], gravity=(0, 0, -GRAVITY), backend=backend)
     solver.step(1.5)

@@ -281,8 +281,10 @@ def _moved(result: SimulationResult, plan: FilmPlan) -> Float | None:
 def _before(
     cloud: GaussianCloud, viewer: Float, moved: Float | None, plan: FilmPlan
 ) -> GaussianCloud:
-    """The background without obstructions between the near camera and the focus, such as trees and
-    posts, along the camera's path."""
+    """The background without obstructions between the near camera and the focus.
+
+    Removes trees, posts and the like along the camera's path.
+    """
     means = cloud.means.detach().cpu().numpy()
     way = np.zeros((1, 3)) if moved is None else moved[:: max(len(moved) // WAY_PLACES, 1)]
     near = np.zeros(len(means), dtype=bool)

@@ -1,5 +1,4 @@
-"""Experiments with vehicles of a scene: the three of the paper, and crash tests on the scene's
-road."""
+"""Experiments with vehicles of a scene: the three of the paper, and crash tests on its road."""
 
 from __future__ import annotations
 

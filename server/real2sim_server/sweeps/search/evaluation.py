@@ -282,8 +282,9 @@ class Watch:
                 self._tracks.setdefault(name, []).append((x, y))
 
     def implausibility(self) -> float:
-        """0 for normal human driving, about 1 for implausible driving. Implausible cases are
-        allowed, but not instructive.
+        """0 for normal human driving, about 1 for implausible driving.
+
+        Implausible cases are allowed, but not instructive.
         """
         found = max(START_GAP - self._start_gap, 0.0) / START_GAP
         for track in self._tracks.values():
@@ -306,8 +307,12 @@ class Watch:
 
 
 def _motion(points: Array, dt: float) -> Array:
-    """[M, 3] speed [m/s], longitudinal and lateral acceleration [m/s^2], from positions [N, 2]
-    every dt."""
+    """[M, 3] speed, longitudinal and lateral acceleration; SI units.
+
+    Args:
+        points: [N, 2] positions [m].
+        dt: time between positions [s].
+    """
     velocity = np.diff(points, axis=0) / dt
     if len(velocity) < 3:
         return np.zeros((0, 3))

@@ -176,8 +176,7 @@ def _plain(options: Mapping[str, Any]) -> str:
 
 
 def _same(one: Driven, other: Driven) -> bool:
-    """Whether two episodes end at the same instant in the same collision, with all objects at the
-    same positions."""
+    """Whether two episodes end in the same collision, with all objects at the same positions."""
     a, b = one.world, other.world
     if a is None or b is None or (a.steps, a.motion) != (b.steps, b.motion):
         return False

@@ -35,8 +35,9 @@ class Archive:
     first: int | None = None
 
     def add(self, found: Evaluation, number: int) -> bool:
-        """Whether it is added: a failure in a new cell, or with a higher score than the cell's
-        elite.
+        """Add a failure in a new cell, or one with a higher score than the cell's elite.
+
+        Returns whether it was added.
         """
         if not found.is_failure or found.cell is None:
             return False
@@ -228,8 +229,10 @@ def search(
 def random_search(
     evaluate: Evaluator, budget: SearchBudget, *, on_progress: Report = lambda _d, _t: None
 ) -> SearchState:
-    """Spend the same budget on independent points, alternating between spaces: the baseline of a
-    search."""
+    """Spend the same budget on independent points, alternating between spaces.
+
+    The baseline of a search.
+    """
     state, rng = SearchState(), np.random.default_rng(budget.seed)
     for k in range(budget.episodes):
         space = k % len(evaluate.spaces)
@@ -273,8 +276,7 @@ def _start(evaluate: Evaluator, budget: SearchBudget) -> Iterator[tuple[int, Poi
 
 
 def _space(spent: NDArray[np.float64], rng: np.random.Generator) -> int:
-    """Select a space: more likely with more kinds of failures per batch (Thompson sampling of
-    rates).
+    """Select a space by Thompson sampling of the kinds of failures per batch.
 
     Args:
         spent: [S, 2] kinds of failures and batches, per space.
@@ -317,8 +319,10 @@ def _compressed(scores: Point) -> Point:
 
 
 def _places(best: Point, rng: np.random.Generator) -> Point:
-    """[N, D] random points: uniform, and near the best [K, D] (small, large, or in few
-    coordinates)."""
+    """[N, D] random points: anywhere, and near the best [K, D].
+
+    The latter are small moves, large moves, and moves in a few coordinates.
+    """
     dimensions = best.shape[1]
     near = np.repeat(best, NEAR, axis=0)
     step = rng.choice([0.02, 0.08, 0.25], size=(len(near), 1)) * rng.standard_normal(near.shape)
@@ -355,8 +359,7 @@ def _descend(
 
 
 def _begin(state: SearchState, rng: np.random.Generator, space: int) -> Evaluation:
-    """One of the most critical points of a space, with a probability that increases with
-    criticality.
+    """One of the most critical points of a space; more critical ones are more likely.
 
     Excludes failures, which are varied elsewhere.
     """

@@ -143,8 +143,10 @@ def point_at(curve, t, ahead, version):
 
 @func
 def _steering_onto(point, coming, state, vehicle):
-    """Road-wheel angle [rad] that brings the vehicle onto the path through ``point``, whose
-    curvature is ``coming`` [1/m] once the steering gear has followed."""
+    """Road-wheel angle [rad] that brings the vehicle onto the path through ``point``.
+
+    ``coming``: curvature of the path [1/m] at the time when the steering gear has followed.
+    """
     dx, dy = state.x - point.x, state.y - point.y
     across = dy * math.cos(point.yaw) - dx * math.sin(point.yaw)
     # Direction of motion: with tyre slip it differs from the heading.
@@ -504,8 +506,10 @@ def _backward(states, inputs, wanted, model):
 
 @func
 def _linearise(A, B, along, model):
-    """Write the derivatives of the next state by state [6, 6], above the diagonal, and by input
-    [6, 2]; all other entries are 0."""
+    """Write the derivatives of the next state.
+
+    ``A``: by state [6, 6], above the diagonal; ``B``: by input [6, 2]. All other entries are 0.
+    """
     state, after = along
     way = (state[3] + after[3]) / 2 * STEP
     middle = (state[2] + after[2]) / 2

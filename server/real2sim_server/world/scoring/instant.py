@@ -479,8 +479,11 @@ def _segment_intersects(
 
 
 def ego_at_fault(record: ContactRecord, off_lane: bool) -> bool:
-    """Whether the ego is at fault (nuPlan): in a front contact, with a stopped vehicle, or in a
-    lateral contact outside its lane."""
+    """Whether the ego is at fault (nuPlan).
+
+    It is in front contacts, in contacts with stopped vehicles, and in lateral contacts outside its
+    lane.
+    """
     if record.side in {"front", "stopped_track"}:
         return True
     return record.side == "lateral" and off_lane

@@ -474,8 +474,7 @@ def lane_symmetric(s: Any, lane: Any) -> Any:
 
 @inner()
 def neo_hookean_batch(dt: Any, s: Any) -> None:
-    """Neo-Hookean stress of all lanes; logarithms in a separate loop, because they do not
-    vectorise."""
+    """Neo-Hookean stress of all lanes; logarithms do not vectorise, so they have their own loop."""
     for lane in range(BATCH):
         F = advance_gradient(lane_matrix(s, _F, lane), lane_matrix(s, _L, lane), dt)
         for c in range(9):

@@ -1,5 +1,4 @@
-"""The substep on the CPU: blocks scatter to tiles, fields sum tiles and apply contact, blocks
-gather."""
+"""The substep on the CPU: blocks scatter to tiles, fields apply contact, blocks gather."""
 
 # Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
@@ -252,8 +251,7 @@ def advance(steps: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any
 
 @inner(parallel=True)
 def scatter_blocks(dt: Any, state: Any, layout: Any, work: Any, params: Any) -> None:
-    """Transfer momentum and mass from particles to tiles, by APIC with stress (MLS-MPM, Hu et al.
-    2018)."""
+    """Transfer particle momentum and mass to tiles (APIC; MLS-MPM stress, Hu et al. 2018)."""
     for chunk in prange(CHUNKS):
         for block in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
             scatter_block(block, dt, state, layout, work, params)
@@ -317,8 +315,10 @@ def collect_fields(dt: Any, layout: Any, work: Any, params: Any) -> None:
 
 @inner()
 def overlap(offset: Any) -> Any:
-    """(first, end, shift): nodes of a block on the tile of the block at ``offset`` below; the tile
-    index is node + shift."""
+    """Nodes of a block on the tile of the block at ``offset`` below it.
+
+    Returns (first, end, shift); the tile index is node + shift.
+    """
     if offset < 0:
         return BLOCK - 1, BLOCK, 1 - BLOCK
     if offset > 0:

@@ -69,8 +69,7 @@ class Translator:
         return "\n".join(self._text)
 
     def add(self, function: Callable[..., Any], kinds: Sequence[Kind]) -> tuple[str, Kind]:
-        """Translate a function for arguments of these kinds; return its name and the kind it
-        returns.
+        """Translate a function for arguments of these kinds; return its name and result kind.
 
         Raises:
             Untranslatable: with the position of the unsupported code.
