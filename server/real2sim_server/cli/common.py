@@ -24,8 +24,8 @@ app = typer.Typer(no_args_is_help=True)
 def command(name: str, *, group: typer.Typer = app) -> Callable[[Function], Function]:
     """Register a function as the command ``name``; its parameters are the command's options.
 
-    On the command line, errors that a person can mend become one sentence and exit code 1; the
-    function itself is left as it is, and raises them.
+    On the command line, errors that a user can fix become one sentence and exit code 1. The
+    function itself is unchanged and raises them.
     """
 
     def register(function: Function) -> Function:
@@ -75,7 +75,7 @@ RenderDevice = Annotated[
 
 
 def log_selection(frames: str, cameras: str | None, every: int) -> LogSelection:
-    """Of ``--frames``, ``--cameras`` and ``--every``. Raises CommandError."""
+    """Frame selection from ``--frames``, ``--cameras`` and ``--every``. Raises CommandError."""
     from ..logs import LogSelection
 
     first, colon, stop = frames.partition(":")
@@ -95,17 +95,17 @@ ON_CUDA = ("auto", "cuda", "nvrtc")
 
 
 def chosen_backend(backend: str, device: str | None) -> str:
-    """The backend that ``--backend`` and ``--device`` ask for; before CUDA is used.
+    """The backend for ``--backend`` and ``--device``. Call it before CUDA is used.
 
-    A device with a number becomes the only one that this process sees, so that every library in it
-    works on the same one.
+    A device with a number becomes the only one visible to this process, so all libraries use the
+    same one.
 
     Args:
         backend: ``auto``, ``cpu``, ``cuda``, ``nvrtc`` or ``reference``.
-        device: ``cpu``, ``cuda``, ``cuda:1`` ...; None takes the backend's own.
+        device: ``cpu``, ``cuda``, ``cuda:1`` ...; None uses the default of the backend.
 
     Raises:
-        CommandError: the device is none, or not one of the backend.
+        CommandError: the device does not exist, or does not fit the backend.
     """
     if device is None:
         return backend
@@ -126,7 +126,7 @@ def chosen_backend(backend: str, device: str | None) -> str:
 
 
 def _visible(number: int, device: str) -> str:
-    """The device ``number`` of those that this process was given."""
+    """The device ``number`` among the devices visible to this process."""
     given = os.environ.get("CUDA_VISIBLE_DEVICES")
     if given is None:
         return str(number)

@@ -1,4 +1,4 @@
-"""``real2sim doctor``: what this machine can do, what is missing, how to mend it."""
+"""``real2sim doctor``: capabilities of this machine, missing parts, and how to fix them."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def doctor(
 
 @dataclass
 class _Report:
-    """What was found; rows of backends, needs and kernels as they are printed and written."""
+    """Results: rows of backends, needs and kernels, for printing and for JSON."""
 
     findings: dict[str, str]
     backends: list[dict[str, object]] = field(default_factory=list)
@@ -202,7 +202,7 @@ def _capability(name: str) -> str:
 
 
 def _check_gpu(*, out: Path | None, json: Path | None) -> None:
-    """Try everything on the GPU of this machine, and print what was found."""
+    """Run all checks on the GPU of this machine, and print the results."""
     from ..render._cuda.needs import unmet_nvrtc_need
 
     need = unmet_nvrtc_need()
@@ -222,7 +222,7 @@ def _check_gpu(*, out: Path | None, json: Path | None) -> None:
 
 
 def _compile_serving(*, report: _Report, arch: list[str] | None) -> None:
-    """Put down what each serving kernel takes on each architecture."""
+    """Add the resource usage of each serving kernel, by architecture."""
     _require_compiler()
     from ..render._cuda.launcher import ARCHITECTURES, THREADS, compile_kernels
     from ..render.cast.cuda import compile_kernels as compile_casting
@@ -235,7 +235,7 @@ def _compile_serving(*, report: _Report, arch: list[str] | None) -> None:
 
 
 def _compile_solver(*, report: _Report, arch: list[str] | None) -> None:
-    """Put down what each kernel of the solver takes on each architecture."""
+    """Add the resource usage of each solver kernel, by architecture."""
     _require_compiler()
     from .._nvrtc import ARCHITECTURES
     from ..physics.backends.cuda.launcher import THREADS, compile_kernels
@@ -288,10 +288,10 @@ def _inspected(findings: dict[str, str]) -> _Report:
     from ..render._cuda.needs import compiler_needs, cuda_needs
 
     described, used = describe_backends(), select_backend("auto").name
-    # Of use where somebody wants CUDA: where torch is built for it, or a driver is loaded.
+    # Only useful if CUDA is expected: torch is built for it, or a driver is loaded.
     wanted = torch.version.cuda is not None or Path("/proc/driver/nvidia/version").is_file()
     needs = [*cuda_needs(), *compiler_needs()] if wanted else []
-    # What both backends for a GPU need is said once: by the needs, or for the first of them.
+    # Report requirements shared by both GPU backends once.
     told = {"cuda", "nvrtc"} if needs else {"nvrtc"}
     mend = {f"{b.name}: {b.remedy}" for b in described if b.remedy and b.name not in told}
     return _Report(
@@ -306,7 +306,7 @@ def _inspected(findings: dict[str, str]) -> _Report:
 
 
 def _require_cuda(*, without_device: bool) -> None:
-    """Leave with an error where CUDA is not usable, or not but for the device."""
+    """Exit with an error if CUDA is not usable; ``without_device`` tolerates a missing device."""
     from ..render._cuda.needs import try_without_device, unmet_gsplat_need
 
     need = unmet_gsplat_need(without_device=without_device)
@@ -319,7 +319,7 @@ def _require_cuda(*, without_device: bool) -> None:
 
 
 def _warm_up() -> tuple[float, list[str]]:
-    """Seconds until the kernels of a worker are ready, and names of those that were compiled."""
+    """Compile a worker's kernels; return the duration [s] and the names of newly compiled ones."""
     from numba.core import event
 
     from .. import render, world
@@ -360,8 +360,7 @@ def _report(report: _Report, json: Path | None) -> None:
 
 
 def _kernels_table(rows: list[dict[str, object]]) -> Table:
-    """A line a kernel: registers of a thread on each architecture, and in brackets the share of
-    threads that can be at work at once."""
+    """One row per kernel: registers per thread by architecture, with occupancy in brackets."""
     architectures = list(dict.fromkeys(str(row["architecture"]) for row in rows))
     table = Table("kernel", *architectures, "shared [bytes]", title="registers of kernels")
     table.title_justify = "left"

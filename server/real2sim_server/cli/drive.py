@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # --- run ------------------------------------------------------------------------------------------
 
 SCRIPTED = "storyboard"
-"""The planner's name where the storyboard drives the ego itself."""
+"""Name of the planner if the storyboard drives the ego."""
 
 
 @command("run")
@@ -122,7 +122,7 @@ def run(
 def _storyboard(
     file: str, values: list[str], leave_out: frozenset[str], ego: str | None
 ) -> tuple[Storyboard, Path | None, tuple[str, ...]]:
-    """The storyboard that is named, the file of its roads, and what has no effect."""
+    """The named storyboard, its road file, and elements without effect."""
     from real2sim_proto.storyboard import Storyboard
 
     from ..scenarios import ScenarioError
@@ -187,7 +187,7 @@ def _with_speed(board: Storyboard, speed: float) -> Storyboard:
 
 
 def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made: Path) -> Scene:
-    """The scene to drive in; a flat one is written to ``made`` first, so that it has a hash."""
+    """The scene to drive in; a flat one is first written to ``made``, so that it has a hash."""
     from ..maps import MapError
     from ..scenarios import ScenarioError
     from ..scenarios.flat_scene import flat_scene
@@ -210,7 +210,7 @@ def _scene(bundle: Path | None, board: Storyboard, road_file: Path | None, made:
 def _drive(
     scene: Scene, board: Storyboard, planner: str, *, seed: int, seconds: float
 ) -> tuple[Driven, list[Event]]:
-    """The episode, and what happened in it."""
+    """Drive the episode and return it with its events."""
     from real2sim.planners import load_planner
 
     from ..sweeps.episode import Drive, drive_episode
@@ -232,7 +232,7 @@ def _drive(
 
 
 class _Scripted:
-    """Plans that are of no account, where the storyboard drives the ego."""
+    """Placeholder planner: its plans are ignored, because the storyboard drives the ego."""
 
     def __init__(self) -> None:
         from real2sim.planners.planner import Needs
@@ -240,7 +240,7 @@ class _Scripted:
         self.needs = Needs()
 
     def reset(self, obs: Any) -> None:
-        """Nothing is to be forgotten."""
+        """Nothing to reset."""
 
     def plan(self, obs: Any) -> dict[str, Any]:
         times, poses = [obs.t_us + 1_000_000], [(0.0, 0.0, 0.0)]
@@ -355,7 +355,7 @@ def _load_its_scene(recording: Recording, path: Path) -> Scene:
 def _replay_factory(
     recording: Recording, scene: Scene, assets: Path | None
 ) -> Callable[[], Replayer]:
-    """Makes the session as it was before its first entry, as often as wanted."""
+    """A factory of the session as it was before its first entry."""
     from ..edit import EditError
     from ..service.library.assets import AssetLibrary
     from ..world.recording.recording import RecordingError
@@ -413,9 +413,9 @@ def sweep(
 ) -> None:
     """Drive points of a parameter space with planners; renders only what planners need.
 
-    Leaves episodes.parquet, a row an episode, and recordings and scenario files of the worst.
-    Killed, the same command goes on; the table is the same bytes whoever drove, and however often
-    it was killed.
+    Writes episodes.parquet with one row per episode, and recordings and scenario files of the
+    worst. If it is interrupted, run the same command again to continue. The table has the same
+    bytes for any executor and any number of interruptions.
     """
     from ..console import write_json
     from ..executors import ExecutorError, executor_of
@@ -462,7 +462,7 @@ def search(
 ) -> None:
     """Find avoidable collisions that are the planner's fault.
 
-    Leaves failures.json, each failure as a case and as a recording, and a page; see docs/sweeps.md.
+    Writes failures.json, each failure as a case and as a recording, and a page; see docs/sweeps.md.
     """
     from ..console import write_json
     from ..sweeps import load_space

@@ -174,8 +174,11 @@ def export(
     overwrite: Overwrite = False,
     json: JsonFile = None,
 ) -> None:
-    """Write a scene for other programs: per object, baked at a time, animated as glTF, or as
-    plain points: all in one .ply, or in a folder the background and each object apart."""
+    """Write a scene for other programs.
+
+    Formats: one file per object, the whole scene baked at a time, animated glTF, or plain points
+    (one .ply, or a folder with the background and each object).
+    """
     from ..scene.io import export_scene, load_scene
     from ..scene.io.splats import FORMATS
 
@@ -185,7 +188,7 @@ def export(
         files = _write_points(loaded, out, t_us, objects)
         _tell(scene, loaded.gaussian_count, files, "z", json)
         return
-    # export_scene itself refuses formats and objects that it does not know, with those there are.
+    # export_scene rejects unknown formats and objects, and lists the allowed ones.
     files = export_scene(loaded, out, format=file_format, t_us=t_us, objects=objects or None)
     axes = {"gltf": "y"} | {known.suffix[1:]: known.up_axis for known in FORMATS}
     _tell(scene, loaded.gaussian_count, files, axes[file_format], json)
@@ -315,7 +318,8 @@ def export_dataset(
 ) -> None:
     """Export labelled images of a scene, its edits or an episode in public formats.
 
-    Stopped and called again it goes on after the last whole clip, and gives the same bytes.
+    If it is interrupted, call it again: it continues after the last complete clip, and the result
+    has the same bytes.
     """
     from ..datasets.clips import ClipMakers
     from ..datasets.export import estimate
@@ -401,7 +405,7 @@ def export_dataset(
 
 
 def _variants(path: Path, **options: Any) -> list[Variant]:
-    """What is exported, made anew in a process of its own."""
+    """Recreate the exported drives in a separate process."""
     from ..scene.io import load_scene
 
     return _swept(load_scene(path), **options)[0]
@@ -416,7 +420,7 @@ def _swept(
     sweep: Path | None,
     seed: int,
 ) -> tuple[list[Variant], dict[str, Any]]:
-    """What is exported, and what decided on it."""
+    """The exported drives, and the inputs that determine them."""
     from ..datasets.drive import ScenarioDrive
     from ..datasets.plan import Variant, swept
 
@@ -433,7 +437,7 @@ def _swept(
 def _drive(
     scene: Scene, operations: Path | None, episode: Path | None, assets: Path | None
 ) -> tuple[Drive, dict[str, Any]]:
-    """What is shown, and what decided on it."""
+    """The exported drive, and the inputs that determine it."""
     from ..datasets.drive import EpisodeDrive, ScenarioDrive
     from ..service.library.assets import AssetLibrary
     from ..world.recording.recording import load_recording
@@ -508,7 +512,7 @@ def _noise(text: str) -> BoxNoise:
 
 
 def _numbers(option: str, text: str, allowed: tuple[str, ...]) -> dict[str, float]:
-    """Of ``name=number,name=number``, none below 0."""
+    """Parse ``name=number,name=number``; numbers must not be negative."""
     found = {}
     for part in text.split(","):
         name, _, number = part.partition("=")
@@ -524,7 +528,7 @@ def _numbers(option: str, text: str, allowed: tuple[str, ...]) -> dict[str, floa
 
 
 def _lidar(name: str | None) -> str | dict[str, Any] | None:
-    """A name of the catalogue as it is, or the values in a file."""
+    """A name of the catalogue unchanged, or the values in a file."""
     if name is None or not name.endswith(".json"):
         return name
     try:
@@ -535,7 +539,7 @@ def _lidar(name: str | None) -> str | dict[str, Any] | None:
 
 
 def _shares(text: str) -> dict[str, float]:
-    """Of ``train=0.8,val=0.2``."""
+    """Parse ``train=0.8,val=0.2``."""
     shares = {}
     for part in text.split(","):
         name, equals, share = part.partition("=")

@@ -1,7 +1,7 @@
-"""``real2sim doctor --gpu-check``: what to find out first on a real GPU, in some minutes.
+"""``real2sim doctor --gpu-check``: checks and measurements for a new GPU, in some minutes.
 
-Each part is tried by itself and says what went wrong, so that one call tells all that it can. What
-is compared is compared with the CPU backends of the same machine.
+Parts run independently and report their own errors, so one call shows as much as possible.
+Comparisons use the CPU backends of the same machine.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ from ..synthetic.gaussian_street import StreetScene, street_scene
 
 DISTRIBUTIONS = ("real2sim", "torch", "gsplat", "numba-cuda", "cuda-core", "nvidia-nvimgcodec-cu13")
 STREET_GAUSSIANS = 100_000
-"""The fewest that make a street; fewer are picked from it."""
+"""Minimum number of Gaussians of a generated street; smaller cases use a subset."""
 DISTANCES = (0.0, 2_000.0, 10_000.0)
-"""From the origin of the world at which pictures are compared [m]."""
+"""Distances from the world origin at which images are compared [m]."""
 YAWS = (0.0, 1.05, -1.05, 2.1, -2.1)
 IMAGES = ("rgb", "depth", "instance")
 COMPARED = (*IMAGES, "median_depth", "semantic")
 SUBSTEPS = 64
 TRAINED_WITHIN = 0.02
-"""Of the loss on the CPU, after all steps."""
+"""Tolerance of the final training loss, relative to the CPU's."""
 
 
 @dataclass(frozen=True)
 class FrameCase:
-    """A set of images of one instant; ``wanted_ms`` is how long it may take."""
+    """A set of images of one instant; ``wanted_ms`` is the maximum time."""
 
     cameras: int
     width: int
@@ -73,16 +73,15 @@ class FrameCase:
 
 @dataclass(frozen=True)
 class Scale:
-    """How much is tried.
+    """Size of the checks.
 
     Attributes:
-        compared: Gaussians of the street whose pictures are compared, in images of
-            ``compared_width``.
-        frames: cases that are timed, each ``repeats`` times.
-        rays: rows and columns of the sweep that is compared and timed.
-        particles: of the block that falls, in numbers tried one after the other.
-        train_steps, train_width, train_frames, train_gaussians: of the short training; the last is
-            how many the background has at most.
+        compared: number of Gaussians for image comparisons, at width ``compared_width`` [px].
+        frames: timed cases, ``repeats`` times each.
+        rays: rows and columns of the LiDAR sweep.
+        particles: particle counts of the falling block, one run each.
+        train_steps, train_width, train_frames, train_gaussians: size of the short training; the
+            last is the maximum number of Gaussians of the background.
     """
 
     compared: int = 200_000
@@ -103,14 +102,14 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Devices:
-    """What is checked.
+    """Backends to check.
 
     Attributes:
-        serving: makes the backend that draws frames.
-        training: name of the backend that trains, or the backend.
-        physics: name of the solver's backend.
-        casting: makes the backend that casts LiDARs.
-        name: of the device, for the table.
+        serving: creates the backend that renders frames.
+        training: backend for training, or its name.
+        physics: name of the solver backend.
+        casting: creates the backend that casts LiDAR rays.
+        name: name of the device, for the table.
     """
 
     serving: Callable[[], Backend]
@@ -122,7 +121,7 @@ class Devices:
 
 @dataclass(frozen=True)
 class Finding:
-    """A line of the table; ``holds`` is None where nothing was wanted."""
+    """A row of the table; ``holds`` is None without an expected value."""
 
     part: str
     what: str
@@ -133,13 +132,13 @@ class Finding:
 
 @dataclass
 class GpuCheck:
-    """What was found.
+    """Results of the check.
 
     Attributes:
-        device: what was checked.
-        date: on which, ISO 8601.
-        findings: in the order of the parts.
-        failed: what went wrong, by part.
+        device: name of the device.
+        date: ISO 8601 date of the check.
+        findings: rows, in the order of the parts.
+        failed: error messages, by part.
     """
 
     device: str
@@ -149,12 +148,12 @@ class GpuCheck:
 
     @property
     def right(self) -> bool:
-        """Whether every part ran and all that is compared agrees; speed is not asked."""
+        """Whether every part ran and all comparisons agree, whatever the speed."""
         compared = (f.holds for f in self.findings if f.part in ("pictures", "lidar", "training"))
         return not self.failed and False not in compared
 
     def markdown(self) -> str:
-        """The table, as ``docs/gpu.md`` has such."""
+        """The results as a Markdown table, as in ``docs/gpu.md``."""
         lines = [f"Checked on {self.date}: {self.device}", ""]
         lines += ["| Part | What | Found | Wanted |", "|---|---|---|---|"]
         for finding in self.findings:
@@ -182,13 +181,13 @@ def run(
     parts: Iterable[str] | None = None,
     on_part: Callable[[str], object] = lambda part: None,
 ) -> GpuCheck:
-    """Try all parts.
+    """Run the parts.
 
     Args:
-        devices: what is checked.
-        scale: how much is tried.
-        parts: some of PARTS; all by default.
-        on_part: told the name of each part before it begins.
+        devices: backends to check.
+        scale: size of the checks.
+        parts: names from PARTS; all by default.
+        on_part: called with the name of each part before it starts.
     """
     check = GpuCheck(devices.name, datetime.now(UTC).date().isoformat())
     for part in parts or PARTS:
@@ -229,7 +228,7 @@ def _install(devices: Devices, scale: Scale) -> Iterator[Finding]:
 
 
 def _pictures(devices: Devices, scale: Scale) -> Iterator[Finding]:
-    """Serving kernels against the CPU backend, at several distances from the origin."""
+    """Images of the serving kernels and the CPU backend, at several distances from the origin."""
     serving, cpu = devices.serving(), select_backend("cpu")
     width = scale.compared_width
     street = _street(scale.compared)
@@ -257,7 +256,7 @@ def _pictures(devices: Devices, scale: Scale) -> Iterator[Finding]:
 
 
 def _lidar(devices: Devices, scale: Scale) -> Iterator[Finding]:
-    """A sweep of a moving sensor against that of the CPU backend, and its time."""
+    """A sweep of a moving sensor, compared with the CPU backend, and its time."""
     rows, columns = scale.rays
     beams = Beams.spinning(np.radians(np.linspace(-24.0, 4.0, rows)), columns=columns)
     lidar = Lidar("check", beams, min_range=1.0, max_range=120.0, returns=2)
@@ -279,7 +278,7 @@ def _lidar(devices: Devices, scale: Scale) -> Iterator[Finding]:
 
 
 def _frames(devices: Devices, scale: Scale) -> Iterator[Finding]:
-    """Times of whole sets of images on the host."""
+    """Times of complete sets of images, on the host."""
     serving = devices.serving()
     for case in scale.frames:
         view = _view(_street(case.gaussians), case)
@@ -306,7 +305,7 @@ def _physics(devices: Devices, scale: Scale) -> Iterator[Finding]:
 
         def advance(solver: Solver = solver, dt: float = dt) -> None:
             solver.simulation.advance(SUBSTEPS, dt, solver.colliders)
-            solver.simulation.measure()  # Waits; particles themselves would be copied back.
+            solver.simulation.measure()  # Waits; reading particles would copy them.
 
         ms = _median_ms(advance, 3) / SUBSTEPS
         rate = count / ms / 1e3
@@ -389,10 +388,10 @@ PARTS: dict[str, Callable[[Devices, Scale], Iterator[Finding]]] = {
     "training": _training,
     "memory": _memory,
 }
-"""What is tried, in this order."""
+"""Parts by name, in order."""
 
 
-# --- what is drawn and timed --------------------------------------------------------------------
+# --- scenes and timing --------------------------------------------------------------------------
 
 
 @functools.lru_cache(1)
@@ -413,7 +412,7 @@ def _street(gaussians: int) -> StreetScene:
 
 
 def _view(street: StreetScene, case: FrameCase, distance: float = 0.0) -> RigView:
-    """The street from a vehicle on it, all of it moved away from the origin."""
+    """A view of the street from a vehicle on it, with everything shifted away from the origin."""
     away = transform_from([distance, -0.5 * distance, 0.0], yaw_quaternion(0.0))
     background, *cars = street.instances
     objects = [cars[k % len(cars)] for k in range(case.objects)]
@@ -474,7 +473,7 @@ def _median_ms(work: Callable[[], object], repeats: int) -> float:
 
 
 def _times_ms(work: Callable[[], object], repeats: int) -> list[float]:
-    """Of each run, after two that bring everything to the device."""
+    """Time of each run [ms], after two warm-up runs."""
     for _ in range(2):
         work()
     times = []

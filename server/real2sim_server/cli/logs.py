@@ -1,4 +1,4 @@
-"""Commands on logs: synth, log-info and track."""
+"""Log commands: synth, log-info and track."""
 
 from __future__ import annotations
 

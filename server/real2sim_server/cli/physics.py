@@ -1,4 +1,4 @@
-"""Commands of the physics: simulate, calibrate and validate."""
+"""Physics commands: simulate, calibrate and validate."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def simulate(
 
 
 def values_of(given: list[str]) -> dict[str, PhysicsValues]:
-    """What is given for each object, and for all as "*"."""
+    """Values of ``--physics`` by object; "*" stands for all objects."""
     from pydantic import ValidationError
 
     from real2sim_proto.operations import PhysicsValues
@@ -175,7 +175,7 @@ def values_of(given: list[str]) -> dict[str, PhysicsValues]:
 
 
 def changed(setup: Experiment, values: dict[str, PhysicsValues]) -> dict[str, ObjectPhysics]:
-    """What takes part, with what was given for all and for each."""
+    """Objects of a setup, with the values for all objects and for each."""
     from ..simulation.structure import with_values
 
     objects = setup.options.objects
@@ -193,7 +193,7 @@ def changed(setup: Experiment, values: dict[str, PhysicsValues]) -> dict[str, Ob
 def continue_driving(
     scene: Scene, state: PlacedObjects, objects: tuple[str, ...], frame: int, *, preset: str
 ) -> Experiment:
-    """Everything named goes on from where and how fast it was driving."""
+    """An experiment in which the named objects continue their recorded motion."""
     import numpy as np
 
     from ..simulation.experiments import Experiment, scene_road
@@ -281,7 +281,7 @@ def calibrate(
 ) -> None:
     """Fit an object's physical parameters to observations.
 
-    Each comes with what it may be wrong by: what observations leave open, and what cells do.
+    Reports the uncertainty of each parameter, from the observations and from the cell size.
     """
     from ..edit.state import ScenarioState
     from ..scene.io import load_scene
@@ -321,7 +321,7 @@ def calibrate(
 
 
 def _read(path: Path | None) -> Observations:
-    """Observations of a file; images that it names by their files are read."""
+    """Read observations from a file, including the image files that it names."""
     import base64
     import json
 
@@ -399,8 +399,11 @@ def validate(
 
 
 def _run(backend: str, cases: str | None, report: Callable[[int, int], None]) -> list[CaseResult]:
-    """The cases asked for; ``published`` stands for all of the published crash figures, and
-    ``simulation`` for all of bodies that roll, hand over and hit thin things."""
+    """Run the requested cases.
+
+    ``published`` selects all published crash figures, ``simulation`` all cases of tyres, mode
+    changes and thin obstacles.
+    """
     from ..physics.validation import table
     from ..simulation.experiments.crash_tests import PUBLISHED, THEORY
 

@@ -1,4 +1,4 @@
-"""Commands on policies: evaluate-policy and train-policy."""
+"""Policy commands: evaluate-policy and train-policy."""
 
 from __future__ import annotations
 
@@ -87,11 +87,11 @@ def evaluate_policy(
 ) -> None:
     """Compare planners over cases: scores, recordings and an HTML report.
 
-    Each planner runs in a process of its own. One that raises, sends a plan that is refused or
-    ends its process fails that episode: the rest is driven, and the exit code is 1.
+    Each planner runs in its own process. If a planner raises an exception, returns an invalid plan
+    or exits, this episode fails. The other episodes continue, and the exit code is 1.
 
-    A suite names cases: a scene or a scenario, options of `reset`, edits, and the `jitter` of
-    numbers in them, by which seeds differ. Its format is described in docs/policies.md.
+    A suite lists cases: a scene or a scenario, options of `reset`, edits, and the `jitter` of
+    numbers in them, which varies with the seed. See docs/policies.md for the format.
     """
     from ..policies.episodes import WorkerTarget, run_episodes
     from ..policies.page import render_page, report_figures, unconfirmed_scores
@@ -127,7 +127,7 @@ def evaluate_policy(
 
 
 def _tell_failures(results: Sequence[EpisodeResult]) -> None:
-    """Why planners have failed; ends the command with exit code 1 where any has."""
+    """Print why planners failed; exit with code 1 if any did."""
     failed = [one for one in results if one.error is not None]
     for policy in dict.fromkeys(one.policy for one in failed):
         own = [one for one in failed if one.policy == policy]
@@ -178,7 +178,7 @@ def _options(reset: str | None) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _own_worker(scenes: Path | None, out: Path) -> Iterator[str]:
-    """A worker with the bundles in ``scenes``, or with the demo's street; its address."""
+    """Start a worker with the bundles in ``scenes``, or with the demo's street; return its URL."""
     import real2sim
 
     from ..demo.run import worker_process

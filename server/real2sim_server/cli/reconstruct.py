@@ -133,7 +133,7 @@ def _with_lanes(options: InitialiseOptions, lanes: str) -> InitialiseOptions:
 
 
 def _training_bar(report: Callable[..., None]) -> Callable[[TrainingProgress], None]:
-    """Shows the figures of training in the progress bar of that stage."""
+    """Shows training figures in the progress bar of that stage."""
 
     def on_training(step: TrainingProgress) -> None:
         text = (
@@ -289,18 +289,18 @@ def _lidar_figures(score: LidarScore) -> dict[str, object]:
 # --- fit-lidar, fit-uncertainty -------------------------------------------------------------------
 
 Fitted = tuple["Scene", dict[str, Any]]
-"""The scene with what was fitted, and figures of the fit."""
+"""The fitted scene, and figures of the fit."""
 
 
 @dataclass(frozen=True)
 class FitFiles:
-    """What is read and written.
+    """Input and output files of a fit.
 
     Attributes:
         scene: bundle.
         log: folder of the driving log.
-        out: bundle to write; None for the scene itself.
-        log_format, sequence: of the log, where its folder does not tell.
+        out: bundle to write; None overwrites the scene.
+        log_format, sequence: format and sequence of the log, if they cannot be detected.
         json: file for the figures.
     """
 

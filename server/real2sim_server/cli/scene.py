@@ -1,4 +1,4 @@
-"""Commands on a scene: render, film, ground and map."""
+"""Scene commands: render, film, ground and map."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def render(
 ) -> None:
     """Draw one logged camera of a scene; with --log print PSNR against the recorded image.
 
-    With --lidar cast a sweep of a LiDAR on the recording vehicle instead, and draw it beside.
+    With --lidar, cast a sweep of a LiDAR on the recording vehicle instead, and draw it next to the
+    image.
     """
     from ..edit.compose import instances_at
     from ..render import render_cameras, warm_up
@@ -79,7 +80,7 @@ def render(
         return
     _check_output(out, modality)
     backend = chosen_backend(backend, device)
-    warm_up(backend)  # Not part of the time that is printed for the picture.
+    warm_up(backend)  # Keeps warm-up out of the printed render time.
     loaded = load_scene(scene)
     time_us = _frame_time(loaded, frame or 0) if t_us is None else t_us
     chosen = loaded.rig[camera] if camera else loaded.rig.cameras[0]
@@ -107,7 +108,7 @@ def render(
 
 @dataclass(frozen=True)
 class _Moment:
-    """What the options say of the time."""
+    """The instant selected by the options."""
 
     frame: int | None
     t_us: int | None
@@ -265,7 +266,7 @@ def film(
 SWEEPS_MAX = 12
 POINTS_DRAWN = 60_000
 BOX_MARGIN = 0.3
-"""Points this near a box are its own, not the ground's [m]."""
+"""Points closer to a box than this belong to its object, not to the ground [m]."""
 
 
 @command("ground")
@@ -309,7 +310,7 @@ def ground(
 
 
 def _plane_figures(planes: dict[str, RoadPlane]) -> dict[str, object]:
-    """What RANSAC found below the boxes in each source."""
+    """RANSAC planes below the boxes, by source."""
     import numpy as np
 
     figures: dict[str, object] = {}
@@ -325,7 +326,7 @@ def _plane_figures(planes: dict[str, RoadPlane]) -> dict[str, object]:
 
 
 def _height_figures(scene: Scene, t_us: int, sources: dict[str, Float]) -> dict[str, object]:
-    """How far the ground fitted to each source is from the scene's, under the boxes."""
+    """Height differences under the boxes: ground fitted to each source against the scene's."""
     import numpy as np
 
     from ..scene.ground_fit import DrivenPath, box_bottoms, fit_ground
@@ -356,7 +357,7 @@ def _under(ground: Ground, boxes: list[tuple[Float, tuple[float, float, float]]]
 
 
 def _lidar_points(log: DrivingLog) -> Float:
-    """Points [N, 3] of some sweeps in the world, without what lies in tracked boxes."""
+    """World points [N, 3] of some sweeps, without those in tracked boxes."""
     import numpy as np
 
     from ..geometry import apply_transform, invert_transform
@@ -505,7 +506,7 @@ def _lanes_of(
     as_it_is: bool,
     reading: tuple[str | None, str | None],
 ) -> tuple[LaneGraph, dict[str, Any]]:
-    """The lanes of a map in the scene's frame, or of its log, and figures of how they fit."""
+    """The lanes of a map in the scene's frame, or of its log, and figures of how well they fit."""
     from ..logs import same_part
     from ..logs.open import open_log
     from ..maps import align, driven_poses, laid_on, lanes_from_log, read_map

@@ -69,10 +69,10 @@ def serve(
         settings = Settings(**given)
     except ValidationError as error:
         raise CommandError(_said(error.errors()[0])) from None
-    # Before the worker's libraries are loaded, which takes seconds.
+    # Fail before the worker's libraries load, which takes seconds.
     check_start(settings)
     begin_compiling()
-    # The worker itself tells of kernels, also of those that another process compiles.
+    # The worker itself reports kernel compilation, including that of other processes.
     LISTENERS.append(lambda _text: None)
     from ..service import serve as worker
 
@@ -81,10 +81,10 @@ def serve(
 
 
 def _check_variables() -> None:
-    """Refuse a misspelt setting, which would silently not count; warn of others that are unknown.
+    """Reject misspelt settings, which would have no effect; warn about other unknown ones.
 
     Raises:
-        CommandError: naming it, and the setting that is probably meant.
+        CommandError: names the variable and the most similar setting.
     """
     from ..settings import unknown_variables
 
@@ -97,7 +97,7 @@ def _check_variables() -> None:
 
 
 def _said(error: Mapping[str, Any]) -> str:
-    """What is wrong with a setting; secrets are not shown."""
+    """Messages of a settings error, without secrets."""
     name = ".".join(str(part) for part in error["loc"])
     message = str(error["msg"]).removeprefix("Value error, ")
     if not name:

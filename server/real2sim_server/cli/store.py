@@ -1,4 +1,4 @@
-"""Commands of operators: store, backup, restore and token."""
+"""Operator commands: store, backup, restore and token."""
 
 from __future__ import annotations
 
@@ -88,10 +88,10 @@ def audit(
 
 @contextmanager
 def _engine(data: Path | None, url: str | None, *, must_exist: bool) -> Iterator[sa.Engine]:
-    """The store's database, with time enough for a migration.
+    """The store's database, with a timeout long enough for migrations.
 
     Raises:
-        CommandError: there is none, or it cannot be reached.
+        CommandError: the database is missing or unreachable.
     """
     from sqlalchemy import exc
 
@@ -231,7 +231,7 @@ def add(
         highlight=False,
         soft_wrap=True,
     )
-    # To stdout and alone, so that it can be piped to where it is kept.
+    # Print only the token to stdout, so that it can be piped.
     print(token)
 
 

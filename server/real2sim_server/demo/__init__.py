@@ -1,4 +1,4 @@
-"""The product shown end to end: a street is made, served, edited and driven through.
+"""End-to-end demo: builds, serves, edits and drives through a street.
 
-The demo does what a user would: it talks to its worker only by the SDK.
+Like a user, the demo accesses its worker only through the SDK.
 """

@@ -1,4 +1,4 @@
-"""``real2sim demo``: take a street, serve it, edit it over REST, drive it over WebSocket."""
+"""``real2sim demo``: serve a street, edit it over REST, drive it over WebSocket."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class WorkerProcess:
     """A running `real2sim serve`.
 
     Attributes:
-        url: where it listens.
-        process: that runs it.
-        log_file: what it prints.
+        url: its address.
+        process: its process.
+        log_file: its output.
     """
 
     url: str
@@ -58,10 +58,10 @@ class WorkerProcess:
     log_file: Path
 
     def wait_listening(self, seconds: float = START_S) -> None:
-        """Wait for the port to open; whether the worker is ready is for it to say.
+        """Wait until the port is open; the worker may not be ready yet.
 
         Raises:
-            WorkerStartError: it ended, or did not listen in time; with the last line of its log.
+            WorkerStartError: it exited, or did not listen in time; with the last line of its log.
         """
         port = int(self.url.rsplit(":", 1)[1])
         deadline = time.monotonic() + seconds
@@ -81,11 +81,12 @@ class WorkerProcess:
 
 @contextlib.contextmanager
 def worker_process(*, scenes: Path, data: Path, log_file: Path) -> Iterator[WorkerProcess]:
-    """Start ``real2sim serve`` on a free loopback port and wait until it listens there; it is
-    stopped when the block ends. Arguments as of :func:`starting_worker`.
+    """Start ``real2sim serve`` on a free loopback port, wait until it listens, and stop it on exit.
+
+    Arguments as for :func:`starting_worker`.
 
     Raises:
-        WorkerStartError: it ended, or did not listen in time; with the last line of its log.
+        WorkerStartError: it exited, or did not listen in time; with the last line of its log.
     """
     with starting_worker(scenes=scenes, data=data, log_file=log_file) as worker:
         worker.wait_listening()
@@ -94,12 +95,12 @@ def worker_process(*, scenes: Path, data: Path, log_file: Path) -> Iterator[Work
 
 @contextlib.contextmanager
 def starting_worker(*, scenes: Path, data: Path, log_file: Path) -> Iterator[WorkerProcess]:
-    """Like :func:`worker_process`, without waiting: something else can be done meanwhile.
+    """Like :func:`worker_process`, without waiting, so that other work can run meanwhile.
 
     Args:
         scenes: folder of scene bundles.
         data: folder for its scenarios and sessions.
-        log_file: takes what the worker prints.
+        log_file: file for the worker's output.
     """
     port = _free_port()
     command = [sys.executable, "-m", "real2sim", "serve", "--port", str(port)]
@@ -124,7 +125,7 @@ def _free_port() -> int:
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:
-    # As Ctrl-C: at SIGTERM a worker first lets proxies see that it is on its way out.
+    # As Ctrl-C does. On SIGTERM, a worker would first wait for proxies to notice.
     process.send_signal(signal.SIGINT)
     try:
         process.wait(timeout=15)
@@ -138,21 +139,21 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 # One car moved, another duplicated, both to free places.
 
 AHEAD = (6.0, 45.0)
-"""How far ahead of the start a car must be to be edited [m]; there the camera sees it well."""
+"""Distance range ahead of the start for edited cars [m], where the camera sees them well."""
 
 WIDTH = 960
 
 
 @dataclass(frozen=True)
 class StreetEdits:
-    """What was edited, and how it looks.
+    """The edits, and images of them.
 
     Attributes:
-        moved, duplicated: ids of the two cars that were edited.
+        moved, duplicated: ids of the two edited cars.
         before, after: RGB uint8 [H, W, 3] of the same camera.
         logged: [L, 2] path of the recording vehicle [m].
         footprints: (id, corners [4, 2] at the start [m], whether it was edited) of every object.
-        gaussians: of the whole scene.
+        gaussians: number of Gaussians of the scene.
     """
 
     moved: str
@@ -165,7 +166,7 @@ class StreetEdits:
 
 
 def edit_street(scenario: Any, scene: SceneInfo, *, camera: str) -> StreetEdits:
-    """Move one standing car and duplicate another, with the pictures before and after."""
+    """Move one parked car and duplicate another, with images before and after."""
     before = scenario.preview(camera=camera, width=WIDTH, codec="jpeg").array
     candidates = _standing_cars(scenario.info.objects, scene)
     moved = _apply_first_without_overlap(scenario, _moves(candidates))
@@ -187,7 +188,7 @@ def edit_street(scenario: Any, scene: SceneInfo, *, camera: str) -> StreetEdits:
 
 
 def _standing_cars(objects: Sequence[ObjectInfo], scene: SceneInfo) -> list[ObjectInfo]:
-    """Standing cars ahead of the start, nearest first."""
+    """Stationary cars ahead of the start, nearest first."""
     start = np.array(scene.ego.positions[0]) if scene.ego else np.zeros(3)
     found = []
     for info in objects:
@@ -201,7 +202,7 @@ def _standing_cars(objects: Sequence[ObjectInfo], scene: SceneInfo) -> list[Obje
 
 
 def _moves(cars: Sequence[ObjectInfo]) -> Iterator[Operation]:
-    """A car out of its parking space into the lane beside it, facing as before."""
+    """Operations that move a car from its parking space into the adjacent lane, same heading."""
     for car in cars:
         position = np.array(car.trajectory.positions[0]) if car.trajectory else np.zeros(3)
         inward = -np.sign(position[1]) * (car.size[1] + 0.9)
@@ -210,14 +211,14 @@ def _moves(cars: Sequence[ObjectInfo]) -> Iterator[Operation]:
 
 
 def _copies(cars: Sequence[ObjectInfo]) -> Iterator[Operation]:
-    """A second car one or two lengths before or behind."""
+    """Operations that duplicate a car, one or two lengths ahead or behind."""
     for car in cars:
         for lengths in (1.25, -1.25, 2.5, -2.5):
             yield Duplicate(object_id=car.object_id, x=lengths * car.size[0], frame="object")
 
 
 def _apply_first_without_overlap(scenario: Any, operations: Iterator[Operation]) -> Any:
-    """Try operations as dry runs; apply the first that gets no warning, else the very first."""
+    """Try operations as dry runs; apply the first one without warnings, else the first one."""
     first: Operation | None = None
     for operation in operations:
         first = first or operation
@@ -248,7 +249,7 @@ EDITED_COLOR = "#d1495b"
 
 
 def mosaic(images: Sequence[Image], caption: str) -> Image:
-    """Images of one height side by side, over a line of text."""
+    """Images of equal height side by side, above a caption."""
     row = np.concatenate(images, axis=1)
     bar = np.full((24, row.shape[1], 3), CAPTION_BACKGROUND, dtype=np.uint8)
     cv2.putText(
@@ -306,19 +307,19 @@ QUIET_S, POLL_S, WARM_UP_S = 5.0, 1.0, 600.0
 
 
 def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
-    """Run the whole demo; results lie below ``out`` afterwards.
+    """Run the whole demo and write the results to ``out``.
 
     Args:
-        out: folder; what an earlier demo left there is replaced.
+        out: output folder; results of an earlier demo are replaced.
         steps: clock steps of 0.1 s to drive; the shipped street ends after 100.
-        from_log: record a drive and reconstruct it without training, rather than unpack the
+        from_log: record a drive and reconstruct it without training, instead of unpacking the
             trained street that is shipped.
-        leave_serving: keep the worker up until Ctrl-C, and print what to try next.
+        leave_serving: keep the worker running until Ctrl-C, and print what to try next.
     """
     clock = StageTimer()
     scenes = _clear(out)
     with starting_worker(scenes=scenes, data=out / "worker", log_file=out / "worker.log") as worker:
-        # Loading libraries and unpacking take as long as the worker takes to start.
+        # Runs while the worker starts; both take about as long.
         _prepare_street(out, scenes, steps, clock, from_log=from_log)
 
         with connect(worker.url) as client:
@@ -349,14 +350,14 @@ def run(*, out: Path, steps: int, from_log: bool, leave_serving: bool) -> None:
 
 
 class StageTimer:
-    """Wall seconds by stage."""
+    """Wall-clock seconds by stage."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Measure the block as ``stage``, and say on the console that it runs."""
+        """Time the block as ``stage``, and print its name."""
         start = time.perf_counter()
         with console.status(stage) if console.is_terminal else nullcontext():
             yield
@@ -364,7 +365,7 @@ class StageTimer:
 
 
 def wait_ready(client: Client) -> None:
-    """Wait for the worker, and say what it does where that takes long.
+    """Wait for the worker, and print its state if this takes long.
 
     Raises:
         ReplyTimeoutError: it is not ready after ten minutes.
@@ -386,7 +387,7 @@ def wait_ready(client: Client) -> None:
 
 
 def _clear(out: Path) -> Path:
-    """Remove what an earlier demo left; the folder for scenes."""
+    """Remove the results of an earlier demo; return the folder for scenes."""
     for stale in ("log", "scenes", "worker"):
         shutil.rmtree(out / stale, ignore_errors=True)
     scenes = out / "scenes"
@@ -471,7 +472,7 @@ def _keep_serving(url: str, scenario_id: str) -> None:
 
 STILLS = 3
 FILM_WIDTH = 960
-"""Of the film; encoding the stills' size would take longer than rendering it."""
+"""Width of the film [px]; encoding at the size of the stills would take longer than rendering."""
 
 
 @dataclass
@@ -480,7 +481,7 @@ class FilmedDrive:
 
     Attributes:
         summary: figures of the episode.
-        path: [N, 2] world positions of the vehicle, one a step [m].
+        path: [N, 2] world positions of the vehicle, one per step [m].
         stills: a few frames of the film, by step.
     """
 
@@ -498,12 +499,12 @@ def drive_through(
     dt_us: int,
     video_path: Path,
 ) -> FilmedDrive:
-    """Let ``planner`` drive ``steps`` steps and film all cameras side by side.
+    """Drive ``steps`` steps with ``planner`` and film all cameras side by side.
 
     Args:
-        session: not yet opened; it is closed afterwards.
-        planner: who drives.
-        cameras: from left to right as they are to be shown.
+        session: unopened session; closed afterwards.
+        planner: planner that drives.
+        cameras: cameras from left to right.
         steps, dt_us: number and length [us] of clock steps.
         video_path: WebM file to write.
     """

@@ -1,7 +1,7 @@
-"""The street that the demo shows: shipped trained, or made anew from a synthetic drive.
+"""The street of the demo: shipped trained, or built from a synthetic drive.
 
-``python -m real2sim_server.demo.street FILE`` records and trains it again, in about a quarter of
-an hour on two cores.
+``python -m real2sim_server.demo.street FILE`` records and trains it again, in about a quarter of an
+hour on two cores.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from ..scene.io import SHIPPED_STREET, load_scene, read_packed, save_scene, writ
 
 SHIPPED = SHIPPED_STREET
 DURATION_S = 10.4
-"""Of the shipped drive: 100 steps of 0.1 s and a little to spare."""
+"""Duration of the shipped drive [s]: 100 steps of 0.1 s and a small margin."""
 TRAINING_HZ, UNTRAINED_HZ = 5.0, 2.0
 MAX_BACKGROUND, MAX_OBJECT = 250_000, 12_000
-"""A third of the usual number of Gaussians: enough for images of this size, and fast to draw."""
+"""Maximum numbers of Gaussians, a third of the defaults: enough for images of this size, and fast
+to render."""
 
 
 def unpack_street(scenes: Path, name: str) -> None:
@@ -37,7 +38,7 @@ def record_street(log: Path, *, duration_s: float, hz: float) -> None:
 
 
 def build_street(log: Path, scenes: Path, name: str) -> None:
-    """Make the bundle ``name`` from the log without training."""
+    """Build the bundle ``name`` from the log without training."""
     from ..reconstruct import InitialiseOptions, ReconstructOptions, reconstruct
 
     small = InitialiseOptions(max_background=MAX_BACKGROUND, max_object=MAX_OBJECT)

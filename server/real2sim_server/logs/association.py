@@ -25,7 +25,7 @@ WINDOW = 7
 """Window size in cells; wider than any vehicle, so that no roof counts as road."""
 
 LOWEST = 10.0
-"""Percentile of heights in a cell that counts as its lowest point; lower points are noise."""
+"""Percentile of heights in a cell that counts as its ground height; lower points are noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def _fill(heights: Float) -> Float:
 
 CELL = 0.35
 HEIGHTS = (0.25, 4.2)
-"""Only points this far above the ground [m] count: neither kerbs nor bridges."""
+"""Height range above the ground of points that are used [m]; excludes kerbs and bridges."""
 
 EGO_MARGIN = 0.6
 MIN_POINTS = 6
@@ -99,10 +99,10 @@ class LidarCluster:
 
     Attributes:
         points: [N, 3] world [m].
-        offset: [N] when each was measured, relative to the frame [s].
-        centre: [2] middle of the points' extent in the world [m].
+        offset: [N] time of measurement relative to the frame [s].
+        centre: [2] centre of the points' extent, world frame [m].
         ground: height of the ground below, world z [m].
-        sensor: [3] where the LiDAR was, world [m].
+        sensor: [3] position of the LiDAR, world frame [m].
     """
 
     points: Float
@@ -183,11 +183,11 @@ def _groups(points: Float, reach: float) -> list[NDArray[np.intp]]:
 # Distinguishes free space from occluded space.
 
 BEAM = 0.013
-"""A beam observes directions this near to its own [rad]."""
+"""Maximum angle to a beam at which it observes a direction [rad]."""
 
 NEIGHBOURS = 4
 SAME_RANGE = 0.4
-"""A beam that ends this near to a point hit the same surface [m]."""
+"""Maximum distance between the end of a beam and a point on the same surface [m]."""
 
 MIN_RANGE = 1.0
 
@@ -255,12 +255,12 @@ class KalmanState:
 
     @classmethod
     def first(cls, position: Float, deviation: float) -> KalmanState:
-        """At a measured ``position`` [2] with unknown velocity."""
+        """A state at a measured ``position`` [2] with unknown velocity."""
         variances = [deviation**2] * 2 + [INITIAL_SPEED**2] * 2
         return cls(np.array([*position, 0.0, 0.0]), np.diag(variances))
 
     def predict(self, seconds: float) -> KalmanState:
-        """After a time."""
+        """The state after ``seconds``."""
         transition = _transition(seconds)
         noise = _process_noise(seconds)
         return KalmanState(
@@ -325,10 +325,10 @@ DEVIATION = 0.5
 """Standard deviation of a cluster's centre between frames [m]: its visible part changes."""
 
 MAHALANOBIS_GATE = 3.5
-"""Farthest match, as a Mahalanobis distance."""
+"""Maximum Mahalanobis distance of a match."""
 
 DISTANCE_GATE = 3.0
-"""Farthest match [m]."""
+"""Maximum distance of a match [m]."""
 
 GATED_COST = 1e6
 
@@ -394,7 +394,7 @@ def _match(tracks: Sequence[Track], clusters: Sequence[LidarCluster], frame: int
 
 
 def _extent_change(track: Track, cluster: LidarCluster) -> float:
-    """How much the extent changes [m]: it distinguishes objects near each other."""
+    """Change of the extent [m]; distinguishes adjacent objects."""
     latest = track.clusters[track.last]
     one = np.ptp(latest.points[:, :2], axis=0)
     two = np.ptp(cluster.points[:, :2], axis=0)
@@ -409,10 +409,10 @@ BOX_DEVIATION = 0.15
 """Standard deviation of the centre of a fitted box [m]."""
 
 MIN_HEADING_SPEED = 0.7
-"""Below this speed [m/s] the direction of motion does not determine the heading."""
+"""Minimum speed at which the direction of motion determines the heading [m/s]."""
 
 EXTENT_PERCENTILE = 80.0
-"""Percentile of extents that counts as the size: the largest may have a neighbour in it."""
+"""Percentile of extents that is used as the size; the largest may include a neighbour."""
 
 
 TYPICAL_LENGTHS = ((1.85, 4.4), (2.5, 5.1), (np.inf, 6.5))
@@ -429,7 +429,7 @@ class FittedBox:
         headings: [T] [rad].
         velocities: [T, 2] world [m/s].
         size: (length, width, height) [m].
-        residual: of the measured middles, root mean square [m].
+        residual: root mean square deviation of the measured centres [m].
     """
 
     frames: NDArray[np.intp]
@@ -441,7 +441,7 @@ class FittedBox:
 
     @property
     def category(self) -> str:
-        """By its size."""
+        """Category according to the size."""
         length, width, height = self.size
         if length > 6.5 or height > 2.7:
             return "truck"
@@ -453,15 +453,15 @@ class FittedBox:
 
 
 def fit_box(clusters: Mapping[int, LidarCluster], times: Float) -> FittedBox:
-    """A box of the size observed over all frames, with a smooth path and headings along it.
+    """A box of the observed size over all frames, with a smooth path and headings along it.
 
-    A scanner sees only the near sides (an L from above), so the box is anchored to those: along
-    each of its axes the near face is at the first points, and the far face follows from the size. A
-    car seen only from behind gets a typical length.
+    A scanner sees only the near sides (an L from above), so these determine the position of the
+    box: along each of its axes the near face is at the first points, and the far face follows from
+    the size. A car seen only from behind gets a typical length.
 
     Args:
         clusters: by frame, in the world.
-        times: of all frames of the log [s].
+        times: times of all frames of the log [s].
     """
     frames = np.arange(min(clusters), max(clusters) + 1)
     rough = [clusters[f].centre if f in clusters else None for f in frames.tolist()]

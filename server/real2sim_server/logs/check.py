@@ -23,9 +23,9 @@ from .driving_log import ChecksFiles, DrivingLog, LidarSweep, LogError, ObjectTr
 # --- Files ----------------------------------------------------------------------------------------
 
 MAX_DISTANCE_M = 100_000.0
-"""Maximum distance from the world's origin; single precision is 8 mm there."""
+"""Maximum distance from the world origin [m]; single precision has a resolution of 8 mm there."""
 NAMED_FILES = 5
-"""How many bad images, and how many bad sweeps, are named in a summary."""
+"""Maximum number of bad images, and of bad sweeps, to name in a summary."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,9 @@ class LogCheck:
         return tuple(lines)
 
     def done(self) -> str:
-        """The checked parts, such as "headers of 120 images and 60 sweeps checked, contents of 3
-        sweeps read".
+        """The checked parts, in words.
+
+        For example "headers of 120 images and 60 sweeps checked, contents of 3 sweeps read".
         """
         headers = _listed((self.image_headers, "image"), (self.sweep_headers, "sweep"))
         contents = _listed((self.images, "image"), (self.sweeps, "sweep"))
@@ -87,7 +88,7 @@ class LogCheck:
         return ", ".join(told) or "there are no files to check"
 
     def raise_for_problems(self) -> None:
-        """Raise LogError with the :meth:`summary` where there are problems."""
+        """Raise LogError with the :meth:`summary` if there are problems."""
         if self.problems:
             raise LogError("\n".join(self.summary()))
 
@@ -220,16 +221,16 @@ def _tracks(log: DrivingLog) -> Iterator[str]:
 # hint names it.
 
 GAP_FACTOR = 1.6
-"""A frame is missing where the time step is this many times the usual one."""
+"""Time step, relative to the median, from which a frame counts as missing."""
 MIN_RATE, MAX_RATE = 0.2, 500.0
-"""Frame rates outside this range mean that times are hardly in microseconds [1/s]."""
+"""Plausible frame rates [1/s]; outside this range, times are probably not in microseconds."""
 PRECISE_DISTANCE_M = 10_000.0
-"""Distance from the world's origin at which the float32 of Gaussians is 1 mm."""
+"""Distance from the world origin at which the float32 resolution of Gaussians is 1 mm [m]."""
 MAX_EGO_SPEED = 70.0
 OFF_HEADING, RIGHT_HEADING = math.radians(45), math.radians(15)
 FRAME_OF_BOXES = "T_world_object, not of the vehicle's frame, x forward"
 MANY_OFF = 0.3
-"""Share of the vehicles; a few may drive backwards."""
+"""Minimum fraction of misaligned vehicles for a hint; a few may drive backwards."""
 DRIVEN_STEP_M = 0.3
 """Minimum distance of two poses for a direction of motion."""
 MIN_UP = 0.3
@@ -239,20 +240,20 @@ CAMERA_REACH = np.array([15.0, 4.0]), (-0.5, 6.0)
 NEAR_BOXES = 30.0
 FAR_BOXES = 150.0
 STANDING_M, FLOATS_M = 15.0, 0.6
-"""Range of boxes that should stand on the road, and their tolerance."""
+"""Maximum distance of boxes that are tested for ground contact, and tolerance [m]."""
 FEW_POINTS = 5
 BETWEEN_SWEEPS_M, SWEEPS_AHEAD = 1.5, 20
 """Distance of the ego between two compared sweeps, and maximum number of frames in between."""
 COMPARED_POINTS = 4000
 ABOVE_TRAFFIC_M, AROUND_BOX_M = 2.0, 0.3
 BETTER = 0.6
-"""An alternative alignment of sweeps is better if distances shrink by this factor."""
+"""Maximum distance ratio at which an alternative alignment of sweeps counts as better."""
 
 VEHICLES = ("car", "van", "truck", "bus")
 CATEGORIES = (*CLASS_OF_CATEGORY, "animal", "other")
 """Known categories of objects."""
 MANY_UNKNOWN = 0.2
-"""A share of all objects."""
+"""Minimum fraction of objects of an unknown category for a hint."""
 AXES_OF_CV = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """Columns: x right, y down, z forward, in a frame of x forward, y left, z up."""
 
@@ -287,7 +288,7 @@ def gaps_between(steps: Float) -> tuple[tuple[int, float], ...]:
 
 
 def ego_steps(log: DrivingLog) -> Float:
-    """Way of the ego from frame to frame, [F - 1] [m]."""
+    """Distance of the ego from frame to frame, [F - 1] [m]."""
     positions = np.array([log.ego.pose(int(t))[0] for t in log.frame_times_us])
     return np.asarray(np.linalg.norm(np.diff(positions, axis=0), axis=1))
 
@@ -491,7 +492,7 @@ def _boxes(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
 
 
 def _standing(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
-    """Whether nearby boxes stand on the road."""
+    """Whether nearby boxes touch the road."""
     bottoms = []
     for frame in sweeps:
         to_vehicle = invert_transform(log.ego.transform(int(log.frame_times_us[frame])))
@@ -585,8 +586,9 @@ def _compared_frames(log: DrivingLog) -> tuple[int, int] | None:
 
 
 def _standing_points(log: DrivingLog, frame: int) -> Float:
-    """Static points: outside boxes, and above the road and most traffic. The road fits itself under
-    any motion.
+    """Static points: outside boxes, and above the road and most traffic.
+
+    Road points would match under any motion.
     """
     sweep = log.lidar(frame)
     points = sweep.points.astype(np.float64)

@@ -25,7 +25,7 @@ EDGES = (
     (0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7),
     (0, 3), (1, 2),
 )  # fmt: skip
-"""Edges between corners, and a cross on the front."""
+"""Edges between corners, and a cross on the front face."""
 
 
 def draw_frame(log: DrivingLog, camera: str, frame: int) -> NDArray[np.uint8]:
@@ -55,7 +55,7 @@ def draw_frame(log: DrivingLog, camera: str, frame: int) -> NDArray[np.uint8]:
 
 
 def colour_of(object_id: str) -> tuple[int, int, int]:
-    """A lively colour, always the same for the same object."""
+    """A bright colour that depends only on the object id."""
     number = sum(ord(c) * (i + 7) for i, c in enumerate(object_id))
     red, green, blue = colorsys.hsv_to_rgb(number * 0.61803 % 1.0, 0.75, 1.0)
     return round(red * 255), round(green * 255), round(blue * 255)

@@ -55,10 +55,10 @@ class ObjectTrack:
     trajectory: Trajectory
 
     def transform_near(self, t_us: int, *, reach_us: int = 60_000) -> Float | None:
-        """``T_world_object`` [4, 4] at ``t_us``, or None when the object is not there.
+        """``T_world_object`` [4, 4] at ``t_us``, or None if the object is not present.
 
-        Boxes hold for the frames' time stamps, but images are taken around them: up to
-        ``reach_us`` before its first and after its last box the object stays where it is there.
+        Boxes refer to the time stamps of frames, but images are taken around them. Up to
+        ``reach_us`` before its first and after its last box, the object keeps that pose.
         """
         path = self.trajectory
         if not path.start_us - reach_us <= t_us <= path.end_us + reach_us:
@@ -96,16 +96,16 @@ class FrameSource(Protocol):
 
 @runtime_checkable
 class ChecksFiles(Protocol):
-    """A source that checks its files by their headers, without reading all of their contents."""
+    """A source that checks files by their headers, without reading all of their contents."""
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is missing, cut off or of another size."""
+        """Raise LogError if the image is missing, truncated or of another size."""
         ...
 
     def check_sweep(self, frame: int) -> int | None:
         """Number of points according to the sweep's header; None if it has none.
 
-        Raises LogError when the sweep is missing, truncated or lacks arrays of the right shape.
+        Raises LogError if the sweep is missing, truncated or lacks arrays of the right shape.
         """
         ...
 
@@ -132,16 +132,16 @@ class DrivingLog:
 
     Attributes:
         name: short name, from the folder.
-        rig: calibrated cameras, distortion already removed from the images.
+        rig: calibrated cameras; images are already undistorted.
         frame_times_us: [F] int64 [us], increasing.
         ego: ``T_world_vehicle`` at least over all frames (rear axle centre on the ground).
         tracks: every tracked object, in a stable order.
-        source: of images and sweeps.
+        source: reads images and sweeps.
         ego_size: (length, width, height) of the recording vehicle [m].
         provenance: dataset, sequence, licence, reader (JSON values only).
         image_times_us: [F] int64 [us] by camera, actual times of its images if they differ from the
             frame's time stamp; see :meth:`image_time_us`.
-        lanes: of the log's map, in its world frame; None without one.
+        lanes: lanes of the log's map, in its world frame; None without a map.
         logged_map: location of a map that has not been read; None without one.
     """
 
@@ -222,7 +222,7 @@ class LogSelection:
         first: index of the first frame.
         stop: index after the last frame; None for the log's end.
         every: use every Nth of these frames.
-        cameras: names; None for all.
+        cameras: camera names; None for all.
     """
 
     first: int = 0
@@ -232,7 +232,7 @@ class LogSelection:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every log is selected completely."""
+        """Whether it selects the complete log."""
         return self == LogSelection()
 
 
@@ -311,7 +311,7 @@ class _SelectedFrames:
 
 
 class _SelectedFiles(_SelectedFrames):
-    """The same of a source that checks its files."""
+    """``_SelectedFrames`` for a source that checks its files."""
 
     def check_image(self, camera: str, frame: int) -> None:
         self._files.check_image(camera, self._frames[frame])
@@ -353,7 +353,7 @@ def _is_there(track: ObjectTrack, start_us: int, end_us: int) -> bool:
 
 
 def _told(log: DrivingLog, frames: range, cameras: tuple[str, ...] | None) -> dict[str, Any]:
-    """Numbers of the whole log, also where a part of a part is taken."""
+    """The selection in frame indices of the whole log, even for a part of a part."""
     before = log.provenance.get(SELECTION)
     if isinstance(before, dict):
         frames = range(*before["frames"])[frames.start : frames.stop : frames.step]

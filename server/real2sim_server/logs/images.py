@@ -118,7 +118,7 @@ def check_encoded_image(data: bytes, where: str, size: tuple[int, int] | None = 
     """Check an encoded image without decoding it.
 
     Raises:
-        LogError: it is no PNG or JPEG, its end is missing, or it has another (width, height).
+        LogError: it is not a PNG or JPEG, its end is missing, or it has another (width, height).
     """
     found = encoded_size(data, where)
     # Some writers pad their files, so the end marker may be followed by a few bytes.

@@ -39,16 +39,16 @@ class LogReport:
         name, dataset, sequence, reader, licence: origin.
         cameras: the rig.
         frames: number of frames.
-        duration: from the first to the last frame [s].
+        duration: time from the first to the last frame [s].
         rate: frames per second, 0 for a single frame.
         gaps: (frame before the gap, its length [s]).
-        lidar_points: of the inspected sweeps, minimum, median and maximum; zeros if none can be
+        lidar_points: minimum, median and maximum of the inspected sweeps; zeros if none can be
             read.
         lidar_range: 99th percentile of distances [m].
         tracks: number of objects by category.
         moving: number of moving objects by category.
         ego_distance: driven distance [m].
-        ego_speed: maximum [m/s].
+        ego_speed: maximum speed [m/s].
         questions: suspicious properties, in plain words; empty for a good log.
         problems: unreadable parts of the inspected frames, one sentence each.
         drawings: files that were written.
@@ -75,11 +75,11 @@ class LogReport:
     drawings: tuple[str, ...] = field(default=())
 
     def as_json(self) -> dict[str, Any]:
-        """JSON values only."""
+        """The report as JSON values."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Readable report, one fact per line; without the problems."""
+        """The report as readable lines, one fact each; without the problems."""
         rate = f", {self.rate:.4g} a second" if self.rate else ""
         least, median, most = self.lidar_points
         lines = [
@@ -196,7 +196,7 @@ def _draw(
 
 
 def _montage(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Pictures side by side, up to three in a row, all made equally wide."""
+    """Pictures side by side, up to three in a row, scaled to equal width."""
     import cv2
 
     width = min(PICTURE_WIDTH if len(pictures) > 1 else 1920, max(p.shape[1] for p in pictures))

@@ -28,7 +28,7 @@ MIN_STRAIGHTNESS = 0.6
 """Minimum displacement as a fraction of the path length; lower values are jitter."""
 
 MIN_FREE_FRACTION = 0.6
-"""Least fraction of the tested points at former positions that must be seen to be empty."""
+"""Minimum fraction of the tested points at former positions that are observed free."""
 
 MIN_TESTED_POINTS = 20
 MAX_TESTED_POINTS = 200
@@ -37,7 +37,7 @@ RAYS_EVERY = 4
 MARGIN = 0.3
 EGO_PART_MOTION, EGO_PART_SIZE = 0.4, 1.2
 MAX_RESIDUAL = 0.5
-"""A track with a larger residual of its fit [m] contains several objects."""
+"""Maximum residual of a fit [m]; a track with a larger one contains several objects."""
 
 JOIN_SPEED = 1.5
 MAX_COMMON_APART = 4
@@ -77,7 +77,7 @@ def track_moving_objects(
     its former positions.
 
     Args:
-        log: with LiDAR; its tracks are ignored.
+        log: log with LiDAR; its tracks are ignored.
         options: see :class:`TrackingOptions`.
         on_progress: called with (done, total) after each sweep.
 
@@ -117,7 +117,7 @@ def _sweep_rays(sweep: LidarSweep, pose: Float) -> SweepRays:
 
 
 def _has_moved(track: Track, times: Float, options: TrackingOptions) -> bool:
-    """A first, cheap test: half of the distance and speed that count in the end."""
+    """A fast first test with half of the required distance and speed."""
     if len(track.clusters) < max(3, options.least_frames // 2):
         return False
     frames = sorted(track.clusters)
@@ -132,7 +132,7 @@ def _has_moved(track: Track, times: Float, options: TrackingOptions) -> bool:
 
 
 def _merge_tracks(tracks: Sequence[Track], times: Float) -> list[dict[int, LidarCluster]]:
-    """Merge the tracks of one object: parts side by side, and tracks that were cut in two."""
+    """Merge the tracks of one object: parts next to each other, and interrupted tracks."""
     parts = [dict(t.clusters) for t in tracks]
     boxes = [fit_box(p, times) for p in parts]
     merged = True
@@ -267,10 +267,10 @@ def _named_tracks(log: DrivingLog, boxes: Sequence[FittedBox]) -> tuple[ObjectTr
 
 # --- Merging -------------------------------------------------------------------------------------
 
-# Found tracks beside those of the log.
+# Detected tracks in addition to those of the log.
 
 INSTANTS = 9
-"""How many instants of their common time tell whether two tracks are one object's."""
+"""Number of common instants at which two tracks are compared."""
 
 
 def merge_tracks(

@@ -29,13 +29,13 @@ CALMER, BOLDER = 5.0, 0.2
 MAX_STEP = 0.5
 """Maximum change of the logarithm of a factor in one step."""
 PATIENCE = 3
-"""Rejected steps in a row after which slopes are taken over a wider span."""
+"""Number of consecutive rejected steps after which slopes use a wider span."""
 SPANS = (0.1, 0.03, 0.01)
-"""Those spans, of the logarithm of a factor, one after the other."""
+"""These spans in order, in the logarithm of a factor."""
 REACHED = 1e-9
-"""Residuals below this are rounding [m]."""
+"""Residuals below this are rounding errors [m]."""
 FLAT = 1e-12
-"""A parameter whose curvature is below this fraction of the largest is left where it is."""
+"""Minimum curvature of a parameter relative to the largest; others keep their values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def calibrate(
     every: int,
     steps: int = 30,
 ) -> Calibration:
-    """Fit factors so that a body's particles go where they were observed.
+    """Fit factors so that a body's particles move as observed.
 
     A step that increases the residual is rejected and shortened (Levenberg 1944, Marquardt 1963).
     Contacts start a substep earlier or later as parameters change, so trajectories are piecewise
@@ -196,8 +196,8 @@ def jacobian(path: Callable[[Tensor], Tensor], logs: Tensor) -> Tensor:
         return tangent.reshape(-1)
 
     with warnings.catch_warnings():
-        # Torch compiles its own forward rules by a function it has deprecated, and lacks a batched
-        # rule for an operation or two.
+        # Torch's forward rules use a function that it has deprecated, and some operations lack a
+        # batched rule.
         warnings.simplefilter("ignore", DeprecationWarning)
         warnings.simplefilter("ignore", UserWarning)
         return torch.func.vmap(along)(torch.eye(len(logs), dtype=logs.dtype)).T

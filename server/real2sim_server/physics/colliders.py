@@ -299,7 +299,7 @@ def _rotation(rotation_vector: Float) -> Float:
 
 TRIANGLES_MAX = 20_000
 FLAT = 1e-10
-"""Triangles whose height is below this fraction of the mesh are degenerate."""
+"""Minimum height of a triangle relative to the mesh; flatter ones are degenerate."""
 _SIDES = ((0, 1), (1, 2), (2, 0))
 """Edges of a triangle, in the order of their pseudonormals."""
 

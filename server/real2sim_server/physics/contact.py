@@ -1,9 +1,9 @@
 """Contact of bodies with colliders and with each other; functions shared by all devices.
 
-Colliders are packed rows with one distance function for all shapes. Contact acts on grid nodes,
-which may all miss a collider that is thin compared with the cells. Thin colliders therefore also
-act on particles: the kernel follows a particle's path through the substep to the first touch and
-removes the velocity that would move it further inside, independently of the grid.
+Colliders are packed rows with one distance function for all shapes. Contact acts on grid nodes. A
+collider that is thin compared with the cells can fall between the nodes, so thin colliders also act
+on particles: the kernel follows a particle's path through the substep to the first touch and
+removes the velocity that would move it further inside.
 """
 
 # Kernels take arrays by position: Numba has no keyword-only arguments.
@@ -21,35 +21,36 @@ from .numerics import F32, ONE, TINY, ZERO, device_function
 PLANE, BOX, HEIGHT_FIELD, CYLINDER, CAPSULE, MESH = range(6)
 
 KIND, FRICTION, SEPARABLE = 0, 1, 2
-"""FRICTION is negative where the body's own holds."""
+"""A negative FRICTION selects the coefficient of the body."""
 POINT, AXES, HALF_SIZE = 3, 6, 15
-"""A plane's normal lies in the first three of AXES, a solid's rotation (world from it) in all. Of a
-cylinder and a capsule HALF_SIZE holds the radius and half of the height or length."""
+"""AXES holds a plane's normal (first three numbers) or a solid's rotation (world from solid).
+HALF_SIZE of a cylinder or a capsule is its radius and half its height or length."""
 SPIN, SPEED = 18, 21
-"""Angular and linear velocity, world axes."""
+"""Angular and linear velocity, world axes [rad/s], [m/s]."""
 FIRST_HEIGHT, COUNT_X, COUNT_Y, SPACING = 24, 25, 26, 27
-"""Of a height field, from where on its heights stand among those of all."""
+"""Height field: offset of its first height in ``heights``, number of samples, spacing [m]."""
 FIRST_NODE, NODES, HALF_THICKNESS = 24, 25, 27
-"""Of a mesh, from where on its boxes and then its triangles stand there, how many boxes there are,
-and half the thickness of a sheet, 0 for a closed body."""
+"""Mesh: offset of its bounding boxes in ``heights``, followed by its triangles; number of boxes;
+half the thickness of a sheet [m], 0 for a closed mesh."""
 THIN = 28
-"""1 where a box is thinner than cells of the grid; see ``resolve_particle_collider``."""
+"""1 if the collider is thin compared with the cells; see ``resolve_particle_collider``."""
 COLLIDER_ROW = 29
 MESH_NODE = 8
-"""Numbers of a box of a mesh: low (3), high (3), the box after all within it, triangle or -1."""
+"""Numbers per bounding box of a mesh: low (3), high (3), index of the next box outside its subtree,
+triangle or -1."""
 MESH_TRIANGLE = 30
-"""Numbers of a triangle: corners (9), pseudonormals of face, edges 01, 12, 20, and corners."""
+"""Numbers per triangle: corners (9), pseudonormals of the face, edges 01, 12, 20, and corners."""
 ON_SURFACE = 1e-9
-"""Nearer to a mesh than this the pseudonormal is taken for the direction away from it [m]."""
+"""Closer to a mesh than this, the normal is the pseudonormal [m]."""
 
 
 @device_function
 def collider_distance(row: Any, heights: Any, x: Any, y: Any, z: Any) -> Any:
-    """Signed distance [m] of a point [m] to a collider, and the unit normal out of it.
+    """Signed distance [m] of a point [m] to a collider, and the outward unit normal.
 
     Args:
         row: packed collider, columns above.
-        heights: of all height fields and meshes, one after the other.
+        heights: concatenated data of all height fields and meshes.
     """
     kind = int(row[KIND])
     if kind == PLANE:
@@ -72,7 +73,7 @@ def collider_distance(row: Any, heights: Any, x: Any, y: Any, z: Any) -> Any:
 
 @device_function
 def into_frame(row: Any, x: Any, y: Any, z: Any) -> Any:
-    """A point of the world in the frame of a solid [m]."""
+    """A world point in the frame of a solid [m]."""
     px, py, pz = x - row[POINT], y - row[POINT + 1], z - row[POINT + 2]
     qx = row[AXES] * px + row[AXES + 3] * py + row[AXES + 6] * pz
     qy = row[AXES + 1] * px + row[AXES + 4] * py + row[AXES + 7] * pz
@@ -82,7 +83,7 @@ def into_frame(row: Any, x: Any, y: Any, z: Any) -> Any:
 
 @device_function
 def out_of_frame(row: Any, n: Any) -> Any:
-    """A direction in the frame of a solid in the world."""
+    """A direction, from the frame of a solid to the world frame."""
     return (
         row[AXES] * n[0] + row[AXES + 1] * n[1] + row[AXES + 2] * n[2],
         row[AXES + 3] * n[0] + row[AXES + 4] * n[1] + row[AXES + 5] * n[2],
@@ -92,7 +93,7 @@ def out_of_frame(row: Any, n: Any) -> Any:
 
 @device_function
 def box_distance(row: Any, x: Any, y: Any, z: Any) -> Any:
-    """Distance to an oriented box; inside it the normal is that of the nearest face."""
+    """Distance to an oriented box; inside, the normal is that of the nearest face."""
     qx, qy, qz = into_frame(row, x, y, z)
     dx = abs(qx) - row[HALF_SIZE]
     dy = abs(qy) - row[HALF_SIZE + 1]
@@ -114,7 +115,7 @@ def box_distance(row: Any, x: Any, y: Any, z: Any) -> Any:
 
 @device_function
 def cylinder_distance(radius: Any, half: Any, q: Any) -> Any:
-    """Distance to a cylinder about z; inside it the normal is that of the nearest side or end."""
+    """Distance to a cylinder about z; inside, the normal is that of the nearest side or end."""
     across = math.sqrt(q[0] * q[0] + q[1] * q[1])
     cx, cy = 1.0, 0.0
     if across > 0.0:
@@ -133,7 +134,7 @@ def cylinder_distance(radius: Any, half: Any, q: Any) -> Any:
 
 @device_function
 def capsule_distance(radius: Any, half: Any, q: Any) -> Any:
-    """Distance to all within ``radius`` of a line along z."""
+    """Distance to a capsule along z."""
     z = q[2] - min(max(q[2], -half), half)
     length = math.sqrt(q[0] * q[0] + q[1] * q[1] + z * z)
     if length > 0.0:
@@ -143,7 +144,7 @@ def capsule_distance(radius: Any, half: Any, q: Any) -> Any:
 
 @device_function
 def mesh_distance(row: Any, data: Any, q: Any) -> Any:
-    """Distance to a closed mesh, signed, or to a sheet; the normal at the nearest place of it."""
+    """Distance to a closed mesh (signed) or to a sheet, and the normal at the nearest point."""
     first, count = int(row[FIRST_NODE]), int(row[NODES])
     triangles = first + MESH_NODE * count
     best, found, part = math.inf, triangles, 0
@@ -180,9 +181,9 @@ def mesh_distance(row: Any, data: Any, q: Any) -> Any:
 
 @device_function
 def nearest_of_triangle(data: Any, at: Any, q: Any) -> Any:
-    """The place on a triangle that is nearest to a point, and which part of it that lies on.
+    """The nearest point on a triangle, and the feature it is on.
 
-    Parts are numbered as pseudonormals are: 0 the face, 1 to 3 edges, 4 to 6 corners (Ericson 2005,
+    Features are numbered like pseudonormals: 0 face, 1 to 3 edges, 4 to 6 corners (Ericson 2005,
     5.1.5).
     """
     ax, ay, az = data[at], data[at + 1], data[at + 2]
@@ -216,7 +217,7 @@ def nearest_of_triangle(data: Any, at: Any, q: Any) -> Any:
 
 @device_function
 def height_distance(row: Any, heights: Any, x: Any, y: Any, z: Any) -> Any:
-    """Distance to bilinear ground, along the normal under the point."""
+    """Distance to bilinear ground, along the normal at the point's x and y."""
     first, nx, ny = int(row[FIRST_HEIGHT]), int(row[COUNT_X]), int(row[COUNT_Y])
     u = min(max((x - row[POINT]) / row[SPACING], 0.0), float(nx - 1))
     v = min(max((y - row[POINT + 1]) / row[SPACING], 0.0), float(ny - 1))
@@ -245,25 +246,26 @@ def collider_velocity(row: Any, x: Any, y: Any, z: Any) -> Any:
 
 @device_function
 def unit(x: Any, y: Any, z: Any) -> Any:
-    """Direction of a vector and its length; the zero vector stays zero."""
+    """Direction and length of a vector; the zero vector stays zero."""
     length = math.sqrt(x * x + y * y + z * z)
     inverse = 1.0 / max(length, TINY)  # type: ignore[operator]
     return (x * inverse, y * inverse, z * inverse), length
 
 
-# Where surfaces are at a grid node, and what contact does to velocities.
+# Surfaces seen from a grid node, and the velocity after contact.
 
 REACH = F32(1.5)
-"""Half width of the spline: a node sees particles up to this many cells away."""
+"""Half width of the spline [cells]: a node sees particles up to this distance."""
 _ENTRIES = 256
 STICKS = F32(1e6)
-"""Stands for infinite friction, which times no pressure would be no number."""
+"""Represents infinite friction: infinity times a pressure of zero would be NaN."""
 
 
 def _half_space_tables() -> Any:
-    """What a node sees of a body that fills u > surface, as the surface passes it [cells].
+    """Lookup tables for a half-space u > surface seen from a node [cells].
 
-    Two tables at even steps: surface by centroid in [0, 1.5], and first moment by filled fraction.
+    Two tables with even steps: surface by centroid in [0, 1.5], and first moment by filled
+    fraction.
     """
     u = np.linspace(-1.5, 1.5, 60_001)
     a = np.abs(u)
@@ -281,22 +283,22 @@ def _half_space_tables() -> Any:
 
 SURFACE, FLAT_MOMENT = _half_space_tables()
 OPPOSED = F32(0.5)
-"""Surfaces are in contact only where the cosine between their normals is beyond this."""
+"""Minimum cosine between opposed surface normals for contact."""
 INSIDE = F32(0.25)
-"""A body whose centroid is this near a node is all around it, and has no normal there [cells]."""
+"""A body with its centroid this close to a node surrounds it and has no normal there [cells]."""
 CRUSHED = F32(1.1)
-"""Volumes at rest that what has been crushed has in a cell, at least; a whole body that slides past
-a node is all around it too, but as dense as it was."""
+"""Minimum rest volumes per cell of a crushed body. An intact body that slides past a node also
+surrounds it, but at its rest density."""
 
 
 @device_function
 def surface_offset(centroid: Any) -> Any:
-    """Where a body's surface lies along its inward normal, seen from a node [cells].
+    """Surface of a body along its inward normal, seen from a node [cells].
 
     Args:
-        centroid: offset of the centroid of the body's mass near the node [cells], inwards.
+        centroid: inward offset of the centroid of the body's mass near the node [cells].
 
-    The body is taken as a half-space. Deep inside this is -1.5: further than the node can see.
+    The body is approximated by a half-space. Deep inside, the result is -1.5.
     """
     if centroid <= ZERO:
         return -REACH + ZERO * centroid
@@ -309,19 +311,19 @@ def surface_offset(centroid: Any) -> Any:
 
 @device_function
 def face_score(moment: Any, filled: Any) -> Any:
-    """How well a body's first moment [cells] tells the normal: how large, and how like a face.
+    """How well a body's first moment [cells] determines the normal; higher for faces.
 
     Args:
         moment: length of the first moment of the filled fraction.
         filled: filled fraction of the node's surroundings.
 
-    Among bodies of one filled a face has the largest moment; edges and corners have less.
+    At a given filled fraction, a face has the largest moment; edges and corners have less.
     """
     scaled = min(filled, ONE) * F32(_ENTRIES)
     index = min(int(scaled), _ENTRIES - 1)
     fraction = scaled - F32(index)
     flat = FLAT_MOMENT[index] + fraction * (FLAT_MOMENT[index + 1] - FLAT_MOMENT[index])
-    # More than a face is no face: what is packed has large moments and is filled more than whole.
+    # Compressed material has larger moments than a face, and a filled fraction above 1.
     likeness = min(moment / max(flat, F32(1e-3)), ONE)
     return likeness * likeness * moment
 
@@ -331,12 +333,12 @@ def coulomb(v: Any, n: Any, friction: Any, separable: Any) -> Any:
     """Relative velocity after contact: no approach along ``n``, Coulomb friction across it.
 
     Args:
-        v: velocity relative to the other, three numbers.
-        n: unit normal out of the collider_rows.
-        friction: Coulomb coefficient; from STICKS on nothing slides.
-        separable: false keeps the normal velocity at zero when it points away, too.
+        v: [3] velocity relative to the other body or collider [m/s].
+        n: outward unit normal of the other.
+        friction: Coulomb coefficient; nothing slides from STICKS on.
+        separable: if false, the contact also keeps the bodies from separating.
 
-    v_t' = max(0, 1 - mu |v_n| / |v_t|) v_t. Takes kinetic energy or leaves it, never adds any.
+    v_t' = max(0, 1 - mu |v_n| / |v_t|) v_t. Never adds kinetic energy.
     """
     approach = v[0] * n[0] + v[1] * n[1] + v[2] * n[2]
     if approach >= ZERO and separable:
@@ -351,25 +353,23 @@ def coulomb(v: Any, n: Any, friction: Any, separable: Any) -> Any:
     return keep * t[0], keep * t[1], keep * t[2]
 
 
-# Contact at one node, of a body with a collider or of two bodies. Arrays are rows of one node:
-# velocity and mass [4], first moment of volume and volume [4], and the totals [TOTALS] of one
-# touch.
+# Contact at one node, of a body with a collider or of two bodies. Array arguments are rows of the
+# node: velocity and mass [4], first moment of volume and volume [4], and contact totals [TOTALS].
 
 
 ON_FACE = 1e-4
-"""A node this near to a face of a thin solid, or to half a cell beyond its edges, lies in it
-[cells]: centroids are known up to rounding, and nodes often lie on faces."""
+"""A node this close to a face of a thin solid, or to half a cell beyond its edges, counts as on it
+[cells]. Centroids have rounding errors, and nodes often coincide with faces."""
 THIN_MARGIN = 0.2
-"""Nodes stop a body this much before it meets a thin solid [cells]: on the way to rest it still
-sinks by up to a third of a cell, and what particles must stop themselves loses its elastic
-energy."""
+"""Nodes stop a body this far in front of a thin solid [cells]. The body still sinks in by up to a
+third of a cell as it stops, and contact of particles loses its elastic energy."""
 
 
 @device_function
 def resolve_node_collider(
     row: Any, heights: Any, dx: Any, body_friction: Any, at: Any, node: Any, moment: Any, total: Any
 ) -> None:
-    """Contact of one body's node at ``at`` with one collider, where surfaces have met."""
+    """Contact of one body's node at ``at`` with one collider, if the surfaces touch."""
     margin = 0.0
     if row[THIN] > 0.5:
         distance, n = distance_behind(row, heights, dx, at, moment)
@@ -388,12 +388,11 @@ def resolve_node_collider(
 
 @device_function
 def distance_behind(row: Any, heights: Any, dx: Any, at: Any, moment: Any) -> Any:
-    """Distance [m] of a node to the face of a thin solid that the body looks at; the normal.
+    """Distance [m] of a node to the face of a thin solid on the body's side, and the normal.
 
-    A node of the grid may lie beyond a thin solid and still stand for what is before it. The
-    centroid of the body's volume near the node tells the side, and the solid counts as thick behind
-    the face there, or the plane that touches it there, as far across as half a cell beyond its
-    edges.
+    A node behind a thin solid can represent material in front of it. The centroid of the body's
+    volume near the node determines the side. Behind that face, or behind its tangent plane, the
+    solid counts as thick, up to half a cell beyond its edges.
     """
     per_volume = dx / moment[3]
     out = (moment[0] * per_volume, moment[1] * per_volume, moment[2] * per_volume)
@@ -411,7 +410,7 @@ def distance_behind(row: Any, heights: Any, dx: Any, at: Any, moment: Any) -> An
 def apply_contact(
     node: Any, n: Any, u: Any, friction: Any, separable: Any, at: Any, total: Any
 ) -> None:
-    """Touch of a node with a collider that moves at ``u``; adds to the touch's totals."""
+    """Contact of a node with a collider that moves at ``u``; adds to the totals."""
     relative = (node[0] - u[0], node[1] - u[1], node[2] - u[2])
     after = coulomb(relative, n, friction, separable)
     change = (after[0] - relative[0], after[1] - relative[1], after[2] - relative[2])
@@ -425,7 +424,7 @@ def apply_contact(
 
 @device_function
 def record_impulse(impulse: Any, slip: Any, other: Any, at: Any, fraction: Any, total: Any) -> None:
-    """Add an impulse at a place, the friction work and the work it did; see ``base.TOTALS``."""
+    """Add an impulse at a point, its friction work and its work; see ``model.TOTALS``."""
     px, py, pz = impulse
     total[0] += px
     total[1] += py
@@ -448,12 +447,12 @@ def resolve_node_pair(
     node_a: Any, node_b: Any, moment_a: Any, moment_b: Any,
     friction: Any, dx: Any, at: Any, total_a: Any, total_b: Any,
 ) -> None:  # fmt: skip
-    """Contact of two bodies at a node, where their surfaces have met.
+    """Contact of two bodies at a node, if their surfaces touch.
 
-    The normal is that of the body that shows more of a face, or edges would plough through faces;
-    surfaces that do not look at each other pass by, unless one body has been crushed and is all
-    around the node, and so has no surface there. Each surface lies where a half-space with that
-    centroid has it.
+    The normal is that of the body whose surface there is more like a face; the normal of an edge
+    would let it plough through a face. There is no contact between surfaces that do not face each
+    other, unless one body is crushed and surrounds the node. Each surface is that of a half-space
+    with the same centroid.
     """
     ma, mb = node_a[3], node_b[3]
     volume_a, volume_b = moment_a[3], moment_b[3]
@@ -491,17 +490,18 @@ def resolve_node_pair(
 
 
 THIN_CELLS = 2.0
-"""A solid thinner than this many cells is thin, and so is every mesh: fewer than two layers of
-nodes may lie in it, and one layer does not stop what is pressed on it (measured: plates of 1.5
-cells leak at some places of the grid, those of 2 cells at none)."""
+"""A solid thinner than this many cells counts as thin, and so does every mesh. It can contain less
+than two layers of nodes, and one layer leaks under pressure (measured: plates of 1.5 cells leak at
+some positions on the grid, plates of 2 cells at none)."""
 SINK = 0.5
-"""Particles stop this far before a face, in halves of their spacing: so nodes stop a body first."""
+"""Distance to a face at which particles stop, in halves of their spacing. Nodes stop a body first.
+"""
 TOUCHING = 1e-3
-"""A particle nearer to where it stops than this touches, in halves of its spacing."""
+"""Tolerance of that distance for a touch, in halves of the spacing."""
 LOOKS = 12
 """Maximum number of sphere tracing steps along a particle's path."""
 MISSES = 2.0
-"""Fraction of a path that stands for no contact."""
+"""Fraction of a path that means no contact."""
 
 
 @device_function
@@ -512,13 +512,13 @@ def half_spacing(volume: Any) -> Any:
 
 @device_function
 def entry(q: Any, w: Any, stop: Any, tolerance: Any, holds: Any) -> Any:
-    """Fraction of a way along one axis until ``stop`` is reached from outside; or MISSES.
+    """Fraction of a path along one axis at which ``stop`` is reached from outside, or MISSES.
 
     Args:
-        q, w: place and way along the axis, from the centre of the box [m].
-        stop: how far from the centre particles stop [m].
+        q, w: position and displacement along the axis, from the centre of the box [m].
+        stop: distance from the centre at which particles stop [m].
         tolerance: [m].
-        holds: whether what has touched is held.
+        holds: whether the contact is not separable.
     """
     gap = abs(q) - stop
     if gap < -tolerance:
@@ -533,13 +533,13 @@ def entry(q: Any, w: Any, stop: Any, tolerance: Any, holds: Any) -> Any:
 
 @device_function
 def first_touch(row: Any, heights: Any, at: Any, way: Any, half: Any) -> Any:
-    """Fraction of a way after which a particle touches a thin solid, and the normal out of it.
+    """Fraction of a path at which a particle touches a thin solid, and the outward normal.
 
     Args:
         row, heights: packed solid, see ``collider_distance``.
-        at: the particle at the start [m].
-        way: that it goes relative to the solid [m].
-        half: half the spacing of particles [m].
+        at: start position of the particle [m].
+        way: its displacement relative to the solid [m].
+        half: half the particle spacing [m].
 
     Returns:
         Fraction in [0, 1], or MISSES, and the unit normal.
@@ -551,9 +551,10 @@ def first_touch(row: Any, heights: Any, at: Any, way: Any, half: Any) -> Any:
 
 @device_function
 def touch_of_surface(row: Any, heights: Any, at: Any, way: Any, half: Any) -> Any:
-    """The same for any solid, by its distance alone: never further than that at once.
+    """``first_touch`` for any solid, by sphere tracing along its distance function.
 
-    Particles are balls here, or round posts would pass between their rows.
+    Particles are balls with the radius ``half``, so that round posts do not pass between their
+    rows.
     """
     length = math.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
     stop, near = half, TOUCHING * half
@@ -577,8 +578,11 @@ def touch_of_surface(row: Any, heights: Any, at: Any, way: Any, half: Any) -> An
 
 @device_function
 def face_on(row: Any, way: Any, length: Any, n: Any, half: Any) -> Any:
-    """The normal ``n`` of a touch, turned against the way where a round post is thinner than
-    particles are apart: it stops those of both rows beside it, and does not part them."""
+    """The normal ``n`` of a touch, turned against the motion for round posts thinner than the
+    spacing.
+
+    Such a post stops the particle rows on both sides instead of parting them.
+    """
     kind = int(row[KIND])
     if not CYLINDER <= kind <= CAPSULE or row[HALF_SIZE] >= half:
         return n
@@ -595,10 +599,10 @@ def face_on(row: Any, way: Any, length: Any, n: Any, half: Any) -> Any:
 
 @device_function
 def touch_of_box(row: Any, at: Any, way: Any, half: Any) -> Any:
-    """The same for a box.
+    """``first_touch`` for a box.
 
-    A particle stops before any of the six faces that it meets within half a spacing of its edges,
-    so that a post cannot pass between two rows of particles, nor push them aside.
+    A particle stops in front of a face if it meets the face within half a spacing beyond its edges.
+    A post therefore does not pass between two rows of particles or push them aside.
     """
     px, py, pz = at[0] - row[POINT], at[1] - row[POINT + 1], at[2] - row[POINT + 2]
     t, axis, sign = MISSES, 0, 1.0
@@ -631,9 +635,9 @@ def resolve_particle_collider(
     row: Any, heights: Any, dt: Any, body_friction: Any, volume: Any, at: Any, v: Any, m: Any,
     total: Any,
 ) -> Any:  # fmt: skip
-    """Velocity of a particle at ``at`` once a thin collider has had its say; adds to the totals.
+    """Velocity of a particle at ``at`` after contact with a thin collider; adds to the totals.
 
-    What brings it to the surface within the substep stays, so that it comes to lie on it.
+    Keeps the velocity that brings the particle to the surface within the substep.
     """
     u = collider_velocity(row, at[0], at[1], at[2])
     relative = (v[0] - u[0], v[1] - u[1], v[2] - u[2])

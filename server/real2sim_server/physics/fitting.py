@@ -23,26 +23,27 @@ from .errors import PhysicsError, SolverError
 from .solver import Solver, SolverOptions
 
 SPANS = (0.2, 0.1, 0.05)
-"""Of the logarithm of a factor, between the runs of a slope: the first, and after steps failed."""
+"""Spans of central differences, in the logarithm of a factor; the first, and smaller ones after
+failed steps."""
 DAMPING, CALMER, BOLDER = 1e-3, 6.0, 0.2
 MAX_STEP = 0.5
-"""Largest change of a factor's logarithm in one step."""
+"""Maximum change of a factor's logarithm in one step."""
 SETTLED = 2e-3
-"""Steps shorter than this, as a fraction of what is uncertain or of the factor, end the search."""
+"""Relative step length, compared with the uncertainty or the factor, below which the search ends.
+"""
 KNOWN_BEFORE = 3.0
-"""Standard deviation of the logarithm of a factor before anything was observed."""
+"""Prior standard deviation of the logarithm of a factor."""
 MAX_UNCERTAINTY = 1.0
 """Standard deviation of the logarithm above which a factor counts as undetermined."""
 COARSER = (1.5, 2.0)
-"""Cells on which the result is looked at again, against those that it was found on."""
+"""Cell sizes for the estimate of the discretisation error, relative to those of the fit."""
 MIN_COARSER = 1.25
-"""Coarsening where bodies are too thin for those."""
+"""Relative cell size if bodies are too thin for COARSER."""
 CHORDS = 2
-"""Steps with the same slopes on coarser cells."""
+"""Number of steps on coarser cells, with unchanged slopes."""
 
 Residuals = Callable[[Mapping[str, float], float], Float]
-"""(factor by parameter, size of cells against the usual) -> differences over what each is known
-to."""
+"""(factors by parameter, relative cell size) -> normalised residuals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ def fit(residuals: Residuals, parameters: Sequence[str], *, steps: int = 12) -> 
     known = search.determined(search.slopes(SPANS[0]))
     search.keep(known)
     search.descend(steps)
-    # If some parameters turn out to be undetermined, the others are fitted without them.
+    # If the observations do not determine some parameters, the others are fitted without them.
     for _ in parameters:
         known = search.determined(search.slopes(SPANS[-1]))
         if known.all():
@@ -118,7 +119,7 @@ class _Search:
         return self._residuals(factors, coarser)
 
     def slopes(self, span: float) -> Float:
-        """[M, K] by central differences, where the search is now."""
+        """[M, K] slopes at the current point, by central differences."""
         columns = []
         for step in np.eye(len(self._logs)) * span / 2:
             columns.append((self._run(self._logs + step) - self._run(self._logs - step)) / span)
@@ -129,7 +130,7 @@ class _Search:
         """[K] bool, whether the observations determine each parameter.
 
         Raises:
-            SolverError: when they determine none.
+            SolverError: if they determine none.
         """
         known: np.ndarray = np.sqrt(np.diag(_covariance(J))) * self._scatter() < MAX_UNCERTAINTY
         if not known.any():
@@ -141,7 +142,7 @@ class _Search:
         return known
 
     def keep(self, known: np.ndarray) -> None:
-        """Continue with the known parameters; the others keep their given values."""
+        """Continue with the ``known`` parameters; the others keep their given values."""
         if known.all():
             return
         self._left = tuple(n for n, is_known in zip(self._left, known, strict=True) if is_known)
@@ -158,7 +159,7 @@ class _Search:
                 break
             off = self._run(self._logs + step)
             if np.isfinite(off).all() and _size(off) < self._history[-1]:
-                # The slopes nearest to the old ones that explain this step, too (Broyden 1965).
+                # The slopes closest to the old ones that also explain this step (Broyden 1965).
                 change = off - self._off - self._J @ step
                 self._J = self._J + np.outer(change, step) / float(step @ step)
                 self._logs, self._off = self._logs + step, off
@@ -187,7 +188,7 @@ class _Search:
         return Fit(factors, total, open_, cells, tuple(self._history), self._runs)
 
     def _discretisation(self, covariance: Float) -> Float:
-        """[K] how far the logarithms are from those on cells of no size."""
+        """[K] distance of the logarithms to those at cell size zero."""
         moved: dict[float, Float] = {}
         for coarser in (*COARSER, MIN_COARSER):
             if moved and coarser == MIN_COARSER:
@@ -205,7 +206,7 @@ class _Search:
         return continued(moved) if moved else np.full(len(self._logs), math.inf)
 
     def _scatter(self) -> float:
-        """By how much differences are larger than said, where they are."""
+        """Factor by which residuals exceed their stated errors, at least 1."""
         free = max(len(self._off) - len(self._logs), 1)
         return max(1.0, math.sqrt(float(self._off @ self._off) / free))
 
@@ -225,7 +226,7 @@ def continued(moved: Mapping[float, Float]) -> Float:
 
 
 def _covariance(J: Float) -> Float:
-    """[K, K] of logarithms, given what each is known to and what was known before."""
+    """[K, K] covariance of the logarithms, from the observation errors and the prior."""
     covariance = np.linalg.inv(J.T @ J + np.eye(J.shape[1]) / KNOWN_BEFORE**2)
     return np.asarray(covariance, dtype=np.float64)
 
@@ -243,21 +244,18 @@ def _size(off: Float) -> float:
     return float(np.sqrt(np.mean(off * off)))
 
 
-# Restitution by dissipation: the viscosity with which a body bounces as requested.
-#
-# An elastic body on a grid bounces too well, never too badly, so removing energy is enough. Kelvin-
-# Voigt damping of the first mode, omega = pi c / 2L, gives e = e0 exp(-pi zeta / sqrt(1 - zeta^2)),
-# zeta = eta omega / 2 (lambda + 2 mu). That is the first guess; impacts of the body itself refine
-# it.
-#
-# The rebound depends on the position of the wall between grid nodes: an elastic block of six cells
-# keeps 0.64 of its speed on a wall through nodes and 0.88 on one just below them. The test impacts
-# therefore use the actual wall if it is given.
+# Restitution by dissipation: the viscosity with which a body rebounds as requested. An elastic body
+# on a grid always rebounds too well, so removing energy is enough. Kelvin-Voigt damping of the
+# first mode, omega = pi c / 2L, gives e = e0 exp(-pi zeta / sqrt(1 - zeta^2)), zeta = eta omega / 2
+# (lambda + 2 mu). This is the first guess; test impacts of the body refine it. The rebound depends
+# on the position of the wall between grid nodes: an elastic block of six cells keeps 0.64 of its
+# speed on a wall through nodes and 0.88 on one just below them. The test impacts therefore use the
+# actual wall if it is given.
 
 TOLERANCE = 0.015
-"""A fit stops when achieved and requested are this near."""
+"""Maximum difference between achieved and requested restitution at which a fit stops."""
 IMPACTS_MAX = 14
-"""A fit makes at most this many test impacts."""
+"""Maximum number of test impacts of a fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,14 +371,14 @@ def impact(
         before = solver.measure.momentum[0] @ n
         solver.step(crossing)
         after = solver.measure.momentum[0] @ n
-        # Off the wall nothing changes the momentum any more.
+        # Away from the wall, the momentum no longer changes.
         if after > 0 and abs(after - before) < 1e-4 * speed * body.particles.mass:
             break
     return max(float(solver.measure.momentum[0] @ n) / (speed * body.particles.mass), 0.0)
 
 
 def _wall_below(body: Body, normal: ArrayLike) -> Plane:
-    """A wall just below the body at its place."""
+    """A wall just below the body at its current position."""
     n = np.asarray(normal, dtype=np.float64)
     n = n / np.linalg.norm(n)
     lowest = float((body.particles.positions @ n).min())
@@ -388,7 +386,7 @@ def _wall_below(body: Body, normal: ArrayLike) -> Plane:
 
 
 def _half_spacing(body: Body) -> float:
-    """From the outermost particles to the surface [m]."""
+    """Distance from the outermost particles to the surface [m]."""
     return 0.5 * float(np.cbrt(body.particles.volumes).mean())
 
 

@@ -71,7 +71,7 @@ CONSTITUTIVE_LAWS = {
     law.code: law
     for law in (FIXED_COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW, CRUSH)
 }
-"""All laws that kernels know, by code."""
+"""All laws of the kernels, by code."""
 
 
 def require_known(law: object, owner: str) -> ConstitutiveLaw:
@@ -213,7 +213,7 @@ class Material:
 
 
 MATERIALS: dict[str, Callable[[], Material]] = {}
-"""Materials by the names that operations know them by, each with typical numbers."""
+"""Named materials with typical parameters."""
 _Kind = TypeVar("_Kind", bound=type[Material])
 
 

@@ -23,10 +23,11 @@ from .materials import Material, law_of_code
 
 TOTALS = 8
 """Columns of contact totals, all on a body: impulse (3) [N s], its moment about the world origin
-(3) [N m s], work of friction [J], work of the other's motion [J].
+(3) [N m s], friction work [J], work of the other's motion [J].
 
-Work of friction is impulse times slip after the contact, the other's is impulse times its velocity:
-both are what the impulse did over the substep, whatever the stresses did at the same node.
+Friction work is impulse times slip after the contact, and the other's work is impulse times its
+velocity. Both are the work of the impulse over the substep, whatever the stresses do at the same
+node.
 """
 
 
@@ -149,7 +150,7 @@ class Simulation(Protocol):
     def contacts(self) -> tuple[Float, Float]:
         """Totals since the start: on bodies by colliders [B, K, TOTALS], by bodies [B, B, TOTALS].
 
-        Between bodies each side counts half of the work of friction.
+        Between bodies, each side counts half of the friction work.
         """
         ...
 
@@ -234,9 +235,9 @@ class SolverDiverged(Exception):
 
 PRECISIONS: dict[str, type[np.floating[Any]]] = {"single": np.float32, "double": np.float64}
 BODIES_MAX = 4096
-"""As many as the grid's block keys can tell apart."""
+"""Limit of the grid's block keys."""
 BYTES_PER_PARTICLE = {"single": 900, "double": 1400}
-"""Peak while solving, saved state and float64 copies included; measured."""
+"""Measured peak memory while solving, including saved state and float64 copies [bytes]."""
 
 
 def build_model(

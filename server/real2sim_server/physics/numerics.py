@@ -15,10 +15,10 @@ from numba.extending import intrinsic, overload, register_jitable
 from .._numba import func, kernel
 
 FASTMATH = {"contract", "nsz", "arcp"}
-"""Fused multiply-add and reciprocals; NaN and infinity keep their meaning, and show."""
+"""Allows fused multiply-add and reciprocals; NaN and infinity are preserved."""
 
 device_function: Any = register_jitable(fastmath=FASTMATH, error_model="numpy")
-"""Decorator of functions that kernels of every backend may call; Python may call them, too."""
+"""Decorator of functions that kernels of every backend and Python may call."""
 
 F32 = np.float32
 ZERO, HALF, ONE, TWO, THREE, FOUR = (F32(v) for v in (0, 0.5, 1, 2, 3, 4))
@@ -27,7 +27,7 @@ TINY = F32(1e-30)
 
 
 def square_root(x: Any) -> Any:
-    """Square root of a number that is not negative.
+    """Square root of a non-negative number.
 
     Compiles to a processor instruction, so loops over lanes can be vectorised; ``math.sqrt`` calls
     the C library to handle negative numbers.
@@ -106,13 +106,13 @@ def multiply(a: Any, b: Any) -> Any:
 
 @device_function
 def symmetric_times(s: Any, a: Any) -> Any:
-    """s a of a symmetric s."""
+    """s a for a symmetric s."""
     return multiply((s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2]), a)
 
 
 @device_function
 def times_transposed(a: Any, b: Any) -> Any:
-    """a b^T where that is symmetric."""
+    """a b^T if it is symmetric."""
     return (
         a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
         a[3] * b[3] + a[4] * b[4] + a[5] * b[5],
@@ -127,7 +127,7 @@ def times_transposed(a: Any, b: Any) -> Any:
 def least_minor(s: Any, bound: Any, sign: Any) -> Any:
     """Least leading principal minor of sign (s - bound I) for a symmetric s.
 
-    It is above zero where all eigenvalues of that are (Sylvester).
+    Positive if all eigenvalues of that matrix are positive (Sylvester).
     """
     xx, yy, zz = sign * (s[0] - bound), sign * (s[1] - bound), sign * (s[2] - bound)
     xy, xz, yz = sign * s[3], sign * s[4], sign * s[5]
@@ -138,7 +138,7 @@ def least_minor(s: Any, bound: Any, sign: Any) -> Any:
 
 @device_function
 def rotation_step(r: Any, determinant: Any) -> Any:
-    """One of Newton's steps towards the rotation of a matrix, and how much it changed.
+    """One Newton step towards the rotation of a matrix, and the size of the change.
 
     r' = (r + r^-T) / 2 (Higham 1986).
     """
@@ -166,14 +166,14 @@ def rotation_step(r: Any, determinant: Any) -> Any:
 def polar_rotation(a: Any, determinant: Any) -> Any:
     """Rotation R of the polar decomposition a = R S, by Newton's iteration.
 
-    Needs det(a) > 0: the caller sees to inverted particles.
+    Requires det(a) > 0: the caller handles inverted particles.
     """
     r = a
     d = determinant
     for _ in range(POLAR_STEPS):
         r, change = rotation_step(r, d)
         d = det(r)
-        # The error squares at each step, so this one is below what the numbers resolve.
+        # The error squares with each step, so the next one would be below the rounding error.
         if ONE + change * change == ONE:
             break
     return r
@@ -182,7 +182,7 @@ def polar_rotation(a: Any, determinant: Any) -> Any:
 @device_function
 def jacobi_angle(pp: Any, qq: Any, pq: Any) -> Any:
     """Tangent, cosine and sine of the rotation that makes the element ``pq`` vanish."""
-    # Without branches, so that it can be vector code.
+    # Branch-free, so that it can be vectorised.
     small = abs(pq) < TINY
     theta = HALF * (qq - pp) / (ONE + ZERO * pq if small else pq)
     t = ONE / (abs(theta) + square_root(theta * theta + ONE))
@@ -194,7 +194,7 @@ def jacobi_angle(pp: Any, qq: Any, pq: Any) -> Any:
 
 @device_function
 def jacobi_sweep(s: Any, v: Any) -> Any:
-    """A symmetric matrix turned to have less off its diagonal; and ``v`` (9) turned alike."""
+    """A symmetric matrix after one Jacobi sweep, and ``v`` (9) rotated by the same angles."""
     xx, yy, zz, xy, xz, yz = s
     v0, v1, v2, v3, v4, v5, v6, v7, v8 = v
     zero = ZERO * xx
@@ -221,7 +221,7 @@ def jacobi_sweep(s: Any, v: Any) -> Any:
 
 @device_function
 def is_diagonal(s: Any) -> Any:
-    """Whether what a symmetric matrix has off its diagonal is below what the numbers resolve."""
+    """Whether the off-diagonal elements of a symmetric matrix are below the rounding error."""
     scale = abs(s[0]) + abs(s[1]) + abs(s[2])
     return scale + (abs(s[3]) + abs(s[4]) + abs(s[5])) == scale
 
@@ -263,7 +263,7 @@ def recompose(values: Any, vectors: Any) -> Any:
 def spline_weights(f: Any) -> Any:
     """Weights of the three nodes at offsets 0, 1, 2 for a particle at ``f`` in [0.5, 1.5).
 
-    f is the distance to the first node in cells. Jiang et al. 2016, MPM course, eq. 123.
+    f is the distance to the first node [cells]. Jiang et al. 2016, MPM course, eq. 123.
     """
     left = THREE_HALVES - f
     right = f - HALF
@@ -274,7 +274,7 @@ def spline_weights(f: Any) -> Any:
 # Decorators of the CPU's kernels.
 
 inner: Any = functools.partial(func, fastmath=FASTMATH)
-"""Compiles functions that only entry points call; they are kept as part of those."""
+"""Compiles functions that only entry points call; cached as part of those."""
 
 entry: Any = functools.partial(kernel, nogil=True, fastmath=FASTMATH)
-"""Compiles what Python calls: kept on disk, without the interpreter's lock."""
+"""Compiles functions that Python calls: cached on disk, without the interpreter's lock."""

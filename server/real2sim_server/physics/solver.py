@@ -18,13 +18,13 @@ from .errors import PhysicsError, SolverError, UnstableError
 from .model import SolverDiverged, build_model
 
 CHECK_INTERVAL = 16
-"""Substeps between two checks of energy and of finite numbers."""
+"""Substeps between two checks for energy and finite numbers."""
 VISCOUS_STEP = 0.2
 """dt <= VISCOUS_STEP rho dx^2 / eta keeps explicit viscosity stable."""
 ENERGY_SLACK = 0.01
-"""Fraction of kinetic and stored energy by which energy may rise before a rollback."""
+"""Maximum relative increase of kinetic plus stored energy before a rollback."""
 DT_SCALE_MIN = 2.0**-12
-"""The solver gives up at this fraction of the stable substep."""
+"""Minimum fraction of the stable substep before the solver gives up."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,8 @@ class Solver:
         o = self.options
         self.model: Model = build_model(bodies, dx=o.dx, gravity=o.gravity, precision=o.precision)
         backend = select_backend(o.backend)
-        # Public for benches and tests of single substeps; time and its step are the solver's.
+        # Public for benchmarks and tests of single substeps. Only the solver updates time and time
+        # step.
         self.simulation: Simulation = backend.start(self.model, self._colliders)
         self._viscous_dt = _viscous_limit(self.model)
         self._dt_scale = 1.0
@@ -202,11 +203,12 @@ class Solver:
     def step(self, duration: float) -> StepReport:
         """Advance by ``duration`` [s], in as many substeps as needed.
 
+        After any error, the solver is at its last valid state.
+
         Raises:
             SolverError: if the duration is not positive or needs too many substeps.
             ParticleError: if particles leave the reach of the grid.
-            UnstableError: if it diverges and smaller substeps do not help. After any error the
-                solver is at its last valid state.
+            UnstableError: if it diverges and smaller substeps do not help.
         """
         if not (math.isfinite(duration) and duration > 0):
             raise SolverError(f"duration of a step must be positive [s], not {duration!r}")
@@ -372,7 +374,7 @@ class Solver:
         rise = self._mechanical(m) - self._mechanical(before) - max(work, 0.0)
         live = float((before.kinetic + before.elastic).sum()) + abs(work)
         g = float(np.linalg.norm(self.model.gravity))
-        # Rounding noise of single-precision sums when hardly anything moves.
+        # Rounding noise of single-precision sums when there is hardly any motion.
         noise = float(m.mass.sum()) * (1e-4 * g * self.dx + 1e-8)
         if rise > ENERGY_SLACK * live + noise:
             return f"energy rose by {rise:.3g} J from {live:.3g} J without cause"

@@ -32,19 +32,20 @@ from .numerics import (
 COROTATED, NEO_HOOKEAN, VON_MISES, VISCOPLASTIC, DRUCKER_PRAGER, SNOW, CRUSH = range(7)
 """Codes of constitutive laws in column LAW; see ``materials.CONSTITUTIVE_LAWS``."""
 LAW, MU, LAMBDA, VISCOSITY, A, B, C, PLASTIC = range(8)
-"""Columns. A, B and C are read by law. VISCOSITY above 0 damps; PLASTIC above 0 keeps F_total."""
+"""Columns. The law determines the meaning of A, B and C. VISCOSITY > 0 damps; PLASTIC > 0 keeps
+F_total."""
 MATERIAL_ROW = 8
 
 
 SQRT_TWO_THIRDS = F32(math.sqrt(2 / 3))
 STRETCH_MIN = F32(0.05)
-"""Principal stretches are taken as no smaller than this, so that logarithms stay finite."""
+"""Minimum of principal stretches, which keeps logarithms finite."""
 SLACK = F32(1e-5)
-"""Stretch at which crushed structure unfolds: beyond what rounding makes, and next to no stress."""
+"""Strain at which crushed structure unfolds: above rounding errors, with negligible stress."""
 UNFOLDED = F32(20.0)
-"""It holds again from where it is shorter by one part in so many."""
+"""Inverse of the shortening below which unfolded structure resists tension again."""
 VOLUME_MIN = F32(1e-3)
-"""A particle squeezed below this fraction of its volume has turned inside out or is about to."""
+"""Minimum volume ratio; a particle below it is inverted or about to be."""
 
 
 @device_function
@@ -91,7 +92,7 @@ def corotated(F: Any, mu: Any, lam: Any) -> Any:
 
 @device_function
 def corotated_about(F: Any, R: Any, volume: Any, mu: Any, lam: Any) -> Any:
-    """The same where rotation R and volume ratio are known."""
+    """Fixed corotated stress for known rotation R and volume ratio."""
     d = (
         F[0] - R[0], F[1] - R[1], F[2] - R[2],
         F[3] - R[3], F[4] - R[4], F[5] - R[5],
@@ -123,7 +124,7 @@ def neo_hookean(F: Any, mu: Any, lam: Any) -> Any:
 
 @device_function
 def neo_hookean_at(F: Any, log_volume: Any, mu: Any, lam: Any) -> Any:
-    """The same where ln J is known."""
+    """Neo-Hookean stress for known ln J."""
     b = times_transposed(F, F)
     pressure = lam * log_volume - mu
     tau = (
@@ -138,7 +139,7 @@ def neo_hookean_at(F: Any, log_volume: Any, mu: Any, lam: Any) -> Any:
 def hencky(stretch: Any, history: Any, row: Any, dt: Any) -> Any:
     """Hencky's law with the flow rule of the row's law, in principal stretches.
 
-    tau = 2 mu e + lambda tr(e), e = ln(stretch). Unknown laws give NaN.
+    tau = 2 mu e + lambda tr(e), e = ln(stretch). Unknown laws return NaN.
     """
     mu, lam = row[MU], row[LAMBDA]
     e = (math.log(stretch[0]), math.log(stretch[1]), math.log(stretch[2]))
@@ -173,7 +174,7 @@ def deviator(e: Any) -> Any:
 
 @device_function
 def shrink(e: Any, d: Any, factor: Any) -> Any:
-    """e with ``factor`` of its deviator ``d`` taken away."""
+    """e minus ``factor`` times its deviator ``d``."""
     return e[0] - factor * d[0], e[1] - factor * d[1], e[2] - factor * d[2]
 
 
@@ -194,9 +195,9 @@ def von_mises(e: Any, history: Any, row: Any) -> Any:
 
 @device_function
 def viscoplastic(e: Any, stretch: Any, row: Any, dt: Any) -> Any:
-    """Von Mises flow that needs time (Yue et al. 2015; as in PhysGaussian's foam).
+    """Rate-dependent von Mises flow (Yue et al. 2015; as in PhysGaussian's foam).
 
-    Columns: A yield stress [Pa], B plastic viscosity [Pa s]; B = 0 flows at once.
+    Columns: A yield stress [Pa], B plastic viscosity [Pa s]; B = 0 flows instantly.
     """
     d, norm = deviator(e)
     mu = row[MU]
@@ -214,7 +215,7 @@ def viscoplastic(e: Any, stretch: Any, row: Any, dt: Any) -> Any:
 def drucker_prager(e: Any, history: Any, row: Any) -> Any:
     """Frictional flow without cohesion (Klar et al. 2016), with volume correction (2017).
 
-    Column A: alpha of the cone; history: volume gained in tension, to be given back.
+    Column A: alpha of the cone; history: volume gained in tension, removed again in compression.
     """
     mu, lam = row[MU], row[LAMBDA]
     fraction = history / THREE
@@ -234,8 +235,8 @@ def snow(stretch: Any, history: Any, row: Any) -> Any:
     """Clamped stretches and hardening, fixed corotated stress (Stomakhin et al. 2013).
 
     Columns: A critical compression, B critical stretch, C hardening exponent; history: ln of the
-    plastic volume ratio. Hardening is held within exp(+-3), as loose and as hard as snow gets.
-    What is crushed rather than packed pulls apart again at next to no stress, up to where it began.
+    plastic volume ratio. Hardening is limited to exp(+-3), the range of loose to hard snow.
+    Structure (CRUSH) unfolds at almost no stress, up to its original length.
     """
     low, high = snow_bounds(history, row)
     s = (

@@ -28,21 +28,21 @@ from ..scene.ground import (
 )
 
 BACKGROUND = "background"
-"""Names of these colliders begin with it."""
+"""Prefix of the names of these colliders."""
 TOP = 4.0
-"""Nothing above this height over the ground is looked at [m]."""
+"""Maximum height above the ground of Gaussians that are used [m]."""
 FOOT = 0.5
-"""Boxes begin this far below the ground [m]."""
+"""Depth below the ground at which boxes begin [m]."""
 THIN = 0.4
-"""A part that is narrower fits its box, however few of its cells are filled [m]."""
+"""Width below which a part always fits its box, regardless of FILLED [m]."""
 FILLED = 0.6
-"""A broader part fits when this fraction of the cells of its box is occupied."""
+"""Minimum occupied fraction of the cells in the box of a broader part."""
 DEPTH = 0.5
 """Depth of boxes behind visible sides, away from the recorded path [m]."""
 NARROW = 0.12
-"""Boxes are at least so wide [m]."""
+"""Minimum width of boxes [m]."""
 TRIM = 0.02
-"""Fraction of a part's Gaussians that may lie before and behind its box, and above it."""
+"""Fraction of a part's Gaussians trimmed in front of its box, behind it, and above it."""
 AROUND = 0.2
 """Clearance around simulated objects at the start [m]."""
 BEYOND = 0.06
@@ -171,7 +171,7 @@ def _fitted(
         yield rectangle
         return
     if rectangle.length <= OBSTACLE_CELL:
-        # Nothing smaller is resolved.
+        # Smaller parts are not resolved.
         if not blocked:
             yield rectangle
         return

@@ -36,24 +36,25 @@ NO_TYRES = Tyres(np.zeros((0, 3)), np.zeros(0), rest=np.zeros(0))
 
 SURFACE_POINTS = 600
 BESIDE = 1.3
-"""Particles of a lattice that are nearer than this many spacings are side by side."""
+"""Maximum distance of neighbours in a lattice of particles [spacings]."""
 NEAR_MAX = 4.0
 """Maximum distance of solids in gap queries [m]."""
 CORNER = 0.87
 """Distance from a particle to the corners of its cube [spacings]."""
 RIGID_STEP = 0.0025
-"""Longest step of rigid motion [s]."""
+"""Maximum time step of rigid motion [s]."""
 SETTLED_SPEED = 0.06
-"""A body has settled at a residual speed below this, or SETTLED_FRACTION of its speed [m/s]."""
+"""A body has settled when its residual speed is below this, or below SETTLED_FRACTION of its speed
+[m/s]."""
 SETTLED_FRACTION = 0.03
 JOLT = 15.0
-"""And while nothing accelerates it by more: half again as much as free fall [m/s^2]."""
+"""Maximum acceleration of a settled body: 1.5 times free fall [m/s^2]."""
 SETTLE_TIME = 0.05
-"""It may become rigid again once it has been settled for this long [s]."""
+"""Time after settling before the body may become rigid [s]."""
 SLEEP_SPEED = 0.06
-"""A body that moves and turns by less, [m/s] and [rad/s] together, may be put to sleep."""
+"""Maximum speed and angular speed for sleep, [m/s] and [rad/s] combined."""
 SLEEP_TIME = 0.08
-"""Once it has been that slow for this long [s]: at the top of a bounce it is so for a moment."""
+"""Time at that speed before sleep [s]; a body is also slow for a moment at the top of a bounce."""
 WHEELS_SLEEP_TIME = 0.2
 """The same for a rigid body on its wheels, at half that speed [s]."""
 
@@ -255,7 +256,7 @@ class DeformableBody:
         return gap, approach, hull[2] or shell[2]
 
     def _within_reach(self, solids: Sequence[Solid], within: float, ahead: float) -> list[Solid]:
-        """Solids so near the box of the body that their surfaces must be compared."""
+        """Solids close enough to the box of the body for an exact comparison of surfaces."""
         gaps, speeds = solid_gaps(*self.box(), solids)
         m = self.motion
         speed = float(np.linalg.norm(m.velocity))

@@ -23,26 +23,27 @@ from .structure import VEHICLES
 
 Kind = Literal["lamp", "pane", "windscreen", "bumper"]
 ENDS = 0.1
-"""Length of an end on which lamps and bumpers are, as a fraction of the vehicle's."""
+"""Length of the end that has lamps and bumpers, as a fraction of the vehicle's length."""
 LAMP_HEIGHT, LAMP_WIDTH = (0.52, 0.9), 0.32
-"""Above the road [m]; of each lamp, as a fraction of the vehicle's width."""
+"""Height of lamps above the road [m]; width of a lamp, as a fraction of the vehicle's width."""
 BUMPER_HEIGHT = (0.18, 0.52)
-"""Above the road [m]."""
+"""Height of bumpers above the road [m]."""
 TALL = 1.9
-"""Vehicles higher than this [m] are vans or lorries: belt and bumpers are higher."""
+"""Height from which on a vehicle is a van or lorry, with higher belt and bumpers [m]."""
 BELT, BELT_TALL = 0.6, 0.5
-"""Heights at which glass begins, as fractions of the vehicle's."""
+"""Height of the belt line, where glass begins, as a fraction of the vehicle's height."""
 COWL, UNDER_ROOF = 0.05, 0.94
-"""From the belt up to where a windscreen begins, and where glass ends, as such fractions."""
+"""Distance from the belt line to the lower edge of a windscreen, and height of the upper edge of
+glass, as fractions of the vehicle's height."""
 SCREEN, REAR_SCREEN = (0.56, 0.86), (0.02, 0.3)
-"""Where screens are along a car, as fractions of its length from the rear."""
+"""Extents of the screens of a car along its length, as fractions from the rear."""
 SCREEN_TALL = (0.72, 0.98)
 INSIDE = 0.14
-"""What is nearer to the middle plane than half the width less this fraction of the width is no side
-window."""
+"""Depth of side windows from the outside, as a fraction of the width."""
 
 AXLES, WHEEL_RADIUS, TREAD = 0.3, 0.38, 0.28
-"""Of wheels: along the length from the middle, radius [m], width within the sides [m]."""
+"""Wheels: distance of the axles from the middle as a fraction of the length, radius [m], width [m].
+"""
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def parts_of(category: str, size: Sequence[float]) -> tuple[Part, ...]:
 
 
 def in_wheels(points: Float, size: Sequence[float]) -> NDArray[np.bool_]:
-    """[N] whether points [N, 3] of a vehicle lie in the wheels below a box of ``size``."""
+    """[N] whether points [N, 3] of a vehicle are in the wheels below a box of ``size``."""
     length, width, height = size
     along = np.abs(np.abs(points[:, 0]) - AXLES * length)
     up = points[:, 2] + height / 2 - WHEEL_RADIUS
@@ -148,17 +149,17 @@ def _glass(size: Sequence[float]) -> list[Part]:
     return found
 
 
-# Breakage: a part breaks when the particles around it move far enough relative to each other.
+# Breakage: a part breaks when the particles around it move by its limit relative to each other.
 
 LIMITS: dict[Kind, float] = {"lamp": 0.05, "bumper": 0.08, "windscreen": 0.03, "pane": 0.035}
-"""A lamp or a bumper breaks when the outer part of what carries it was pushed in by so much; glass
-when its frame is racked by so much, root mean square over the frame [m]. Laminated screens crack
-first: side windows give way with their door."""
+"""Limits [m]. Lamps and bumpers: depth to which the outer part of their support is pushed in.
+Glass: root mean square racking of its frame. Laminated screens crack first; side windows break with
+their door."""
 OUTER = 0.75
-"""Quantile of the way in that counts: half of what is around a lamp is behind it."""
+"""Quantile of the inward displacement that counts: half the material around a lamp is behind it."""
 MIN_PARTICLES = 3
 NEAR = 0.6
-"""Distance from a part's box within which particles carry it [spacings]."""
+"""Maximum distance from a part's box of the particles that carry it [spacings]."""
 
 
 @dataclass(frozen=True)
@@ -254,13 +255,13 @@ def _strain(part: Part, moved: Float) -> float:
 # of time, so every instant can be rendered independently and is deterministic.
 
 Heights = Callable[[Float], Float]
-"""[K, 2] or [K, 3] places -> [K] height of the ground [m]."""
+"""Height of the ground [K] [m] at positions [K, 2] or [K, 3]."""
 
 GRAVITY = 9.81
 REBOUND, KEPT, BOUNCES = 0.3, 0.6, 3
 """Vertical and horizontal restitution of a bounce, and number of bounces."""
 SLIDING = 0.6
-"""Friction on the road."""
+"""Coefficient of friction on the road."""
 SPIN = 18.0
 """Angular speed of tumbling fragments [rad/s]."""
 SH_0 = 0.28209479177387814
@@ -342,7 +343,7 @@ def _cloud(breakage: Breakage, age: float, heights: Heights) -> GaussianCloud:
 def _leaving(
     breakage: Breakage, shards: _Shards, n: int, random: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Start and velocity, [n, 3] each, relative to the outward direction of the part."""
+    """Start [n, 3] and velocity [n, 3], relative to the outward direction of the part."""
     outward = np.array(breakage.outward)
     outward[2] = 0.0
     outward /= max(float(np.linalg.norm(outward)), 1e-9)
@@ -389,7 +390,7 @@ def _fallen(
 
 
 def _tumbling(tumbled: Float, random: np.random.Generator) -> Float:
-    """[n, 4] quaternions of fragments that have tumbled for [n] s; flat when they lie."""
+    """[n, 4] quaternions of fragments after tumbling for [n] s; flat at rest."""
     n = len(tumbled)
     yaw, rate = random.uniform(0, np.pi, n), random.uniform(-SPIN, SPIN, n)
     axis = random.uniform(0, 2 * np.pi, n)
@@ -412,25 +413,25 @@ def _tensor(values: NDArray[np.float64]) -> torch.Tensor:
     return torch.from_numpy(values.astype(np.float32))
 
 
-# The underside of a vehicle that turns over.
-#
-# Recordings do not show it. Training fits the contact shadow between wheels and road instead, which
-# would look like a ragged plate on an overturned vehicle.
+# The underside of a vehicle that turns over. Recordings do not show it. Training fits the contact
+# shadow between wheels and road instead, and it would look like a ragged plate on an overturned
+# vehicle.
 
 SHADOW, SILLS = 0.1, 0.3
-"""What is below sills and reaches so far down is shadow or tyre: heights over the road [m]."""
+"""Gaussians below the sills that reach down to this height are shadow or tyre; both above the road
+[m]."""
 FLOOR = 0.2
-"""Height of a floor over the road [m]."""
+"""Height of the floor above the road [m]."""
 INSET = (0.16, 0.06)
 """Inset of the floor from the ends and from the sides [m]."""
 ROUNDED = 4.0
-"""Exponent of its outline, which has no corners where bumpers are round."""
+"""Exponent of its superelliptic outline, without corners where bumpers are round."""
 PITCH, THICK = 0.07, 0.012
-"""Of its Gaussians, and half their thickness [m]."""
+"""Spacing of its Gaussians, and half their thickness [m]."""
 SHEET, FRAME, EXHAUST = 0.12, 0.2, 0.34
 """Brightness of the floor, of axles and sills, of the exhaust."""
 ROUGH = 0.12
-"""By how much ribs and covers are lighter and darker."""
+"""Amplitude of the brightness variation of ribs and covers."""
 AXLE, PIPE = 0.09, 0.06
 """Half widths of an axle and of an exhaust [m]."""
 

@@ -33,7 +33,7 @@ from .spawn import spawn_bodies
 from .structure import GRID_MIN, ObjectPhysics, preset_of
 
 IMAGE_WIDTH = 96
-"""Images are compared at this width or below [px]."""
+"""Maximum width at which images are compared [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Simulated:
         return self.result.objects[self.subject.object_id]
 
     def frames(self, times_s: Float) -> list[int]:
-        """The frames of instants [s]."""
+        """Frame indices of instants [s]."""
         return [int(np.abs(self.result.times_s - t).argmin()) for t in times_s]
 
     def displacements(self, frame: int) -> Float:
@@ -252,7 +252,7 @@ def small(camera: Camera, image: NDArray[np.uint8]) -> tuple[Camera, NDArray[np.
 
 
 def recorded_track(trajectory: Trajectory, start_us: int, end_us: int) -> BoxTrack:
-    """The tracked boxes after ``start_us`` up to ``end_us`` [us].
+    """The tracked boxes in (``start_us``, ``end_us``] [us].
 
     Raises:
         PhysicsError: if there is no box in that interval.
@@ -295,7 +295,7 @@ def _require_sigmas(observation: object, *names: str) -> None:
 # Observations from requests and files, checked against a scene.
 
 MAX_OBSERVED_TIME = 30.0
-"""Latest observation after the start of a simulation [s]."""
+"""Maximum time of an observation after the start of a simulation [s]."""
 
 
 def observations_of(
@@ -403,7 +403,8 @@ def _decoded(seen: ObservedImage, k: int) -> NDArray[np.uint8]:
 PARAMETERS = ("stiffness", "yield_stress", "viscosity", "friction", "speed")
 """Parameters that can be fitted: positive factors on the initial values of the object."""
 CRUSH_MOST = 0.9
-"""Of critical compression, as a strain."""
+"""Maximum strain at which a crushable material yields, as a fraction of its critical compression.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -590,7 +591,7 @@ def _scaled(material: Material, factors: Mapping[str, float]) -> Material:
         "viscosity": viscosity * material.viscosity,
     }
     if isinstance(material, Snow):
-        # It yields at a strain; the stress there is that times Young's modulus.
+        # It yields at a strain; the stress there is the strain times Young's modulus.
         strain = material.critical_compression * strength / stiffness
         changed["critical_compression"] = min(strain, CRUSH_MOST)
     elif "yield_stress" in material.__dataclass_fields__:

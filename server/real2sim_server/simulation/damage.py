@@ -1,6 +1,6 @@
-"""Rendering of damaged vehicles: moves, folds, shades and breaks their Gaussians.
+"""Rendering of damaged vehicles: displaces, folds, shades and breaks their Gaussians.
 
-Particles give the displacement field; this module derives the appearance of the sheet metal.
+Particles provide the displacement field; this module derives the appearance of the sheet metal.
 Rollouts, the REST API and the closed loop use the same code.
 """
 
@@ -28,16 +28,17 @@ from .particles import Deformed, Embedding, deform_cloud, replaced_rows
 CELLS = (0.5, 0.22)
 """Sizes of facets and of the dents in them [m]."""
 HEIGHTS = (0.2, 0.04)
-"""Largest heights of their corners [m]."""
+"""Maximum heights of their corners [m]."""
 HIGHEST = sum(HEIGHTS)
 STREAK = np.array([0.45, 0.45, 0.05])
-"""Length, width and height of scrapes [m]: what moves on a road scrapes along it."""
+"""Length, width and height of scrapes [m], elongated along the road."""
 SCRAPED_FROM, SCRAPE_EDGE = (0.68, 0.66), 0.1
-"""Of a field from 0 to 1, from where on paint is gone or smeared, and how soon wholly."""
+"""Thresholds of a noise field in [0, 1] above which paint is gone or smeared, and the width of the
+transition."""
 MAX_SCRAPE = (0.5, 0.3)
-"""Greatest share of paint that is gone, and that is smeared."""
+"""Maximum fractions of paint scraped off and smeared."""
 TABLE = 16
-"""Heights repeat after so many cells, more than a vehicle is long."""
+"""Period of the noise, in cells; longer than a vehicle."""
 
 
 def crumple(points: Float, seed: int) -> tuple[Float, Float]:
@@ -105,44 +106,45 @@ WAVELENGTHS = (0.36, 0.17)
 SHARES = (0.8, 0.35)
 """Fraction of the shortening that each takes up."""
 IRREGULAR = 1.7
-"""By how much folds wander from straight lines [rad]."""
+"""Amplitude of the deviation of folds from straight lines [rad]."""
 ELASTIC = 0.03
-"""Shortening that leaves no fold."""
+"""Shortening without folds, as a fraction."""
 KEPT = 0.5
 """Fraction of the largest shortening that stays folded when the body springs back."""
 STEEPEST = 0.75
-"""Largest shortening by folds: flanks at 66 degrees."""
+"""Maximum shortening by folds: flanks at 66 degrees."""
 SKIN = (0.25, 0.7)
-"""Distance from the middle of the particles about a point, in spacings, from which on it is inside
-and on the skin."""
+"""Distances [spacings] to the mean of nearby particles: a point is inside below the first and on
+the skin above the second."""
 AROUND, NEIGHBOURS = 3.0, 64
-"""Particles about a point that say where outside is: within so many spacings, so many at most."""
+"""Radius [spacings] and maximum number of the nearby particles that determine the outward
+direction."""
 BONNET_BEHIND, BONNET_UP = 0.2, 0.55
-"""A bonnet is in this fraction of the length from the front, where the skin faces up so much."""
+"""A bonnet is in this fraction of the length at the front; minimum z of its normals."""
 BONNET_HEIGHT = 0.72
-"""Highest place of a bonnet, as a fraction of the vehicle's height."""
+"""Maximum height of a bonnet, as a fraction of the vehicle's height."""
 ACROSS_BONNET = 0.35
-"""Of a bonnet's shortening that goes into folds besides."""
+"""Fraction of a bonnet's shortening that also appears as small folds."""
 BONNET_MOST = 0.32
-"""Height by which a bonnet rises at most [m]."""
+"""Maximum rise of a bonnet [m]."""
 SKY, SIDE = 0.45, 0.55
-"""Shares of light from all of the sky and from one side."""
+"""Fractions of the light from the whole sky and from one side."""
 GROUND = 0.3
-"""Of the sky's light that reaches what faces down."""
+"""Fraction of the sky's light on surfaces that face down."""
 SLANT, HEIGHT = 0.6, 0.8
-"""Of light from one side: how far beside the normal at rest, and how high it stands."""
+"""Light from one side: horizontal offset from the normal at rest, and vertical component."""
 AHEAD = np.array([0.45, 0.4, 0.0])
-"""Where it comes from for what faces up."""
+"""Its horizontal direction for surfaces that face up."""
 DARKEST, BRIGHTEST = 0.35, 1.7
 DENT = (0.03, 0.14)
-"""Depths from which on sheet that was pushed in is crumpled, and wholly so [m]."""
+"""Depths at which dented sheet starts to crumple, and is fully crumpled [m]."""
 HOLLOW = 0.4
-"""Light that the lowest facets of a deep dent lose to its rim and to the others."""
+"""Fraction of light that the lowest facets of a deep dent lose."""
 FLATTER = 0.4
-"""Of the height of facets by which what is drawn is moved; it is lit by all of their slope, as what
-is drawn is too coarse to show it otherwise."""
+"""Fraction of the facet height by which Gaussians move. Shading uses the full slope, because
+Gaussians are too coarse to show facets otherwise."""
 OCCLUDED = 0.4
-"""Light that is lost at the bottom of a deep fold."""
+"""Fraction of light lost at the bottom of a deep fold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +204,7 @@ class Sheet:
         return shorter
 
     def fold(self, body: Deformed, most: Float, rows: NDArray[np.int64]) -> FoldedSheet:
-        """The sheet on a body.
+        """The deformed sheet.
 
         Args:
             body: deformation of R points.
@@ -211,7 +213,7 @@ class Sheet:
         """
         at_rest, foldable = self.normals[rows], self._foldable[rows]
         shortened = np.maximum(self.shortening(body.F), KEPT * most) * foldable[:, None]
-        # A sheet is shortened along itself only.
+        # A sheet is only shortened in its own plane.
         shortened = shortened * (1 - at_rest**2)
         normals = _turned(body.rotations, at_rest)
         raised, hump = self._bonnet_rise(shortened, rows)
@@ -268,7 +270,7 @@ class Sheet:
 
 
 def _outward(points: Float, rest: Float, spacing: float) -> tuple[Float, Float]:
-    """[G, 3] normals, away from the particles about each point, and how far away [spacings]."""
+    """[G, 3] normals, away from the nearby particles, and distance to their mean [spacings]."""
     from scipy.spatial import cKDTree
 
     nearest = np.arange(1, min(NEIGHBOURS, len(rest)) + 1)
@@ -305,7 +307,7 @@ def _triangle(phase: Float) -> tuple[Float, Float]:
 
 
 def _lengthened(F: Float, shortened: Float) -> Float:
-    """F with the length restored that folding takes up."""
+    """F without the shortening that folds represent."""
     factors = 1 / np.maximum(1 - shortened, 1 - STEEPEST)
     longer: Float = F * factors[:, None, :]
     return longer
@@ -357,44 +359,45 @@ def _light(normals: Float, towards: Float) -> Float:
 
 SH_0 = 0.28209479177387814
 GLASS_DARKER = 0.7
-"""Glass is what is darker than so much of the vehicle's paint, within a pane's place."""
+"""Glass is darker than this fraction of the vehicle's paint, within the box of a pane."""
 OTHER_HUE = 0.05
-"""Or what differs by so much in a channel's share of the light: glass that shows the sky."""
+"""Or its share of a colour channel differs by this, for glass that reflects the sky."""
 LEANING = 0.12
-"""Of the width, by which side windows lean inwards."""
+"""Inward lean of side windows, as a fraction of the width."""
 OF_GLASS = 0.1
-"""A windscreen differs from paint by so much."""
+"""Minimum colour difference between a windscreen and the paint."""
 SILLS = 0.3
-"""Below this fraction of a vehicle's height there are wheels and shadow."""
+"""Fraction of a vehicle's height below which only wheels and shadow are expected."""
 OTHER_COLOUR = 0.22
-"""A lamp is what differs by so much from the colour of most of the vehicle, within its place."""
+"""Minimum colour difference between a lamp and the paint."""
 LAMP_DARKER, LAMP_SHARE = 0.6, 0.6
-"""And is not darker than so much of it, as grilles are; the most unlike of these, this share."""
+"""A lamp is brighter than this fraction of the paint, unlike grilles; of these Gaussians, the most
+different ones up to this share belong to it."""
 LAMP_LEFT, PANE_LEFT = 0.22, 0.35
-"""Light that comes from the hole where a lamp or a pane was."""
+"""Fraction of light from the hole left by a lamp or a pane."""
 CRACKED = np.array([0.62, 0.67, 0.68])
 """Colour of crazed laminated glass."""
 CRAZED = 0.55
 """Fraction of a cracked windscreen that is crazed."""
 BARE, SMEAR = np.array([0.55, 0.56, 0.57]), np.array([0.1, 0.1, 0.1])
-"""Metal under scraped paint; rubber, plastic and dirt that scraping leaves."""
+"""Metal under scraped paint; rubber, plastic and dirt left by scraping."""
 DROOP, DROOP_TIME = 0.16, 0.35
 """Droop angle of a loose bumper at one end [rad], and its duration [s]."""
 HANGS_STILL = 3 * DROOP_TIME
-"""After so long a loose bumper has come to rest [s]: it would sink by less than 0.1 mm more."""
+"""Time after which a loose bumper is at rest [s]: it would sink by less than 0.1 mm more."""
 LOOSE = 0.25
-"""How far its loose end stands off, against how far it hangs down."""
+"""Outward displacement of the loose end, as a fraction of its droop."""
 CLEARANCE = 0.04
 """Clearance of a loose bumper above the road [m]."""
 MIN_DISPLACEMENT = 8e-3
-"""Particles that have moved less than this leave Gaussians where they are [m]: a body hit hard
-bends elastically by several millimetres all along, and the slowest impact that deforms at all
-dents by more than twice as much."""
+"""Minimum displacement of particles that moves Gaussians [m]. A vehicle that is hit hard bends
+elastically by several millimetres everywhere; the slowest impact that deforms it dents it by more
+than twice as much."""
 CARRIED_ROUNDS, CARRIED_SCALE = 5, 0.01
-"""How often weights are found anew, and what counts as little [m], where it is found how a vehicle
-has moved as a whole."""
+"""Iterations of reweighting, and length scale of the weights [m], for the rigid motion of a
+vehicle."""
 SPLIT = 1.5
-"""Gaussians stretched by more are drawn as two, side by side."""
+"""Gaussians stretched by more than this factor are split in two."""
 
 
 class DamagedVehicle:
@@ -448,7 +451,7 @@ class DamagedVehicle:
     def shortening(self, displacements: Float) -> Float:
         """[G, 3] relative shortening of the sheet at each Gaussian along the vehicle axes.
 
-        For particle displacements [N, 3] [m]. Pass the maximum so far to :meth:`cloud`.
+        Takes particle displacements [N, 3] [m]. Pass the maximum so far to :meth:`cloud`.
         """
         shorter = np.zeros((len(self._points), 3))
         rows = np.flatnonzero(self._embedding.near(_moved(displacements)))
@@ -492,12 +495,13 @@ class DamagedVehicle:
         return _split(replace(moved, means=means, sh=sh), rows, body.F)
 
     def _rows_of(self, part: Part) -> NDArray[np.int64]:
-        """Gaussians of a part: all in its box, without the surrounding paint."""
+        """Rows of the Gaussians of a part: those in its box, without the surrounding paint."""
         inside = part.holds(self._points)
         if part.kind == "pane" and part.outward[1]:
             inside |= self._leaning(part)
         if part.kind == "windscreen":
-            # It shows the sky, brighter than paint at times; nothing else faces ahead up there.
+            # A windscreen reflects the sky and can be brighter than paint, so brightness does not
+            # help.
             inside &= self._unlike_paint > OF_GLASS
         elif part.kind == "pane":
             dark = self._brightness < max(GLASS_DARKER * self._paint, 0.12)
@@ -530,7 +534,7 @@ class DamagedVehicle:
         return painted if painted.any() else np.ones(len(painted), dtype=bool)
 
     def _drooped(self, name: str, means: torch.Tensor, age: float) -> torch.Tensor:
-        """A bumper hanging by one end, which varies between vehicles."""
+        """A bumper that hangs by one end; the end varies between vehicles."""
         rows = self._rows[name]
         if not len(rows):
             return means
@@ -543,7 +547,7 @@ class DamagedVehicle:
         sunk = np.minimum(sunk, places[:, 2] + self._size[2] / 2 - CLEARANCE)
         sunk = np.maximum(sunk, 0.0)
         places[:, 2] -= sunk
-        # The loose end also moves forwards.
+        # The loose end also moves outwards.
         places[:, 0] += np.sign(places[:, 0].mean()) * LOOSE * sunk
         moved = means.clone()
         moved[rows] = torch.from_numpy(places.astype(np.float32)).to(means.device)
@@ -602,7 +606,7 @@ def _with(body: Deformed, turn: Float, shift: Float) -> Deformed:
 
 
 def _lit(sh: torch.Tensor, light: Float) -> torch.Tensor:
-    """Harmonics of Gaussians whose colours are multiplied by ``light`` [G]."""
+    """Harmonics with colours multiplied by ``light`` [G]."""
     factor = torch.from_numpy(light.astype(np.float32)).to(sh.device)
     lit = sh * factor[:, None, None]
     lit[:, 0] += ((factor - 1) * 0.5 / SH_0)[:, None]

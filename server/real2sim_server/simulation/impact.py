@@ -26,24 +26,24 @@ from .particles import fill_object
 from .structure import VEHICLES, preset_of
 
 PARTICLES = 1000
-"""Of one body, about: half the time of twice as many, with residual crush within a fifth and less
-difference to the impulse. A step of a closed loop waits for it."""
+"""Approximate number of particles per body. Twice as many take twice the time and change residual
+crush by up to a fifth, and the impulse by less. A step of a closed loop waits for the result."""
 FINEST = 0.1
-"""Spacing of particles that is the smallest taken [m]."""
+"""Minimum particle spacing [m]."""
 HOOD, UNDER, CABIN = 0.95, 0.2, (0.22, 0.84)
-"""Height of a plain vehicle's hood and of its underside [m]; its cabin from and to, as fractions of
-the length from the rear."""
+"""Plain vehicle: height of its hood and of its underside [m]; start and end of its cabin, as
+fractions of the length from the rear."""
 CFL = 0.6
-"""Fraction of a cell that waves may cross in a substep: crashes damp much, and are as stable as
-with shorter ones."""
+"""Fraction of a cell that waves may cross in a substep. Crashes are strongly damped, so shorter
+substeps are not more stable."""
 SAMPLE_DT = 0.005
 FRAME_SAMPLES = 2
 MAX_CRASH_TIME = 0.25
-"""Longest simulated crash [s]."""
+"""Maximum simulated duration of a crash [s]."""
 SETTLING_TIME = 0.015
-"""After they parted, shapes displacement_history out for so long [s]."""
+"""Time to simulate after separation, in which shapes settle [s]."""
 TOUCHED, ENDED = 0.01, 0.002
-"""Fractions of the closing speed whose change tells that a crash has begun, and that it goes on."""
+"""Velocity changes at which a crash begins and continues, as fractions of the closing speed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class CrashBody:
 
     Attributes:
         rest: undeformed particles, object frame.
-        materials, regions: see :class:`~.body.Body`.
+        materials, regions: see :class:`~..physics.body.Body`.
         friction: friction coefficient of its surface.
         spacing: particle spacing [m].
         shape: shape after earlier impacts, or None.
@@ -183,7 +183,7 @@ def simulate_impact(
 
 
 class ImpactSimulation:
-    """An impact solved incrementally, only as far as frames are requested."""
+    """An impact, solved frame by frame on request."""
 
     def __init__(self, first: ImpactBody, second: ImpactBody | Box) -> None:
         """See :func:`simulate_impact`."""

@@ -27,11 +27,11 @@ from .structure import default_mass
 
 NEIGHBOURS = 20
 FLAT = 0.05
-"""Second moments below this times spacing^2 say nothing about the gradient along their axis."""
+"""Second moments below this times spacing^2 do not determine the gradient along their axis."""
 STRETCH_LIMITS = (0.2, 2.0)
 """Stretch limits of a Gaussian, so that it does not become a sheet across a tear."""
 TURNED = 1e-3
-"""Smallest rotation, as matrix entry, for which colours are turned."""
+"""Minimum rotation, as a matrix entry, at which colours are rotated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,14 +201,14 @@ def _directions(count: int = 32) -> Float:
 # (typically the underside) are closed by the opposite side or the tracked box.
 
 OPACITY_MIN = 0.05
-"""Fainter Gaussians are haze and stand for no particles."""
+"""Minimum opacity of Gaussians that become particles; fainter ones are haze."""
 BOX_SLACK, BOX_SLACK_MAX = 0.1, 0.15
-"""Gaussians further outside the box than this fraction of its size, and at most so much [m], do not
-belong to the object."""
+"""Gaussians outside the box by more than this fraction of its size, up to the second value [m], do
+not belong to the object."""
 SEEN_FRACTION = 0.5
-"""A side is seen when this fraction of its silhouette shows a surface of that side."""
+"""Minimum fraction of its silhouette with a surface for a side to count as recorded."""
 SAMPLES_MAX = 7
-"""A Gaussian's extent is sampled by at most this many points along each of its axes."""
+"""Maximum number of sample points along each axis of a Gaussian."""
 
 Mask = NDArray[np.bool_]
 
@@ -236,7 +236,7 @@ class Filling:
         """One particle at the centre of each voxel of the largest connected piece.
 
         A regular lattice makes a smoother solid than Gaussians, with fewer particles; the Gaussians
-        follow it by :class:`~.embedding.Embedding`. The total mass is that of ``particles``.
+        follow it by :class:`Embedding`. The total mass is that of ``particles``.
 
         Args:
             above: omit voxels with centres below this height, object frame [m].
@@ -340,7 +340,7 @@ class _Side:
         return f"{'-+'[self.sign > 0]}{'xyz'[self.axis]}"
 
 
-# A bonnet lies far below the roof line and a windscreen far behind the bumper.
+# A bonnet is far below the roof line, and a windscreen far behind the bumper.
 SIDES = (
     _Side(0, -1, 0.45), _Side(0, 1, 0.45),
     _Side(1, -1, 0.35), _Side(1, 1, 0.35),

@@ -36,21 +36,21 @@ from .rigid import RigidMotion, clearance
 # as through one piece, so vibration losses occur once, not at every face.
 
 QUIET = 2
-"""An impact is over after so many steps without an impulse."""
+"""Steps without an impulse after which an impact is over."""
 NOTHING = 1e-3
-"""Impulses below this fraction of what there was are none."""
+"""Fraction of the previous impulse below which there is none."""
 EXACT = 0.01
-"""What parts within this fraction of the approach of what was requested is left as it is."""
+"""Tolerance of the separation speed, as a fraction of the approach; no correction within it."""
 SLOWEST = 0.3
-"""Impacts that begin more slowly are no bounces [m/s]."""
+"""Minimum initial approach of a bounce [m/s]."""
 ELASTIC = 0.8
-"""Least restitution between bodies that nothing damps and of which none was requested: what elastic
-cubes with a Poisson's ratio of 0.3 have by finite elements, the rest is vibration. Grids lose more,
-as nodes where two meet take on one velocity at once."""
+"""Minimum restitution between undamped bodies without a requested one: that of elastic cubes with a
+Poisson's ratio of 0.3 by finite elements; vibration takes the rest. Grids lose more, because nodes
+shared by two bodies take on one velocity."""
 MAX_IMPACT_TIME = 0.1
-"""Others of a chain no longer wait for an impact that takes longer than this [s]."""
+"""Maximum time for which other impacts of a chain wait for one [s]."""
 ROUNDS = 100
-"""Impacts of a chain one after the other, at most; with a restitution below 1 few matter."""
+"""Maximum number of successive impacts in a chain; few matter if the restitution is below 1."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,11 @@ class Correction:
 
 @dataclass(eq=False)
 class _Impact:
-    """An ongoing impact: motions before it, impulse and moment on the body so far, its duration,
-    and the number of steps without impulse."""
+    """An ongoing impact.
+
+    Motions before it, impulse and moment on the body so far, its duration, and the number of steps
+    without impulse.
+    """
 
     before: tuple[RigidMotion, ...]
     impulse: Float = field(default_factory=lambda: np.zeros(3))
@@ -316,7 +319,7 @@ def _meeting(
     distance, normals = clearance(other, body.shell_points())
     normal = normals[int(distance.argmin())]
     moving = _velocity(other, point)
-    # A wall does not fall with the body while nothing acts.
+    # A wall does not fall with the body while no forces act.
     drift = QUIET * duration * gravity + moving
     still = float(moving @ normal), float(drift @ normal)
     return _Meeting((body,), other, point, normal, body.rebound.requested, still, False)
@@ -402,14 +405,14 @@ def _rounded(value: Any) -> Any:
 
 
 HORIZON = 10.0
-"""Time for which a body is followed [s]."""
+"""Maximum time for which a body is tracked [s]."""
 STEPS_MAX = 4_000
 STRIDE = 0.5
-"""Furthest way between two looks [cells]."""
+"""Maximum distance between two checks along the path [cells]."""
 SLOW = 0.1
-"""Slower approaches are no impacts [m/s]."""
+"""Minimum approach speed of an impact [m/s]."""
 USUAL_SPEED = 2.0
-"""Approach at which restitution is fitted when the object itself stands [m/s]."""
+"""Approach speed for fitting the restitution of stationary objects [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,10 @@
 """Resting contact: persistent rigid contacts, and stability at rest.
 
 On a grid, stacked bodies keep sinking into each other. Once they no longer deform, they become
-rigid, and contact forces separate them: repulsive, with Coulomb friction, and preventing deeper
-penetration than at the start of the contact (sequential impulses; Catto 2005). Each step is warm
-started from the previous one. An approach faster than GENTLE_THRESHOLD is an impact and deforms.
+rigid and contact forces separate them. These forces are repulsive, have Coulomb friction, and
+prevent deeper penetration than at the start of the contact (sequential impulses; Catto 2005). Each
+step is warm started from the previous one. An approach faster than GENTLE_THRESHOLD is an impact
+and deforms the bodies.
 """
 
 from __future__ import annotations
@@ -19,20 +20,19 @@ from .body import BodyMode, DeformableBody
 from .rigid import RigidMotion, clearance, rotation_of
 
 # Stability at rest: contact forces against gravity.
-#
 
 GAP_CELLS = 0.15
-"""A corner of a particle that is nearer to something than this touches it [cells]."""
+"""Maximum gap between a particle's corner and a surface in contact [cells]."""
 SINK_CELLS = 1.5
-"""What is deeper inside a collider is no contact any more but was placed there [cells]."""
+"""Maximum depth of a contact inside a collider [cells]; deeper particles were placed there."""
 DIRECTIONS = 8
-"""Of friction at a contact, the first against gravity's pull along the surface."""
+"""Directions of friction at a contact; the first opposes gravity's pull along the surface."""
 CORNERS = 16
-"""Directions in which the outermost contacts are taken; those between carry nothing more."""
+"""Directions in which the outermost contact points are selected; inner points are not needed."""
 SHORTFALL = 2e-3
-"""Fraction of the weight that may stay unbalanced: a tenth of a degree of slope."""
+"""Maximum unbalanced fraction of the weight: a tenth of a degree of slope."""
 FRICTION_MAX = 1e3
-"""Stands for what sticks."""
+"""Coefficient that represents sticking."""
 _CUBE = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
 
 
@@ -186,23 +186,23 @@ def _balanced(body: DeformableBody, contacts: Sequence[Contacts], gravity: Float
 
 
 GENTLE_THRESHOLD = 0.3
-"""Contacts in which nothing approaches faster carry without deforming, nor bounce [m/s]."""
+"""Maximum closing speed of a contact that carries load without deforming or bouncing [m/s]."""
 STEADY_THRESHOLD = 2.0
-"""What is pushed away faster has not come to rest against it but is about to bounce [m/s^2]."""
+"""Maximum acceleration away from a collider at rest on it [m/s^2]; above, the body is still
+bouncing."""
 SWEEPS = 30
 """Passes over all contacts in a step."""
 DRIFT = 0.1
-"""Once points have slid or opened by so much their pair is looked at anew [spacings]."""
+"""Sliding or opening distance after which a pair's contact points are updated [spacings]."""
 LAID_THRESHOLD = 0.1
-"""Points that lie higher than this above a collider do not carry yet [spacings]."""
+"""Points higher than this above a collider carry no load yet [spacings]."""
 PUSH, PUSH_SPEED = 0.2, 0.05
-"""Fraction of what is too deep that a step takes back, and at most how fast [m/s]. Bodies are moved
-by it and keep none of it as velocity: what rests would never come to a stop."""
+"""Fraction of the excess depth corrected in a step, and maximum correction speed [m/s]. Corrections
+move bodies without changing their velocities, so that they come to rest."""
 SLOP = 1e-4
-"""Within so much of where they carry points are held where they are [m]: chasing less than that
-keeps in motion what should rest."""
+"""Tolerance of the rest gap [m]; correcting smaller errors would keep bodies in motion."""
 PUSH_SWEEPS = 10
-"""Passes over all contacts that are too deep."""
+"""Passes over all contacts that are too deep, in a step."""
 
 Pair = tuple[str, str]
 
@@ -335,7 +335,7 @@ class RestingContacts:
         speeds = {n: np.concatenate([m.velocity, m.angular_velocity]) for n, m in before.items()}
         went = {n: speed.copy() for n, speed in speeds.items()}
         for name, speed in went.items():
-            # Steps within a step fall less far than the speed at their end says.
+            # Substeps fall less far than the final velocity suggests.
             speed[:3] = (before[name].centre - starts[name]) / duration
         shifts = {name: np.zeros(6) for name in free}
         step = _Step(before, speeds, went, shifts, duration)
@@ -345,7 +345,7 @@ class RestingContacts:
         for _ in range(SWEEPS):
             for row in rows:
                 row.relax()
-        # Separating bodies are not shifted, which would change the angular momentum.
+        # Separating bodies are not shifted, because this would change the angular momentum.
         deep = [row for row in rows if row.is_deep and row.carries]
         for _ in range(PUSH_SWEEPS):
             for row in deep:
@@ -370,7 +370,7 @@ class RestingContacts:
             for touch in known:
                 nearest = min(touches, key=lambda t: float(np.abs(t.local - touch.local).sum()))
                 touch.impulse = nearest.impulse * (len(touches) / len(known))
-            # A body that tips over strikes with its far edge, which is an impact.
+            # A body that tips over strikes with its far edge, and this is an impact.
             if known and all(_closing(t) <= GENTLE_THRESHOLD for t in known):
                 self._touches[pair] = known
             else:

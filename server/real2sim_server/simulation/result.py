@@ -245,13 +245,13 @@ ARRAYS = (
 # --- Frames for the renderer ----------------------------------------------------------------------
 
 WHEEL_RADIUS, WHEEL_HALF_WIDTH = 0.36, 0.2
-"""What Gaussians of a vehicle are its wheels: so far around the axle and along it [m]."""
+"""Region of a vehicle's Gaussians that are a wheel: radius around the axle and half width [m]."""
 
 TURNED_OVER = 0.3
-"""Cosine between the upright of a vehicle and the world's below which its underside is seen."""
+"""Cosine between the vehicle's and the world's up axis below which the underside is visible."""
 
 HANGING = 2.0
-"""After this time a bumper that came loose no longer moves [s]."""
+"""Time after which a loose bumper no longer moves [s]."""
 
 
 class PlacedObject(Protocol):

@@ -31,7 +31,7 @@ def rotation_of(vector: Float) -> Float:
 
 
 def cross_matrix(vector: Float) -> Float:
-    """[3, 3] matrix of the cross product with ``vector`` [3] from the left."""
+    """[3, 3] matrix of the cross product of ``vector`` [3] with a vector on its right."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
@@ -101,7 +101,7 @@ class RigidMotion:
         """
         momentum = self.angular_momentum
         turned = rotation_of(duration * self.angular_velocity) @ self.rotation
-        # Prevents accumulated rounding from skewing the rotation.
+        # Keeps rounding errors from skewing the rotation.
         left, _, right = np.linalg.svd(turned)
         moved = replace(self, rotation=left @ right, centre=self.centre + duration * self.velocity)
         turning = np.linalg.solve(moved.world_inertia, momentum).astype(np.float64, copy=False)
@@ -138,7 +138,7 @@ def added_inertia(masses: Float, volumes: Float, *, cell: float) -> float:
 def best_rotation(rest: Float, now: Float, masses: Float) -> Float:
     """[3, 3] mass-weighted best-fit rotation from ``rest`` [N, 3] to ``now`` (Kabsch 1976).
 
-    Both sets are taken about their own centres of mass.
+    Positions are relative to the centres of mass of each set.
     """
     a = rest - masses @ rest / masses.sum()
     b = now - masses @ now / masses.sum()

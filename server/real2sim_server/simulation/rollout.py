@@ -21,7 +21,7 @@ from .simulator import STEP, HybridSimulator, energies
 from .spawn import spawn_bodies, starts_of
 from .structure import ObjectPhysics, preset_of
 
-# Frames as the simulation advances.
+# Recording of frames as the simulation advances.
 
 
 class TrajectoryRecorder:
@@ -131,7 +131,7 @@ def _wheel_lifts(body: DeformableBody, pose: Float, road: Sequence[Collider]) ->
 # Broken parts of simulated vehicles, detected from the frames.
 
 LEAVING_TIME = 0.04
-"""After a part has broken its fragments are free [s]."""
+"""Time after a part breaks at which its fragments separate [s]."""
 
 
 def find_breakages(
@@ -197,7 +197,8 @@ def _triple(vector: Float) -> tuple[float, float, float]:
 
 PARTICLES_MIN = 100
 BESIDE, FURTHEST = 10.0, 80.0
-"""The background counts so far beyond what the fastest could reach, and no further than [m]."""
+"""Margin beyond the reach of the fastest object within which the background counts, and maximum
+distance [m]."""
 
 Progress = Callable[[int, int], None]
 
@@ -207,7 +208,7 @@ class SimulateOptions:
     """Options of a rollout.
 
     Attributes:
-        preset: ``vehicle`` or ``paper``, see ``presets``.
+        preset: ``vehicle`` or ``paper``, see :mod:`.structure`.
         objects: simulated objects with their physical values; at least one.
         colliders: rigid colliders; those named in ``road`` support tyres.
         road: names of ground colliders.
@@ -220,7 +221,7 @@ class SimulateOptions:
         backend: solver backend.
         brake_after_hit: braked fraction of the wheels' grip after a vehicle is hit.
         background: whether obstacles of the scene's background (walls, poles, trees) are colliders,
-            see ``background``.
+            see :mod:`.background`.
         max_particles: maximum total number of particles; if exceeded, all objects are filled more
             coarsely than in the preset.
     """

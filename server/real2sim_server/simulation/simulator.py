@@ -73,7 +73,7 @@ class ContactLog:
     def add_sleep(self, bodies: set[str], time: float, duration: float) -> None:
         """Count a step of sleep at a time [s].
 
-        Support forces of a sleeping body are recorded only in steps with resting neighbours; all
+        Support forces of a sleeping body are only recorded in steps with resting neighbours. All
         other steps count as sleep once another impulse follows.
         """
         for key, (_, last) in self._times.items():
@@ -93,7 +93,7 @@ class ContactLog:
         """All contacts, in the order they began.
 
         Args:
-            masses: of bodies [kg].
+            masses: masses of bodies [kg].
             gravity: [3] acceleration [m/s^2].
         """
         order = sorted(self._impulses, key=lambda key: (self._times[key][0], key))
@@ -141,20 +141,19 @@ def energies(bodies: Iterable[DeformableBody], gravity: Float) -> tuple[float, f
     return kinetic, elastic, potential
 
 
-# Unyielding bodies stay rigid and act as colliders for other bodies.
-#
-# A cone does not dent a truck. If the total energy of an impact cannot dent a body by more than its
-# particles resolve, only the lighter body deforms. The other body is represented by a few boxes on
-# its nearby surface and receives the exchanged impulse and moment.
+# Unyielding bodies stay rigid and act as colliders for other bodies. For example, a cone does not
+# dent a truck. If the total energy of an impact cannot dent a body by more than its particles
+# resolve, only the lighter body deforms. The other body is represented by a few boxes on its nearby
+# surface and receives the exchanged impulse and moment.
 
 LIGHTER = 10.0
-"""A body may stay rigid against what is so many times lighter."""
+"""Minimum mass ratio at which the heavier body may stay rigid."""
 DENT = 0.5
-"""Dents that are shallower than so many spacings of particles are not resolved by them."""
+"""Smallest dent that particles resolve [spacings]."""
 PATCH_CELLS = 4.0
-"""Boxes cover a body's surface as far as this around what touches it [cells]."""
+"""Margin around the other body within which boxes cover a body's surface [cells]."""
 ALIKE = 1.5
-"""Layers whose sides lie within so many spacings of each other are one box."""
+"""Layers whose sides differ by less than this become one box [spacings]."""
 
 
 def withstands(body: DeformableBody, other: DeformableBody, gravity: Float) -> bool:
@@ -165,7 +164,7 @@ def withstands(body: DeformableBody, other: DeformableBody, gravity: Float) -> b
 
     Args:
         body: the body.
-        other: a body that touches it, or will.
+        other: a body that touches it or is about to.
         gravity: [3] [m/s^2].
     """
     a, b = body.motion, other.motion
@@ -211,7 +210,7 @@ def as_boxes(body: DeformableBody, other: DeformableBody) -> list[Box]:
 def by_owner(
     contacts: Iterable[ContactTotals], owners: Mapping[str, DeformableBody]
 ) -> list[ContactTotals]:
-    """Contacts, with the effects of a body's boxes summed under the body's name."""
+    """Contacts, with those of a body's boxes summed under the body's name."""
     found: dict[tuple[str, str], ContactTotals] = {}
     for c in contacts:
         other = owners[c.other].name if c.other in owners else c.other
@@ -230,7 +229,7 @@ def by_owner(
 
 
 def _patch(body: DeformableBody, other: DeformableBody) -> NDArray[np.bool_]:
-    """[N] whether particles of a body are in a cube around another, aligned with the body."""
+    """[N] whether particles of a body are in a cube around another body, aligned with the first."""
     pose = body.T_world_object
     centre = pose[:3, :3].T @ (other.motion.centre - pose[:3, 3])
     half = other.reach + PATCH_CELLS * body.cell
@@ -239,7 +238,7 @@ def _patch(body: DeformableBody, other: DeformableBody) -> NDArray[np.bool_]:
 
 
 def _layers(local: Float, cell: float, spacing: float) -> list[tuple[Float, Float]]:
-    """Corners (low, high) of boxes about particles [N, 3], one above the other."""
+    """Corners (low, high) of stacked boxes around particles [N, 3]."""
     level = np.floor(local[:, 2] / cell)
     layers: list[tuple[Float, Float]] = []
     for k in np.unique(level).tolist():
@@ -256,32 +255,32 @@ def _layers(local: Float, cell: float, spacing: float) -> list[tuple[Float, Floa
 
 
 STEP = 0.005
-"""Longest time between two checks of what is near what [s]."""
+"""Maximum time between two proximity checks [s]."""
 NEAR_CELLS = 3.0
-"""What is nearer than this shares nodes of a grid."""
+"""Bodies closer than this share grid nodes [cells]."""
 TOUCH_CELLS = 0.25
-"""Bodies are activated when surfaces come this near within a step: falling free until then is exact
-and costs next to nothing. It is more than what the front of a body moves in a step beyond its
-centre."""
+"""Gap within a step at which bodies are activated [cells]. Free motion until then is exact and
+cheap. The front of a body moves less than this in a step relative to its centre."""
 ROAD_CELLS = 0.4
-"""On its wheels a body is near the road all the time; what strikes it is this near and deforms."""
+"""The same gap for the road under a body on wheels, which is always near the road [cells]."""
 LAG = 0.01
-"""Particles whose turning lags behind by more than this at the surface are made to catch up [m/s].
+"""Maximum speed at the surface by which particles may lag behind the rotation of their body [m/s].
 """
 APPROACH_MIN = 1e-3
-"""Bodies approach each other when speed times distance is beyond this [m^2/s], or a speed [m/s]."""
+"""Minimum speed times distance at which bodies approach each other [m^2/s], or minimum speed [m/s].
+"""
 HIT_DELTA_V = 0.3
-"""A vehicle was hit when something has changed its velocity by more [m/s]."""
+"""Minimum delta-v of a contact that counts as a hit of a vehicle [m/s]."""
 TYRES = "tyres"
-"""Name under which the contact log keeps what the road does through tyres."""
+"""Name of the road in the contact log for forces through tyres."""
 
 
 class HybridSimulator:
     """Simulator of bodies and colliders that switches bodies between rigid and deforming.
 
-    A body is rigid until something comes near, deforms in a solver while in contact, and becomes
-    rigid or falls asleep once it has settled. Bodies track their state themselves; the simulator
-    triggers the transitions.
+    A body is rigid until something is near, deforms in a solver while in contact, and becomes rigid
+    or falls asleep once it has settled. Bodies track their state; the simulator triggers the
+    transitions.
 
     Args:
         bodies: simulated bodies.
@@ -512,8 +511,8 @@ class HybridSimulator:
     def _is_struck(self, body: DeformableBody, held: Set[str], duration: float) -> bool:
         """Whether a supported body deforms again.
 
-        It does if its contact partners deform, or if something approaches faster than contacts can
-        bear.
+        It does if its contact partners deform, or if something approaches faster than rigid
+        contacts allow.
         """
         others = [b for b in self.bodies if b is not body]
         if any(b.name in held and b.mode == BodyMode.DEFORMING for b in others):
@@ -527,16 +526,16 @@ class HybridSimulator:
             if not collider.moving and (asleep or collider.name in held):
                 continue
             gap, approach = body.gap_to_colliders([collider])
-            # Rigid contacts do not support moving colliders, however slow.
+            # Rigid contacts do not support moving colliders, even slow ones.
             least = APPROACH_MIN if collider.moving else GENTLE_THRESHOLD
             if approach > least and gap < _touch_distance(body) + approach * duration:
                 return True
         return not asleep and self._strikes_through(body, duration)
 
     def _strikes_through(self, body: DeformableBody, duration: float) -> bool:
-        """Whether the floor of a body on wheels strikes the road through its springs.
+        """Whether the floor of a body on wheels strikes the road because its springs are too weak.
 
-        Gentle landings are carried by springs and rigid contacts, without deformation.
+        Springs and rigid contacts absorb gentle landings without deformation.
         """
         if body.tyres is None:
             return False

@@ -38,15 +38,16 @@ EGO = "ego"
 REAR_OVERHANG = 0.95
 """Distance from the rear axle to the rear end of its box [m], as in the closed loop."""
 STEP = 0.07
-"""Between Gaussians over its surface [m]."""
+"""Spacing of Gaussians over its surface [m]."""
 PAINT, GLASS, RUBBER, LAMP = (0.16, 0.27, 0.42), (0.05, 0.06, 0.08), (0.03,) * 3, (0.75, 0.74, 0.68)
 SILL, BELT, BONNET = 0.17, 0.58, 0.60
-"""Fractions of the height: underside of its body, lower edge of its windows, and its bonnet."""
+"""Heights of the underside, of the lower edge of the windows and of the bonnet, as fractions of the
+vehicle's height."""
 ROOFLINE = np.array(
     [[0.0, 0.62], [0.02, 0.66], [0.14, 0.72], [0.3, 0.98], [0.42, 1.0], [0.58, 0.97], [0.74, 0.66],
      [0.97, 0.57], [1.0, 0.5]]
 )  # fmt: skip
-"""Fractions of length from the rear and of height along its middle, seen from the side."""
+"""Side profile: fractions of the length from the rear, and of the height."""
 WHEEL = 0.33
 """Radius of its wheels [m]."""
 SH_DC = 0.28209479177387814
@@ -191,15 +192,15 @@ def _wheel(size: tuple[float, float, float], axle: float, side: float) -> tuple[
 
 
 SPEED_MAX = 200.0
-"""Faster things are no traffic, and would cross bodies within a step [m/s]."""
+"""Maximum speed [m/s]; faster bodies would pass through others within a step."""
 SPIN_MAX = 100.0
-"""[rad/s]"""
+"""Maximum angular speed [rad/s]."""
 COARSEST = 4.0
-"""Bodies of fewer particles than this across their shortest side no longer deform."""
+"""Minimum number of particles across the shortest side of a body that deforms."""
 PENETRATION_MAX = 0.3
-"""Deeper inside something else than this a body was placed by mistake [m]."""
+"""Maximum initial penetration [m]; deeper bodies were placed by mistake."""
 VOLUME_SPACING, VOXELS_MAX = 0.05, 1_000_000
-"""Edge of the voxels that volume is measured by [m], and how many of them a box may have."""
+"""Edge of the voxels for measuring volume [m], and their maximum number per box."""
 OVERLAP_FRACTION = 0.01
 """Bodies overlap when this fraction of one's particles is among the other's."""
 

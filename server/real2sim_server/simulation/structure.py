@@ -30,11 +30,10 @@ from ..physics.materials import (
 # A vehicle is a stiff core with yielding zones around it: front and rear, sides (door, sill and B
 # pillar together) and roof. Each zone has a force-deflection curve from published tests.
 # :func:`vehicle_structure` derives materials so that the particles of a zone carry that force; the
-# closed loop uses the same values per area of overlap.
-#
-# Front and rear have two layers in series. The outer one (bumper, skin, headlamps, attachments)
-# folds at low force and slowly recovers; the inner one (rails) keeps its crush. This reproduces a
-# car with 0.6 m dynamic crush, a rebound at a fraction of its speed, and 0.26 m residual crush.
+# closed loop uses the same values per area of overlap.  Front and rear have two layers in series.
+# The outer one (bumper, skin, headlamps, attachments) folds at low force and slowly recovers. The
+# inner one (rails) keeps its crush. This reproduces a car with 0.6 m dynamic crush, a rebound at a
+# fraction of its speed, and 0.26 m residual crush.
 
 M = TypeVar("M", bound=Material)
 
@@ -77,9 +76,9 @@ STRUCTURES = {
     ),
     "bus": replace(CAR, front=9e5, rear=9e5, side=1e6, roof=1.5, source="roof: ECE R66; no test"),
 }
-"""By category."""
+"""Structure by category."""
 PERSON_STIFFNESS, OTHER_STIFFNESS = 6e4, 3e5
-"""The same, alike on all sides, of people and of what no class is known of; no tests [N/m^2]."""
+"""Stiffness on all sides of persons and of other objects, without tests [N/m^2]."""
 
 
 def stiffness_of(category: str) -> tuple[float, float, float]:
@@ -92,26 +91,26 @@ def stiffness_of(category: str) -> tuple[float, float, float]:
 
 
 END, OUTER = 0.2875, 0.1745
-"""Fractions of the length, at each end, that give way, and that are straightened again."""
+"""Fractions of the length at each end: crumple zone, and its outer layer, which recovers."""
 END_HEIGHT = 1.35
-"""Height of the section that the ends' stresses below are for [m]: the barrier test's."""
+"""Height of the section to which the stresses of the ends refer [m], as in the barrier test."""
 MIN_SECTION = 0.3
-"""Smallest filled height of a section [m]; a lower one was seen too little to carry its load."""
+"""Minimum filled height of a section [m]; lower ones come from incomplete recordings."""
 OUTER_DENSITY = 0.35
-"""Density of the outer part against that of the rest: engine and axles are behind it."""
+"""Density of the outer layer relative to the rest; engine and axles are behind it."""
 ROOF_DENSITY = 0.12
-"""The same of what is above the belt: glass, pillars and air."""
+"""Relative density above the belt line: glass, pillars and air."""
 SIDE = 0.36
-"""Fraction of the width, at each side, that is door, sill and pillar."""
+"""Fraction of the width at each side that is door, sill and pillar."""
 BELT = 0.5
-"""Fraction of the height above which there is roof."""
+"""Fraction of the height above which the roof zone begins."""
 ROOF_TEST = 0.127
-"""Deflection at which strength of a roof is measured [m] (49 CFR 571.216a)."""
+"""Deflection at which roof strength is measured [m] (49 CFR 571.216a)."""
 ROOF_HARDENING = 2.0
 ROOF_SHARE = 0.75
-"""Of the roof's force that its own stress carries; its edges on the body below carry the rest."""
+"""Fraction of the roof's force from its own stress; its edges on the body carry the rest."""
 CORE, DOORS, ROOF, ENDS = range(4)
-"""Zones; from ENDS on the materials of the rear, and then those of the front."""
+"""Zones; materials of the rear start at ENDS, followed by those of the front."""
 
 CORE_MATERIAL = Snow(
     young=3e7,
@@ -122,7 +121,7 @@ CORE_MATERIAL = Snow(
     hardening=4.0,
     viscosity=5e3,
 )
-"""Survival cell and drivetrain: strong enough to stay whole while all else gives way."""
+"""Survival cell and drivetrain: stays intact while all other zones yield."""
 RAILS_MATERIAL = Snow(
     young=2.27e7,
     poisson=0.0,
@@ -142,12 +141,12 @@ FOLDS_MATERIAL = Structure(
     viscosity=20.0,
 )
 SPRINGS_MATERIAL = NeoHookean(young=4e4, poisson=0.0, density=150.0, viscosity=2.3e3)
-"""Half of the outer part, particle by particle beside what folds. Its viscosity takes the energy
-that low-speed restitution does not give back."""
+"""Half of the outer layer, alternating with folding particles. Its viscosity absorbs the energy
+that low-speed restitution does not return."""
 END_MATERIALS: tuple[Material, ...] = (RAILS_MATERIAL, FOLDS_MATERIAL, SPRINGS_MATERIAL)
 SIDE_STRESS = 0.0855
-"""Stress of a side against that of the ends for the same force per width and deflection: it is
-shallower, and carries along what is beside the place that is struck."""
+"""Stress of a side relative to the ends for the same force per width and deflection. A side is
+shallower, and the neighbourhood of the impact point is carried along."""
 
 
 def vehicle_structure(
@@ -283,7 +282,7 @@ PERSON_MASS = ClassMass(
 )
 PERSON_KG, PERSON_HEIGHT, GROWTH = 78.0, 1.75, 2.5
 HEIGHTS = (0.6, 2.0)
-"""Of persons [m]; boxes that are lower or higher are wrong."""
+"""Valid heights of persons [m]; other boxes are wrong."""
 CLASS_MASSES = {
     "car": CAR_MASS,
     "vehicle": CAR_MASS,
@@ -308,14 +307,14 @@ CLASS_MASSES = {
     ),
     "motorcycle": ClassMass(150.0, "200 kg machine and 78 kg rider in 2.1 x 0.8 x 1.1 m of box"),
 }
-"""Typical figures for want of better ones; give a mass where it is known."""
+"""Typical values by category. Set ``mass`` if you know it."""
 OTHER = ClassMass(100.0, "between empty furniture and wood; no better guess")
 
 
 YAW_RADIUS = 0.261
-"""Radius of gyration of vehicles about the vertical, over their length: 1538.9 kg m^2 of a Ford
-Escort of 1225.9 kg and 4.298 m (CommonRoad vehicle models). The particles of a car have 0.262, a
-box of even mass 0.31."""
+"""Radius of gyration of vehicles about the vertical axis, relative to their length: 1538.9 kg m^2
+of a Ford Escort of 1225.9 kg and 4.298 m (CommonRoad vehicle models). The particles of a car have
+0.262, a homogeneous box 0.31."""
 
 
 def yaw_inertia(category: str, mass: float, size: Sequence[float]) -> float:

@@ -25,13 +25,14 @@ from .rigid import RigidMotion, clearance, nearest, packed
 ROLLING = 0.015
 """Rolling resistance of a free wheel, fraction of its load."""
 ROUNDS = 6
-"""Sweeps over the four patches in one step; their impulses act on each other."""
+"""Sweeps over the four patches in one step; the impulses of patches affect each other."""
 UPRIGHT = 0.5
-"""Wheels carry while the body's up axis leans less than 60 degrees from the ground's normal."""
+"""Minimum cosine between the body's up axis and the road's normal for loaded wheels (60 degrees).
+"""
 STATIC_GRAVITY = 9.81
-"""Static loads are divided by this for the mass that a wheel carries [m/s^2]."""
+"""Gravity by which static loads are divided for the mass on a wheel [m/s^2]."""
 FRICTION, BRAKE, FREQUENCY, DAMPING, TRAVEL = range(5)
-"""Entries of a row of tyre parameters, see ``Tyres``."""
+"""Columns of a row of tyre parameters, see ``Tyres``."""
 
 
 @kernel
@@ -102,7 +103,7 @@ def press(
     """Apply road forces to four patches over ``dt`` [s]; updates the velocities in ``motion``.
 
     Springs and dampers act along the normal. In the tangent plane, friction stops the slip of each
-    patch within its friction circle: laterally always, longitudinally as far as it is braked.
+    patch within its friction circle: laterally always, longitudinally in proportion to the braking.
 
     Args:
         points: [4, 3] patches, world frame [m].
@@ -258,11 +259,11 @@ def times(matrix: Any, a: Any) -> Any:
 
 
 ABOVE_MAX = 0.1
-"""Tracked boxes of standing vehicles are at most this high above the road [m]."""
+"""Maximum height of the tracked box of a standing vehicle above the road [m]."""
 TRACK = 0.84
-"""Over the width of the box."""
+"""Track width as a fraction of the box width."""
 LIFT_MAX = 0.3
-"""Wheels never go further into their arches than this [m]."""
+"""Maximum displacement of wheels into their arches [m]."""
 
 
 @dataclass(frozen=True, eq=False)

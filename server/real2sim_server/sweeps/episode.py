@@ -50,7 +50,7 @@ def signed_gaps_into(box, centres, yaws, sizes, found):
         dx, dy = centres[k, 0] - x, centres[k, 1] - y
         turned = yaws[k] - yaw
         cos, sin = math.cos(turned), math.sin(turned)
-        # The other's middle as the box sees it, and the box's as the other does.
+        # The other centre in the frame of the box, and the box's centre in the other's frame.
         tx, ty = c * dx + s * dy, c * dy - s * dx
         ox, oy = -(cos * tx + sin * ty), -(cos * ty - sin * tx)
         la, wa, lb, wb = length / 2, width / 2, sizes[k, 0] / 2, sizes[k, 1] / 2
@@ -77,13 +77,13 @@ def _to_rectangle(x, y, half_length, half_width):
 
 @kernel
 def least_margin(bumper, velocity, others, per_metre):
-    """The least of time and distance to others ahead: ``min over t of t + per_metre * gap(t)``.
+    """Smallest criticality margin of objects ahead: ``min over t of t + per_metre * gap(t)``.
 
-    All keep their velocities, for 3 s in steps of 0.2 s.
+    All velocities are constant, for 3 s in steps of 0.2 s.
 
     Args:
         bumper: centre x, y [m], yaw [rad], length, width [m] of the front of the ego.
-        velocity: of it, x and y [m/s].
+        velocity: velocity of the bumper, x and y [m/s].
         others: centres [K, 3] [m], yaws [K] [rad], sizes [K, 3] [m], velocities [K, 2] [m/s].
         per_metre: [s/m].
     """
@@ -141,11 +141,12 @@ second.
 SHARPNESS = 16.0
 """Sharpness of the smooth minimum over time [1/s]."""
 FARTHEST = 100.0
-"""Upper limit of margins [s], reached at half as many metres."""
+"""Maximum margin [s], reached at half as many metres."""
 AT_FAULT, PER_SPEED = 0.5, 0.05
-"""An at-fault collision, and each m/s of its speed."""
+"""Criticality of an at-fault collision, and additional criticality per m/s of its speed."""
 NOT_AT_FAULT = -1.0
-"""At most, where others caused a collision: a margin of a second, so that no search ends there."""
+"""Maximum criticality of a collision caused by others. It equals a margin of one second, so that no
+search ends there."""
 
 
 def adversaries_of(
@@ -190,7 +191,7 @@ class Danger:
     _margins: list[float] = field(default_factory=list)
 
     def add(self, world: World) -> None:
-        """The instant that a world is at."""
+        """Add the current instant of a world."""
         instant, context = world.instant, world.context
         ego, others = instant.ego, instant.others
         if not others.ids:
@@ -222,7 +223,7 @@ class Danger:
     def criticality(self, world: World) -> float:
         """Criticality of the episode so far.
 
-        -100 far from everybody, rising towards 0 at closer range; positive for an at-fault
+        -100 far from all objects, rising towards 0 at closer range; positive for an at-fault
         collision, increasing with its speed.
         """
         if sum(world.accumulator.at_fault.values()):
@@ -230,7 +231,7 @@ class Danger:
         margins = np.array(self._margins or [FARTHEST])
         least = float(margins.min())
         smooth = least - math.log(np.exp(-SHARPNESS * (margins - least)).sum()) / SHARPNESS
-        # Without fault it is not a failure, at any distance.
+        # A collision without fault is not a failure.
         found = min(-smooth, 0.0)
         return min(found, NOT_AT_FAULT) if world.accumulator.collisions else found
 
@@ -245,7 +246,7 @@ class CameraFeed:
     """The colour images for a planner.
 
     Attributes:
-        cameras: resized to the planner's needs.
+        cameras: cameras at the size that the planner needs.
     """
 
     cameras: tuple[Camera, ...]
@@ -269,7 +270,7 @@ class CameraFeed:
         return cls(tuple(c if needs.width is None else c.resized(needs.width) for c in cameras))
 
     def added_to(self, obs: Observation, world: World) -> Observation:
-        """The observation with the images of its instant."""
+        """The observation with its images."""
         frames = {camera.name: {"rgb": draw_frames([world], camera)[0]} for camera in self.cameras}
         return replace(obs, frames=frames)
 
@@ -278,8 +279,8 @@ def draw_frames(worlds: Sequence[World], camera: Camera) -> list[Frame]:
     """Images of a camera in several worlds of one scene, rendered in one call.
 
     Args:
-        worlds: at their current times; at least one.
-        camera: of the ego.
+        worlds: worlds at their current times; at least one.
+        camera: camera of the ego.
     """
     views = [View(w.instances(), camera.viewmat(w.T_world_body), camera.K) for w in worlds]
     drawn = rasterize_batch(
@@ -328,8 +329,11 @@ class Drive:
         return cls(planner, case.reset_for(seed), edits)
 
     def key(self, scene_hash: str) -> str:
-        """Hex, the same for episodes that come out the same: scene, options, edits, planner with
-        the file that it is made of, and the versions of program and scores."""
+        """Hex key of the result.
+
+        A hash of scene, options, edits, planner with its files, and the versions of program and
+        scores.
+        """
         name, _, argument = self.planner.partition("=")
         content = {
             "scene": scene_hash,
@@ -395,9 +399,9 @@ def drive_episode(
     As over the network, edits are applied at the start time, after the planner's first observation.
 
     Args:
-        scene: of the case.
+        scene: scene of the case.
         drive: the episode.
-        planner: as loaded.
+        planner: loaded planner.
         keep_entries: keep the entries for a recording.
         keep_worlds: keep the world of each step, to continue from it.
         on_world: called with the world at every time step.
@@ -446,7 +450,7 @@ def drive_episode(
 
 
 def observation_of(world: World, feed: CameraFeed | None = None) -> Observation:
-    """What a session would show."""
+    """The observation that a session would send."""
     obs = observation_from_wire(Obs(**world.observe().obs_fields(), frames=[]))
     return obs if feed is None else feed.added_to(obs, world)
 

@@ -33,7 +33,7 @@ from real2sim_proto.sweeps import (
 
 MAX_CHARACTERS = 200
 MAX_POWER = 64.0
-"""Larger exponents are rejected as mistakes."""
+"""Maximum exponent; larger ones are rejected as mistakes."""
 
 BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -53,10 +53,10 @@ FUNCTIONS: Mapping[str, Callable[..., float]] = {
 
 
 def names_in(expression: str) -> set[str]:
-    """Parameters that an expression needs.
+    """Parameters used in an expression.
 
     Raises:
-        ValueError: it is no expression of numbers, names and the operators and functions above.
+        ValueError: it is not an expression of numbers, names and the operators and functions above.
     """
     tree = _parsed(expression)
     functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
@@ -70,11 +70,11 @@ def evaluate(expression: str, values: Mapping[str, float], *, check_only: bool =
 
     Args:
         expression: text.
-        values: of the names in it.
-        check_only: errors caused by these values are ignored.
+        values: values of its names.
+        check_only: ignore errors caused by these values.
 
     Raises:
-        ValueError: not arithmetic, an unknown name, or no finite result.
+        ValueError: not arithmetic, an unknown name, or a result that is not finite.
     """
     try:
         found = float(_value(_parsed(expression).body, values))
@@ -168,7 +168,7 @@ class FloatRange(FloatParameter):
 
 
 class IntRange(IntParameter):
-    """Whole numbers from ``low`` to ``high``, both included, each as likely."""
+    """Uniform integers from ``low`` to ``high``, both included."""
 
     def at(self, u: float) -> int:
         """The value at a coordinate."""
@@ -176,7 +176,7 @@ class IntRange(IntParameter):
         return self.low + min(int(u * count), count - 1)
 
     def coordinate(self, value: Any) -> float:
-        """The middle of a value's stretch."""
+        """Coordinate of the middle of a value's interval."""
         return (int(value) - self.low + 0.5) / (self.high - self.low + 1)
 
     def levels(self, count: int) -> list[float]:
@@ -187,23 +187,23 @@ class IntRange(IntParameter):
 
 
 class Choice(ChoiceParameter):
-    """One of a list, each as likely."""
+    """Uniform choice from a list."""
 
     def at(self, u: float) -> Value:
         """The value at a coordinate."""
         return self.values[min(int(u * len(self.values)), len(self.values) - 1)]
 
     def coordinate(self, value: Any) -> float:
-        """The middle of a value's stretch."""
+        """Coordinate of the middle of a value's interval."""
         return (self.values.index(value) + 0.5) / len(self.values)
 
     def levels(self, count: int) -> list[float]:
-        """Coordinates of all values, whatever the count."""
+        """Coordinates of all values, regardless of ``count``."""
         return [(k + 0.5) / len(self.values) for k in range(len(self.values))]
 
 
 class Normal(NormalParameter):
-    """Normal, cut off at ``low`` and ``high``."""
+    """Normal distribution, truncated at ``low`` and ``high``."""
 
     def at(self, u: float) -> float:
         """The value at a coordinate, which is its cumulative probability."""
@@ -223,12 +223,12 @@ class Normal(NormalParameter):
         return (x - low) / (high - low)
 
     def levels(self, count: int) -> list[float]:
-        """Coordinates of a grid, at middles of equal shares."""
+        """Coordinates of a grid, in the middle of intervals of equal probability."""
         return [(k + 0.5) / count for k in range(count)]
 
 
 class Derived(DerivedParameter):
-    """Computed from other parameters, by arithmetic."""
+    """Computed from other parameters by an expression."""
 
     @model_validator(mode="after")
     def _check_expression(self) -> Self:
@@ -241,7 +241,7 @@ Parameter = Annotated[Drawn | Derived, Field(discriminator="kind")]
 
 
 def drawn_parameters(parameters: Mapping[str, Parameter]) -> dict[str, Drawn]:
-    """Those that have a coordinate, in the order that they are written in."""
+    """Parameters with a coordinate, in the order of the file."""
     return {k: p for k, p in parameters.items() if not isinstance(p, Derived)}
 
 
@@ -249,7 +249,7 @@ def values_at(parameters: Mapping[str, Parameter], point: Sequence[float]) -> di
     """Values of all parameters, by name.
 
     Args:
-        parameters: of the space.
+        parameters: parameters of the space.
         point: coordinates from 0 to 1 of the sampled parameters.
 
     Raises:
@@ -290,10 +290,10 @@ Method = Annotated[GridMethod | SpreadMethod | ImportanceMethod, Field(discrimin
 def points_of(
     method: GridMethod | SpreadMethod | ImportanceMethod, drawn: Mapping[str, Drawn]
 ) -> tuple[Points, Points]:
-    """Points [N, D] with coordinates from 0 to 1, and their weights [N], 1 where all are alike.
+    """Points [N, D] with coordinates from 0 to 1, and their weights [N], 1 if all are equal.
 
     Raises:
-        ValueError: too many points, or a parameter that is none.
+        ValueError: too many points, or an unknown parameter.
     """
     if isinstance(method, GridMethod):
         points = _grid(method, drawn)
@@ -305,8 +305,9 @@ def points_of(
 
 
 def spread(kind: str, count: int, dimensions: int, *, seed: int) -> Points:
-    """[count, dimensions] in [0, 1). The points are a prefix of longer sequences, except for Latin
-    hypercubes.
+    """Spread points [count, dimensions] in [0, 1).
+
+    The points are a prefix of longer sequences, except for Latin hypercubes.
     """
     from scipy.stats import qmc
 

@@ -59,10 +59,10 @@ from .parameters import (
 
 
 def open_scene(name: str, folder: Path | None = None) -> Scene:
-    """The bundle at that path, or with that name below a folder; the demo street by default.
+    """The bundle with a path, or with a name below a folder; the demo street by default.
 
     Raises:
-        CommandError: there is none.
+        CommandError: the bundle does not exist.
         BundleError: it cannot be read.
     """
     places = [Path(name), *([folder / name] if folder is not None else [])]
@@ -86,7 +86,7 @@ SECONDS = 15.0
 MAX_FILE_BYTES = 16 << 20
 MAX_VALUES = 1000
 WIDTHS = 4.0
-"""Cut-off of a normal distribution without a range, in standard deviations."""
+"""Truncation of a normal distribution without a range, in standard deviations."""
 
 
 class ScenarioSource(BaseModel):
@@ -169,9 +169,9 @@ def read_scenario(
     """A scenario with values of its parameters.
 
     Raises:
-        ScenarioError: no scenario, or something that is not supported.
-        ValueError: a parameter that it does not have.
-        OSError: it cannot be read.
+        ScenarioError: not a scenario, or with unsupported elements.
+        ValueError: an unknown parameter.
+        OSError: the file cannot be read.
     """
     if source.file.startswith(GALLERY):
         return ScenarioFile(corner_case(source.file).storyboard(**parameters))
@@ -191,14 +191,14 @@ def read_scenario(
 def write_scenario_file(
     folder: Path, name: str, read: ScenarioFile, source: ScenarioSource
 ) -> ScenarioSource:
-    """Write a storyboard with its road network; returns the source to read it again.
+    """Write a storyboard with its road network; return the source to read it again.
 
     Args:
-        folder: of the file.
-        name: of the file, without its suffix: ``.xosc``, or ``.json`` if OpenSCENARIO cannot
-            express it.
-        read: in the frame of its file.
-        source: its original source.
+        folder: folder of the file.
+        name: file name without its suffix: ``.xosc``, or ``.json`` if OpenSCENARIO cannot express
+            it.
+        read: storyboard in the frame of its file.
+        source: original source of the storyboard.
     """
     board = read.board
     if isinstance(board.roads, MapRoads) and read.road_file is not None:
@@ -234,12 +234,12 @@ def with_storyboard(
     Parameters with distributions in the file can be omitted.
 
     Args:
-        fields: of the file.
+        fields: fields of the space file.
         folder: base of the relative path.
         scenes: folder of bundles, as for :func:`~.open_scene`.
 
     Raises:
-        CommandError: no such scenario, or one that cannot be a space; the message says why.
+        CommandError: no such scenario, or one that cannot be a space; the message explains why.
         ValueError: invalid fields.
     """
     asked = fields["storyboard"]
@@ -272,9 +272,9 @@ def _name(file: str) -> str:
 
 
 def _parameters(given: Mapping[str, Any], found: ScenarioFile, file: str) -> dict[str, Any]:
-    """Parameters named by the space, and further ones with distributions in the file."""
+    """Parameters named by the space, and other parameters with distributions in the file."""
     board = found.board
-    # What a space names itself may have any distribution in the file.
+    # The file may have any distribution for parameters that the space names itself.
     drawn = {n: d for n, d in board.distributions.items() if n not in given}
     parameters = {name: _parameter(name, d) for name, d in drawn.items()}
     parameters |= {n: p for n, p in _of_cases(found.cases).items() if n not in given}
@@ -379,10 +379,10 @@ class Space(BaseModel):
         return self
 
     def case_at(self, values: Mapping[str, Value]) -> Case:
-        """The case with values of the parameters in their places.
+        """The case with values of the parameters inserted.
 
         Raises:
-            ValueError: a path that leads nowhere, or a value that is not allowed there.
+            ValueError: a path that does not exist, or an invalid value.
         """
         fields: dict[str, Any] = {
             "reset": copy.deepcopy(self.case.reset),
@@ -424,7 +424,7 @@ class SweepSpec(Space):
     @model_validator(mode="after")
     def _check_points(self) -> Self:
         if isinstance(self.method, SpreadMethod) and self.method.count > 4096:
-            return self  # Names cannot be wrong, and drawing them twice would take its time.
+            return self  # Names are valid already, and computing the points again takes time.
         points_of(self.method, drawn_parameters(self.parameters))
         return self
 
@@ -433,14 +433,14 @@ S = TypeVar("S", bound=Space)
 
 
 def load_sweep(path: Path, scenes: Path | None = None) -> SweepSpec:
-    """A sweep in a YAML or JSON file.
+    """Load a sweep from a YAML or JSON file.
 
     Args:
         path: the file.
         scenes: folder of bundles, for a storyboard placed in a scene.
 
     Raises:
-        CommandError: it cannot be read, or is not a sweep; the message says why.
+        CommandError: the file cannot be read, or is not a sweep; the message explains why.
     """
     return _loaded(path, SweepSpec, "sweep", scenes)
 
@@ -476,7 +476,7 @@ def _loaded(path: Path, kind: type[S], what: str, scenes: Path | None) -> S:
 def _validated(
     fields: dict[str, Any], folder: Path, kind: type[S], named: tuple[str, str], scenes: Path | None
 ) -> S:
-    """Args: fields; base folder of names in them; model; file and kind for messages."""
+    """Validate the fields of a file; ``named``: file and kind, for messages."""
     name, what = named
     if kind is Space:
         fields = {k: v for k, v in fields.items() if k in Space.model_fields}
@@ -508,7 +508,9 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _put(fields: dict[str, Any], path: str, value: Value) -> None:
-    """Set the value at a path: ``reset.agents.drivers.van_0.gap``, the same without ``reset``, or
+    """Set the value at a path.
+
+    For example ``reset.agents.drivers.van_0.gap``, the same without ``reset``, or
     ``operations.0.delta.1``.
     """
     parts = path.split(".")

@@ -47,7 +47,7 @@ class Journal:
     cut off. Other damaged lines are skipped, and their episodes driven again.
 
     Args:
-        path: of the file; it is created if missing.
+        path: path of the file; created if missing.
 
     Raises:
         ValueError: a file of another kind, or too large.
@@ -79,8 +79,8 @@ class Journal:
         self._file = None
 
     def add(self, key: str, row: Mapping[str, Any]) -> None:
-        """Keep a row: once this returns, no kill of the program loses it."""
-        # Numbers are written as the shortest text that reads back as the same bits.
+        """Store a row durably: after the call returns, it survives a kill of the program."""
+        # Numbers are written as the shortest text that reads back to the same bits.
         text = f"{key} {json.dumps(dict(row), separators=(',', ':'))}".encode()
         self._write(b"%08x %s\n" % (zlib.crc32(text), text))
         self.rows[key] = dict(row)
@@ -92,7 +92,7 @@ class Journal:
         os.fdatasync(self._file.fileno())
 
     def _read(self) -> int:
-        """Read all whole lines; returns the end of the last one."""
+        """Read all complete lines; returns the end of the last one."""
         if (size := self._path.stat().st_size) > MAX_BYTES:
             raise ValueError(f"{self._path} has {size} bytes; at most {MAX_BYTES} are read")
         end = 0
@@ -131,9 +131,9 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[st
     """Write rows atomically; equal rows give equal bytes.
 
     Args:
-        path: of the file.
-        rows: in order.
-        types: of the columns, in order: ``bool``, ``int``, ``float`` or ``str``.
+        path: path of the file.
+        rows: rows in order.
+        types: types of the columns, in order: ``bool``, ``int``, ``float`` or ``str``.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -185,17 +185,17 @@ COLUMNS: Mapping[str, type] = {
 
 
 def recipe_of(scene: str, scenes: Path | None, metrics: Sequence[str] = ()) -> Recipe:
-    """Makes workers for a scene; see :func:`.spec.open_scene`."""
+    """A factory of workers for a scene; see :func:`.spec.open_scene`."""
     return partial(EpisodeWorker, scene, scenes, tuple(metrics))
 
 
 class EpisodeWorker:
-    """Holds a scene.
+    """Holds a scene and drives episodes in it.
 
     Args:
-        scene, scenes: as :func:`.spec.open_scene` takes them.
+        scene, scenes: as for :func:`.spec.open_scene`.
         metrics: scores that get columns.
-        threads: that it computes with.
+        threads: number of threads.
     """
 
     def __init__(
@@ -275,11 +275,11 @@ class PlannedEpisode:
 
     Attributes:
         point: index of the point in the space.
-        planner, seed: of the episode.
-        weight: of its point.
-        values: of the parameters.
+        planner, seed: planner and seed of the episode.
+        weight: weight of the point.
+        values: values of the parameters.
         drive: the episode.
-        key: of the journal.
+        key: key in the journal.
     """
 
     point: int
@@ -427,7 +427,7 @@ def _check(spec: SweepSpec, scene: Scene) -> None:
 
 
 def _parts(planned: list[PlannedEpisode], stop: StopRule | None) -> Iterator[list[PlannedEpisode]]:
-    """What is handed out at a time: all, or as much as cannot be far beyond the stop."""
+    """Batches of episodes: all at once, or up to AT_ONCE with a stop rule."""
     size = AT_ONCE if stop is not None else max(len(planned), 1)
     for first in range(0, len(planned), size):
         yield planned[first : first + size]
@@ -450,7 +450,7 @@ def _enough(planned: list[PlannedEpisode], rows: Mapping[str, Row], stop: StopRu
 def _worst(
     episodes: list[PlannedEpisode], rows: list[Row], spec: SweepSpec
 ) -> list[PlannedEpisode]:
-    """The highest in the column that ranks them."""
+    """The episodes with the highest values in the ranking column."""
 
     def rank(k: int) -> tuple[float, int]:
         value = rows[k].get(spec.rank_by)

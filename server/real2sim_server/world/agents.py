@@ -28,7 +28,7 @@ def rows_of(agents: Agents) -> dict[str, int]:
 
 
 def rows_in(before: Agents, after: Agents) -> NDArray[np.int64]:
-    """The row in ``before`` of each object of ``after``, [K] int64; -1 where it was not there."""
+    """The row in ``before`` of each object of ``after``, [K] int64; -1 if it was not present."""
     if before.objects is after.objects:
         return _all_rows(len(after.objects))
     rows = rows_of(before)
@@ -37,7 +37,7 @@ def rows_in(before: Agents, after: Agents) -> NDArray[np.int64]:
 
 @lru_cache(maxsize=64)
 def _all_rows(count: int) -> NDArray[np.int64]:
-    """Shared between callers: never written to."""
+    """Shared between callers; do not write to it."""
     return np.arange(count)
 
 
@@ -70,10 +70,10 @@ def agent_fields(agents: Agents) -> list[dict[str, Any]]:
 # strides computed from their motion.
 
 LED = 1e-3
-"""A pedestrian this close to the recorded trajectory [m], also in the entries of the rotation,
-walks with its recorded stride."""
+"""Maximum deviation from the recorded trajectory for recorded strides: position [m], and entries of
+the rotation."""
 UPRIGHT = 0.9
-"""Cosine of the angle to the vertical beyond which a pedestrian does not walk."""
+"""Minimum cosine between a walking pedestrian and the vertical."""
 
 Walker = tuple[int, ObjectState, Figure]
 

@@ -58,7 +58,7 @@ TRACKERS = tuple(name for name, kind in KINDS.items() if kind not in PLANNING_AH
 FREE = frozenset({"seed", "start_us", "dt_us", "horizon", "sensors", "privileged", "scoring"})
 """Fields of a reset without restrictions; the caller of the batch renders cameras."""
 CHECKED = frozenset({"ego", "action", "agents", "contact"})
-"""Fields of which only a part is known here."""
+"""Fields that are supported in part."""
 
 
 def check_batchable(spec: ResetSpec) -> None:

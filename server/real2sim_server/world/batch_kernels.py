@@ -58,7 +58,7 @@ def advance_objects(
     t_us, dt_us, bodies, rows, tracks, drivers, driving, objects,
     new_drivers, new_driving, new_objects, new_present
 ):  # fmt: skip
-    """Objects ``dt_us`` after ``t_us``: recorded ones, then those with drivers."""
+    """Objects ``dt_us`` after ``t_us``: recorded ones first, then those with drivers."""
     end_us = t_us + dt_us
     record_objects(end_us, tracks, new_objects, new_present)
     for k in range(len(drivers)):
@@ -79,7 +79,7 @@ def advance_objects(
 
 @func
 def record_objects(t_us, tracks, objects, present):
-    """Objects as they are recorded."""
+    """Recorded poses of objects."""
     known, positions, quaternions, velocities, _ = poses_at(
         t_us, tracks.ends, tracks.times, tracks.knots
     )
@@ -99,7 +99,7 @@ def path_of(k, tracks):
 
 @func
 def begin_driver(k, tracks, pose, driver):
-    """A driver from where its object is, see ``Idm.from_pose``."""
+    """A driver at the current pose of its object, see ``Idm.from_pose``."""
     s, offset, _, yaw, _ = nearest_point(path_of(k, tracks), pose[0], pose[1], math.nan)
     driver[0], driver[1] = s, offset
     driver[2] = max(pose[7] * math.cos(yaw) + pose[8] * math.sin(yaw), 0.0)
@@ -151,8 +151,8 @@ def remainder(value, period):
 
 STATE = len(PlanarState._fields)
 S, OFFSET, PATH_X, PATH_Y, PATH_Z, PATH_YAW, BEYOND = range(7)
-"""Columns of ``places``: along and beside the route, the nearest point of it, and how far the worst
-corner of the ego box is off the road [m]."""
+"""Columns of ``places``: position along and lateral offset from the route, its nearest point, and
+distance of the worst corner of the ego box off the road [m]."""
 PLACES = 7
 
 STANDS, GOES, MOVED = 0, 1, 2

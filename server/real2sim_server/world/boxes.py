@@ -151,10 +151,11 @@ WAY = 5
 """Columns of a box motion: fraction of the step, centre x, y [m], yaw [rad], bottom height [m]."""
 
 MIN_OVERLAP = 1e-9
-"""Boxes that overlap by no more than this only touch [m]."""
+"""Maximum overlap of boxes that only touch [m]."""
 
 MAX_PIECES = 64
-"""Parts of a piece in which boxes above one another are looked at again."""
+"""Maximum number of subdivisions of a segment for boxes that overlap in the plane but not in
+height."""
 
 
 @kernel
@@ -193,7 +194,7 @@ def first_contacts(way, size, rows, start, end, sizes, slack, tolerance):
         other_reach = math.hypot(sizes[k, 0], sizes[k, 1]) / 2
         for i in range(len(way) - 1):
             f, g = way[i, 0], way[i + 1, 0]
-            # Centre of the object from that of the vehicle, at both ends of this piece.
+            # Centre of the object relative to the vehicle's, at both ends of this segment.
             px, py = ax + (bx - ax) * f - way[i, 1], ay + (by - ay) * f - way[i, 2]
             qx, qy = ax + (bx - ax) * g - way[i + 1, 1], ay + (by - ay) * g - way[i + 1, 2]
             if _nearest(px, py, qx - px, qy - py) > reach + other_reach:
@@ -374,8 +375,8 @@ def _hits(x, y, yaw, size, spacing, origin, cell, occupied):
 # --- Ego box -------------------------------------------------------------------------------------
 
 REAR_OVERHANG = 0.95
-"""Distance from the rear axle to the rear end of the ego box [m]. Recorders store the box size but
-not where the axle lies in it; 0.95 m is usual for passenger cars between 4.3 and 4.9 m long."""
+"""Distance from the rear axle to the rear end of the ego box [m]. Recordings store the box size,
+but not the position of the axle; 0.95 m is usual for passenger cars between 4.3 and 4.9 m long."""
 
 
 def ego_box(T_world_vehicle: Float, size: tuple[float, float, float]) -> Float:

@@ -52,7 +52,7 @@ S = TypeVar("S")
 V = TypeVar("V")
 
 MAX_CACHED = 512
-"""Objects in a cache, which is emptied when it is full."""
+"""Maximum number of objects in a cache; a full cache is emptied."""
 
 
 def cache_by_identity(fn: Callable[[S], V]) -> Callable[[S], V]:
@@ -89,7 +89,7 @@ class Draws:
     """Random numbers of an episode.
 
     Attributes:
-        seed: of the episode.
+        seed: seed of the episode.
     """
 
     seed: int

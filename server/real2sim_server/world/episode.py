@@ -154,28 +154,29 @@ def _check_sensor(scene: Scene, spec: ResetSpec, sensor: SensorSpec) -> None:
 # (:class:`.path.LoopTransform`). Road users that follow the route move with it; all others stay.
 
 BEND_FROM = 10.0
-"""The bend at the end of the recorded drive is that of its last metres [m]."""
+"""Length at the end of the recorded drive that determines the final curvature [m]."""
 
 SHARPEST_BEND = 0.05
-"""More than this is noise or a turn at a junction, which the road does not continue [1/m]."""
+"""Maximum curvature to continue [1/m]; above, it is noise or a turn at a junction."""
 
 BEND_FADES = 40.0
-"""Way along which a bend falls to 1/e [m]."""
+"""Distance over which the curvature falls to 1/e [m]."""
 
 SPACING, FADED = 2.0, 160.0
-"""Of the places behind the recorded drive, and where the rest of the way is straight [m]."""
+"""Spacing of the points of the continuation, and distance after which it is straight [m]."""
 
 MAX_ROUTE = 100_000.0
-"""[m]"""
+"""Maximum length of a route [m]."""
 
 FASTEST = 15.0
-"""A route is long enough to go on at this speed, or half as fast again as recorded [m/s]."""
+"""Minimum speed for which an extended route is long enough [m/s]; 1.5 times the highest recorded
+speed, if greater."""
 
 SHORTEST_LOOP = 20.0
-"""Recorded drives shorter than this are no loop [m]."""
+"""Minimum length of a recorded drive for a loop [m]."""
 
 STANDING = 2.0
-"""Objects that cover less than this in the recording stand [m]."""
+"""Maximum distance that a stationary object covers in the recording [m]."""
 
 
 def driven_route(scene: Scene, spec: ResetSpec, horizon: int) -> LoggedPath:
@@ -216,7 +217,7 @@ def continued(path: LoggedPath, reach: float, ground: Ground) -> LoggedPath:
     bend = min(max(bend, -SHARPEST_BEND), SHARPEST_BEND)
     way = SPACING * np.arange(1, round(min(reach, FADED) / SPACING) + 1)
     yaws = path.yaws[-1] + bend * BEND_FADES * (1.0 - np.exp(-way / BEND_FADES))
-    # Along the chord of each piece, whose heading is that of its middle.
+    # Along the chord of each piece, with the heading at its middle.
     middles = np.concatenate([[path.yaws[-1]], yaws])
     chords = SPACING * np.exp(0.5j * (middles[1:] + middles[:-1]))
     plane = path.positions[-1, 0] + 1j * path.positions[-1, 1] + np.cumsum(chords)
@@ -235,7 +236,7 @@ def continued(path: LoggedPath, reach: float, ground: Ground) -> LoggedPath:
 
 
 def at_start_again(motion: Motion, near: PathPoint, route: LoggedPath, s: float) -> Motion:
-    """The motion moved to route distance ``s``, with the offset and heading error at ``near``."""
+    """The motion moved to route distance ``s``, with its offset and heading error at ``near``."""
     x, y, _, yaw = route.at(s)
     return motion._replace(
         x=x - near.offset * math.sin(yaw),
@@ -247,8 +248,8 @@ def at_start_again(motion: Motion, near: PathPoint, route: LoggedPath, s: float)
 # --- objects --------------------------------------------------------------------------------------
 
 Prolonged = dict[Trajectory, Trajectory]
-"""Trajectories of standing objects by what they were before they were prolonged, so that one is
-the same object as long as an episode lasts: drivers begin anew with another."""
+"""Extended trajectories of stationary objects, by original trajectory. Caching keeps their identity
+over an episode, because drivers restart with a new trajectory."""
 
 
 def tracks_beyond_log(
@@ -321,7 +322,7 @@ class LoopReset(NamedTuple):
 
     Attributes:
         laps: number of completed laps.
-        way: their length [m].
+        way: total length of these laps [m].
         motion, point: motion of the ego after the reset, and its route position.
         seam: transform from before to after the reset.
     """

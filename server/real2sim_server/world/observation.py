@@ -57,7 +57,7 @@ class PendingStep(NamedTuple):
 
 
 LANE_LENGTH = 5.0
-"""Recorded vehicles that moved less than this show no lane [m]."""
+"""Minimum distance that a recorded vehicle moves for its path to count as a lane [m]."""
 
 
 def scoring_context(
@@ -176,9 +176,9 @@ def _named(objects: tuple[ObjectState, ...]) -> tuple[tuple[str, ...], tuple[str
 RADIUS = 60.0
 """Maximum distance of centre line points from the vehicle [m]."""
 SPACING = 5.0
-"""Between places along a lane, at most [m]."""
+"""Maximum distance between points along a lane [m]."""
 MAX_LANES, MAX_PLACES = 32, 32
-"""The nearest lanes, and of each the places nearest to its own nearest one."""
+"""Maximum numbers of lanes, and of points per lane; the nearest ones are used."""
 
 
 class LanePiece(NamedTuple):
@@ -213,8 +213,10 @@ class LanePiece(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Centre line points of all lanes [P, 4] as in :class:`LanePiece`, lane indices [P], and a
-    k-d tree of the points."""
+    """Centre line points of all lanes, with a k-d tree.
+
+    Points [P, 4] as in :class:`LanePiece`, lane indices [P], and the tree of the points.
+    """
 
     values: Float
     lane: NDArray[np.int64]
@@ -233,7 +235,7 @@ def lanes_around(graph: LaneGraph, x: float, y: float) -> tuple[LanePiece, ...]:
     if not len(near):
         return ()
     distances = np.hypot(*(known.values[near, :2] - (x, y)).T)
-    # By distance, then by number, so that ties fall alike everywhere.
+    # By distance, then by index, so that ties have the same order everywhere.
     order = near[np.lexsort((near, distances))]
     _, first = np.unique(known.lane[order], return_index=True)
     lanes = list(graph.lanes.values())
@@ -388,13 +390,13 @@ def ego_fields(
 
 
 def _quaternion(T_world_vehicle: Float) -> tuple[float, float, float, float]:
-    """wxyz, w >= 0, of an upright vehicle: one case of four, and no arrays."""
+    """wxyz, w >= 0, of an upright vehicle: only one of the four cases, without arrays."""
     (xx, xy, xz, _), (yx, yy, yz, _), (zx, zy, zz, _), _ = T_world_vehicle.tolist()
     # With the z axis up, w^2 + z^2 is at least a half, so the larger of the two is a safe pivot.
     w, z = 1 + xx + yy + zz, 1 - xx - yy + zz
     q = (w, zy - yz, xz - zx, yx - xy) if w >= z else (yx - xy, xz + zx, yz + zy, z)
     length = math.copysign(math.sqrt(sum(v * v for v in q)), q[0])
-    # A level body would have negative zeros.
+    # Avoids the negative zeros of a level body.
     return (
         q[0] / length + 0.0,
         q[1] / length + 0.0,

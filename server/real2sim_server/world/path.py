@@ -15,16 +15,16 @@ from ..scene import Trajectory
 KNOT = 11
 
 NEAR_BEHIND, NEAR_AHEAD = 20.0, 60.0
-"""Where along the path a vehicle is looked for first, from where it was last [m]."""
+"""Range along the path that is searched first, relative to the last position [m]."""
 
 LOST = 10.0
-"""Farther from the path than this, the whole of it is searched [m]."""
+"""Distance from the path beyond which the whole path is searched [m]."""
 
 PIECE = 4.0
-"""Curvature is taken over pieces of this length [m]."""
+"""Length of the segments for curvature [m]."""
 
 REACH = 80
-"""The leading object is searched for in as many metres, at points one metre apart."""
+"""Search range for the leading object [m], in points one metre apart."""
 
 SIDE = 0.3
 """Lateral clearance of a box that counts as blocked [m]."""
@@ -291,10 +291,10 @@ def _foot(knots, x, y, first, last):
 Float = NDArray[np.float64]
 
 SPACING = 0.05
-"""Logged poses nearer than this to the one before add nothing but noise [m]."""
+"""Minimum distance between logged poses [m]; closer ones only add noise."""
 
 STUB = 1.0
-"""Length given to the path of a vehicle that never moved, along its heading [m]."""
+"""Length of the path of a vehicle that never moved, along its heading [m]."""
 
 
 class PathPoint(NamedTuple):
@@ -415,8 +415,8 @@ class LoopTransform(NamedTuple):
     """Transform from world positions before a loop reset to the equivalent ones after it.
 
     Attributes:
-        x, y: shift after the turn [m].
-        turn: about the origin of the world [rad].
+        x, y: shift after the rotation [m].
+        turn: rotation about the world origin [rad].
     """
 
     x: float
@@ -456,13 +456,13 @@ Command = Literal["straight", "left", "right"]
 
 WAYPOINTS = 20
 WAYPOINT_SPACING = 2.0
-"""Distance along the path between waypoints; the first lies this far ahead [m]."""
+"""Distance along the path between waypoints, and to the first one [m]."""
 
 COMMAND_AHEAD = 25.0
-"""The command looks at the heading this far ahead [m]."""
+"""Distance ahead at which the heading determines the command [m]."""
 
 TURN = 0.35
-"""A change of heading beyond this is a turn [rad]."""
+"""Minimum change of heading that counts as a turn [rad]."""
 
 
 def route_ahead(path: LoggedPath, s: float, x: float, y: float, yaw: float) -> Float:

@@ -71,7 +71,7 @@ def in_frame(points: Float, frame: str, T_vehicle_sensor: Float) -> NDArray[np.f
 
 
 SHORTEST_US = 100_000
-"""The history is at least this long, whatever the sensors [us]."""
+"""Minimum duration of the history, whatever the sensors [us]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,25 +119,25 @@ class MotionHistory:
         """``T_world_body`` [S, 4, 4] at ``times_us`` [S] [us].
 
         Args:
-            times_us: absolute, none later than ``t_us``.
-            t_us: now.
-            now: [4, 4], the pose now.
-            twist: [6] velocity [m/s] and angular velocity [rad/s] now, for times before the first
-                step.
+            times_us: absolute times, none later than ``t_us``.
+            t_us: current time [us].
+            now: [4, 4] current pose.
+            twist: [6] current velocity [m/s] and angular velocity [rad/s], for times before the
+                first step.
         """
         if not self.segments:
             return _on(now, twist[:3], float(twist[5]), (times_us - t_us) * 1e-6)
         return _along(times_us, self.segments, [segment.ego for segment in self.segments])
 
     def object_poses(self, object_id: str, times_us: Float, *, t_us: int, now: Agents) -> Float:
-        """``T_world_object`` [S, 4, 4] of an object that is there now, at ``times_us`` [S] [us]."""
+        """``T_world_object`` [S, 4, 4] of a currently present object at ``times_us`` [S] [us]."""
         row = rows_of(now)[object_id]
         ends = [_ends(segment, object_id) for segment in self.segments]
         first = next((k for k, pair in enumerate(ends) if pair is not None), len(ends))
         whole = [pair for pair in ends[first:] if pair is not None]
         pose = now.transforms[row]
         if not whole or len(whole) < len(ends) - first or not np.array_equal(whole[-1][1], pose):
-            # An edit has put it here.
+            # An edit has placed it here.
             return _on(pose, now.velocities[row], 0.0, (times_us - t_us) * 1e-6)
         return _along(times_us, self.segments[first:], whole)
 
@@ -196,9 +196,9 @@ class MountedLidar:
     """A LiDAR of an episode.
 
     Attributes:
-        spec: as asked for.
-        lidar: its last ray is fired at time 0.
-        period_us: between sweeps.
+        spec: the requested sensor.
+        lidar: the sensor; its last ray is fired at time 0.
+        period_us: time between sweeps [us].
     """
 
     spec: LidarSpec
@@ -207,22 +207,22 @@ class MountedLidar:
 
     @property
     def name(self) -> str:
-        """Of its clouds."""
+        """Name of its clouds."""
         return self.spec.lidar
 
     @property
     def duration_us(self) -> int:
-        """From the first ray of a sweep to the last."""
+        """Time from the first to the last ray of a sweep [us]."""
         return span_us(self.lidar.beams)
 
     @property
     def rays(self) -> int:
-        """Of one sweep."""
+        """Number of rays of a sweep."""
         return self.lidar.beams.count
 
     @property
     def most_returns(self) -> int:
-        """Of one ray."""
+        """Maximum number of returns of a ray."""
         return self.lidar.returns
 
 
@@ -231,9 +231,9 @@ class MountedRadar:
     """A radar of an episode.
 
     Attributes:
-        spec: as asked for.
+        spec: the requested sensor.
         radar: the sensor.
-        period_us: between scans.
+        period_us: time between scans [us].
     """
 
     spec: RadarSpec
@@ -242,17 +242,17 @@ class MountedRadar:
 
     @property
     def name(self) -> str:
-        """Of its clouds."""
+        """Name of its clouds."""
         return self.spec.radar
 
     @property
     def rays(self) -> int:
-        """Of one scan."""
+        """Number of rays of a scan."""
         return self.radar.rays.beams.count
 
     @property
     def most_returns(self) -> int:
-        """Of one ray: itself and a ghost."""
+        """Maximum number of returns of a ray: the target and a ghost."""
         return 2
 
 
@@ -271,12 +271,12 @@ class RangingSensors:
 
     @property
     def all(self) -> tuple[Mounted, ...]:
-        """LiDARs first."""
+        """All sensors, LiDARs first."""
         return (*self.lidars, *self.radars)
 
     @property
     def longest_us(self) -> int:
-        """Of their sweeps."""
+        """Duration of the longest sweep [us]."""
         return max((m.duration_us for m in self.lidars), default=0)
 
     def due(self, elapsed_us: int) -> tuple[Mounted, ...]:
@@ -310,7 +310,7 @@ def mounted_sensors(
 
 
 def span_us(beams: Beams) -> int:
-    """From the first ray to the last."""
+    """Time from the first to the last ray [us]."""
     return int(np.ceil(np.ptp(beams.time_us)))
 
 

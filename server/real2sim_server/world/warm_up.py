@@ -31,7 +31,7 @@ PERIOD_US = 100_000
 CAR = (4.0, 2.0, 1.5)
 DEFORMED_AFTER_US = 20_000
 STEPS = 20
-"""More than fill the window of the comfort metrics."""
+"""Number of steps; more than the window of the comfort metrics."""
 STEP_KERNELS = 28
 """Number of kernels that :func:`warm_up` compiles."""
 
@@ -107,7 +107,7 @@ def planning_on_disk() -> bool:
 
 def deformation_on_disk() -> bool:
     """Whether the disk cache has the kernels of :func:`warm_up_deformation`."""
-    from ..physics.backends.cpu.kernels import advance  # Imported only where something deforms.
+    from ..physics.backends.cpu.kernels import advance  # Heavy import, only needed for deformation.
 
     return is_on_disk(advance)
 
@@ -172,7 +172,7 @@ def _impact(*, against_background: bool) -> Impact:
 
 
 def _filling() -> GaussianCloud:
-    """Gaussians all over a car, so that it can be filled with particles."""
+    """Gaussians spread over a car, so that it can be filled with particles."""
     places = np.stack(np.meshgrid(*(np.linspace(-s / 2, s / 2, 9) for s in CAR), indexing="ij"))
     means = torch.from_numpy(places.reshape(3, -1).T.astype(np.float32).copy())
     return _cloud(means)

@@ -63,7 +63,7 @@ from .traffic import ObservedEgo, Surroundings, Traffic
 from .traffic.spawner import begin_spawner
 
 OFF_ROUTE_DISTANCE = 10.0
-"""Beyond this distance from the recorded path an event says so [m]; images get poor there."""
+"""Distance from the recorded path that triggers an event [m]; image quality drops beyond it."""
 
 
 class World:
@@ -208,8 +208,10 @@ class World:
 
     @property
     def T_world_estimate(self) -> Float:
-        """[4, 4] float64, body pose as estimated by the ego; equals ``T_world_body`` if the
-        estimate has no errors."""
+        """[4, 4] float64, body pose as estimated by the ego.
+
+        Equals ``T_world_body`` if the estimate has no errors.
+        """
         if self._estimate_error is None:
             return self.T_world_body
         estimate = self._estimate_error.applied(self.motion)

@@ -29,7 +29,7 @@ def register_reader(reader: LogReader) -> None:
     """Register a reader from outside this package for ``open_log``.
 
     Args:
-        reader: of a layout that no other reader recognises.
+        reader: reader of a layout that no other reader recognises.
 
     Raises:
         ValueError: a reader with that name is registered.

@@ -31,7 +31,7 @@ EGO_SIZE = (4.87, 1.85, 1.48)
 
 IMAGE_TOLERANCE_US = 60_000
 LEFT_OUT = ("stereo_",)
-"""Cameras that run at a quarter of the rate of the others, in grey."""
+"""Grey cameras with a quarter of the frame rate of the others."""
 
 CATEGORIES = {
     "regular_vehicle": "car",
@@ -258,7 +258,7 @@ class _Argoverse2Source:
         return self.images.read(camera, frame)
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off or not of its camera's size."""
+        """Raise LogError if the image is truncated or has a wrong size."""
         self.images.check(camera, frame)
 
     def check_sweep(self, frame: int) -> None:

@@ -1,4 +1,4 @@
-"""What readers of logs share: tracks from boxes, matching of clocks, motion of sweeps, lenses."""
+"""Common parts of log readers: tracks from boxes, clock matching, sweep motion, lenses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class FrameBox:
 
     Attributes:
         key: the dataset's own name of the track.
-        category: in the project's words.
+        category: the project's category.
         size: (length, width, height) [m].
         time_us: [us].
         T_world_object: [4, 4], origin at the box centre, x forward, z up.
@@ -41,7 +41,7 @@ class FrameBox:
 
 
 def upright_pose(centre: Iterable[float], heading: float) -> Float:
-    """``T_frame_object`` [4, 4] of a box that is only turned about z by ``heading`` [rad]."""
+    """``T_frame_object`` [4, 4] of a box rotated about z by ``heading`` [rad]."""
     pose = np.eye(4)
     cos, sin = np.cos(heading), np.sin(heading)
     pose[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -102,7 +102,7 @@ def _trajectory(key: str, members: list[FrameBox]) -> Trajectory:
 
 # --- Image matching ------------------------------------------------------------------------------
 
-# Every frame gets one image per camera, where cameras run by their own clocks.
+# If cameras have their own clocks, each frame gets one image per camera.
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ def select_sequence(folder: Path, known: list[str], sequence: str | None) -> str
     """``sequence``, or the only known one.
 
     Raises:
-        LogError: there is none, ``sequence`` is not among them, or several need a name.
+        LogError: no sequence exists, ``sequence`` is not among them, or several require a name.
     """
     if not known:
         raise LogError(f"{folder}: holds no sequence")
@@ -311,11 +311,9 @@ class Lens:
         return self._zoomed(high)
 
     def camera(self, name: str, T_vehicle_camera: Float, shutter: Shutter = GLOBAL) -> Camera:
-        """The pinhole camera of the undistorted images, with the original lens and shutter. A lens
-        that folds inside the image is omitted, because it cannot be rendered.
+        """The pinhole camera of the undistorted images, with the original lens and shutter.
 
-        Raises:
-            SceneError: invalid camera values.
+        A lens that folds inside the image is omitted, because it cannot be rendered.
         """
         pinhole = Camera(name, self.width, self.height, self.pinhole_K, T_vehicle_camera)
         k1, k2, p1, p2, k3 = self.distortion

@@ -33,7 +33,8 @@ from .waymo_common import EGO_SIZE, LICENCE, TRUCK_LENGTH, waymo_camera
 
 PERIOD_US = 100_000
 COLUMNS = 14
-"""origin 3, point 3, flow 3, flow class, ground, intensity, elongation, laser: float32."""
+"""Number of float32 columns: origin (3), point (3), flow (3), flow class, ground, intensity,
+elongation, laser."""
 ONLY_WAYMO = "only folders made of Waymo segments can be read"
 
 CATEGORIES = {"vehicle": "car", "pedestrian": "pedestrian", "cyclist": "cyclist", "sign": "sign"}
@@ -53,8 +54,7 @@ class DrivestudioReader:
         return (path / "ego_pose" / "000.txt").is_file() and not (path / "timestamps.json").exists()
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The drive in the folder ``path``; ``sequence`` is rejected, because a folder contains
-        one.
+        """The drive in the folder ``path``; ``sequence`` is rejected: a folder contains one.
 
         Raises:
             LogError: see :class:`LogReader`.
@@ -188,7 +188,7 @@ class _DrivestudioSource:
         return self.images.read(camera, frame)
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off or not of its camera's size."""
+        """Raise LogError if the image is truncated or has a wrong size."""
         self.images.check(camera, frame)
 
     def check_sweep(self, frame: int) -> int:

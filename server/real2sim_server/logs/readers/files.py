@@ -33,7 +33,7 @@ class ImageFiles:
         return self.lenses[camera].undistort(read_image(self.files[camera][frame]))
 
     def check(self, camera: str, frame: int) -> None:
-        """Raise LogError when the file is cut off or of another size than its lens."""
+        """Raise LogError if the file is truncated or its size differs from the lens's."""
         lens = self.lenses[camera]
         check_image_file(self.files[camera][frame], (lens.width, lens.height))
 
@@ -45,7 +45,7 @@ def read_json(path: Path) -> Any:
     """The content of a JSON file.
 
     Raises:
-        LogError: the file is missing or no JSON.
+        LogError: the file is missing or not JSON.
     """
     try:
         return json.loads(path.read_bytes())
@@ -103,7 +103,7 @@ class _Row(dict[str, Any]):
 # --- Parquet and Feather -------------------------------------------------------------------------
 
 CACHE_BYTES = 1 << 30
-"""How much of decoded row groups a file may keep in memory."""
+"""Maximum size of cached row groups per file [bytes]."""
 
 
 class ParquetFile:
@@ -113,7 +113,7 @@ class ParquetFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open ``path`` and read its footer. Raises LogError when it is missing or broken."""
+        """Open ``path`` and read its footer. Raises LogError if it is missing or broken."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -122,7 +122,7 @@ class ParquetFile:
         self._groups: OrderedDict[tuple[int, str], Any] = OrderedDict()
         try:
             self._file = pq.ParquetFile(path)
-        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:  # A name may be damaged.
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:  # Damaged name.
             raise LogError(f"{path}: cannot be read as Parquet ({_line(error)})") from error
         with _broken_named(f"{path}: the list of columns"):
             self.names = frozenset(self._file.schema_arrow.names)
@@ -204,7 +204,7 @@ class ParquetFile:
 
 
 def check_feather(path: Path, columns: Sequence[str]) -> None:
-    """Raise LogError when a Feather file is truncated or lacks a column; reads no values."""
+    """Raise LogError if a Feather file is truncated or lacks a column; reads no values."""
     import pyarrow as pa
     from pyarrow import ipc
 
@@ -235,9 +235,9 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     try:
         with path.open("rb") as file:
             table = ipc.open_file(file).read_all()
-        # The file's offsets are followed as they are, unless they are looked at before.
+        # Unvalidated offsets could point outside the file.
         table.validate(full=True)
-    except (OSError, ValueError, pa.ArrowException) as error:  # names that are no text among them
+    except (OSError, ValueError, pa.ArrowException) as error:  # Damaged text.
         raise LogError(f"{path}: cannot be read as a Feather file ({_line(error)})") from error
     with _broken_named(f"{path}: the list of columns"):
         _require(path, columns, list(table.column_names))
@@ -355,7 +355,7 @@ def read_number_table(path: Path, *, columns: int, what: str) -> Float:
 
 
 def check_rigid(matrix: Float, where: str) -> Float:
-    """The matrix [4, 4] itself when it is a finite rigid transform.
+    """The matrix [4, 4], if it is a finite rigid transform.
 
     Raises:
         LogError: otherwise.
@@ -386,7 +386,7 @@ def check_frame_times(times_us: NDArray[np.int64], where: str) -> NDArray[np.int
 
 
 def check_ego_covers(ego: Trajectory, times_us: NDArray[np.int64], where: str) -> None:
-    """Refuse ego poses that do not reach over all frames.
+    """Check that ego poses cover all frames.
 
     Raises:
         LogError: otherwise.

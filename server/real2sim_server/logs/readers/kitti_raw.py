@@ -112,7 +112,7 @@ def _read_calibration(drive: Path) -> tuple[Path, KittiCalibration]:
 
 
 def _image_files(drive: Path) -> dict[str, list[Path]]:
-    """As many files for each camera as the one with the most images has."""
+    """Image files of each camera; all lists have the length of the longest."""
     folders = {f"image_{i:02d}": drive / f"image_{i:02d}" / "data" for i in range(4)}
     folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
     suffixes = {n: ".jpg" if any(f.glob("*.jpg")) else ".png" for n, f in folders.items()}
@@ -189,7 +189,7 @@ def _read_tracklets(
 
 def _tracklet_items(path: Path) -> Sequence[ET.Element]:
     text = "\n".join(read_lines(path))
-    # Entities could blow a small file up to fill the memory, and no tracklet file has any.
+    # Entities could expand a small file until it fills the memory; tracklet files have none.
     if "<!ENTITY" in text:
         raise LogError(f"{path}: declares entities; tracklet files have none")
     try:

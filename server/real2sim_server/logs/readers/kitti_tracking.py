@@ -70,7 +70,7 @@ class KittiLabel:
 
     Attributes:
         frame, track_id: as in the file.
-        category: lower-case, in the project's words.
+        category: the project's category, lower-case.
         size: (length, width, height) [m].
         T_cam0_object: [4, 4], origin at the box centre, x forward, z up.
     """
@@ -115,8 +115,7 @@ def calibration_from(entries: Mapping[str, Float], path: Path) -> KittiCalibrati
 
 
 def read_entries(path: Path, *, words: Sequence[str] = ()) -> dict[str, Float]:
-    """Lines ``key: numbers`` of a calibration file; ``words`` are keys with text, which are
-    skipped.
+    """Lines ``key: numbers`` of a calibration file; skips keys with text, given in ``words``.
 
     Raises:
         LogError: values that are not finite numbers; names the line.
@@ -150,7 +149,7 @@ def _place_velodyne(T_cam0_velo: Float, T_velo_imu: Float) -> Float:
 
 
 def read_poses(path: Path) -> Float:
-    """``T_world_cam0`` [N, 4, 4] of a KITTI odometry pose file (12 numbers a line).
+    """``T_world_cam0`` [N, 4, 4] of a KITTI odometry pose file (12 numbers per line).
 
     Raises:
         LogError: with the line.
@@ -164,10 +163,10 @@ def read_poses(path: Path) -> Float:
 
 
 def read_oxts(path: Path) -> Float:
-    """``T_world_imu`` [N, 4, 4] of an OXTS file (30 numbers a line), Mercator projection.
+    """``T_world_imu`` [N, 4, 4] of an OXTS file (30 numbers per line), Mercator projection.
 
-    As the KITTI development kit does: the projection is scaled by the cosine of the first
-    latitude, and the rotation is Rz(yaw) Ry(pitch) Rx(roll).
+    As in the KITTI development kit, the projection is scaled by the cosine of the first latitude,
+    and the rotation is Rz(yaw) Ry(pitch) Rx(roll).
 
     Raises:
         LogError: with the line.
@@ -196,7 +195,7 @@ def _about(axis: int, angle: Float) -> Float:
 
 
 def read_times(path: Path, frame_count: int) -> NDArray[np.int64]:
-    """Frame times [F] [us]: seconds, one a line, from ``path``, or 10 Hz where it is absent.
+    """Frame times [F] [us], from ``path`` with one time per line [s], or at 10 Hz without the file.
 
     Raises:
         LogError: wrong count or order.
@@ -355,7 +354,7 @@ def read_rig(path: Path, calibration: KittiCalibration, images: dict[str, list[P
             raise LogError(f"{path}: P{index} needs positive focal lengths, not {projection}")
         T_camera_cam0 = np.eye(4)
         T_camera_cam0[:3, 3] = np.linalg.solve(k, projection[:, 3])
-        # KITTI puts pixel centres on whole numbers, a Camera at +0.5.
+        # KITTI puts pixel centres at integers, a Camera at +0.5.
         k[:2, 2] += 0.5
         pose = calibration.T_vehicle_cam0 @ invert_transform(T_camera_cam0)
         width, height = image_size(files[0])

@@ -41,9 +41,9 @@ POSE_KEYS = ("times_us", "positions", "quaternions")
 EGO_KEYS = ("size", *POSE_KEYS)
 TRACK_KEYS = ("object_id", "category", "size", *POSE_KEYS)
 SWEEP_SHAPES = {"points": (-1, 3), "intensity": (-1,), "offset_us": (-1,), "origin": (3,)}
-"""-1 is the number of points."""
+"""Shapes of the arrays; -1 is the number of points."""
 MAX_OFFSET_US = 10_000_000
-"""Points of one sweep are measured nearer to its frame's time than this."""
+"""Maximum difference between the time of a point and its frame's [us]."""
 
 
 class NativeReader:
@@ -57,7 +57,7 @@ class NativeReader:
         return (path / MANIFEST).is_file()
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The log in the folder ``path``. ``sequence`` is refused: a folder holds one log.
+        """The log in the folder ``path``. ``sequence`` is rejected: a folder holds one log.
 
         Raises:
             LogError: see :class:`LogReader`.
@@ -299,7 +299,7 @@ class _NativeSource:
 
 
 def _check_sweep(path: Path) -> int:
-    """How many points the headers of a sweep's arrays promise."""
+    """Number of points according to the headers of a sweep's arrays."""
     with _sweep_archive(path) as archive:
         headers = read_headers(archive, max_bytes=MAX_SWEEP_BYTES)
     return _check_arrays(path, headers)
@@ -340,7 +340,7 @@ def _sweep_archive(path: Path) -> Iterator[zipfile.ZipFile]:
         raise LogError(
             f"{path}: no such file; log.json says that every frame has a sweep"
         ) from error
-    # Damage shows as almost any error, depending on where it is.
+    # Damaged files can raise almost any error.
     except Exception as error:
         cut = "; is the file cut off?" if isinstance(error, zipfile.BadZipFile) else ""
         raise LogError(
@@ -450,7 +450,7 @@ def _report(done: int, total: int, on_progress: Callable[[int, int], None] | Non
 
 
 def _recorded(camera: Camera) -> dict[str, Any]:
-    """What the camera really is, where that is known."""
+    """The optics of the physical camera, if known."""
     if camera.recorded is None:
         return {}
     return {"recorded": OpticsPart.of(camera.recorded).model_dump(mode="json")}

@@ -121,7 +121,7 @@ class NuScenesReader:
 def _map_beside(
     root: Path, folder: Path, scene: Mapping[str, Any], T_world_map: Float
 ) -> LoggedMap | None:
-    """The map expansion of a scene's town, if it was unpacked next to the tables."""
+    """The map expansion of a scene's location, if it was unpacked next to the tables."""
     if not (folder / "log.json").is_file():
         return None
     log = Tables(folder, ("log",)).row("log", str(scene["log_token"]))
@@ -221,7 +221,7 @@ class _Ego:
 
 
 def _ego(tables: Tables, recordings: Iterable[_Recording], start_us: int) -> _Ego:
-    """Through the poses of all recordings of the scene."""
+    """The ego path through the poses of all recordings of the scene."""
     where = tables.path("ego_pose")
     poses: dict[int, Mapping[str, Any]] = {}
     for recording in recordings:
@@ -284,7 +284,7 @@ class _NuScenesSource:
         return self.images.read(camera, frame)
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off or not of its camera's size."""
+        """Raise LogError if the image is truncated or has a wrong size."""
         self.images.check(camera, frame)
 
     def check_sweep(self, frame: int) -> int:

@@ -43,7 +43,7 @@ from .waymo_common import (
 # Read a pickle without running its code.
 
 MAX_ENTRY_BYTES = 4 << 30
-"""Maximum size of an unpacked entry; a drive of 200 frames has less than 1 GiB."""
+"""Maximum size of an unpacked entry [bytes]; a drive of 200 frames has less than 1 GiB."""
 MAX_ARRAYS = 100_000
 MAX_DIMENSIONS = 8
 SECONDS = 300.0
@@ -54,7 +54,7 @@ _NUMBERS = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
 def read_pickled_arrays(path: Path, name: str) -> dict[Any, NDArray[Any]]:
     """The dictionary of arrays that ``numpy.savez`` stored under ``name`` as a pickled object.
 
-    A pickle is a program, and its interpreter is not made for untrusted files. It is read in a
+    A pickle is a program, and Python's unpickler is not safe for untrusted files. It is read in a
     separate process that returns only plain ``.npy`` files of numbers.
 
     Raises:
@@ -86,7 +86,7 @@ def read_pickled_arrays(path: Path, name: str) -> dict[Any, NDArray[Any]]:
 
 
 def unpack_arrays(path: str, name: str, folder: str) -> list[int | str]:
-    """Write the arrays of a pickled dictionary as ``0.npy``, ``1.npy``, ...; their keys in order.
+    """Write the arrays of a pickled dictionary as ``0.npy``, ``1.npy``, ...; return their keys.
 
     Raises:
         LogError: as :func:`read_pickled_arrays`.
@@ -98,7 +98,7 @@ def unpack_arrays(path: str, name: str, folder: str) -> list[int | str]:
         raise LogError(f"{path}: has no entry {name!r}") from error
     except MemoryError:
         raise
-    # Damage shows as almost any error, depending on where it is.
+    # Damaged files can raise almost any error.
     except Exception as error:
         raise LogError(
             f"{path}: entry {name!r} is no pickled dictionary of arrays: {error}"
@@ -157,7 +157,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 class _Kept:
-    """What a pickle made. Nothing of it can be changed except by a state of the right form."""
+    """A value made by a pickle. It can only be changed by a state of the right form."""
 
     __slots__ = ()
 
@@ -166,7 +166,7 @@ class _Kept:
 
 
 class _ArrayClass(_Kept):
-    """``numpy.ndarray``: an argument of ``_reconstruct``, and nothing that can be called."""
+    """``numpy.ndarray``: an argument of ``_reconstruct`` that cannot be called."""
 
     __slots__ = ()
 
@@ -189,7 +189,7 @@ class _Type(_Kept):
         self.text = state[1] + self.text.lstrip("<>=|")
 
     def numbers(self) -> np.dtype[Any]:
-        """The type, where it is one of plain numbers."""
+        """The type, if it is one of plain numbers."""
         if not _NUMBERS.fullmatch(self.text):
             raise pickle.UnpicklingError(f"values of type {self.text!r} are not read")
         return np.dtype(self.text)
@@ -211,7 +211,7 @@ class _Array(_Kept):
 
     @property
     def holds_object(self) -> bool:
-        """Whether this is the array of one object that ``numpy.savez`` puts around a dictionary."""
+        """Whether this is the one-object array in which ``numpy.savez`` wraps a dictionary."""
         is_object = isinstance(self.type, _Type) and self.type.text.strip("<>=|") in ("O", "O8")
         return is_object and self.shape == () and isinstance(self.data, list) and bool(self.data)
 
@@ -243,11 +243,11 @@ _STAND_INS: Final = {
 }
 
 
-# --- what it says -----------------------------------------------------------------------------
+# --- conversion -------------------------------------------------------------------------------
 
 
 def _numbers(array: Any) -> NDArray[Any]:
-    """The array that a pickle describes, once type, shape and bytes fit together."""
+    """The array that a pickle describes, after checking that type, shape and bytes agree."""
     if not isinstance(array, _Array) or not isinstance(array.type, _Type):
         raise ValueError(f"holds a {type(array).__name__}, where an array must be")
     dtype, shape, data = array.type.numbers(), array.shape, array.data
@@ -259,7 +259,7 @@ def _numbers(array: Any) -> NDArray[Any]:
         raise ValueError("the values of an array are no bytes")
     if len(data) != math.prod(shape) * dtype.itemsize:
         raise ValueError(f"{len(data)} bytes do not fit {dtype} of shape {shape}")
-    # The copy must not keep a file's bytes of the other order, nor be read-only.
+    # A copy is writable and in native byte order.
     in_order = np.frombuffer(data, dtype)
     numbers = in_order.reshape(shape, order="F" if array.order == "F" else "C")
     return numbers.astype(dtype.newbyteorder("="))
@@ -295,8 +295,7 @@ class StreetGaussiansReader:
         return (path / "ego_pose").is_dir() and (path / "timestamps.json").is_file()
 
     def read(self, path: Path, *, sequence: str | None = None) -> DrivingLog:
-        """The drive in the folder ``path``; ``sequence`` is rejected, because a folder contains
-        one.
+        """The drive in the folder ``path``; ``sequence`` is rejected: a folder contains one.
 
         Raises:
             LogError: see :class:`LogReader`.
@@ -441,11 +440,11 @@ class _StreetSource:
         return self.images.read(camera, frame)
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off or not of its camera's size."""
+        """Raise LogError if the image is truncated or has a wrong size."""
         self.images.check(camera, frame)
 
     def check_sweep(self, frame: int) -> int:
-        """All frames are in one file without a header of each, so it is read."""
+        """Number of points of a frame; reads it, because the file has no header per frame."""
         return len(self.lidar(frame).points)
 
     def lidar(self, frame: int) -> LidarSweep:

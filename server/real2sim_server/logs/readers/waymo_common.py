@@ -91,11 +91,11 @@ class RangeImage:
 
 @dataclass(frozen=True)
 class SweepTiming:
-    """Times of one sweep of the TOP laser, which turns from behind over the left to the front.
+    """Times of one sweep of the TOP laser, which rotates from the rear over the left to the front.
 
     Attributes:
-        start_us: of the first column, relative to the frame's time stamp.
-        duration_us: of the sweep.
+        start_us: time of the first column relative to the frame's time stamp [us].
+        duration_us: duration of the sweep [us].
     """
 
     start_us: float
@@ -107,8 +107,8 @@ def merge_range_images(
 ) -> LidarSweep:
     """All points of a frame in its vehicle frame.
 
-    Points of the TOP laser are measured while it turns; those of the others have no times and get
-    offset 0. Intensities are clipped to [0, 1].
+    Points of the TOP laser are measured while it rotates; those of the other lasers have no times
+    and get offset 0. Intensities are clipped to [0, 1].
 
     Args:
         images: all returns of all lasers.
@@ -139,8 +139,10 @@ def merge_range_images(
 
 
 def pixel_points(image: RangeImage) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
-    """Rows [N], columns [N] and points [N, 3] float64 of all pixels with a return, row by row, in
-    the vehicle frame of their own instant."""
+    """Pixels with a return, row by row.
+
+    Rows [N], columns [N] and points [N, 3] float64, vehicle frame at the time of each pixel.
+    """
     height, width = image.values.shape[:2]
     inclination = image.laser.rows(height, image.where)
     azimuth = image.laser.azimuths(width)
@@ -184,7 +186,7 @@ SHUTTERS = {
 }
 CATEGORIES = {0: "other", 1: "car", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 TRUCK_LENGTH = 7.0
-"""Waymo has one type for all vehicles; those longer than this [m] become trucks."""
+"""Minimum length of a truck [m]; Waymo has one type for all vehicles."""
 
 EGO_SIZE = (5.18, 2.05, 1.78)
 """Chrysler Pacifica without its roof sensors [m]."""
@@ -204,7 +206,7 @@ class WaymoCamera:
 
     @property
     def name(self) -> str:
-        """As the log calls it."""
+        """The log's name of the camera."""
         return CAMERA_NAMES[self.number]
 
 
@@ -217,10 +219,10 @@ def waymo_camera(
     shutter: int,
     where: str,
 ) -> WaymoCamera:
-    """A camera of its calibration: (width, height), [f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3].
+    """A camera from its calibration: (width, height), [f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3].
 
     Raises:
-        LogError: an unknown camera, or values that make no camera.
+        LogError: an unknown camera, or invalid values.
     """
     where = f"{where}: camera {number}"
     if number not in CAMERA_NAMES:
@@ -238,12 +240,12 @@ def waymo_camera(
 
 @dataclass(frozen=True, eq=False)
 class WaymoImage:
-    """When and where an image was taken.
+    """Time and vehicle pose of an image.
 
     Attributes:
         time_us: time of ``pose`` [us].
         pose: ``T_world_vehicle`` [4, 4].
-        readout_us: from the first to the last row or column [us].
+        readout_us: time from the first to the last row or column [us].
     """
 
     time_us: int
@@ -270,9 +272,9 @@ class WaymoFrame:
     Attributes:
         start_us: the frame's time stamp in the files [us].
         pose: ``T_world_vehicle`` [4, 4], in Waymo's world.
-        images: by camera number.
-        boxes: of the lasers.
-        lasers: numbers of those that have a range image.
+        images: images by camera number.
+        boxes: LiDAR boxes.
+        lasers: numbers of the lasers with a range image.
     """
 
     start_us: int
@@ -283,7 +285,7 @@ class WaymoFrame:
 
     @property
     def time_us(self) -> int:
-        """When ``pose`` holds [us]."""
+        """Time of ``pose`` [us]."""
         front = self.images.get(FRONT)
         return front.time_us if front is not None else self.start_us + SWEEP_US // 2
 
@@ -301,7 +303,7 @@ def with_sweeps(frames: Sequence[WaymoFrame]) -> tuple[list[int], list[WaymoFram
 
 
 def sweep_timings(frames: Sequence[WaymoFrame]) -> list[SweepTiming]:
-    """When the TOP laser swept, frame by frame."""
+    """Sweep times of the TOP laser, by frame."""
     starts = np.array([f.start_us for f in frames])
     duration = float(np.median(np.diff(starts))) if len(starts) > 1 else float(SWEEP_US)
     return [SweepTiming(f.start_us - f.time_us, duration) for f in frames]

@@ -116,7 +116,7 @@ def read_record(path: Path, record: Record) -> bytes:
 
 
 def masked_crc32c(data: bytes) -> int:
-    """The checksum that TFRecord stores: CRC-32C, turned right by 15 bits, plus a constant."""
+    """The checksum of TFRecord: CRC-32C, rotated right by 15 bits, plus a constant."""
     crc = _crc_kernel()(np.frombuffer(data, dtype=np.uint8), _crc_table())
     return int(((crc >> 15 | crc << 17) + _CRC_MASK) & 0xFFFFFFFF)
 
@@ -131,7 +131,7 @@ def _crc_table() -> NDArray[np.uint32]:
 
 @lru_cache(maxsize=1)
 def _crc_kernel() -> Any:
-    """Compiled where it is used: a segment has a gigabyte to check, byte by byte."""
+    """Compiled CRC-32C, on first use: a segment has a gigabyte to check, byte by byte."""
     from ..._numba import kernel
 
     @kernel
@@ -148,7 +148,7 @@ class ProtoMessage:
     """The fields of one protocol-buffer message, by number; nested messages stay bytes."""
 
     def __init__(self, data: bytes, where: str) -> None:
-        """Split ``data`` into fields. Raises LogError naming ``where`` when it is no message."""
+        """Split ``data`` into fields. Raises LogError naming ``where`` if it is not a message."""
         self.where = where
         self._fields: dict[int, list[int | bytes]] = defaultdict(list)
         try:
@@ -174,22 +174,22 @@ class ProtoMessage:
         return [v for v in values if isinstance(v, bytes)]
 
     def blob(self, number: int) -> bytes:
-        """Bytes of a field, empty where it is absent."""
+        """Bytes of a field, empty if it is absent."""
         return (self.blobs(number) or [b""])[-1]
 
     def text(self, number: int) -> str:
-        """Text of a field, empty where it is absent."""
+        """Text of a field, empty if it is absent."""
         return self.blob(number).decode("utf-8", errors="replace")
 
     def integer(self, number: int) -> int:
-        """Signed integer of a field, 0 where it is absent."""
+        """Signed integer of a field, 0 if it is absent."""
         value = (self._fields.get(number) or [0])[-1]
         if not isinstance(value, int):
             raise LogError(f"{self.where}: field {number} should hold a whole number")
         return value - (1 << 64) if value >= 1 << 63 else value
 
     def number(self, number: int) -> float:
-        """Double of a field, 0 where it is absent."""
+        """Double of a field, 0 if it is absent."""
         values = self.doubles(number)
         return float(values[-1]) if len(values) else 0.0
 
@@ -389,7 +389,7 @@ class _WaymoV1Source:
         return lens.undistort(decode_image(data, where, (lens.width, lens.height)))
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off or not of its camera's size."""
+        """Raise LogError if the image is truncated or has a wrong size."""
         data, where = self._encoded(camera, frame)
         lens = self.cameras[camera].lens
         check_encoded_image(data, where, (lens.width, lens.height))

@@ -241,7 +241,7 @@ def _read_frames(
 
 @dataclass(frozen=True, eq=False)
 class _Lidar:
-    """The files of range images and where each frame's are."""
+    """The files of range images, and the location of each frame in them."""
 
     ranges: ParquetFile
     poses: ParquetFile | None
@@ -306,7 +306,7 @@ class _WaymoV2Source:
         return lens.undistort(decode_image(data, where, (lens.width, lens.height)))
 
     def check_image(self, camera: str, frame: int) -> None:
-        """Raise LogError when the image is cut off or not of its camera's size."""
+        """Raise LogError if the image is truncated or has a wrong size."""
         data, where = self._encoded(camera, frame)
         lens = self.cameras[camera].lens
         check_encoded_image(data, where, (lens.width, lens.height))

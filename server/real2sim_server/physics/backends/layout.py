@@ -1,11 +1,11 @@
 """Occupied blocks of the grid and their neighbours.
 
 The grid is divided into blocks of 4^3 nodes. Particles are sorted by block and body: a *block* of
-the kernels holds the particles of one body in one block. It scatters into its own tile of 8^3
-nodes (the block plus a margin of two nodes on each side), so that no two blocks write to the same
-place and sums do not depend on threads. Particles may leave their block by one cell before they
-must be sorted again. A *field* is a block of nodes with the velocities of one body; it exists for
-occupied blocks and all their neighbours.
+the kernels holds the particles of one body in one block. It scatters into its own tile of 8^3 nodes
+(the block plus a margin of two nodes on each side). No two blocks write to the same memory, so sums
+do not depend on threads. Particles may leave their block by one cell before they must be sorted
+again. A *field* is a block of nodes with the velocities of one body; it exists for occupied blocks
+and all their neighbours.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ BLOCK = 4
 COORDINATE_BITS, BODY_BITS = 17, 12
 COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1)
 CHUNKS = 64
-"""Parts of about equal work that are divided among threads."""
+"""Number of work items of about equal size, divided among threads."""
 BLOCK_REACH = 3.5
-"""From the centre of a block to its corners [cells]."""
+"""Distance from the centre of a block to its corners [cells]."""
 PARTICLE_CENTRE, PARTICLE_REACH = 2.5, 6.0
-"""Middle of where a block's particles may be along an axis, from the first node of the block, and
-how far they reach from there, their own radius included [cells]."""
+"""Centre of the region of a block's particles along an axis, from the first node of the block, and
+distance to its corners including the particle radius [cells]."""
 COLLIDER_MARGIN = 2.0
-"""Colliders count as near this much earlier [cells]; moving ones may move by half of it."""
+"""Additional distance within which colliders count as near [cells]; moving ones may move by half of
+it."""
 
 _range = np.arange(-1, 2)
 OFFSETS: Int = np.stack(np.meshgrid(_range, _range, _range, indexing="ij"), axis=-1).reshape(27, 3)
@@ -160,7 +161,7 @@ def arrange(
 
 
 def _pack(blocks: Int, bodies: Int) -> Int:
-    """One sortable number for block and body."""
+    """A sortable key of block and body."""
     shifted = np.asarray(blocks, dtype=np.int64) + COORDINATE_LIMIT
     key = shifted[..., 0]
     for axis in (1, 2):
@@ -190,21 +191,22 @@ def _near_colliders(
     Args:
         blocks: [M, 3].
         dx: cell size [m].
-        colliders: all.
-        middle: of what may touch along each axis, from the first node of the block [cells].
-        reach: from there to the corners [cells].
+        colliders: all colliders.
+        middle: centre of the contact region along each axis, from the first node of the block
+            [cells].
+        reach: distance from the centre to its corners [cells].
         wanted: [K] bool.
     """
     centres = (blocks * BLOCK + middle) * dx
     rows, heights = pack_colliders(colliders, dx)
     near = np.zeros((len(blocks), len(colliders)), dtype=bool)
     for k in np.flatnonzero(wanted).tolist():
-        # Distance to a height field is measured along one normal, which misses nearby slopes.
+        # The distance to a height field is measured along one normal and misses nearby slopes.
         slack = BLOCK_REACH if isinstance(colliders[k], HeightField) else 0.0
         far = (reach + COLLIDER_MARGIN + slack) * dx
         near[:, k] = distances(colliders[k], rows[k], heights, centres) < far
     start = np.append(0, np.cumsum(near.sum(axis=1)))
-    # Strided, as nonzero leaves it, it would have kernels compiled once more.
+    # Contiguous, because strided arrays would compile the kernels once more.
     return start, np.ascontiguousarray(np.nonzero(near)[1])
 
 

@@ -20,7 +20,7 @@ from ..contact import CRUSHED, FLAT_MOMENT, INSIDE, ON_FACE, OPPOSED, STICKS, SU
 from ..model import TOTALS, Measure, Model, ParticleArrays, SolverDiverged, is_thin
 from .reference_laws import collider_distance, first_touch, stress_update, wave_hardening
 
-# One substep as a pure function; it passes its pieces by position, as kernels do.
+# One substep as a pure function, with positional arguments as in the kernels.
 
 # ruff: noqa: PLR0917
 
@@ -159,7 +159,7 @@ def _stencil(x: Tensor, dx: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     nodes = torch.stack(
         [keys // (span[1] * span[2]), keys // span[2] % span[1], keys % span[2]], dim=1
     )
-    # Whole numbers times a Python float would come out in single precision.
+    # Integers times a Python float would be single precision.
     arm = cells.to(x.dtype) * dx - x[:, None]
     return index, weights, arm, (nodes + low).to(x.dtype) * dx
 
@@ -230,7 +230,7 @@ def _resolve_body_contact(
     params: TorchParameters,
     contacts: list[NodeContact],
 ) -> Tensor:
-    """Contact of every two bodies, pair after pair."""
+    """Contact of each pair of bodies, in a fixed order."""
     fields = list(velocity)
     for a in range(len(fields)):
         for b in range(a + 1, len(fields)):
@@ -256,7 +256,7 @@ def _resolve_body_contact(
 def _normal(moment_a: Tensor, moment_b: Tensor) -> tuple[Tensor, Tensor]:
     """Contact normals [U, 3] from a to b, and whether [U] the surfaces are in contact.
 
-    They are if they face each other or one body surrounds the node.
+    Surfaces are in contact if they face each other, or one body surrounds the node.
     """
     size_a, size_b = moment_a[:, :3].norm(dim=-1), moment_b[:, :3].norm(dim=-1)
     out_of_a = -moment_a[:, :3] / size_a.clamp(min=1e-30)[:, None]
@@ -311,7 +311,7 @@ def _resolve_collider_contact(
 def _distance_behind(
     solid: Collider, nodes: Tensor, moment: Tensor, dx: float
 ) -> tuple[Tensor, Tensor]:
-    """Distance [U] of nodes to the face that the body looks at, as ``resolve_node_collider``."""
+    """Distance [U] of nodes to the face on the body's side, as ``resolve_node_collider``."""
     volume = moment[:, 3:]
     out = dx * moment[:, :3] / torch.where(volume > 0, volume, torch.ones_like(volume))
     distance, n = collider_distance(solid, nodes + out)
@@ -480,10 +480,10 @@ class ReferenceSimulation:
         return self._by_collider.copy(), self._by_body.copy()
 
     def save(self) -> Any:
-        """The state; it is never written to."""
+        """The current state; substeps never modify it."""
         return self._state, self._by_collider.copy(), self._by_body.copy()
 
     def restore(self, saved: Any) -> None:
-        """Go back."""
+        """Restore a saved state."""
         self._state = saved[0]
         self._by_collider, self._by_body = saved[1].copy(), saved[2].copy()

@@ -116,7 +116,7 @@ def _hencky(
     trace = _trace(left)
     tau = 2 * mu[:, None, None] * left + (lam * trace)[:, None, None] * eye
     energy = mu * left.square().sum((1, 2)) + lam / 2 * trace**2
-    # The flow is coaxial with e, so taking strain away is a product.
+    # The flow is coaxial with e, so removing strain is a matrix product.
     return torch.linalg.matrix_exp(-taken) @ F, tau, energy, history
 
 
@@ -204,7 +204,7 @@ def _snow(F: Tensor, history: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Ten
 
 
 def wave_hardening(history: Tensor, rows: Tensor) -> Tensor:
-    """[N] by how much plastic flow has stiffened particles; see ``stress.stress_update``."""
+    """[N] stiffening of particles by plastic flow; see ``stress.stress_update``."""
     codes = rows[:, stress.LAW]
     packed = (codes == stress.SNOW) | (codes == stress.CRUSH)
     hardening = (rows[:, stress.C] * (1 - history.exp())).clamp(-3, 3).exp()
@@ -376,7 +376,7 @@ def first_touch(solid: Solid, x: Tensor, way: Tensor, half: Tensor) -> tuple[Ten
 
 
 def _face_on(solid: Solid, along: Tensor, n: Tensor, half: Tensor) -> Tensor:
-    """See ``contact.face_on``; ``along`` is the direction of the way."""
+    """See ``contact.face_on``; ``along`` is the direction of motion."""
     if not isinstance(solid, Cylinder | Capsule):
         return n
     own = (solid.radius / half).clamp(max=1.0)[:, None]
@@ -384,7 +384,7 @@ def _face_on(solid: Solid, along: Tensor, n: Tensor, half: Tensor) -> Tensor:
 
 
 def _touch_of_box(box: Box, x: Tensor, way: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """The same for a box, whose faces reach half a spacing beyond its edges."""
+    """``first_touch`` for a box, whose faces extend half a spacing beyond its edges."""
     pose = torch.as_tensor(box.T_world_box)
     size = torch.as_tensor(box.size) / 2
     q, w = (x - pose[:3, 3]) @ pose[:3, :3], way @ pose[:3, :3]

@@ -35,7 +35,7 @@ from .motion import (
 )
 
 Case = Callable[[str], list[Check]]
-"""Takes the name of a backend."""
+"""Function of a backend's name."""
 CASES: dict[str, Case] = {
     case.__name__: case
     for case in (
@@ -64,6 +64,6 @@ CASES: dict[str, Case] = {
         gradients,
     )
 }
-"""All cases by name, the cheap ones first."""
+"""All cases by name, fastest first."""
 
 __all__ = ["CASES", "Case", "Check", "ReferenceCurve"]

@@ -55,7 +55,7 @@ class Check:
 
 
 def placed(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
-    """Transform [4, 4] that only shifts."""
+    """Transform [4, 4] of a translation."""
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
     return pose
@@ -76,6 +76,6 @@ def block(
 
 
 def solve(bodies: Sequence[Body], colliders: Sequence[Collider] = (), **options: object) -> Solver:
-    """A solver in double precision without gravity, where ``options`` say nothing else."""
+    """A solver; by default in double precision without gravity."""
     defaults = {"dx": 0.1, "gravity": (0.0, 0.0, 0.0), "precision": "double"}
     return Solver(bodies, colliders, SolverOptions(**{**defaults, **options}))  # type: ignore[arg-type]

@@ -48,7 +48,7 @@ def vibrating_bar(backend: str) -> list[Check]:
 
 
 def bar_on_wall(backend: str) -> list[Check]:
-    """A bar on a rigid wall: stress rho c v there, for 2 L / c, then it comes off whole."""
+    """A bar on a rigid wall: stress rho c v for 2 L / c, then full rebound."""
     material = FixedCorotated(young=1e6, poisson=0, density=1000)
     length, speed, dx = 2.0, 0.3, 0.05
     c, area = material.wave_speed, 0.1**2
@@ -57,7 +57,7 @@ def bar_on_wall(backend: str) -> list[Check]:
     middle = (t > 0.6 * length / c) & (t < 1.8 * length / c)
     force = float(np.polyfit(t[middle], J[middle], 1)[0])
     stress = material.density * c * speed
-    # Impulse over plateau force is how long the wall was pushed.
+    # Impulse over plateau force is the duration of the contact.
     lasted = float(J[-1]) / force
     pushes = np.gradient(J, t) / area
     curve = ReferenceCurve(
@@ -82,7 +82,7 @@ def _bar_run(
     speed: float,
     dx: float,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Times, impulses of the wall until then, and the restitution."""
+    """Times, impulse of the wall up to each time, and restitution."""
     length, c = size[0], material.wave_speed
     at = (length / 2 + 0.2 * dx, 0, 0)
     body = block(material, size=size, spacing=dx / 2, at=at, velocity=(-speed, 0, 0))
@@ -98,10 +98,11 @@ def _bar_run(
 
 
 def confined_compression(backend: str) -> list[Check]:
-    """A block in a smooth box under a slow piston: pressure on the walls over squeeze inside.
+    """A block in a smooth box under a slow piston: wall pressure over strain inside.
 
-    Mean pressure over loss of volume is the bulk modulus, differences give the shear modulus. The
-    squeeze is read in the middle of the block, as surfaces give way by part of a cell.
+    Mean pressure over volume loss is the bulk modulus; pressure differences give the shear modulus.
+    The strain is measured in the middle of the block, because surfaces yield by a fraction of a
+    cell.
     """
     material = FixedCorotated(young=1e6, poisson=0.3, density=1000, viscosity=2000)
     edge, speed, window = 0.8, 0.1, 0.04
@@ -190,11 +191,11 @@ def cantilever(backend: str) -> list[Check]:
 
 
 def loaded_beam(backend: str, *, length: float | None = None) -> list[Check]:
-    """A weight on the tip bends the beam by P L^3 / 3 E I, its own by what a line load does.
+    """A tip load bends a beam by P L^3 / 3 E I, in addition to the deflection by its weight.
 
-    Let go at rest it oscillates about that bend: the mean from rest to the lowest point. Shear adds
-    (P + q L / 2) L / k G A with k = 5/6 (Timoshenko). On the reference, which is slow, the beam is
-    half as long by default.
+    Released at rest, the beam oscillates about the static deflection: the mean of the initial and
+    the lowest point. Shear adds (P + q L / 2) L / k G A with k = 5/6 (Timoshenko). On the slow
+    reference backend, the beam is half as long by default.
     """
     L = length or (LENGTH / 2 if backend == "reference" else LENGTH)
     tip_mass, gravity, piece = LINE_DENSITY * L / 2, 0.025 * (LENGTH / L) ** 3, 0.05
@@ -208,7 +209,7 @@ def loaded_beam(backend: str, *, length: float | None = None) -> list[Check]:
     shape = a**2 * (6 * L**2 - 4 * L * a + a**2) / (24 * BENDING)
     shear = (tip_mass * a + LINE_DENSITY * (L * a - a**2 / 2)) * gravity / SHEARING
     exact = point + LINE_DENSITY * gravity * shape + shear
-    # Rayleigh's estimate is near enough to know when to expect the lowest point.
+    # Rayleigh's estimate is accurate enough for the time of the lowest point.
     swinging = tip_mass + 33 / 140 * LINE_DENSITY * L
     half = math.pi * math.sqrt(swinging * a**3 / (3 * BENDING))
     solver = solve([body], [_clamp()], backend=backend, dx=DX, gravity=(0, 0, -gravity))
@@ -232,7 +233,7 @@ def _beam(length: float = LENGTH) -> Body:
 
 
 def _clamp() -> Box:
-    """Holds all of the beam at x < 0."""
+    """A clamp for the part of the beam at x < 0."""
     return Box(
         name="clamp",
         T_world_box=placed(-1.0),
@@ -245,7 +246,7 @@ def _clamp() -> Box:
 def _follow_tip(
     solver: Solver, tip: np.ndarray, every: float, duration: float
 ) -> tuple[Float, Float]:
-    """Times and mean heights of the tip from its start."""
+    """Times and mean heights of the tip, from the start."""
     start = float(solver.particles().positions[tip, 2].mean())
     times, heights = [0.0], [0.0]
     while solver.time < duration:
@@ -258,13 +259,14 @@ def _follow_tip(
 # Elastic bodies in collision.
 
 _HERTZ_POWER = 1.5 * 1.07
-"""Hertz's indentation is close to sin(pi t)^(1.07), its force to the power 3/2 of that."""
+"""Hertz's indentation is close to sin(pi t)^(1.07), and its force is the power 3/2 of that."""
 
 
 def two_discs(backend: str) -> list[Check]:
-    """Sulsky's discs on her 40 x 40 cells, and on half as many (Sulsky et al. 1994).
+    """Sulsky's discs on the original 40 x 40 cells, and on half as many (Sulsky et al. 1994).
 
-    They touch when their surfaces do, rebound and part; what is lost shrinks with the cells.
+    The discs touch when their surfaces meet, rebound and separate. The energy loss decreases with
+    the cell size.
     """
     radius, speed, finest = 0.2, 0.1, 0.025
     fine, first_contact, start = _disc_run(backend, finest)
@@ -273,7 +275,7 @@ def two_discs(backend: str) -> list[Check]:
     kept, kept_coarse = fine[0], coarse[0]
     return [
         Check("two discs: kinetic energy at the start, 1 m thick", start, 2.513, 0.02 * 2.513, "J"),
-        # Half a cell, as surfaces are that well known, and one check of the contacts.
+        # Half a cell, the uncertainty of surfaces, and one check interval of the contacts.
         Check("two discs: touch", first_contact, exact, 0.5 * finest / (2.83 * speed) + 0.02, "s"),
         Check("two discs: kinetic energy gained", max(kept - 1, 0.0), 0, 1e-9),
         Check("two discs: more is kept on smaller cells", float(kept > kept_coarse), 1, 0),
@@ -304,16 +306,16 @@ def _disc_run(backend: str, dx: float) -> tuple[tuple[float, float], float, floa
             first_contact = solver.time
     m = solver.measure
     centre = m.momentum / m.mass[:, None]
-    # Of the discs as wholes: what still rings in them is not lost, but not kept either.
+    # Motion of the discs as a whole; vibration is neither kept nor lost.
     kept = float((m.mass * (centre**2).sum(1)).sum()) / 2 / start
     apart = float(np.linalg.norm(m.centre[1] - m.centre[0]))
     return (kept, apart), first_contact, start / thickness
 
 
 def stiff_discs(backend: str) -> list[Check]:
-    """Two discs of 1 GPa that meet at 114 m/s swap velocities (Nairn's two-disc example).
+    """Two discs of 1 GPa that collide at 114 m/s swap velocities (Nairn's two-disc example).
 
-    Up to what goes on ringing in them, for they meet at a seventh of the speed of sound.
+    Vibration remains, because they collide at a seventh of the speed of sound.
     """
     diameter, dx = 0.05, 0.0025
     material = FixedCorotated(young=1e9, poisson=0.33, density=1500)
@@ -358,7 +360,7 @@ def hertz(backend: str) -> list[Check]:
         times.append(solver.time)
         impulses.append(float(solver.contacts[0].impulse[2]) if solver.contacts else 0.0)
     J = np.array(impulses) / impulses[-1]
-    # The force law is symmetric: the middle 98 % of the impulse take 0.85 of the contact.
+    # The force law is symmetric: the middle 98 % of the impulse takes 0.85 of the contact.
     inner = float(np.interp(0.99, J, times) - np.interp(0.01, J, times))
     force = np.diff(impulses).max() / (exact / 40)
     depth = (15 * particles.mass * speed**2 / (16 * math.sqrt(radius) * stiffness)) ** 0.4
@@ -381,7 +383,7 @@ def hertz(backend: str) -> list[Check]:
 
 
 def _hertz_fraction(tail: float) -> float:
-    """Fraction of the contact time in which all but ``tail`` at each end of the impulse passes."""
+    """Fraction of the contact time that contains all but ``tail`` at each end of the impulse."""
     t = np.linspace(0, 1, 2001)
     J = np.cumsum(np.sin(np.pi * t) ** _HERTZ_POWER)
     J /= J[-1]
@@ -389,7 +391,7 @@ def _hertz_fraction(tail: float) -> float:
 
 
 def disc_particles(radius: float, thickness: float, *, spacing: float, density: float) -> Particles:
-    """A disc across z, centred on the origin; volumes sum to the disc's."""
+    """A disc perpendicular to z, centred on the origin; volumes sum to the disc's."""
     lattice = box_particles([2 * radius, 2 * radius, thickness], spacing=spacing, density=density)
     inside = (lattice.positions[:, :2] ** 2).sum(axis=1) < radius**2
     disc = lattice.take(inside)

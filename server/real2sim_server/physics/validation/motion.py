@@ -40,8 +40,8 @@ def free_fall(backend: str, *, edge: float = 0.4, steps: int = 100) -> list[Chec
 def affine_patch(backend: str, *, edge: float = 0.4) -> list[Check]:
     """v = A x on a block without stiffness: C = A, F = (I + dt A)^n.
 
-    The first step is exact. Later ones differ by O(dt^2): the field v = A x moves with itself, and
-    the gradients particles carry lag behind by a step.
+    The first step is exact. Later ones differ by O(dt^2): the field v = A x is advected, and
+    particle gradients lag behind by a step.
     """
     A = np.array([[0.3, -0.2, 0.1], [0.5, -0.4, 0.2], [-0.1, 0.6, 0.2]])
     size = (edge,) * 3
@@ -68,7 +68,7 @@ def affine_patch(backend: str, *, edge: float = 0.4) -> list[Check]:
 
 
 def spin(backend: str, *, edge: float = 0.48, turns: float = 1.0) -> list[Check]:
-    """A free block at 60 rad/s keeps its angular momentum and its energy for a revolution."""
+    """A free block at 60 rad/s keeps its angular momentum and energy for a revolution."""
     material = FixedCorotated(young=2e6, poisson=0.4)
     body = block(material, size=(edge,) * 3, spacing=0.06, angular_velocity=(0, 0, 60.0))
     solver = solve([body], backend=backend, dx=0.12)
@@ -84,7 +84,7 @@ def spin(backend: str, *, edge: float = 0.48, turns: float = 1.0) -> list[Check]
 
 
 def invariants(backend: str, *, edge: float = 0.4, parts: int = 10) -> list[Check]:
-    """Two blocks that collide in space: mass, momentum, angular momentum, energy."""
+    """Two blocks that collide in free space: mass, momentum, angular momentum, energy."""
     material = FixedCorotated(young=2e5, poisson=0.3)
     size, away = (edge,) * 3, 0.625 * edge
     bodies = [
@@ -114,7 +114,7 @@ def invariants(backend: str, *, edge: float = 0.4, parts: int = 10) -> list[Chec
 
 
 def scale_invariance(backend: str) -> list[Check]:
-    """Everything twice as large, E / rho times 4, g and v times 2: the same motion."""
+    """Lengths times 2, E / rho times 4, g and v times 2: the same motion."""
     ends = []
     for s in (1.0, 2.0):
         body = block(
@@ -139,7 +139,7 @@ def scale_invariance(backend: str) -> list[Check]:
 
 
 def reproducibility(backend: str) -> list[Check]:
-    """The same run twice gives the same bits; particles in another order, the same motion."""
+    """Equal runs are bitwise identical; another particle order gives the same motion."""
     body = block(
         FixedCorotated(young=2e5, poisson=0.4), at=(0.01, 0.02, 0.21), velocity=(0.5, 0, -2)
     )
@@ -163,7 +163,7 @@ def reproducibility(backend: str) -> list[Check]:
 
 
 def _drop(body: Body, backend: str) -> np.ndarray:
-    """[N, 3] where the particles of a body are after it hit the ground [m]."""
+    """[N, 3] particle positions of a body after it has hit the ground [m]."""
     solver = solve([body], [Plane(name="ground")], gravity=(0, 0, -GRAVITY), backend=backend)
     solver.step(0.03)
     return solver.particles().positions
@@ -175,7 +175,7 @@ STEPS, DT = 60, 5e-4
 
 
 def gradients(backend: str = "reference") -> list[Check]:
-    """How a bounce changes with stiffness, yield, viscosity, friction and speed."""
+    """Derivatives of a bounce by stiffness, yield stress, viscosity, friction and speed."""
     metal = Metal(young=2e5, poisson=0.3, yield_stress=4e3, hardening=1e4, viscosity=50)
     body = block(
         metal, size=(0.2, 0.2, 0.2), at=(0.013, 0.027, 0.12), velocity=(1, 0.2, -2), friction=0.3
@@ -196,7 +196,7 @@ def gradients(backend: str = "reference") -> list[Check]:
 
 
 def _outcome(state: TorchState, params: TorchParameters) -> Callable[[Tensor], Tensor]:
-    """Final motion as one number, of logarithms of factors on five parameters."""
+    """Final motion as one number, as a function of the logarithms of factors on five parameters."""
 
     def run(knobs: Tensor) -> Tensor:
         factor = knobs.exp()
@@ -221,7 +221,7 @@ def _outcome(state: TorchState, params: TorchParameters) -> Callable[[Tensor], T
 # Contact: friction, rebound, impulse.
 
 RUBBER = FixedCorotated(young=2e5, poisson=0.2, viscosity=200)
-"""Damped, so that a block that is set down comes to rest and stays in contact."""
+"""Damped, so that a block set down on a surface comes to rest and stays in contact."""
 
 
 def incline(backend: str, *, duration: float = 5.0) -> list[Check]:
@@ -250,7 +250,7 @@ def incline(backend: str, *, duration: float = 5.0) -> list[Check]:
 
 
 def braking(backend: str, *, speed: float = 10.0) -> list[Check]:
-    """A block sliding to rest: v^2 / (2 mu g), after v / (mu g)."""
+    """A sliding block stops after v^2 / (2 mu g) and v / (mu g)."""
     mu = 0.7
     body = block(RUBBER, size=(0.8, 0.8, 0.2), at=(0, 0, 0.1), friction=mu, velocity=(speed, 0, 0))
     solver = solve([body], [Plane(name="road")], gravity=(0, 0, -GRAVITY), backend=backend)
@@ -273,7 +273,7 @@ def braking(backend: str, *, speed: float = 10.0) -> list[Check]:
 
 
 def oblique_impact(backend: str) -> list[Check]:
-    """A block that hits a wall and slides: the wall's impulse leans by mu, delta-v follows."""
+    """A block hits a wall and slides: the impulse is inclined by mu, and delta-v agrees."""
     checks = []
     for mu in (0.1, 0.3):
         body = block(
@@ -295,9 +295,9 @@ def oblique_impact(backend: str) -> list[Check]:
 
 
 def frictionless_slide(backend: str) -> list[Check]:
-    """Two blocks pressed together that slide with mu = 0 keep their slip, touch, and part.
+    """Two pressed blocks that slide with mu = 0 keep their slip, touch, and separate.
 
-    Stiff enough that edges do not dig in, which would brake them in earnest.
+    They are stiff enough that edges do not dig in, as this would brake them.
     """
     material = FixedCorotated(young=2e6, poisson=0.2)
     upper = block(material, at=(0.1, 0, 0.205), velocity=(-3, 0, -0.5), friction=0, name="upper")
@@ -322,7 +322,7 @@ def frictionless_slide(backend: str) -> list[Check]:
 
 
 def restitution(backend: str, *, requests: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7)) -> list[Check]:
-    """Requested against achieved, by an impact made after the fit, in which no energy appears."""
+    """Requested and achieved restitution, in an impact after the fit, without energy gain."""
     checks = []
     dx, speed = 0.08, 2.5
     wall = Plane(name="wall", point=(0, 0, 0.75 * dx))
@@ -351,10 +351,10 @@ def restitution(backend: str, *, requests: tuple[float, ...] = (0.1, 0.3, 0.5, 0
 
 
 def collinear_bars(backend: str) -> list[Check]:
-    """A bar into a heavier one of its length and speed of sound: both part as if all were elastic.
+    """A bar into a heavier one of the same length and speed of sound: elastic delta-v of both.
 
-    Waves of both come back to the contact at once, 2 L / c after it began, so that nothing goes on
-    ringing (Johnson 1985, 11.1): delta-v is 2 m2 / (m1 + m2) times the speed.
+    Waves of both bars return to the contact at the same time, 2 L / c after it began, so no
+    vibration remains (Johnson 1985, 11.1): delta-v is 2 m2 / (m1 + m2) times the speed.
     """
     speed, size = 0.5, (1.6, 0.2, 0.2)
     light = FixedCorotated(young=1.5e6, poisson=0, density=150)
@@ -375,7 +375,7 @@ def collinear_bars(backend: str) -> list[Check]:
 
 
 def rest(backend: str) -> list[Check]:
-    """A block dropped on the ground comes to rest on it: no gap, no sinking, the weight held."""
+    """A block dropped on the ground comes to rest: no gap, no sinking, force equal to weight."""
     body = block(RUBBER, size=(0.4, 0.4, 0.4), at=(0, 0, 0.3))
     solver = solve([body], [Plane(name="ground")], gravity=(0, 0, -GRAVITY), backend=backend)
     solver.step(1.5)
@@ -391,9 +391,9 @@ def rest(backend: str) -> list[Check]:
 
 
 def rolling_ball(backend: str) -> list[Check]:
-    """A ball set down sliding comes to roll, having lost 2/7 of its speed, whatever mu is.
+    """A ball set down sliding starts to roll after losing 2/7 of its speed, for any mu.
 
-    Being elastic it winds up and down a little while it sticks, so means over that count.
+    The elastic ball twists back and forth a little while it sticks, so mean values are compared.
     """
     radius, speed = 0.5, 2.0
     particles = ball_particles(radius, spacing=0.05, density=1000)

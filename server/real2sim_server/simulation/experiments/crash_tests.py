@@ -1,12 +1,15 @@
 """Crash tests of the vehicle preset, compared with published figures and with theory.
 
-Sources: frontal barrier test of the 2015 Chevrolet Malibu (NHTSA, as in joe-cormier/pycrash):
-1651 kg, 56.5 km/h, 10.1 in mean residual crush, restitution 0.013; its load cells give 877 kN/m,
-from which follow 0.68 m of dynamic crush, a peak of 37 g and 68 ms to it. Restitution over impact
-speed: Cipriani et al. 2002, e = .47477 - .26139 L + .03382 L^2 - .11639 L^3 with L = log10(v /
-(m/s)). Mutual stiffness of two cars: 405 +- 139 kN/m (Bonugli et al. 2017); 100 to 150 ms of a
-rear end. Roof: 127 mm at three times the weight (49 CFR 571.216a). Side against a pole of 254 mm
-at 32 km/h (49 CFR 571.214): intrusions of sedans lie around 0.4 m.
+Sources:
+
+- Frontal barrier: test of the 2015 Chevrolet Malibu (NHTSA, as in joe-cormier/pycrash): 1651 kg,
+  56.5 km/h, 10.1 in mean residual crush, restitution 0.013. Its load cells give 877 kN/m, from
+  which follow 0.68 m of dynamic crush, a peak of 37 g and 68 ms to the peak.
+- Restitution over impact speed: Cipriani et al. 2002, e = .47477 - .26139 L + .03382 L^2 - .11639
+  L^3 with L = log10(v / (m/s)).
+- Mutual stiffness of two cars: 405 +- 139 kN/m (Bonugli et al. 2017); 100 to 150 ms for a rear end.
+- Roof: 127 mm at three times the weight (49 CFR 571.216a).
+- Side against a pole of 254 mm at 32 km/h (49 CFR 571.214): intrusions of sedans are about 0.4 m.
 """
 
 from __future__ import annotations
@@ -34,21 +37,22 @@ MALIBU_MASS = 1651.0
 MALIBU_SIZE = (4.87, 1.85, 1.35)
 """Length and width of the car, height of its body above the wheels [m]."""
 COLUMN = (0.4, 0.4)
-"""Width and height of the part of it that is simulated against a wall, with its fraction of the
-mass [m]. Nothing differs across a block that meets a wall squarely."""
+"""Width and height of the simulated column of the car, with its fraction of the mass [m]. A block
+that hits a wall squarely is uniform across its section."""
 CAR_SIZE = (4.87, 1.85, 1.47)
 """Size of the whole car [m]."""
 SPACING = 0.15
 """Particle spacing of the whole car [m]."""
 FRAME_RATE = 500.0
 FILTER = 5
-"""Frames over which a pulse is averaged: 10 ms, about what a load-cell wall resolves."""
+"""Frames over which a pulse is averaged: 10 ms, about the resolution of a load-cell wall."""
 BEGUN = 0.1
 """A pulse lasts while the deceleration is above this fraction of its peak."""
 GAP = 0.02
-"""Between the bodies at the start [m]."""
+"""Initial gap between the bodies [m]."""
 LAYER, MIDDLE = 0.15, 0.3
-"""Depth of the struck face and half length of the middle that are averaged [m]."""
+"""Depth of the struck face, and half length of the middle, over which positions are averaged [m].
+"""
 POLE = 0.254
 """Diameter of the pole of FMVSS 214 [m]; here it is square."""
 
@@ -149,7 +153,7 @@ def barrier_test(speed: float, backend: str, *, duration: float | None = None) -
 
 
 def rear_end(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
-    """A car of 1000 kg into the rear of a standing one of 2000 kg: the pulses of both."""
+    """A car of 1000 kg into the rear of a stationary one of 2000 kg: the pulses of both."""
     x = (CAR_SIZE[0] + GAP) / 2
     striker = whole_car("striker", mass=1000.0, place=(-x, 0, 0), velocity=(speed, 0, 0))
     struck = whole_car("struck", mass=2000.0, place=(x, 0, 0))
@@ -161,7 +165,7 @@ def rear_end(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
 
 
 def side_crash(speed: float, backend: str) -> tuple[CrashPulse, CrashPulse]:
-    """A car squarely into the side of a standing one: the pulses of both."""
+    """A car squarely into the side of a stationary one: the pulses of both."""
     striker = whole_car("striker", place=(-(CAR_SIZE[0] + GAP) / 2, 0, 0), velocity=(speed, 0, 0))
     struck = whole_car("struck", place=((CAR_SIZE[1] + GAP) / 2, 0, 0), yaw=np.pi / 2)
     result = _crash([striker, struck], [], 0.4, backend)
@@ -288,7 +292,7 @@ SPEEDS = (1.0, 2.24, 4.47, 8.94)
 SPREAD = 0.08
 MUTUAL_STIFFNESS = 405e3
 ROOF_SPEED = 2.0
-"""Slow enough that the roof is pushed in by about what the test of its strength does [m/s]."""
+"""Speed of the roof drop [m/s]; pushes the roof in by about as much as the strength test."""
 ROOF_DEPTH, ROOF_STRENGTH = 0.127, 3.0
 
 
@@ -304,7 +308,7 @@ def malibu(backend: str) -> list[Check]:
 
 
 def malibu_checks(test: CrashPulse) -> list[Check]:
-    """A test at the published speed against the published figures."""
+    """Checks of a test at the published speed against the published figures."""
     return [
         _within("Malibu dynamic crush", test.dynamic_crush, MALIBU_DYNAMIC, 0.2, "m"),
         _within("Malibu peak deceleration", test.peak, MALIBU_PEAK, 0.2, "g"),
@@ -316,7 +320,7 @@ def malibu_checks(test: CrashPulse) -> list[Check]:
 
 
 def restitution_by_speed(backend: str) -> list[Check]:
-    """Restitution from walking pace to 32 km/h, as published and falling."""
+    """Restitution from walking pace to 32 km/h: as published, and decreasing with speed."""
     tests = [barrier_test(speed, backend, duration=0.5) for speed in SPEEDS]
     checks = [
         Check(f"restitution at {t.speed:.2f} m/s", t.restitution, cipriani(t.speed), SPREAD)
@@ -327,9 +331,10 @@ def restitution_by_speed(backend: str) -> list[Check]:
 
 
 def collinear_pair(backend: str) -> list[Check]:
-    """1000 kg into the rear of 2000 kg at 10 m/s: it takes time, and costs both length.
+    """1000 kg into the rear of 2000 kg at 10 m/s: duration, delta-v, and crush of both.
 
-    Delta-v are those of the published restitution, with its spread: not of the one that came out.
+    The expected delta-v follows from the published restitution and its spread, not from the
+    simulated one.
     """
     speed, light, heavy = 10.0, 1000.0, 2000.0
     striker, struck = rear_end(speed, backend)
@@ -357,7 +362,7 @@ def pole(backend: str) -> list[Check]:
 
 
 def t_bone(backend: str) -> list[Check]:
-    """A car into another one's side at 12 m/s: both look it, and share the speed."""
+    """A car into the side of another at 12 m/s: both are dented and reach a common speed."""
     striker, struck = side_crash(12.0, backend)
     return [
         Check("side: door pushed in", struck.residual_crush, 0.2, 0.1, "m"),
@@ -367,7 +372,7 @@ def t_bone(backend: str) -> list[Check]:
 
 
 def roof(backend: str) -> list[Check]:
-    """Fallen on its roof: intrusion by what carries three times the weight at 127 mm."""
+    """Dropped on its roof: intrusion by the force of three times the weight at 127 mm."""
     test = roof_drop(ROOF_SPEED, backend)
     return [
         _within("roof: intrusion", test.dynamic_crush, ROOF_DEPTH, 0.25, "m"),
@@ -385,15 +390,15 @@ PUBLISHED = {
 """Cases by name; ``real2sim validate --cases published`` runs them."""
 
 
-# Bodies against theory: on tyres, from rigid to deforming and back, at a post.
+# Bodies against theory: on tyres, changing between rigid and deforming, and at a post.
 
 GRIP = 0.7
 POST = 0.1
-"""Edge of a post, a third of a cell of what meets it [m]."""
+"""Edge of a post [m]: a third of a cell of the car."""
 
 
 def tyre_braking(backend: str) -> list[Check]:
-    """A car with locked wheels slides v^2 / (2 mu g) in v / (mu g), and is no rigid block."""
+    """A car with locked wheels slides v^2 / (2 mu g) in v / (mu g), and pitches on its springs."""
     speed = 10.0
     road = Plane(name="ground", friction=GRIP)
     centre = whole_car().rest.centre_of_mass
@@ -425,7 +430,7 @@ def tyre_braking(backend: str) -> list[Check]:
 
 
 def handover(backend: str) -> list[Check]:
-    """Two blocks that fly, meet off centre and fly on: momenta stay through both handovers."""
+    """Two blocks collide off centre and fly on: both mode changes conserve the momenta."""
     bodies = [_block("left", (-0.6, 0, 0), 2.0), _block("right", (0.6, 0.2, 0.1), -1.0)]
     before, energy = _momenta(bodies), sum(b.kinetic_energy for b in bodies)
     options = SimulateOptions(
@@ -450,7 +455,7 @@ def handover(backend: str) -> list[Check]:
 
 
 def thin_post(backend: str) -> list[Check]:
-    """A car at 11 m/s is stopped by a post of a third of a cell, at its middle and beside it."""
+    """A post of a third of a cell stops a car at 11 m/s, at its middle and off centre."""
     speed, checks = 11.0, []
     for aside in (0.0, 0.3):
         post = Box(

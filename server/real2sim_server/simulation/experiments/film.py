@@ -192,13 +192,14 @@ RGB_ONLY = RasterOptions(depth=False, instance=False)
 FILM_RATE = 15.0
 STILLS = 5
 HARD_SHARE = 0.05
-"""Of the kinetic energy, lost from one picture of a film to the next: something was hit."""
+"""Minimum fraction of the kinetic energy lost between two frames that counts as an impact."""
 AFTERWARDS = 0.25
-"""Of the time from there to the end, at which the still between them is."""
+"""Time of the still between the impact and the end, as a fraction of the time from impact to end.
+"""
 WAY_PLACES = 8
-"""Of a camera that moves, at which it is asked what stands before it."""
+"""Number of positions of a moving camera at which occluding background is searched."""
 CLEAR = 0.8
-"""Of the distance from a near view to its focus."""
+"""Radius cleared around a near camera, as a fraction of its distance from the focus."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +209,8 @@ class FilmView:
     Attributes:
         camera: camera in the world: ``T_vehicle_camera`` is ``T_world_camera`` at the start.
         background: the visible part of the background.
-        clear: uninvolved objects closer than this are omitted [m]; they would hide the subjects and
-            were not recorded from so near.
+        clear: uninvolved objects closer than this are omitted [m]; they would hide the subjects,
+            and were not recorded from this distance.
         without: objects that are omitted.
         obstacles: virtual obstacles that vehicles run into.
         moved: [F, 3] displacement of the camera in each frame [m]; None if it is fixed.
@@ -280,7 +281,10 @@ def _moved(result: SimulationResult, plan: FilmPlan) -> Float | None:
 def _before(
     cloud: GaussianCloud, viewer: Float, moved: Float | None, plan: FilmPlan
 ) -> GaussianCloud:
-    """The background without trees and posts between the near camera and the focus, on its path."""
+    """The background without obstructions between the near camera and the focus.
+
+    Removes trees, posts and the like along the camera's path.
+    """
     means = cloud.means.detach().cpu().numpy()
     way = np.zeros((1, 3)) if moved is None else moved[:: max(len(moved) // WAY_PLACES, 1)]
     near = np.zeros(len(means), dtype=bool)

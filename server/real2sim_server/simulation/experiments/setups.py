@@ -1,4 +1,4 @@
-"""Experiments with vehicles of a scene: the paper's three, and crash tests on its road."""
+"""Experiments with vehicles of a scene: the three of the paper, and crash tests on its road."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ..rollout import SimulateOptions
 from ..spawn import object_particles, spaced_for
 from ..structure import VEHICLES, ObjectPhysics, preset_of
 
-# Viewpoints of the recording vehicle: sides that no camera saw cannot be shown.
+# Views from the recording vehicle: sides that no camera saw cannot be shown.
 
 VIEWS_MAX = 24
-"""Recorded frames that are considered."""
+"""Maximum number of recorded frames to evaluate."""
 DEPTH_MIN = 2.0
 
 
@@ -79,13 +79,13 @@ def in_view(
 # Experiments, and the parts of a scene they need.
 
 SIDEWAYS, SLANT_MIN = 2.0, 0.25
-"""Near views stand at most so many times as far to the side as the recording saw it from, and at
-least so far."""
+"""Maximum lateral over longitudinal component of near views, as a multiple of the recorded one; and
+the minimum of this limit."""
 ROAD_FRICTION = 0.7
 CLEARED = 11.0
 """Uninvolved objects closer to the experiment than this are hidden [m]."""
 FROM_AHEAD = 0.18
-"""By how much a view from the side is from ahead as well."""
+"""Default forward over lateral component of views from the side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ def viewer(
     """Direction [3] to a camera on the recorded side and end.
 
     Args:
-        slant: lateral over longitudinal component; reduced for hardly visible sides.
+        slant: lateral over longitudinal component; reduced for sides that are hardly visible.
         rise: upward component.
     """
     x, y, _ = visibility_of(scene, subject).direction
@@ -215,20 +215,22 @@ AHEAD = 14.0
 GAP = 1.2
 """Initial gap to the obstacle [m]."""
 BARRIER = (0.8, 2.4, 1.0)
-"""Depth, width, height of the block of a frontal crash [m]."""
+"""Depth, width and height of the block of a frontal crash [m]."""
 POLE, POLE_HEIGHT = 0.25, 2.6
 """Width and height of a lamp post [m]."""
 OFF_CENTRE = 0.12
-"""Of the width: where a pole meets a front, beside its middle."""
+"""Lateral offset of the pole from the middle of the front, as a fraction of the width."""
 ASIDE = 0.8
-"""Where a T-bone is looked at, from the middle of what is struck towards what strikes it [m]."""
+"""Distance of the focus of a T-bone from the middle of the struck vehicle, towards the other [m].
+"""
 TURNED_OVER = np.radians(158.0)
-"""About its length, of a vehicle that falls on the edge of its roof (SAE J996 has 25 degrees of
-roll)."""
+"""Roll angle of a vehicle that falls on the edge of its roof: 22 degrees from upside down (SAE J996
+has 25 degrees of roll)."""
 FALL = 0.4
-"""Of the lowest corner above the road at the start of a roof crash [m]; it is falling by then."""
+"""Height of the lowest corner above the road at the start of a roof crash [m]; it is falling by
+then."""
 FRAME_RATE, SLOW = 60.0, 4.0
-"""Frames a second, and how many times slower a film shows them than they were."""
+"""Frame rate [Hz], and slow-motion factor of films."""
 
 
 def frontal(request: Request) -> Experiment:
@@ -248,7 +250,7 @@ def frontal(request: Request) -> Experiment:
 
 
 def pole(request: Request) -> Experiment:
-    """One vehicle with its front into a post, at 12 m/s."""
+    """One vehicle frontally into a post, at 12 m/s."""
     subject = _best(request)
     speed = 12.0 if request.speed is None else request.speed
     pose, forward = _on_the_road(request, subject)
@@ -264,7 +266,7 @@ def pole(request: Request) -> Experiment:
 
 
 def t_bone(request: Request) -> Experiment:
-    """One vehicle into the side of a stationary vehicle, at its middle, at 15 m/s."""
+    """One vehicle into the middle of the side of a stationary vehicle, at 15 m/s."""
     speed = 15.0 if request.speed is None else request.speed
     runner = _best(request)
     others = [s for s in _candidates(request) if s is not runner]
@@ -284,7 +286,7 @@ def t_bone(request: Request) -> Experiment:
         runner.object_id: ObjectPhysics(T_world_object=own, velocity=speed * forward),
         struck.object_id: ObjectPhysics(T_world_object=target, velocity=(0.0, 0.0, 0.0)),
     }
-    # Look along the struck side past the striking vehicle and follow the struck one: the dent is
+    # Look along the struck side past the striking vehicle and follow the struck one. The dent is
     # visible between them after they have separated.
     side = ahead - 0.6 * forward + np.array([0.0, 0.0, 0.5])
     focus = target[:3, 3] - ASIDE * forward
@@ -299,7 +301,7 @@ def roof(request: Request) -> Experiment:
     own, forward = _on_the_road(request, subject)
     left = np.cross([0.0, 0.0, 1.0], forward)
     seen = 1.0 if visibility_of(request.scene, subject).direction[1] >= 0 else -1.0
-    # Upside down, the recorded side is on the other side, and its edge lands first.
+    # Upside down, the recorded side is on the opposite side, and its edge lands first.
     turn = -seen * TURNED_OVER
     side = forward - seen * 1.1 * left + np.array([0.0, 0.0, 0.08])
     c, s = np.cos(turn), np.sin(turn)
@@ -320,13 +322,13 @@ CRASHES = {"frontal": frontal, "t_bone": t_bone, "pole": pole, "roof": roof}
 
 
 def _best(request: Request) -> PlacedObject:
-    """The first named vehicle, else the best recorded car."""
+    """The first named vehicle, else the car with the best recording."""
     candidates = _candidates(request)
     return candidates[0] if request.named else _seen_best(request, candidates)
 
 
 def _candidates(request: Request) -> list[PlacedObject]:
-    """The named vehicles, else all cars at the start; they are moved anyway."""
+    """The named vehicles, else all cars at the start; experiments move them anyway."""
     if request.named:
         return list(request.chosen)
     there = [
@@ -348,7 +350,7 @@ def _seen_best(request: Request, candidates: list[PlacedObject]) -> PlacedObject
 
 
 def _on_the_road(request: Request, subject: PlacedObject) -> tuple[Float, Float]:
-    """Its pose [4, 4] at the crash site, and its forward direction there [3]."""
+    """Pose [4, 4] of the vehicle at the crash site, and its forward direction there [3]."""
     pose = subject.trajectory.transform(request.start_us)
     path = request.scene.ego.positions
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -370,7 +372,7 @@ def _height(request: Request, subject: PlacedObject, pose: Float) -> float:
 def _standing_box(
     name: str, size: tuple[float, float, float], at: Float, forward: Float, request: Request
 ) -> Box:
-    """A box on the ground, across ``forward``."""
+    """A box on the ground, perpendicular to ``forward``."""
     pose = np.eye(4)
     pose[:3, :3] = np.stack([forward, np.cross([0, 0, 1.0], forward), [0, 0, 1.0]], axis=1)
     pose[:2, 3] = at[:2]
@@ -388,7 +390,7 @@ def _experiment(
     focus: Float,
     side: Float,
 ) -> Experiment:
-    """One vehicle on the road into obstacles."""
+    """One vehicle on the road that drives into obstacles."""
     own, _ = _on_the_road(request, subject)
     objects = {subject.object_id: ObjectPhysics(T_world_object=own, velocity=velocity)}
     return _made(request, name, objects, obstacles, focus=focus, side=side, distance=6.0)
@@ -426,16 +428,17 @@ def _made(
 
 
 WALL_GAP = 0.5
-"""Between the vehicle and the wall at the start [m]: contact after 1 s at 0.5 m/s."""
+"""Initial gap between vehicle and wall [m]: contact after 1 s at 0.5 m/s."""
 DROP_HEIGHT = 1.225
 """Free fall of 0.5 s [m]."""
 DAMPED = FixedCorotated(young=2e6, poisson=0.4, density=200.0, viscosity=1.5e4)
-"""The paper's medium for the fall. Its table has no damping, with which a block of this size jumps
-back up by a third of the height; this much leaves a slight bounce."""
+"""The paper's material for the fall, with damping. The undamped material of the paper rebounds by a
+third of the height for a block of this size; this viscosity leaves a slight bounce."""
 PAIR_GAP = 1.5
-"""Between the vehicles that collide [m]: contact after 0.43 s at 3.5 m/s."""
+"""Initial gap between colliding vehicles [m]: contact after 0.43 s at 3.5 m/s."""
 APART, ASIDE_STEP, ASIDE_TRIES = 0.4, 0.5, 400
-"""Room between pairs that collide, steps in which one is moved aside for it, and how many [m]."""
+"""Clearance between colliding pairs [m], lateral step to reach it [m], and maximum number of steps.
+"""
 DEPTH_RANGE = (4.0, 45.0)
 
 
@@ -455,13 +458,13 @@ def set_up(
     Args:
         name: ``wall``: one vehicle against a virtual wall; ``pair``: vehicles into as many
             stationary ones, without gravity; ``drop``: vehicles dropped on the extracted ground;
-            ``frontal``, ``t_bone``, ``pole``, ``roof``: see ``crashes``.
+            ``frontal``, ``t_bone``, ``pole``, ``roof``: the crash tests above.
         preset: material preset; by default ``paper`` for the paper's experiments and ``vehicle``
             for crashes.
         speed: [m/s]; the experiment's default if None.
         objects: ids of the objects; by default the visible vehicles whose impact side was recorded
-            best. ``pair`` takes two or more: the first half runs into the others, and the last one
-            of an odd number is stationary.
+            best. ``pair`` takes two or more: the first half drives into the others, and the last
+            one of an odd number is stationary.
         start_us: [us]; the first frame by default.
         grids: requested grids, see ``ObjectPhysics.grid``; they determine the extent of particles.
 
@@ -486,7 +489,7 @@ def set_up(
 
 
 def most_visible(scene: Scene, state: PlacedObjects, t_us: int) -> list[PlacedObject]:
-    """Vehicles in front of the first camera, largest in its image first."""
+    """Vehicles in front of the first camera, in order of decreasing size in its image."""
     camera = scene.rig.cameras[0]
     ego = scene.ego.transform(t_us)
     found = []
@@ -532,11 +535,11 @@ def _wall(request: Request) -> Experiment:
 
 
 ROLLING_FRICTION = 0.0
-"""In the paper's preset a vehicle has no wheels; that it rolls means it slides freely."""
+"""Vehicles of the paper's preset have no wheels; frictionless sliding stands in for rolling."""
 
 
 def _standing_road(request: Request, subject: PlacedObject) -> Collider:
-    """The road; without wheels it must not reach into the vehicle's underside."""
+    """The road; without wheels it must not overlap the vehicle's underside."""
     if request.preset != "paper":
         return scene_road(request.scene, request.state, request.start_us)
     pose = subject.trajectory.transform(request.start_us)

@@ -1,3 +1,5 @@
-"""Search for avoidable failures of a planner: it is at fault, and a driver who knows the future
-could have avoided the collision.
+"""Search for avoidable failures of a planner.
+
+In such a collision the planner is at fault, and a driver with knowledge of the future could have
+avoided it.
 """

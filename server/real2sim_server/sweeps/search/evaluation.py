@@ -21,11 +21,11 @@ from ..spec import Space
 
 # --- Reference driver ----------------------------------------------------------------------------
 
-# The reference driver knows the future. It tries manoeuvres in copies of the world, in which all
-# others act as they will. A collision that it avoids was avoidable.
+# The reference driver knows the future. It tries manoeuvres in copies of the world, with the actual
+# behaviour of all others. A collision that it avoids was avoidable.
 
 CRUISE = 8.0
-"""Speed that it drives at where nothing hinders it, unless it begins faster [m/s]."""
+"""Cruising speed without hindrance, unless it starts faster [m/s]."""
 HORIZON, SPACING = 4.0, 0.2
 """Horizon of a tried manoeuvre, and spacing of the poses of its plan [s]."""
 DECIDES_EVERY = 0.3
@@ -80,7 +80,7 @@ class Drove:
 
 
 def manoeuvres(most: float) -> list[Manoeuvre]:
-    """All of them, mildest first."""
+    """All manoeuvres, mildest first."""
     found = [Manoeuvre(0.0, 1.5, most)]
     found += [Manoeuvre(0.0, a, most) for a in (-1.5, -3.0, -5.0, -8.0)]
     found += [
@@ -94,10 +94,10 @@ def manoeuvres(most: float) -> list[Manoeuvre]:
 
 
 def drive_reference(world: World) -> Drove:
-    """Drive a world to its end; the world is changed.
+    """Drive a world to its end; modifies the world.
 
     Args:
-        world: with trajectories as plans, at any time.
+        world: a world with trajectories as plans, at any time.
     """
     start, free = world.steps, gap_now(world)
     most = max(CRUISE, world.motion.speed)
@@ -124,7 +124,7 @@ def plan_of(world: World, manoeuvre: Manoeuvre) -> TrajectoryPlan:
     """Poses of a manoeuvre from the current time, along the route and next to it."""
     route, motion, point = world.route, world.motion, world.path_point
     shift = manoeuvre.aside - point.offset
-    # A quintic change of lanes has 5.77 d / T^2 at most.
+    # A quintic lane change has a maximum lateral acceleration of 5.77 d / T^2.
     change = max(math.sqrt(5.7735 * abs(shift) / SIDEWAYS), 1.0)
     poses, times = [], []
     s, speed, yaw = point.s, max(motion.speed, 0.0), motion.yaw
@@ -208,11 +208,11 @@ HARDEST, SIDEWAYS_LIMIT, JERK = 8.0, 4.0, 20.0
 TIGHTEST = 0.2
 """Maximum curvature of a vehicle's path at any speed [1/m]: no vehicle turns within 5 m."""
 START_GAP = 1.0
-"""Free around the ego when the episode begins [m]."""
+"""Minimum clearance around the ego at the start of the episode [m]."""
 MIN_DRIVERS = 5
 """Minimum number of moving vehicles for driving statistics of a log."""
 MIN_SPREAD = np.array([1.0, 0.5, 0.5])
-"""Standard deviations are at least these: speed [m/s], accelerations [m/s^2]."""
+"""Minimum standard deviations of speed [m/s] and accelerations [m/s^2]."""
 ORDINARY = 3.0
 """No penalty within this many standard deviations."""
 
@@ -230,7 +230,7 @@ class Manners:
 
     @classmethod
     def of(cls, scene: Scene) -> Manners:
-        """Those of the objects of a scene, and of its recording vehicle."""
+        """Statistics of the objects of a scene and of its recording vehicle."""
         tracks = [o.trajectory for o in scene.objects.values()] + [scene.ego]
         rows = []
         for track in tracks:
@@ -261,8 +261,8 @@ class Watch:
     """Monitors the adversaries over an episode.
 
     Attributes:
-        names: their objects.
-        manners: of the log.
+        names: object ids of the adversaries.
+        manners: driving statistics of the log.
     """
 
     names: frozenset[str]
@@ -272,7 +272,7 @@ class Watch:
     _start_gap: float = math.inf
 
     def add(self, world: World) -> None:
-        """The instant that a world is at."""
+        """Add the current instant of a world."""
         if world.steps == 0:
             self._start_gap, self._dt = gap_now(world), world.context.dt
         others = world.instant.others
@@ -282,8 +282,9 @@ class Watch:
                 self._tracks.setdefault(name, []).append((x, y))
 
     def implausibility(self) -> float:
-        """0 for normal human driving, about 1 for implausible driving. Implausible cases are
-        allowed, but not instructive.
+        """0 for normal human driving, about 1 for implausible driving.
+
+        Implausible cases are allowed, but not instructive.
         """
         found = max(START_GAP - self._start_gap, 0.0) / START_GAP
         for track in self._tracks.values():
@@ -306,11 +307,16 @@ class Watch:
 
 
 def _motion(points: Array, dt: float) -> Array:
-    """[M, 3] speed [m/s], acceleration along and across [m/s^2], from places [N, 2] every dt."""
+    """[M, 3] speed, longitudinal and lateral acceleration; SI units.
+
+    Args:
+        points: [N, 2] positions [m].
+        dt: time between positions [s].
+    """
     velocity = np.diff(points, axis=0) / dt
     if len(velocity) < 3:
         return np.zeros((0, 3))
-    # Smoothed over three instants: places are rounded, and drivers change at steps of the clock.
+    # Smoothed over three instants, because positions are rounded and drivers react at clock steps.
     smooth = (velocity[:-2] + velocity[1:-1] + velocity[2:]) / 3
     change = np.diff(smooth, axis=0) / dt
     speed = np.hypot(smooth[:-1, 0], smooth[:-1, 1])
@@ -336,14 +342,14 @@ def _beyond(values: Array, most: float) -> float:
 
 
 UNAVOIDABLE, REFUSED = -1.0, -200.0
-"""Scores of a failure that the reference does not avoid, and of a case that cannot start."""
+"""Scores of a failure that the reference cannot avoid, and of a case that cannot start."""
 MAX_STRANGE = 0.5
-"""A collision in a case that is less plausible than this is no finding."""
+"""Maximum implausibility of a finding."""
 SPEED_BIN = 2.0
 """Width of the archive's cells [m/s]."""
 
 Cell = tuple[str, str, str]
-"""Contact position on the ego, speed of the impact, kind of the other."""
+"""Contact position on the ego, impact speed, and kind of the other object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,14 +359,14 @@ class Evaluation:
     Attributes:
         space: index of its space.
         point: coordinates from 0 to 1.
-        values: of the parameters.
+        values: values of the parameters.
         drive: the episode.
         score: higher is nearer to an avoidable failure; positive for one.
-        criticality: of the tested planner.
+        criticality: criticality of the tested planner's episode.
         implausibility: subtracted from it.
         at_fault: whether the planner caused a collision.
         avoided: whether the reference survived the same case; None if it did not drive.
-        cell: of the archive; None unless at fault.
+        cell: cell of the archive; None unless at fault.
         impact: columns of the collision.
     """
 
@@ -386,10 +392,10 @@ class Evaluator:
     """Drives points of spaces of one scene with one planner.
 
     Args:
-        scene: of all spaces.
-        spaces: that are searched.
-        planner: tested, by name.
-        seed: of the episodes.
+        scene: scene of all spaces.
+        spaces: spaces to search.
+        planner: name of the tested planner.
+        seed: seed of the episodes.
     """
 
     def __init__(
@@ -400,7 +406,7 @@ class Evaluator:
         self.done = 0
 
     def dimensions(self, space: int) -> int:
-        """Coordinates of a point of a space."""
+        """Number of coordinates of a point of a space."""
         return len(drawn_parameters(self.spaces[space].parameters))
 
     def __call__(self, space: int, point: Sequence[float] | NDArray[np.float64]) -> Evaluation:
@@ -439,7 +445,7 @@ class Evaluator:
         )
 
     def reference(self, drive: Drive) -> Drove:
-        """The same episode with the reference at the wheel."""
+        """The same episode, driven by the reference driver."""
         world = begin(self.scene, drive, Needs(), privileged=False)
         if drive.operations:
             world.apply(OPERATIONS.validate_python([dict(o) for o in drive.operations]))
@@ -454,7 +460,7 @@ def cell_of(driven: Driven) -> Cell:
 
 
 def impact_of(driven: Driven) -> dict[str, Any]:
-    """What an at-fault collision was: where on the ego, with whom, how fast."""
+    """Columns of an at-fault collision: contact position on the ego, other object, speed."""
     assert driven.world is not None
     world = driven.world
     begun = [c for c in world.instant.contacts if c.begun]

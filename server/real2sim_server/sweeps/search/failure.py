@@ -107,13 +107,13 @@ NAMING = ("name", "author", "date")
 
 @dataclass(frozen=True)
 class WrittenScenario:
-    """The file of a failure.
+    """The scenario file of a failure.
 
     Attributes:
-        file: relative to the folder of the search; OpenSCENARIO, or a storyboard in JSON if
+        file: path relative to the folder of the search; OpenSCENARIO, or a storyboard in JSON if
             OpenSCENARIO cannot express it.
-        command: drives it.
-        same: whether it ends in the same collision, bit for bit.
+        command: command that drives it.
+        same: whether it ends in the same collision, bitwise.
     """
 
     file: str
@@ -127,8 +127,8 @@ def write_scenario(
     """Write a failure's storyboard and its road network, read it, and drive it.
 
     Args:
-        path: in the folder of the search, without a suffix.
-        evaluate: of the search.
+        path: path in the folder of the search, without a suffix.
+        evaluate: evaluator of the search.
         found: the failure.
         driven: its episode.
         scene: name or path of the scene, for display.
@@ -160,7 +160,7 @@ def write_scenario(
 
 
 def _same_options(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> bool:
-    """Whether two resets are the same episode."""
+    """Whether two resets define the same episode."""
     return _plain(mine) == _plain(theirs)
 
 
@@ -176,8 +176,7 @@ def _plain(options: Mapping[str, Any]) -> str:
 
 
 def _same(one: Driven, other: Driven) -> bool:
-    """Whether two episodes end at the same instant with everybody at the same places, in the same
-    collision."""
+    """Whether two episodes end in the same collision, with all objects at the same positions."""
     a, b = one.world, other.world
     if a is None or b is None or (a.steps, a.motion) != (b.steps, b.motion):
         return False
@@ -195,15 +194,15 @@ class Failure:
     """An avoidable collision that was the planner's fault.
 
     Attributes:
-        name: of its files.
+        name: name of its files.
         found: the evaluation.
-        recording: of the planner's episode.
-        replays: whether the recording replays bit for bit.
+        recording: recording of the planner's episode.
+        replays: whether the recording replays bitwise.
         avoidable_until: latest take-over by the reference that avoids the impact, in seconds before
             it; None if there is none, or plans are not trajectories.
-        boundaries: nearest first.
-        film: file, or None.
-        scenario: its file; None if the case is not a storyboard.
+        boundaries: boundaries, nearest first.
+        film: film file, or None.
+        scenario: its scenario file; None if the case is not a storyboard.
     """
 
     name: str
@@ -216,7 +215,7 @@ class Failure:
     scenario: WrittenScenario | None = None
 
     def fields(self) -> dict[str, Any]:
-        """For JSON."""
+        """The failure as JSON values."""
         found = self.found
         return {
             "name": self.name,

@@ -1,7 +1,7 @@
-"""The search: spread points, then points that a surrogate expects to be more critical. After the
-first finding, also CMA-ES and variations of it for other kinds of failures.
+"""The search: spread points, then points that a surrogate expects to be more critical.
 
-All random numbers come from the seed, so the search is reproducible.
+After the first finding, CMA-ES and variations of the finding look for other kinds of failures. All
+random numbers come from the seed, so the search is reproducible.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ class Archive:
     first: int | None = None
 
     def add(self, found: Evaluation, number: int) -> bool:
-        """Whether it is added: a failure in a new cell, or with a higher score than the cell's
-        elite.
+        """Add a failure in a new cell, or one with a higher score than the cell's elite.
+
+        Returns whether it was added.
         """
         if not found.is_failure or found.cell is None:
             return False
@@ -48,7 +49,7 @@ class Archive:
         return True
 
     def ordered(self) -> list[Evaluation]:
-        """Elites, the worst first."""
+        """Elites, worst first."""
         return sorted(self.elites.values(), key=lambda e: (-e.score, e.cell or ()))
 
 
@@ -59,21 +60,21 @@ class Archive:
 Array = NDArray[np.float64]
 
 SHORTEST, LONGEST = 0.05, 5.0
-"""Length scales, of a range."""
+"""Limits of length scales, as fractions of the range."""
 NOISE = 1e-3
-"""Variance that no length scale explains, of the variance of values: episodes change by jumps."""
+"""Unexplained variance, relative to the variance of the values: episodes change discontinuously."""
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianProcess:
-    """Conditioned on points.
+    """A Gaussian process conditioned on points.
 
     Attributes:
         scales: [D] length scales of the kernel (Matern 5/2).
         points: [N, D].
         factor: [N, N] Cholesky factor of their covariance.
         weights: [N].
-        mean, spread: of the values.
+        mean, spread: mean and spread of the values.
     """
 
     scales: Array
@@ -110,7 +111,7 @@ class GaussianProcess:
 
 
 def _covariance(a: Array, b: Array, scales: Array) -> Array:
-    """[A, B] Matern 5/2 of variance 1."""
+    """[A, B] Matern 5/2 covariance of variance 1."""
     from scipy.spatial.distance import cdist
 
     r = np.sqrt(5.0) * cdist(a / scales, b / scales)
@@ -144,7 +145,7 @@ def _likeliest(points: Array, unit: Array) -> Array:
     options: Any = {"maxiter": 20}
     start = np.full(points.shape[1], np.log(0.5))
     found = minimize(cost, start, method="L-BFGS-B", bounds=bounds, options=options)
-    # Rounded, so that sums of other threads lead to the same.
+    # Rounded, so that different summation orders on other threads give the same result.
     scales: Array = np.round(np.exp(found.x), 3)
     return scales
 
@@ -154,13 +155,13 @@ Report = Callable[[int, int], None]
 
 POPULATION = 8
 STEP = 0.25
-"""Standard deviation that CMA-ES begins with, of a range."""
+"""Initial standard deviation of CMA-ES, as a fraction of the range."""
 STALE = 3
 """Generations without improvement before a restart elsewhere."""
 START, MIN_START = 8, 4
-"""Spread points in all, and of each space."""
+"""Number of initial points: total, and minimum per space."""
 BATCH = 8
-"""Points by the surrogate before spaces are weighed again."""
+"""Points from the surrogate before a space is selected again."""
 OPTIMISM = (2.0, 0.5, 1.0)
 """Standard deviations added to the surrogate's mean, in turn."""
 REFIT = 4
@@ -175,11 +176,11 @@ ISO, LINE = 0.05, 0.3
 
 @dataclass(frozen=True)
 class SearchBudget:
-    """How much is driven.
+    """The budget of a search.
 
     Attributes:
-        episodes: of the tested planner, in all.
-        seed: of points.
+        episodes: total number of episodes of the tested planner.
+        seed: seed of the points.
         stop_at_first: end with the first avoidable failure.
     """
 
@@ -190,11 +191,11 @@ class SearchBudget:
 
 @dataclass
 class SearchState:
-    """What a search has seen.
+    """The state of a search.
 
     Attributes:
-        evaluations: all, in their order.
-        archive: of failures.
+        evaluations: all evaluations, in order.
+        archive: archive of failures.
     """
 
     evaluations: list[Evaluation] = field(default_factory=list)
@@ -228,7 +229,10 @@ def search(
 def random_search(
     evaluate: Evaluator, budget: SearchBudget, *, on_progress: Report = lambda _d, _t: None
 ) -> SearchState:
-    """The same budget spent on independent points, spaces in turn: the baseline of a search."""
+    """Spend the same budget on independent points, alternating between spaces.
+
+    The baseline of a search.
+    """
     state, rng = SearchState(), np.random.default_rng(budget.seed)
     for k in range(budget.episodes):
         space = k % len(evaluate.spaces)
@@ -260,7 +264,7 @@ def _points(
 
 
 def _start(evaluate: Evaluator, budget: SearchBudget) -> Iterator[tuple[int, Point]]:
-    """Spread points of every space, spaces by turns."""
+    """Initial points, alternating between spaces."""
     spaces = len(evaluate.spaces)
     each = max(START // spaces, MIN_START)
     clouds = [
@@ -272,8 +276,7 @@ def _start(evaluate: Evaluator, budget: SearchBudget) -> Iterator[tuple[int, Poi
 
 
 def _space(spent: NDArray[np.float64], rng: np.random.Generator) -> int:
-    """Select a space: more likely with more kinds of failures per batch (Thompson sampling of
-    rates).
+    """Select a space by Thompson sampling of the kinds of failures per batch.
 
     Args:
         spent: [S, 2] kinds of failures and batches, per space.
@@ -302,7 +305,7 @@ def _guided(
 
 
 def _telling(seen: Sequence[Evaluation]) -> list[Evaluation]:
-    """The most critical ones and the latest, in their order."""
+    """The most critical and the latest evaluations, in order."""
     if len(seen) <= MAX_SEEN:
         return list(seen)
     ranked = sorted(range(len(seen)), key=lambda k: -seen[k].score)[: MAX_SEEN // 2]
@@ -316,7 +319,10 @@ def _compressed(scores: Point) -> Point:
 
 
 def _places(best: Point, rng: np.random.Generator) -> Point:
-    """[N, D] anywhere, and near the best [K, D]: moved a little, a lot, or in few coordinates."""
+    """[N, D] random points: anywhere, and near the best [K, D].
+
+    The latter are small moves, large moves, and moves in a few coordinates.
+    """
     dimensions = best.shape[1]
     near = np.repeat(best, NEAR, axis=0)
     step = rng.choice([0.02, 0.08, 0.25], size=(len(near), 1)) * rng.standard_normal(near.shape)
@@ -328,8 +334,10 @@ def _places(best: Point, rng: np.random.Generator) -> Point:
 def _descend(
     state: SearchState, rng: np.random.Generator, space: int
 ) -> Iterator[tuple[int, Point]]:
-    """CMA-ES from a point that was critical and is no failure known already, until it finds nothing
-    better, or a failure in a new cell."""
+    """CMA-ES from a critical point outside known failures.
+
+    Ends when it stops improving, or after a failure in a new cell.
+    """
     begin = _begin(state, rng, space)
     optimiser = _cma(begin, seed=int(rng.integers(2**31)))
     best, stale = -np.inf, 0
@@ -351,8 +359,10 @@ def _descend(
 
 
 def _begin(state: SearchState, rng: np.random.Generator, space: int) -> Evaluation:
-    """One of the most critical points of a space, more likely the more critical, without failures:
-    they are varied elsewhere."""
+    """One of the most critical points of a space; more critical ones are more likely.
+
+    Excludes failures, which are varied elsewhere.
+    """
     mine = [e for e in state.evaluations if e.space == space]
     ranked = sorted([e for e in mine if not e.is_failure] or mine, key=lambda e: -e.score)
     return ranked[min(int(rng.exponential(3.0)), len(ranked) - 1)]
@@ -378,7 +388,7 @@ def _cma(begin: Evaluation, *, seed: int) -> Any:
 def _variations(
     state: SearchState, rng: np.random.Generator, space: int
 ) -> Iterator[tuple[int, Point]]:
-    """Two generations of them, each of a failure, towards another of its space."""
+    """Two generations of variations, each of a failure towards another one of its space."""
     for _ in range(2 * POPULATION):
         own = [e for e in state.archive.ordered() if e.space == space]
         one = np.array(own[int(rng.integers(len(own)))].point)

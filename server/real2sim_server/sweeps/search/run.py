@@ -53,7 +53,7 @@ class Probability:
 
 
 def wilson(failures: int, episodes: int) -> Probability:
-    """Of independent episodes (Wilson 1927).
+    """Failure probability of independent episodes (Wilson 1927).
 
     Examples:
         >>> found = wilson(0, 100)
@@ -84,13 +84,13 @@ def splitting(
     until all are above ``level``. Moves preserve the uniform distribution of the space.
 
     Args:
-        score: of a point from 0 to 1; higher is nearer to failing.
-        dimensions: of points.
+        score: function of a point with coordinates from 0 to 1; higher is nearer to failing.
+        dimensions: number of coordinates.
         level: minimum score of a failure.
-        particles: at least 10.
-        seed: of all random numbers.
+        particles: number of particles, at least 10.
+        seed: seed of all random numbers.
         most_episodes: limit; beyond it the estimate is an upper bound.
-        moves: tries for each new particle.
+        moves: attempts per new particle.
     """
     from scipy.special import ndtr, ndtri
 
@@ -176,7 +176,7 @@ class SearchOptions:
     """Options beyond the search itself.
 
     Attributes:
-        budget: of the search itself.
+        budget: budget of the search itself.
         shrink: number of failures, worst first, to find boundaries for.
         probability: episodes for the probability of an at-fault collision in each space; 0: none.
         films: number of failures, worst first, to film.
@@ -246,7 +246,7 @@ def _check_planner(planner: str, scene: Scene) -> None:
 def _failure(
     evaluate: Evaluator, found: Evaluation, number: int, out: Path, options: SearchOptions
 ) -> Failure:
-    """Recorded, written as a case, shrunk and filmed."""
+    """Record a failure, write it as a case, shrink it and film it."""
     name = f"failure_{number + 1:02d}"
     driven = drive_episode(
         evaluate.scene,
@@ -276,7 +276,7 @@ def _failure(
 
 
 def _scene_path(name: str, folder: Path | None) -> str:
-    """What `real2sim run` takes for a scene."""
+    """The scene argument for `real2sim run`."""
     below = folder / name if folder is not None else None
     return str(below) if below is not None and below.is_dir() else name
 
@@ -327,7 +327,7 @@ def _probabilities(
 
 
 def _danger(found: Evaluation) -> float:
-    """At least 0 for every collision at fault, avoidable or not."""
+    """Criticality, at least 0 for every at-fault collision, avoidable or not."""
     return max(found.criticality, 0.0) if found.at_fault else min(found.criticality, -1e-9)
 
 
@@ -338,7 +338,7 @@ def _report(
     odds: Sequence[Probability | None],
     options: SearchOptions,
 ) -> dict[str, Any]:
-    """What failures.json holds."""
+    """Contents of failures.json."""
     at_fault = [e for e in state.evaluations if e.at_fault]
     return {
         "format": "real2sim-failures",

@@ -21,13 +21,13 @@ from ..traffic.driver import AgentPose, Surroundings
 # State, impulses, and sliding to rest.
 
 SLIDING_SLIP = 0.1
-"""Slip angle from which on a tyre of a sliding car gives all its friction [rad]."""
+"""Slip angle at which a tyre of a sliding car reaches its maximum friction [rad]."""
 
 CREEP = 0.5
-"""Speed below which friction fades, so that bodies come to rest without a jerk [m/s]."""
+"""Speed below which friction decreases, so that bodies come to rest smoothly [m/s]."""
 
 AT_REST = 0.05
-"""Speed, and yaw rate times half a length, below which a body without drive is at rest [m/s]."""
+"""Speed, or yaw rate times half the length, below which a body without drive is at rest [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,8 @@ def is_rolling(motion: Motion, spec: EgoSpec) -> bool:
 # --- Impacts -------------------------------------------------------------------------------------
 
 MUTUAL_STIFFNESS = 405e3
-"""Of two cars in series, where impacts are sudden: 405 +- 139 kN/m (Bonugli et al. 2017) [N/m]."""
+"""Series stiffness of two cars for instantaneous impacts [N/m]: 405 +- 139 kN/m (Bonugli et al.
+2017)."""
 
 
 class ImpactParticipant(NamedTuple):

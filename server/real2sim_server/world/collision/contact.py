@@ -20,7 +20,7 @@ from .bodies import BodyProperties, BodyState
 Corner = tuple[float, float]
 
 SLOW = 0.3
-"""Approach below this speed ends without rebound [m/s]."""
+"""Approach speed below which there is no rebound [m/s]."""
 
 
 class ContactManifold(NamedTuple):
@@ -265,7 +265,7 @@ KEPT = 0.38
 """Fraction of the maximum crush that is permanent: 0.26 of 0.68 m in the barrier test of the 2015
 Malibu."""
 SQUARE = 1e-6
-"""Faces across a normal lie so well across it, as a sine."""
+"""Sine of the maximum angle at which a face counts as perpendicular to a normal."""
 MIN_LENGTH = 1.0
 """Minimum length of a crushed body [m]."""
 MIN_WIDTH = 0.1

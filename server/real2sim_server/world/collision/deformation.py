@@ -40,7 +40,7 @@ from .bodies import BodyState, Impact, ImpactParticipant
 # Broken and folded parts of a vehicle, over the frames of an impact.
 
 HARD = 5.0
-"""Fragments fly as far as they do from a limit passed once, per so much approach speed [m/s]."""
+"""Approach speed per multiple of the breakage limit, for the speed of fragments [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class DamageHistory:
     _log: BreakageLog | None = field(default=None)
 
     def after(self, frames: Sequence[Float], impact: Impact, role: int) -> VehicleDamage:
-        """The damage after the first frames of an impact, one each ``crash.FRAME_S``.
+        """The damage after the first frames of an impact, with an interval of ``impact.FRAME_S``.
 
         Args:
             frames: displacements [N, 3] of the vehicle's particles, from first contact [m].
@@ -153,10 +153,10 @@ T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 MIN_APPROACH_SPEED = 1.1
-"""Bumpers take impacts up to this speed without damage (2.5 mph, 49 CFR 581) [m/s]."""
+"""Minimum approach speed for damage [m/s]: bumpers withstand 2.5 mph (49 CFR 581)."""
 
 MAX_IMPACTS = 4
-"""Impacts that deform one object; further ones move it only."""
+"""Maximum number of impacts that deform one object; further ones only move it."""
 
 NEVER_DEFORMED = frozenset({"pedestrian", "person", "cyclist", "motorcyclist", "animal"})
 """Categories that are never shown deformed."""
@@ -165,22 +165,22 @@ FRICTION = 0.4
 """Friction coefficient of bodywork on bodywork."""
 
 MIN_MOVED = 5e-3
-"""Particles that have moved less than this leave Gaussians where they are [m]."""
+"""Minimum displacement of particles that moves Gaussians [m]."""
 
 REACH = 2.5
-"""Gaussians follow particles no farther away than this many spacings."""
+"""Maximum distance from particles to Gaussians that follow them [spacings]."""
 
 PARTS = np.array([8, 1, 1])
-"""Parts of an object along its length, width and height that follow their particles apart."""
+"""Number of parts along the length, width and height; each follows its own particles."""
 
 WALL = (1.0, 2.0, 2.0)
-"""Size of the part of the background that an object runs into: depth, width, height [m]; narrower
-where the background is, down to a POLE."""
+"""Size of the background part in an impact: depth, width, height [m]; narrower for a narrow
+background, down to POLE."""
 POLE = 0.25
 
 
 FOR_GOOD = 2**62
-"""An instant at which every impact is over [us]."""
+"""A time after the end of every impact [us]."""
 
 
 class Deformation(Protocol):

@@ -38,15 +38,15 @@ from .solver_state import (
     pair_impulse,
 )
 
-# --- Corners -------------------------------------------------------------------------------------
+# Bodies that cross each other's corner between two substeps.
 
 # Bodies that pass through each other's corner between two substeps.
 
 SLOWEST = 0.05
-"""Bodies that move less than this against each other in a substep cannot do so unseen [m]."""
+"""Minimum relative motion in a substep that needs this check [m]."""
 
 HEIGHT = 1.0
-"""Of both bodies here: whether they are above one another is looked at elsewhere."""
+"""Height of both bodies for this check, because height ranges are compared elsewhere."""
 
 Way = tuple[BodyState, BodyState]
 """A body before and after a substep."""
@@ -103,7 +103,7 @@ def _centre(body: BodyState, shape: BodyProperties) -> tuple[float, float]:
 
 SUBSTEP_US = 10_000
 SLOP = 0.01
-"""Overlap that is left between bodies in contact, so that they stay in contact [m]."""
+"""Overlap that remains between bodies in contact, so that they stay in contact [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ def solve_collisions(step: CollisionStep) -> CollisionResult:
         pushed = _resolve_contacts(state, (end - begin) * 1e-6)
         if pushed or sliding:
             motion = ego_motion(state.bodies[EGO], motion, step.spec)
-            # Lasting contacts push a little in each substep, which the wheels must not undo.
+            # Lasting contacts push a little in each substep, and the wheels must not undo this.
             going_on = pushed and step.contact.progressive
             sliding = going_on or not is_rolling(motion, step.spec)
     return CollisionResult(

@@ -254,10 +254,10 @@ def make_dynamic(state: SolverState, impacted_now: set[str]) -> None:
 
 STRIPS = 16
 SHALLOW, DEEPENING, RATE = 0.2, 0.35, 0.015
-"""Share of the stiffness of two vehicles that acts at no depth, how much comes with each metre of
-depth, and what depth closing by 1 m/s counts as [m]. Fitted to forces between the matter's cars:
-57 kN at once and 88 kN at 0.5 m in a rear end of 10 m/s, 153 kN at once and 435 kN at 1.25 m head
-on at 30 m/s; and to how long they push."""
+"""Progressive force between vehicles: fraction of the stiffness at zero depth, increase per metre
+of depth, and equivalent depth of a closing speed of 1 m/s [m]. Fitted to the durations and forces
+of MPM car impacts: 57 kN at once and 88 kN at 0.5 m in a rear-end impact at 10 m/s; 153 kN at once
+and 435 kN at 1.25 m head-on at 30 m/s."""
 
 
 class Strip(NamedTuple):

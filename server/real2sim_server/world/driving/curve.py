@@ -21,10 +21,10 @@ from .vehicle import clamped, wrapped
 T, X, Y, YAW, VX, VY = range(6)
 
 MOVING = 0.5
-"""Below this speed the direction between plan poses is mostly noise [m/s]."""
+"""Minimum speed for using the direction between plan poses [m/s]; it is mostly noise below."""
 
 DENSE = 0.25
-"""Plans that begin within this time say where they come from, too [s]."""
+"""Maximum time of the first pose for plans whose initial direction is used [s]."""
 
 TRUSTED_YAW = 0.5
 """Maximum deviation of a planned heading from the path to be used as its tangent [rad]."""

@@ -35,11 +35,11 @@ HEADWAY, SHORTEST = 0.55, 2.0
 """Length scale of the lateral regulator: distance in this time [s], and its minimum [m]."""
 
 DIFFERENCE = 0.05
-"""Acceleration and curvature of the plan are taken over this time [s]."""
+"""Time step of the finite differences for the plan's acceleration and curvature [s]."""
 
 
 NEWTON_STEPS = 8
-"""From the start that is taken, the gains are then exact for lags of up to ten times the scale."""
+"""Iterations for the gains; enough for lags of up to ten times the time scale."""
 
 
 class PlanPoint(NamedTuple):
@@ -143,8 +143,10 @@ def point_at(curve, t, ahead, version):
 
 @func
 def _steering_onto(point, coming, state, vehicle):
-    """Road-wheel angle [rad] that brings the vehicle onto the path through ``point``, whose
-    curvature is ``coming`` [1/m] once the steering gear has followed."""
+    """Road-wheel angle [rad] that brings the vehicle onto the path through ``point``.
+
+    ``coming``: curvature of the path [1/m] at the time when the steering gear has followed.
+    """
     dx, dy = state.x - point.x, state.y - point.y
     across = dy * math.cos(point.yaw) - dx * math.sin(point.yaw)
     # Direction of motion: with tyre slip it differs from the heading.
@@ -172,14 +174,14 @@ def _steering_of(curvature, speed, vehicle):
 # --- Pure pursuit --------------------------------------------------------------------------------
 
 LOOKAHEAD = 0.4
-"""The controller aims at where the plan is this much later [s]."""
+"""Look-ahead time along the plan [s]."""
 
 MIN_AIM = 3.0
-"""Steering aims at least this far ahead; nearer aims would turn centimetres into angles [m]."""
+"""Minimum look-ahead distance [m]; shorter ones amplify centimetres into steering angles."""
 
 AIM_TRIES = 8
 MAX_LAG = 2.0
-"""Distance behind or ahead of the plan beyond which the controller hurries no more [m]."""
+"""Maximum longitudinal error that the controller corrects [m]."""
 
 
 @func
@@ -304,15 +306,15 @@ STEP = 0.1
 STEPS = 15
 ITERATIONS = 5
 GAINS = (1.0, 0.5, 0.2, 0.05)
-"""Fractions of the step that the line search tries."""
+"""Fractions of the step in the line search."""
 
 ENOUGH = 1e-4
-"""Iterations end where one gains less than this fraction of the cost."""
+"""Minimum relative decrease of the cost for another iteration."""
 
 STATE_COST = np.array([4.0, 4.0, 10.0, 1.0, 0.0, 0.0])
-"""Per squared error of x, y [m], yaw [rad], speed [m/s], road-wheel angle [rad], acceleration."""
+"""Costs of squared errors: x, y, yaw, speed, road-wheel angle, acceleration; SI units."""
 INPUT_COST = np.array([0.05, 0.5])
-"""Per squared acceleration [m/s^2] and steering rate [rad/s]."""
+"""Cost per squared acceleration [m/s^2] and steering rate [rad/s]."""
 
 NX, NU = 6, 2
 
@@ -348,7 +350,7 @@ def follow_schedule(state, curve, t, vehicle, schedule):
     k = min(int(elapsed / STEP + 1e-9), STEPS - 1)
     fraction = elapsed / STEP - k
     steering = (1 - fraction) * states[k, 4] + fraction * states[k + 1, 4]
-    # The angle at the end of the substep is what its mean must lead to.
+    # The commanded mean must lead to the angle at the end of the substep.
     rolling = steering + 0.01 * inputs[k, 1]
     curvature = math.tan(rolling) / vehicle.wheelbase
     ahead = steady_steering(vehicle.model, rolling, curvature, state.speed, vehicle)
@@ -504,8 +506,10 @@ def _backward(states, inputs, wanted, model):
 
 @func
 def _linearise(A, B, along, model):
-    """Write the derivatives of the next state by state [6, 6], above the diagonal, and by input
-    [6, 2]; all other entries are 0."""
+    """Write the derivatives of the next state.
+
+    ``A``: by state [6, 6], above the diagonal; ``B``: by input [6, 2]. All other entries are 0.
+    """
     state, after = along
     way = (state[3] + after[3]) / 2 * STEP
     middle = (state[2] + after[2]) / 2
@@ -580,13 +584,13 @@ TRACKERS: Mapping[str, Tracker] = {
     "lqr": Tracker(regulate),
     "ilqr": Tracker(follow_schedule, prepare),
 }
-"""By the name of ``EgoSpec.tracker``."""
+"""Trackers by the name in ``EgoSpec.tracker``."""
 
 HOLD = 0
 """Kind of the law that holds one command."""
 
 KINDS: Mapping[str, int] = {name: k for k, name in enumerate(TRACKERS, start=1)}
-"""Number of each tracker for compiled code."""
+"""Number of each tracker in compiled code."""
 
 PURSUIT, LQR, ILQR = KINDS["pursuit"], KINDS["lqr"], KINDS["ilqr"]
 

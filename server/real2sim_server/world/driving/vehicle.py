@@ -238,8 +238,8 @@ def sinc(angle):
 _wheel_load = func(wheel_load)
 
 SLOWEST, FASTER = 2.0, 4.0
-"""Below the first speed slip angles mean nothing and the kinematic bicycle holds; between the two
-its lateral motion fades into that of the tyres [m/s]."""
+"""Speeds at which blending from the kinematic to the dynamic bicycle starts and ends [m/s]. Slip
+angles are undefined at low speed."""
 
 
 @func
@@ -334,7 +334,7 @@ def fiala(slip, stiffness, limit):
     Args:
         slip: angle from the wheel's motion to its heading [rad]; the force has its sign.
         stiffness: at zero slip [N/rad].
-        limit: friction times load, less what the longitudinal force takes [N].
+        limit: friction times load, reduced by the longitudinal force [N].
     """
     if limit <= 0.0:
         return 0.0
@@ -427,7 +427,7 @@ VEHICLE_MODELS: Mapping[str, VehicleModel] = {
     "kinematic_bicycle": VehicleModel(step_rolling, rolling_steering),
     "dynamic_bicycle": VehicleModel(step_slipping, understeer_steering),
 }
-"""By the name of ``EgoSpec.dynamics``; the number of a model is its place."""
+"""Models by the name in ``EgoSpec.dynamics``; the number of a model is its index."""
 
 step_vehicle = choice([model.step for model in VEHICLE_MODELS.values()])
 steady_steering = choice([model.steady_steering for model in VEHICLE_MODELS.values()])

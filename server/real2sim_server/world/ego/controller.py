@@ -225,10 +225,10 @@ Plan = TrajectoryPlan | Control | PoseCommand
 WorldPlan = PlannedTrajectory | Control | PoseCommand
 
 LOG_SPACING_US = 100_000
-"""Where there is no plan, the log is followed by poses this far apart at most [us]."""
+"""Maximum interval between poses for following the log [us]."""
 
 EMERGENCY_BRAKING = 6.0
-"""Deceleration of the fallback ``brake``, where the vehicle can [m/s^2]."""
+"""Maximum deceleration of the fallback ``brake`` [m/s^2]."""
 
 
 class Controller(Protocol):

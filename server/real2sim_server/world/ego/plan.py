@@ -31,11 +31,12 @@ from ..path import Float, LoopTransform
 from .motion import ControlLaw, Motion, advance_motion, commanded, constant_law
 
 Pose = tuple[float, float, float]
-"""x, y [m], yaw [rad] in the world."""
+"""x, y [m], yaw [rad], world frame."""
 
 
 FEW, CLEARLY = 40, 1e-6
-"""Poses up to so many are looked at one by one; a way [m] that no rounding turns round."""
+"""Maximum number of poses that are checked one by one, and minimum distance between poses that
+rounding cannot reverse [m]."""
 
 
 MAX_GAP_US = 1_000_000
@@ -227,17 +228,16 @@ class ReferenceTrajectory:
 # --- Legs ----------------------------------------------------------------------------------------
 
 CUSP, ON_AGAIN = 0.05, 0.02
-"""A plan turns back where it goes the other way for this far, and goes on forwards again for this;
-less is noise of a plan that stands [m]."""
+"""Minimum distances of a plan against and along its headings that count as a change of direction
+[m]; less is noise of a stationary plan."""
 
 NEAR = 0.05
-"""A plan of a single pose changes the gear where the pose is farther away than this on the other
-side [m]."""
+"""Minimum distance of a single pose on the other side of the vehicle for a gear change [m]."""
 
 
 CREEPING = 0.1
-"""Plans of a single pose that go faster than this from one to the next have the gear of that way,
-wherever the vehicle is [m/s]."""
+"""Minimum speed between successive single poses that determines the gear, wherever the vehicle is
+[m/s]."""
 
 
 @made_quickly
@@ -339,7 +339,7 @@ def _is_behind(pose: Float, motion: Motion) -> bool:
 # in which they were given.
 
 SHIFT_BRAKING = 6.0
-"""Deceleration of a vehicle that still rolls on when its plan has turned back already, where it can
+"""Maximum deceleration of a vehicle that still moves when its plan has already changed direction
 [m/s^2]."""
 
 SHIFT_LOOK_US = 10_000

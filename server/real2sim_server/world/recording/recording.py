@@ -62,7 +62,7 @@ from .replay import KINDS, Entry, Replayer, recorded_spec
 # values must be right.
 
 MAX_WAY_M = 1e6
-"""Length of a route or lane [m]: they are cut into pieces of less than a metre."""
+"""Maximum length of a route or lane [m]; they are divided into segments of less than a metre."""
 
 MAX_NUMBER = 1e12
 """Maximum of any length, speed or mass, SI units."""
@@ -427,7 +427,7 @@ def load_recording(path: Path) -> Recording:
     """Read a recording from a file.
 
     Raises:
-        RecordingError: the file is no recording, damaged, too large, or of a newer version.
+        RecordingError: the file is not a recording, damaged, too large, or of a newer version.
         OSError: the file cannot be read.
     """
     with path.open("rb") as file:

@@ -85,7 +85,7 @@ class Entry:
 
     Attributes:
         kind: one of ``KINDS``.
-        step: of the clock when it took effect.
+        step: clock step at which it took effect.
         payload: msgpack, made by one of the functions below.
     """
 
@@ -148,7 +148,7 @@ class Replayer:
     Attributes:
         begin: creates the world of an episode.
         world: world after the entries so far; None before the first reset. Never modified in place.
-        snapshots: by name.
+        snapshots: snapshots by name.
     """
 
     begin: Callable[[ResetSpec], World]

@@ -19,7 +19,7 @@ from .instant import EgoSample, Instant, ScoringContext
 T = TypeVar("T")
 
 ROOM = 8
-"""Rows that a window of rows has room for at least."""
+"""Minimum capacity of a window of rows."""
 
 
 class Window(Generic[T]):
@@ -45,11 +45,11 @@ class Window(Generic[T]):
         return self._entries[self._end - 1 - back]
 
     def pushed(self, entry: T, most: int) -> Window[T]:
-        """With one more entry, the last ``most`` of them."""
+        """The window with one more entry, limited to the last ``most`` entries."""
         kept = min(self._length, most - 1)
         entries = self._entries
         try:
-            # Atomic, so that worlds that go on from here on two threads do not share.
+            # Atomic, so that worlds that continue on two threads do not share entries.
             self._unclaimed.pop()
             shared = len(entries) < 2 * most
         except IndexError:
@@ -87,7 +87,7 @@ class RowWindow:
         return len(self.rows)
 
     def pushed(self, row: Sequence[float], most: int) -> RowWindow:
-        """With one more row, the last ``most`` of them."""
+        """The window with one more row, limited to the last ``most`` rows."""
         kept = min(len(self.rows), most - 1)
         buffer, end = self._buffer, self._end
         try:
@@ -112,12 +112,12 @@ class RowWindow:
 
 
 PLAN_BOUNDS = (0.7, 0.5, 0.1, 0.1)
-"""Greatest RMS difference of successive plans in acceleration, jerk, yaw rate, yaw acceleration
+"""Maximum RMS differences of successive plans in acceleration, jerk, yaw rate and yaw acceleration
 (NAVSIM v2, extended comfort)."""
 
 PLAN_STEP = 0.1
 SHORTEST_OVERLAP = 6
-"""Fewer common times than these say nothing."""
+"""Minimum number of common times for a comparison."""
 
 
 @kernel
@@ -254,7 +254,7 @@ YAW_ACCELERATION = 1.93
 """Bounds of nuPlan and NAVSIM [m/s^2], [m/s^3], [rad/s], [rad/s^2]."""
 
 HUGSIM_LON_JERK = 8.37
-"""HUGSIM bounds the jerk ahead by this and no other; the rest as above [m/s^3]."""
+"""HUGSIM's bound of the longitudinal jerk [m/s^3]; the other bounds are the same."""
 
 
 class ComfortSample(NamedTuple):
@@ -327,7 +327,7 @@ class ComfortAccumulator:
         return ComfortAccumulator(self.window)
 
     def updated(self, speed: float, yaw: float, dt: float) -> ComfortAccumulator:
-        """After one more clock step."""
+        """The accumulator one clock step later."""
         return self._with(*_newest(self.window, speed, yaw, dt))
 
     def updated_beside(
@@ -408,29 +408,30 @@ def plans_agree(before: PlannedTrajectory, now: PlannedTrajectory) -> bool | Non
 
 
 MAX_ACCELERATION, MAX_CURVATURE = 10.4, 0.3
-"""Waymax, kinematic infeasibility, for steps of 0.1 s [m/s^2], [1/m]."""
+"""Bounds of Waymax's kinematic infeasibility, for steps of 0.1 s [m/s^2], [1/m]."""
 
 STEP_S = 0.1
-"""Shorter clock steps are looked at together: noise of places would be acceleration."""
+"""Minimum interval [s]; shorter clock steps are combined, because position noise would look like
+acceleration."""
 
 SLOWEST_CURVATURE = 0.5
-"""Below this speed curvature is noise [m/s]."""
+"""Minimum speed at which curvature is evaluated [m/s]."""
 
 PLACE_NOISE = 0.03
 """Noise of recorded positions [m]."""
 
 SLIP = 0.05
-"""Way sideways per way ahead that nobody minds, beside what the vehicle model says: the rear axle
-is rarely known better."""
+"""Tolerated lateral over longitudinal displacement, in addition to the vehicle model. The position
+of the rear axle is rarely known more accurately."""
 
 SPIN_S, SPIN_NOISE = 1.0, 0.1
-"""Turning on the spot: time over which it is looked at [s], noise of headings in it [rad]."""
+"""Turning on the spot: time window [s], and heading noise in it [rad]."""
 
 FASTEST_BACKWARDS = 8.0
-"""More than the reverse gear of a car gives [m/s]."""
+"""Maximum reverse speed [m/s], above that of a car's reverse gear."""
 
 SETTLED = 0.2
-"""Speed across below which a vehicle that was pushed rolls again [m/s]."""
+"""Lateral speed below which a pushed vehicle rolls again [m/s]."""
 
 
 Samples = Window[tuple[EgoSample, float]]
@@ -454,7 +455,7 @@ class Feasibility:
     first: int | None = None
 
     def updated(self, instant: Instant, way: float, context: ScoringContext) -> Feasibility:
-        """After one more clock step; ``way``: distance driven so far [m]."""
+        """One clock step later; ``way``: distance driven so far [m]."""
         ego = instant.ego
         pushed = bool(instant.contacts) and any(c.impulse != (0.0, 0.0) for c in instant.contacts)
         if pushed or (self.pushed and not _settled(ego)):
@@ -487,7 +488,7 @@ def _is_feasible(samples: Samples, dt: float) -> bool:
 
 
 def _follows(before: EgoSample, now: EgoSample, h: float) -> bool:
-    """Whether a car gets from one sample to another ``h`` seconds later."""
+    """Whether a car can get from one sample to another in ``h`` seconds."""
     if abs(now.speed - before.speed) > MAX_ACCELERATION * h * (1 + 1e-9):
         return False
     if now.speed < -FASTEST_BACKWARDS and now.speed < before.speed:

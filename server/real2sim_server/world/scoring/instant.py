@@ -29,7 +29,7 @@ VRU = frozenset({"pedestrian", "cyclist", "motorcycle", "bicycle", "person"})
 VEHICLES = frozenset({"car", "vehicle", "van", "truck", "bus", "trailer", "tram"})
 
 Lines = tuple[Float, NDArray[np.int64]]
-"""Points [P, 2] [m] of lines, one line after another, and the end of each among them."""
+"""Concatenated points [P, 2] of several lines [m], and the end index of each line."""
 
 
 class EgoSample(NamedTuple):
@@ -297,10 +297,10 @@ def _dense(line: Float) -> Float:
 
 HORIZON, STEP = 3.0, 0.1
 STEPS = 31
-"""Times from 0 to the horizon."""
+"""Number of times from 0 to the horizon."""
 
 AHEAD, BEHIND = math.radians(30), math.radians(150)
-"""Bearings within which an object counts as ahead, beyond which as behind (nuPlan)."""
+"""Objects within the first bearing are ahead, beyond the second one behind (nuPlan) [rad]."""
 
 
 @kernel
@@ -379,7 +379,7 @@ def _overlap(x, y, yaw, size, other_yaw, other_size):
 
 
 STANDSTILL = 5e-3
-"""Below this speed the time to collision is not defined (NAVSIM) [m/s]."""
+"""Minimum speed for a time to collision (NAVSIM) [m/s]."""
 
 NEVER = math.inf
 
@@ -419,7 +419,7 @@ def time_to_collision(
 
 
 STOPPED = 5e-2
-"""Speed at which a vehicle counts as stopped (nuPlan) [m/s]."""
+"""Maximum speed of a stopped vehicle (nuPlan) [m/s]."""
 
 
 def side_of_contact(
@@ -481,7 +481,8 @@ def _segment_intersects(
 def ego_at_fault(record: ContactRecord, off_lane: bool) -> bool:
     """Whether the ego is at fault (nuPlan).
 
-    It is in a front contact or with a stopped vehicle, and in a lateral one outside its lane.
+    It is in front contacts, in contacts with stopped vehicles, and in lateral contacts outside its
+    lane.
     """
     if record.side in {"front", "stopped_track"}:
         return True
@@ -496,10 +497,10 @@ def fault_class(category: str) -> str:
 
 
 ALONG = 0.5
-"""Cosine of the greatest angle between an ego and the direction that a stop line is for."""
+"""Minimum cosine between an ego's heading and the direction of a stop line."""
 
 LAMPS = {"on", "off", "flashing", "counting"}
-"""Words of states that list lamps from the first, red one on, as ``off;off;on``."""
+"""Words of states that list lamps, red first, such as ``off;off;on``."""
 
 
 class StopLineAt(NamedTuple):

@@ -81,7 +81,7 @@ class MetricAccumulator:
         hit: objects in contact so far.
         lights: traffic light states and violations.
         ego: ego sample at the newest instant.
-        states: states of single metrics, by name; see :class:`.metric.Metric`.
+        states: states of single metrics, by name; see :class:`Metric`.
     """
 
     steps: int = 0
@@ -129,8 +129,8 @@ class MetricAccumulator:
 
 
 MIN_ROUTE = 1.0
-"""A recorded drive that gets no farther stands still [m]; one that does is measured against here,
-also where it is short: standing still where somebody drove is no progress."""
+"""Minimum length of a recorded drive for relative progress [m]; shorter drives are stationary. A
+short drive counts as well, so that an ego that does not move makes no progress."""
 
 
 def expert_progress(accumulator: MetricAccumulator, context: ScoringContext) -> float:
@@ -152,7 +152,7 @@ Aspect = Literal[
     "fault",
     "lights",
 ]
-"""What a score may look at, beside contact and whether a car can move so."""
+"""Inputs of a score, besides contacts and feasibility."""
 
 UNSEEN: dict[Aspect, str] = {
     "progress": "progress",
@@ -164,13 +164,13 @@ UNSEEN: dict[Aspect, str] = {
     "speed_limit": "speeding",
     "fault": "whose fault a contact is",
 }
-"""In the order in which a reader misses them."""
+"""Phrases for inputs that a score ignores, most important first."""
 
 LONG_STEP = 0.1
-"""TTC is looked at once a clock step; longer ones leave something out [s]."""
+"""Maximum clock step for gapless TTC values [s]; TTC is evaluated once per step."""
 
 NOT_NOTICED = 2.0
-"""Ways up to this are not mentioned [m]."""
+"""Minimum distance to mention [m]."""
 
 
 def cannot_see(
@@ -271,7 +271,7 @@ class Score(NamedTuple):
     cannot_see: str = ""
 
     def fields(self) -> dict[str, Any]:
-        """As a plain map."""
+        """The score as a plain map."""
         return {
             "name": self.name,
             "version": self.version,
@@ -445,17 +445,17 @@ NUPLAN_DRIVABLE_TOLERANCE = 0.3
 ONCOMING_WINDOW_S = 1.0
 LANE_OFFSET, LANE_SECONDS = 0.5, 2.0
 CRASH_S = 0.2
-"""Crashes change velocities within this time (crash pulses of cars last 0.1 to 0.15 s) [s]."""
+"""Time over which impulses of a crash are summed [s]; crash pulses of cars last 0.1 to 0.15 s."""
 HUGSIM_TTC = 1.0
-"""Longest shift of the plan in HUGSIM's time to collision [s]."""
+"""Maximum shift of the plan in HUGSIM's time to collision [s]."""
 HUGSIM_REACHED = 3.0
-"""Distance from the route within which a point of it counts as reached [m]."""
+"""Maximum distance from a route point that counts as reached [m]."""
 
 NONE_AGAINST = np.zeros(0)
 
 BEND, SHORT_CUT = 3.0, 10.0
-"""Inside a bend way along the route is at most this many times the way driven; jumps of the nearest
-point at a corner are shorter than this [m]."""
+"""Maximum ratio of route progress to driven distance inside a bend, and maximum jump of the nearest
+route point at a corner [m]. Larger progress is a short cut."""
 
 
 def begin_accumulator(instant: Instant, context: ScoringContext) -> MetricAccumulator:
@@ -607,7 +607,7 @@ def _with_contacts(
         else:
             secondary += 1
         contacts[record.category] = contacts.get(record.category, 0) + 1
-        # Each object counts once, however often it is touched (nuPlan).
+        # Each object counts once, regardless of the number of contacts (nuPlan).
         if name not in hit and ego_at_fault(
             record, _was_off_lane(accumulator, instant, record, context)
         ):

@@ -16,10 +16,11 @@ from .metric import (
 )
 
 SHORT_ROUTE = 5.0
-"""Ways up to this are no measure of progress to NAVSIM and AlpaSim [m]."""
+"""Maximum length of a drive that is too short to measure progress, for NAVSIM and AlpaSim [m]."""
 
 TTC_BOUND = 0.95
-"""nuPlan; NAVSIM's projections at 0, 0.3, 0.6, 0.9 s ask the same on a grid of 0.1 s [s]."""
+"""Bound of nuPlan [s]; NAVSIM's projections at 0, 0.3, 0.6 and 0.9 s are equivalent on a grid of
+0.1 s."""
 
 NAVSIM_SEES: tuple[Aspect, ...] = ("progress", "comfort", "near_misses", "road", "fault")
 CARLA_PENALTIES = {"vru": 0.5, "vehicle": 0.6, "object": 0.65}

@@ -17,7 +17,7 @@ from ...scene.io.document import graph_of, lane_document
 from ...scene.lane import DRIVABLE
 
 DENSITY = 0.25
-"""Distance between points of the lines that roads are made of [m]."""
+"""Maximum distance between points of road lines [m]."""
 
 MAX_SPACING = DENSITY * (1 + 1e-9)
 """Spacings exceed ``DENSITY`` by rounding; the margin keeps the search exact [m]."""
@@ -44,7 +44,7 @@ def off_road(middle, size, route, lanes, half_widths):
     cos, sin = math.cos(yaw), math.sin(yaw)
     points, beyond = np.empty((8, 2)), np.empty(8)
     for k in range(8):
-        # Corners and, half as far from the middle of the box, the middles of its quarters.
+        # Corners, and the centres of quarters, which are half as far from the middle of the box.
         far = 0.5 if k < 4 else 0.25
         u = far * size[0] if k % 4 < 2 else -far * size[0]
         v = far * size[1] if 0 < k % 4 < 3 else -far * size[1]
@@ -85,7 +85,7 @@ def in_lane(place, lines, half_width):
 
 @kernel
 def _narrow(beyond, places, lines, half_width):
-    """Lower ``beyond`` [P] [m] to the distances of points [P, 2] [m] from the strips of lines."""
+    """Reduce ``beyond`` [P] [m] to the distances of points [P, 2] [m] from the strips of lines."""
     distance = math.inf
     for k in range(len(places)):
         x, y = places[k, 0], places[k, 1]
@@ -127,9 +127,9 @@ def _distance(x, y, lines, bound):
 
 
 MIN_BEYOND_M = 0.01
-"""A corner off every lane and area is this far off the road at least."""
+"""Minimum off-road distance of a corner outside every lane and area [m]."""
 ALONG = 0.5
-"""Cosine of the greatest angle between an ego and the lane that it drives along."""
+"""Minimum cosine between an ego's heading and the lane that it drives along."""
 
 
 class EgoPose(Protocol):
@@ -149,7 +149,7 @@ class EgoPose(Protocol):
 
     @property
     def offset(self) -> float:
-        """To the left of the route [m]."""
+        """Offset from the route [m], positive left."""
 
 
 @dataclass(frozen=True, eq=False)

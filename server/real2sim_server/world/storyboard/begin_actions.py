@@ -47,7 +47,7 @@ from .roads import Place, RoadPoint, Trajectory, Way, course_of, path_through
 from .view import ACROSS, EntityState, PositionResolver, View, across, ahead_on_way
 
 BESIDE_ROUTE = 10.0
-"""An entity teleported within this distance of its assigned route keeps the route [m]."""
+"""Maximum distance from its assigned route at which a teleported entity keeps the route [m]."""
 
 SLOWEST_DESIRED = 3.0
 """Desired speed of an entity at rest when its controller is activated [m/s]."""
@@ -214,7 +214,7 @@ def _lane_offset(actor: EntityState, action: LaneOffsetAction, at: Beginning) ->
         if action.continuous and acceleration is None:
             return copy_with(actor, lateral=FollowOffset(at.token, action.relative_to, value))
         value += lane_offset(at.view.entities[action.relative_to], at.view)
-    # An entity off the road or on a route is measured from the centre of its lane from now on.
+    # From now on, offsets of an entity off the road or on a route refer to the centre of its lane.
     actor = actor.on_lane(at.view.network)
     if action.continuous and acceleration is None:
         return copy_with(actor, lateral=HoldOffset(at.token, value))

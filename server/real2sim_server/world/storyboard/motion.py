@@ -21,7 +21,7 @@ from .roads import Place
 from .view import EntityState, Moved, Shifted, View, across, ahead_on_way, coasting
 
 STEEPEST = {"linear": 1.0, "cubic": 1.5, "sinusoidal": math.pi / 2, "quintic": 1.875}
-"""Highest slope of each form f(u), u from 0 to 1."""
+"""Maximum slope of each shape f(u), u from 0 to 1."""
 
 CURVIEST = {"cubic": 6.0, "sinusoidal": math.pi**2 / 2, "quintic": 10.0 / math.sqrt(3.0)}
 """Maximum second derivative of each shape; infinite for linear."""
@@ -75,7 +75,7 @@ def gentle_duration(shape: Shape, change: float, acceleration: float | None) -> 
 
 
 AT_PLACE = 0.01
-"""A distance sideways is reached within this [m]."""
+"""Tolerance of lateral distances [m]."""
 
 
 @dataclass(frozen=True)
@@ -159,10 +159,10 @@ def lane_offset(actor: EntityState, view: View) -> float:
 
 
 DONE = 1e-9
-"""Times and distances below this are none."""
+"""Times and distances below this count as zero [s], [m]."""
 
 AT_PLACE, AT_SPEED = 0.05, 0.05
-"""A distance is reached within these [m], [m/s]."""
+"""Tolerances of a target distance and speed [m], [m/s]."""
 
 SLOWEST_MASTER = 0.05
 """Minimum speed of a master with a known arrival time [m/s]."""
@@ -368,7 +368,7 @@ class Synchronize:
         """Constant acceleration to arrive in time."""
         rate = 2 * (d - v * time) / time**2
         if v + rate * time < 0.0:
-            # It would overshoot and return: it stops at its target instead.
+            # A constant acceleration would overshoot and return, so it stops at its target instead.
             return -v * v / (2 * max(d, DONE))
         return rate
 

@@ -134,16 +134,16 @@ def program_of(board: Storyboard) -> Program:
 
 
 PLACING = frozenset({"teleport", "follow_trajectory"})
-"""Kinds of actions that put an entity somewhere."""
+"""Kinds of actions that set the position of an entity."""
 
 _SPEEDING = frozenset({"speed", "speed_profile"})
 
 
 def _in_order(entries: Sequence[InitAction]) -> tuple[InitAction, ...]:
-    """Init actions in the order of the file, but after those that they depend on.
+    """Init actions in the order of the file, but after their dependencies.
 
-    A position relative to an entity comes after that entity's position, a relative speed after the
-    speed that it refers to.
+    A position relative to an entity comes after the position of that entity, and a relative speed
+    after the speed that it refers to.
     """
     waiting, done = list(entries), list[InitAction]()
     while waiting:
@@ -316,7 +316,7 @@ class ShownSignal(NamedTuple):
 # --- Conditions ----------------------------------------------------------------------------------
 
 EQUAL = 1e-6
-"""Numbers that differ by less are equal."""
+"""Tolerance for equal numbers."""
 
 STANDING = 0.01
 """Maximum speed at standstill [m/s]."""

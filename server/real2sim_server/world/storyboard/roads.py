@@ -331,8 +331,8 @@ def _refused(error: SceneError) -> WorldError:
 # Polylines, clothoids, NURBS.
 
 SAMPLE = 0.1
-"""Way between samples of clothoids and NURBS [m]; chords of theirs are off by 0.1 mm at curvatures
-of 0.1 / m."""
+"""Spacing of samples of clothoids and NURBS [m]; the chord error is 0.1 mm at a curvature of 0.1 /
+m."""
 
 MAX_SAMPLES = 100_000
 

@@ -124,7 +124,7 @@ BOXES = {
     "pedestrian": ((0.5, 0.6, 1.8), 0.0),
     "animal": ((0.9, 0.3, 0.7), 0.0),
 }
-"""Size [m] of a category, and how far ahead of the reference point its middle is [m]."""
+"""Default size of a category, and distance from the reference point to its centre [m]."""
 
 OTHER = ((1.0, 1.0, 1.0), 0.0)
 
@@ -133,7 +133,7 @@ ALIKE = (
     frozenset({"motorcycle", "cyclist", "bicycle"}),
     frozenset({"pedestrian", "person", "animal"}),
 )
-"""Categories that may lend each other their looks."""
+"""Categories that can share appearances."""
 
 Vector = tuple[float, float, float]
 
@@ -327,7 +327,7 @@ class StoryboardRun:
             board: storyboard, with or without expressions.
             subjects: object of each entity except the ego, by name.
             surroundings: the start instant, with the recorded ego.
-            ego_size: size of its box [m].
+            ego_size: size of the ego's box [m].
             network: road network; None for lanes along the route.
             draws: random numbers of the episode; None to keep parameters as written.
 

@@ -31,10 +31,10 @@ from ..traffic.driver import AgentPose, ObservedEgo, Surroundings, level_quatern
 from .roads import Place, RoadNetwork, RoadPoint, Trajectory, Way, course_of, straight
 
 ACROSS = math.radians(45.0)
-"""Entities with a larger heading difference to their lane continue straight instead."""
+"""Maximum heading difference to a lane; entities beyond it continue straight instead [rad]."""
 
 SLOW = 0.5
-"""Below this speed a drift sideways does not turn it [m/s]."""
+"""Minimum speed at which lateral motion changes the heading [m/s]."""
 
 
 class Moved(NamedTuple):
@@ -224,7 +224,7 @@ def coasting(actor: EntityState, h: float) -> EntityState:
 
 
 BESIDE = 8.0
-"""Maximum distance of places from a path to be along it [m]."""
+"""Maximum distance of places from a path for distances along it [m]."""
 
 CLOSED = 1e-9
 

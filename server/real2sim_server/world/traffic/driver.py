@@ -53,7 +53,7 @@ class ObservedEgo:
         x, y: centre of its box [m].
         yaw: heading [rad].
         speed: along its heading [m/s].
-        length, width: of its box [m].
+        length, width: size of its box [m].
         s: position of its rear axle along the route [m].
         offset: offset of its rear axle from the route, positive left [m].
         front: distance from the rear axle to the front end of its box [m].
@@ -413,7 +413,7 @@ def leading_agent(
 
 
 class Neighbours(NamedTuple):
-    """Leader and follower in a lane; None if nobody is within 80 m."""
+    """Leader and follower in a lane; None without one within 80 m."""
 
     leader: Leader | None
     follower: Leader | None
@@ -474,13 +474,13 @@ def lane_of(route: LoggedPath, x: float, y: float, yaw: float) -> LoggedPath:
 
 
 HARDEST = 8.0
-"""Deceleration that brakes can bring about [m/s^2]."""
+"""Maximum deceleration by the brakes [m/s^2]."""
 
 BACK_TO_LANE = 2.0
-"""Time constant with which an offset from the path fades [s]."""
+"""Time constant for the decay of an offset from the path [s]."""
 
 STANDSTILL = 0.1
-"""A desired speed below this is one of standing [m/s]."""
+"""Desired speed below which an object is stationary [m/s]."""
 
 SLOWEST_DESIRED = 3.0
 """Desired speed of objects that hardly moved in the recording [m/s]."""

@@ -45,8 +45,7 @@ from .driver import (
 )
 
 AHEAD, BEHIND = 600.0, 100.0
-"""A way goes on so far from the end of its lane, and begins so far before it, where there are lanes
-[m]."""
+"""Maximum length of a lane chain beyond the end of its lane and before its start [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,16 +120,16 @@ def _travelled(graph: LaneGraph, names: Iterable[str]) -> list[Lane]:
 FARTHEST = 3.0
 """Maximum distance from the centre of a lane at the start of a driver [m]."""
 HEADED = 0.7
-"""Cosine of the angle to the lane from which on a vehicle drives along it."""
+"""Minimum cosine between a vehicle's heading and the lane that it drives along."""
 SETTLES = 2.0
-"""Time between two changes of lanes [s]."""
+"""Minimum time between two lane changes [s]."""
 SLOWEST = 3.0
-"""At which it changes lanes: vehicles that hardly move do not move aside [m/s]."""
+"""Minimum speed for lane changes [m/s]."""
 DECIDES_EVERY = 1.0
 """Interval between lane change decisions [s]. Each driver decides at its own phase: two that always
 decide at once would yield to each other forever."""
 RENEWED = 200.0
-"""Way that is left from which on a longer one is taken [m]."""
+"""Remaining length at which the lane chain is extended [m]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,13 +26,13 @@ PREFIX = DRAWN_PREFIX
 """Prefix of the ids of spawned objects; ids on the wire have no colon, so it cannot clash."""
 
 LOOKS = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle"})
-"""Categories whose look spawned objects may have."""
+"""Categories whose appearance spawned objects can use."""
 
 SIDE = 0.3
 """Lateral clearance of a box that counts as blocked [m]."""
 
 SLOWEST = 3.0
-"""Desired speed where the recorded drive hardly moved [m/s]."""
+"""Minimum desired speed, for recorded drives that hardly moved [m/s]."""
 
 
 class Lane(NamedTuple):
@@ -168,7 +168,7 @@ class Spawner:
         name = f"agents.{made.subject.object_id}"
         return {f"{name}.desired_speed": made.desired, f"{name}.lane_position": made.s}
 
-    # --- one object -----------------------------------------------------------------------------
+    # --- single objects -------------------------------------------------------------------------
 
     def _at_an_edge(
         self,
@@ -232,7 +232,7 @@ class Spawner:
         return (ahead, behind) if lane.oncoming else (behind, ahead)
 
     def _draw(self, what: str, low: float, high: float) -> float:
-        """Uniform, for the next object."""
+        """A uniform number for the next object."""
         return low + (high - low) * self.draws.uniform(f"spawn.{what}", self.number)[0]
 
 

@@ -44,8 +44,8 @@ from .spawner import PREFIX as SPAWNED
 from .spawner import Spawner
 
 BeginDriver = Callable[[ObjectState, Any, Surroundings], AgentDriver]
-"""``begin(subject, spec, surroundings)``: the driver of an object from the instant on that the
-surroundings are of; ``spec`` is of the type that it is registered for."""
+"""``begin(subject, spec, surroundings)``: creates the driver of an object from the instant of the
+surroundings; ``spec`` has the type that the function is registered for."""
 
 DRIVERS: dict[type[Any], BeginDriver] = {
     ReplayDriver: Replay.begin,
@@ -57,7 +57,7 @@ DRIVERS: dict[type[Any], BeginDriver] = {
     JunctionCrossingDriver: JunctionCrossing.begin,
     ExternalDriver: External.begin,
 }
-"""By the model of the wire that names the driver and holds its parameters."""
+"""Drivers by the wire model that selects them and holds their parameters."""
 
 
 def begin_driver(subject: ObjectState, spec: DriverSpec, surroundings: Surroundings) -> AgentDriver:
@@ -66,13 +66,13 @@ def begin_driver(subject: ObjectState, spec: DriverSpec, surroundings: Surroundi
 
 
 MOVING = 2.0
-"""Objects that cover less than this in the recording stand and get no driver [m]."""
+"""Minimum distance in the recording of objects that get a driver [m]."""
 
 DRIVEN = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle", "cyclist"})
-"""Categories that a default driver drives; pedestrians keep to the log."""
+"""Categories for default drivers; pedestrians replay the log."""
 
 SCRIPTED = (Replay, ConstantVelocity, Idm, LaneChanger, CutIn, HardBrake, JunctionCrossing)
-"""Drivers that move an object by themselves."""
+"""Drivers that need no external input."""
 
 NOTHING_SAMPLED: Mapping[str, float] = MappingProxyType({})
 

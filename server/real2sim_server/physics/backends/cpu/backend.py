@@ -20,7 +20,7 @@ from .deform import SCRATCH
 from .kernels import advance, measure_blocks
 from .particle import COLUMNS, NODES, TILE, ParticleState, StepParameters, Workspace
 
-# Loading, sorting, sums, contact totals and saving of particles in blocks.
+# Particles in blocks: loading, sorting, sums, contact totals and saving.
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class BlockSimulation:
             np.zeros((bodies, bodies, TOTALS)),
         )
         self._moved = 0.0
-        # Of few bits, which sort in linear time.
+        # int16 is sorted in linear time.
         self._laws = model.table[model.material, LAW].astype(np.int16)
         self._set_params(colliders)
         self._load(model.start)
@@ -101,7 +101,7 @@ class BlockSimulation:
         raise NotImplementedError
 
     def _allocate(self, size: int) -> Any:
-        """Uninitialised numbers [size] on the backend's device."""
+        """Uninitialised array [size] on the backend's device."""
         raise NotImplementedError
 
     def advance(self, steps: int, dt: float, colliders: Sequence[Collider]) -> None:
@@ -129,10 +129,10 @@ class BlockSimulation:
             self._arrange(colliders)
 
     def measure(self) -> Measure:
-        """Sums in float64, in the order of blocks."""
+        """Sums in float64, added in the order of blocks."""
         layout, bodies = self._layout, self._model.bodies
         rows, block = self._measure_blocks()
-        # The middle one of the fields around a block is its own.
+        # The middle one of the fields around a block is the block's own.
         body = layout.field_body[layout.block_fields[block, 13]]
         sums = np.zeros((bodies, columns.SUMS))
         np.add.at(sums, body, rows[:, : columns.SUMS])
@@ -168,12 +168,12 @@ class BlockSimulation:
         )
 
     def contacts(self) -> tuple[Float, Float]:
-        """Totals of all arrangements so far."""
+        """Totals over all layouts so far."""
         self._flush()
         return self._totals[0].copy(), self._totals[1].copy()
 
     def save(self) -> _Saved:
-        """Copy all that changes."""
+        """Copy the mutable state."""
         return _Saved(
             self._copy_state(self._state),
             self._blocks.copy(),
@@ -199,7 +199,7 @@ class BlockSimulation:
             if kept.size:
                 held[:] = kept
         self._totals = (saved.totals[0].copy(), saved.totals[1].copy())
-        # Collider poses at layout construction are not saved, so count from its margin.
+        # Saved states have no collider poses, so moving colliders rebuild the layout.
         self._moved = np.inf
 
     def _load(self, start: ParticleArrays) -> None:
@@ -234,7 +234,7 @@ class BlockSimulation:
         if hasattr(self, "_work"):
             self._flush()
         shift = _block_of(at)
-        # Moving more than a few blocks at once means that the solver diverges.
+        # A particle that crosses more than a few blocks at once means that the solver diverges.
         if np.abs(shift).max() > 1 << 10:
             raise SolverDiverged
         xi = (at - (shift * BLOCK).astype(self._dtype)).astype(self._dtype)
@@ -281,7 +281,7 @@ class BlockSimulation:
             work.by_collider[:] = 0
         if work.by_thin.size:
             block = np.repeat(np.arange(len(layout.thin_start) - 1), np.diff(layout.thin_start))
-            # The middle one of the fields around a block is its own.
+            # The middle one of the fields around a block is the block's own.
             body = layout.field_body[layout.block_fields[block, 13]]
             np.add.at(self._totals[0], (body, layout.thin_collider), self._fetch(work.by_thin))
             work.by_thin[:] = 0
@@ -317,7 +317,8 @@ def _block_of(cells: Any) -> Int:
 
 
 PARTICLES_PER_THREAD = 5000
-"""With fewer, threads gain little, and wait long for each other where others compute as well."""
+"""Minimum number of particles per thread. More threads would gain little, and wait for each other
+on a busy machine."""
 
 
 class CpuSolverBackend:

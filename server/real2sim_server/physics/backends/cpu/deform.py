@@ -1,11 +1,11 @@
-"""Deformation and stress of a block's particles, several at a time.
+"""Deformation and stress of a block's particles, in batches.
 
-Stress is written for one particle. Elastic laws have no branches worth the name, so a batch of
-particles is laid out component by component and the function called in a loop of fixed length,
-which LLVM turns into vector code. What packs and breaks (snow, structure) is fixed corotated up to
-where it yields, so it goes the same way, and no stretch has to be found to see that none is out of
-bounds. What flows is turned to its principal stretches, a batch together as well where several do;
-few, and what does not converge, go one by one.
+The laws are written for one particle. A batch of particles is stored component by component, and a
+loop of fixed length calls the law, so LLVM can vectorise it. This needs laws that are almost free
+of branches. Snow and structure are fixed corotated until they yield, so they use the same path; a
+test without principal stretches detects yielding. Particles that yield are processed by principal
+stretches, as a batch if there are several. The rest, and those that do not converge, are processed
+one by one.
 """
 
 # Kernels take arrays by position: Numba has no keyword-only arguments.
@@ -59,20 +59,19 @@ from ...stress import (
 )
 from .particle import deform
 
-# Between particles in rows and lanes in columns, as explicit vector code.
-#
-# Rows are turned eight at a time by three rounds of shuffles; moving single numbers would cost as
-# much as the computation.
+# Conversion between rows of particles and columns of lanes, as explicit vector code. Three rounds
+# of shuffles transpose eight rows at a time; moving single numbers would cost as much as the
+# computation.
 
 
 EIGHT = 8
 BATCH = 2 * EIGHT
-"""Particles laid out side by side."""
+"""Particles per batch."""
 I32, I64 = ir.IntType(32), ir.IntType(64)
 
 
 class _ColumnEmitter:
-    """Moves vectors between two arrays of the same precision: [N, width] and scratch space."""
+    """Moves vectors between an array [N, width] and scratch space of the same precision."""
 
     def __init__(self, context: Any, builder: ir.IRBuilder, kinds: Any, values: Any) -> None:
         self.builder = builder
@@ -105,17 +104,17 @@ class _ColumnEmitter:
         return self.builder.add(index, I64(half))
 
     def columns(self, plane: Any, half: int, count: int) -> list[Any]:
-        """Eight lanes of each of ``count`` planes."""
+        """Eight lanes of each of ``count`` planes from ``plane`` on."""
         places = [self.column(plane, number, half) for number in range(count)]
         return [self.load(self.scratch, place, EIGHT) for place in places]
 
     def pick(self, first: Any, second: Any, lanes: list[int]) -> Any:
-        """A vector of lanes of two others, numbered through."""
+        """A vector of the given lanes of two vectors, numbered consecutively."""
         mask = ir.Constant(ir.VectorType(I32, len(lanes)), lanes)
         return self.builder.shuffle_vector(first, second, mask)
 
     def turned(self, vectors: list[Any]) -> list[Any]:
-        """Eight vectors of eight: rows become columns."""
+        """Transpose eight vectors of eight numbers."""
         for distance in (4, 2, 1):
             turned = list(vectors)
             for i in range(EIGHT):
@@ -131,7 +130,7 @@ class _ColumnEmitter:
 
 @intrinsic
 def lay_out(typingctx, rows, first, scratch, plane):
-    """Nine numbers of each of BATCH particles from ``first`` on to planes from ``plane`` on."""
+    """Copy nine numbers of BATCH particles from ``first`` on to planes from ``plane`` on."""
 
     def generate(context, builder, signature, arguments):
         data, first, space, plane = arguments
@@ -154,7 +153,7 @@ def lay_out(typingctx, rows, first, scratch, plane):
 
 @intrinsic
 def bring_back_nine(typingctx, scratch, plane, rows, first):
-    """Nine planes from ``plane`` on back to the rows of BATCH particles from ``first`` on."""
+    """Copy nine planes from ``plane`` on to the rows of BATCH particles from ``first`` on."""
 
     def generate(context, builder, signature, arguments):
         e, plane, first = _way_back(context, builder, signature, arguments)
@@ -172,7 +171,7 @@ def bring_back_nine(typingctx, scratch, plane, rows, first):
 
 @intrinsic
 def bring_back_six(typingctx, scratch, plane, rows, first):
-    """Six planes from ``plane`` on back to the rows of BATCH particles from ``first`` on."""
+    """Copy six planes from ``plane`` on to the rows of BATCH particles from ``first`` on."""
 
     def generate(context, builder, signature, arguments):
         e, plane, first = _way_back(context, builder, signature, arguments)
@@ -194,28 +193,29 @@ def _way_back(context: Any, builder: Any, signature: Any, arguments: Any) -> tup
 
 
 _F, _L, _TAU, _ENERGY, _VOLUME, _MU, _LAMBDA, _ETA, _OFF = 0, 9, 18, 24, 25, 26, 27, 28, 29
-"""Rows of the scratch space, BATCH numbers each; _OFF tells lanes that did not converge."""
+"""Rows of the scratch space, BATCH numbers each; _OFF marks lanes that did not converge or yield.
+"""
 _LOW, _HIGH, _TOTAL = 30, 31, 32
-"""Of what yields: bounds of its principal stretches, and its total deformation."""
+"""Plastic laws: bounds of the principal stretches, and the total deformation."""
 _SYMMETRIC, _VECTORS = 41, 47
-"""Of what flows: F F^T and its eigenvectors; later in place of the first ``_RATIO``, ``_PULL``."""
+"""Lanes that yield: F F^T and its eigenvectors; ``_RATIO`` and ``_PULL`` overwrite F F^T later."""
 _RATIO, _PULL = 41, 44
-"""What is left of principal stretches, and principal stresses."""
+"""Ratios of the principal stretches after and before yielding, and principal stresses."""
 SCRATCH = 56 * BATCH
 SWEEPS = 4
-"""Of Jacobi's method in a batch; what has not converged then goes one by one."""
+"""Jacobi sweeps of a batch; lanes that have not converged are then processed one by one."""
 FLOWN = TWO
-"""Marks lanes in _OFF whose flow has been found."""
+"""Marks lanes in _OFF whose plastic flow has been computed."""
 FEW = 2
-"""So many lanes that flow cost less one by one than all of a batch together."""
+"""Minimum number of yielding lanes in a batch to process them together."""
 
-# Beyond what LLVM takes over by itself, and what is called is no vector code.
+# LLVM does not inline this function by itself, and calls prevent vectorisation.
 sweep: Any = inner(forceinline=True)(jacobi_sweep)
 
 
 @inner()
 def deform_all(begin: Any, end: Any, dt: Any, state: Any, table: Any, scratch: Any) -> None:
-    """Advance the deformation of sorted particles by their velocity gradients; find stress."""
+    """Advance the deformation of sorted particles by their velocity gradients; compute stress."""
     for first in range(begin, end, BATCH):
         count = min(end - first, BATCH)
         law = common_law(first, count, state.material, table)
@@ -242,9 +242,9 @@ def deform_all(begin: Any, end: Any, dt: Any, state: Any, table: Any, scratch: A
 
 @inner()
 def common_law(first: Any, count: Any, material: Any, table: Any) -> Any:
-    """Code of the law that all particles of a batch follow, or -1.
+    """Code of the law of all particles of a batch, or -1 if they differ.
 
-    What folds is taken for snow: it yields at other bounds.
+    Structure (CRUSH) counts as SNOW, because only the yield bounds differ.
     """
     law = int(table[material[first], LAW])
     if law == CRUSH:
@@ -258,7 +258,7 @@ def common_law(first: Any, count: Any, material: Any, table: Any) -> Any:
 
 @inner()
 def load(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
-    """Lay particles out by component; lanes without one repeat the last."""
+    """Copy particles to the scratch space; unused lanes repeat the last particle."""
     if count == BATCH:
         lay_out(state.F, first, s, _F)
         lay_out(state.L, first, s, _L)
@@ -277,7 +277,7 @@ def load(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
 
 @inner()
 def load_bounds(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
-    """What depends on plastic memory: bounds, hardened moduli; and total deformation."""
+    """Load total deformation; derive yield bounds and hardened moduli from the plastic memory."""
     if count == BATCH:
         lay_out(state.F_total, first, s, _TOTAL)
     else:
@@ -299,7 +299,7 @@ def load_bounds(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
 
 @inner()
 def store(first: Any, count: Any, dt: Any, state: Any, table: Any, s: Any) -> None:
-    """Bring results back; lanes that are off are done again, one by one."""
+    """Copy results back; lanes marked in _OFF are first computed one by one."""
     if lanes_off(count, s) > 0:
         for lane in range(count):
             if s[_OFF * BATCH + lane] != ZERO:
@@ -322,7 +322,7 @@ def store(first: Any, count: Any, dt: Any, state: Any, table: Any, s: Any) -> No
 
 @inner()
 def do_again(p: Any, lane: Any, dt: Any, state: Any, row: Any, s: Any) -> None:
-    """One lane by the whole of its law, from the deformation that the batch has put there."""
+    """Apply the complete law to one lane, starting from its deformation in the scratch space."""
     F, tau, energy, history = stress_update(lane_matrix(s, _F, lane), state.history[p], row, dt)
     if row[VISCOSITY] > ZERO:
         tau = add_viscosity(tau, lane_matrix(s, _L, lane), det(F), row[VISCOSITY])
@@ -332,7 +332,7 @@ def do_again(p: Any, lane: Any, dt: Any, state: Any, row: Any, s: Any) -> None:
 
 @inner()
 def store_total(first: Any, count: Any, state: Any, s: Any) -> None:
-    """Bring total deformation back."""
+    """Copy the total deformation back."""
     if count == BATCH:
         bring_back_nine(s, _TOTAL, state.F_total, first)
         return
@@ -343,7 +343,7 @@ def store_total(first: Any, count: Any, state: Any, s: Any) -> None:
 
 @inner()
 def lanes_off(count: Any, s: Any) -> Any:
-    """How many of the first ``count`` lanes are off."""
+    """Number of lanes marked in _OFF, of the first ``count``."""
     off = 0
     for lane in range(count):
         if s[_OFF * BATCH + lane] != ZERO:
@@ -353,7 +353,7 @@ def lanes_off(count: Any, s: Any) -> Any:
 
 @inner()
 def corotated_batch(dt: Any, s: Any) -> None:
-    """Fixed corotated stress of all lanes; three steps find rotations at strains up to 20 %."""
+    """Fixed corotated stress of all lanes; three Newton steps suffice at strains up to 20 %."""
     for lane in range(BATCH):
         L = lane_matrix(s, _L, lane)
         F = advance_gradient(lane_matrix(s, _F, lane), L, dt)
@@ -372,10 +372,10 @@ def corotated_batch(dt: Any, s: Any) -> None:
 
 @inner()
 def snow_batch(dt: Any, s: Any) -> None:
-    """Stress of all lanes where snow and structure are elastic; lanes that yield are off.
+    """Elastic stress of all lanes of snow and structure; marks lanes that yield in _OFF.
 
-    No stretch is out of bounds where neither V - low nor high - V has a negative eigenvalue, V the
-    left stretch F R^T, by Sylvester's criterion. NaN fails it, and so stays to be seen.
+    With the left stretch V = F R^T, all stretches are within bounds if neither V - low nor high - V
+    has a negative eigenvalue (Sylvester's criterion). NaN fails the test.
     """
     for lane in range(BATCH):
         L = lane_matrix(s, _L, lane)
@@ -405,7 +405,7 @@ def snow_batch(dt: Any, s: Any) -> None:
 
 @inner()
 def flow_batch(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
-    """Snow and structure by their principal stretches, in those lanes that are off."""
+    """Return mapping of the marked lanes of snow and structure, by principal stretches."""
     for lane in range(BATCH):
         F = lane_matrix(s, _F, lane)
         b = times_transposed(F, F)
@@ -426,7 +426,7 @@ def flow_batch(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
 
 @inner()
 def flow(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
-    """The flow of the lanes that are off, one by one; those that did not converge stay off."""
+    """Plastic flow of the marked lanes, one by one; lanes that did not converge stay marked."""
     for lane in range(count):
         b = lane_symmetric(s, lane)
         if s[_OFF * BATCH + lane] != ZERO and is_diagonal(b):
@@ -444,7 +444,7 @@ def flow(first: Any, count: Any, state: Any, table: Any, s: Any) -> None:
 
 @inner()
 def compose(s: Any) -> None:
-    """Deformation and stress of lanes that have flown; they are no longer off."""
+    """Deformation and stress after plastic flow; unmarks these lanes."""
     for lane in range(BATCH):
         at = _RATIO * BATCH + lane
         F, v = lane_matrix(s, _F, lane), lane_matrix(s, _VECTORS, lane)
@@ -464,7 +464,7 @@ def compose(s: Any) -> None:
 
 @inner()
 def lane_symmetric(s: Any, lane: Any) -> Any:
-    """Six numbers of one lane's symmetric matrix."""
+    """The six numbers of a lane's symmetric matrix."""
     at = _SYMMETRIC * BATCH + lane
     return (
         s[at], s[at + BATCH], s[at + 2 * BATCH],
@@ -474,7 +474,7 @@ def lane_symmetric(s: Any, lane: Any) -> Any:
 
 @inner()
 def neo_hookean_batch(dt: Any, s: Any) -> None:
-    """Neo-Hookean stress of all lanes; logarithms one by one, as they are no vector code."""
+    """Neo-Hookean stress of all lanes; logarithms do not vectorise, so they have their own loop."""
     for lane in range(BATCH):
         F = advance_gradient(lane_matrix(s, _F, lane), lane_matrix(s, _L, lane), dt)
         for c in range(9):
@@ -495,7 +495,7 @@ def neo_hookean_batch(dt: Any, s: Any) -> None:
 
 @inner()
 def lane_matrix(s: Any, row: Any, lane: Any) -> Any:
-    """Nine numbers of one lane, from consecutive rows."""
+    """The nine numbers of a lane's matrix, from consecutive rows."""
     at = row * BATCH + lane
     return (
         s[at], s[at + BATCH], s[at + 2 * BATCH],
@@ -506,7 +506,7 @@ def lane_matrix(s: Any, row: Any, lane: Any) -> Any:
 
 @inner()
 def put(s: Any, lane: Any, F: Any, tau: Any, energy: Any) -> None:
-    """Results of one lane."""
+    """Store the results of one lane."""
     for c in range(9):
         s[(_F + c) * BATCH + lane] = F[c]
     for c in range(6):

@@ -1,4 +1,4 @@
-"""The substep on the CPU: blocks scatter to tiles, fields add up and touch, blocks gather."""
+"""The substep on the CPU: blocks scatter to tiles, fields apply contact, blocks gather."""
 
 # Kernels take arrays by position: Numba has no keyword-only arguments.
 # ruff: noqa: PLR0917
@@ -53,7 +53,7 @@ def resolve_collider_contact(field: Any, layout: Any, work: Any, params: Any) ->
 
 @inner()
 def resolve_body_contact(begin: Any, end: Any, layout: Any, work: Any, params: Any) -> None:
-    """Contact of every two bodies in one block, pair after pair (Bardenhagen et al. 2001)."""
+    """Contact of each pair of bodies in one block, in a fixed order (Bardenhagen et al. 2001)."""
     for a in range(begin, end):
         for b in range(a + 1, end):
             body_a, body_b = layout.field_body[a], layout.field_body[b]
@@ -82,10 +82,9 @@ def measure_blocks(state: Any, layout: Any, params: Any, out: Any) -> None:
                 add_material(p, state, params.table[state.material[p]], row)
 
 
-# Transfers between one particle and its 27 nodes as explicit vector code.
-#
-# A node is four numbers in a row, so one LLVM vector; LLVM's own vectorisers do not find that shape
-# in scalar loops. Precision follows the array.
+# Transfers between one particle and its 27 nodes as explicit vector code. A node is four
+# consecutive numbers, so one LLVM vector; LLVM's own vectorisers do not find this pattern in scalar
+# loops. Precision follows the array.
 
 
 LANES = 4
@@ -103,19 +102,19 @@ class _LaneEmitter:
         self.data = context.make_array(kind)(context, builder, array).data
 
     def splat(self, scalar: Any, kind: Any) -> Any:
-        """One number in all lanes of a node or of a line."""
+        """A scalar in all lanes of a node or of a line."""
         single = self.builder.insert_element(ir.Constant(kind, ir.Undefined), scalar, I32(0))
         return self._pick(single, [0] * kind.count)
 
     def pack(self, scalars: list[Any]) -> Any:
-        """A node of these numbers; zero for those that are missing."""
+        """A node of these numbers; missing ones are zero."""
         vector = ir.Constant(self.node, [0.0] * LANES)
         for lane, scalar in enumerate(scalars):
             vector = self.builder.insert_element(vector, scalar, I32(lane))
         return vector
 
     def repeated(self, node: Any) -> Any:
-        """A line of three times the same node."""
+        """A line of three copies of a node."""
         return self._pick(node, [*range(LANES)] * 3)
 
     def nodes(self, line: Any) -> list[Any]:
@@ -123,7 +122,7 @@ class _LaneEmitter:
         return [self._pick(line, list(range(k * LANES, (k + 1) * LANES))) for k in range(3)]
 
     def spread(self, scalars: list[Any]) -> Any:
-        """A line of three numbers, each in all lanes of its node."""
+        """A line of three scalars, each in all lanes of its node."""
         return self._pick(self.pack(scalars), [k for k in range(3) for _ in range(LANES)])
 
     def _pick(self, vector: Any, lanes: list[int]) -> Any:
@@ -140,7 +139,7 @@ class _LaneEmitter:
         return self.builder.call(function, [a, b, c])
 
     def place(self, first: Any, i: int, j: int) -> Any:
-        """Pointer to the line (i, j) after the node number ``first``."""
+        """Pointer to the line (i, j) relative to node number ``first``."""
         index = self.builder.add(first, ir.Constant(first.type, (i * SIDE + j) * SIDE))
         index = self.builder.mul(index, ir.Constant(first.type, LANES))
         pointer = self.builder.gep(self.data, [index], source_etype=self.scalar)
@@ -161,7 +160,8 @@ def _unpack(builder: ir.IRBuilder, value: Any, count: int) -> list[Any]:
 def scatter(typingctx, tiles, first, wx, wy, wz, start, qx, qy, qz):
     """Add w (start + i qx + j qy + k qz) to the nodes at offsets (i, j, k) from ``first``.
 
-    tiles: flat array; wx, wy, wz: weights, three each; start: four numbers; qx, qy, qz: three.
+    Args: ``tiles``: flat array; ``wx``, ``wy``, ``wz``: three weights each; ``start``: four
+    numbers; ``qx``, ``qy``, ``qz``: three numbers each.
     """
 
     def generate(context, builder, signature, arguments):
@@ -233,9 +233,9 @@ def _lever(e: _LaneEmitter, w: Sequence[Any], v: Sequence[Any]) -> Any:
 
 @entry()
 def advance(steps: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any) -> Any:
-    """Make up to ``steps`` substeps; returns how many, fewer when particles must be sorted.
+    """Make up to ``steps`` substeps and return their number; fewer if particles must be sorted.
 
-    No steps at all find the stress and energy of the particles as they stand.
+    With 0 steps, compute stress and energy of the current particles.
     """
     if steps == 0:
         gather_blocks(dt, state, layout, work, params, False, False)
@@ -251,7 +251,7 @@ def advance(steps: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any
 
 @inner(parallel=True)
 def scatter_blocks(dt: Any, state: Any, layout: Any, work: Any, params: Any) -> None:
-    """Particles to tiles: momentum with APIC and stress (MLS-MPM, Hu et al. 2018), mass."""
+    """Transfer particle momentum and mass to tiles (APIC; MLS-MPM stress, Hu et al. 2018)."""
     for chunk in prange(CHUNKS):
         for block in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
             scatter_block(block, dt, state, layout, work, params)
@@ -259,7 +259,7 @@ def scatter_blocks(dt: Any, state: Any, layout: Any, work: Any, params: Any) -> 
 
 @inner()
 def scatter_block(block: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any) -> None:
-    """Add the particles of one block to its tile, and their moments where contact needs them."""
+    """Add the particles of one block to its tile, and their moments if contact needs them."""
     tile = work.tiles[block]
     tile[:] = ZERO
     begin, end = layout.block_start[block], layout.block_start[block + 1]
@@ -283,7 +283,7 @@ def scatter_particles(begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: 
 
 @inner()
 def scatter_moments(begin: Any, end: Any, state: Any, moments: Any) -> None:
-    """Add w V (x_p - x_i) and w V of one block's particles to its moments; V at rest."""
+    """Add w V (x_p - x_i) and w V of one block's particles to its moments; V is the rest volume."""
     for p in range(begin, end):
         first, f = place(p, state.xi)
         V = state.volume[p]
@@ -297,7 +297,7 @@ def scatter_moments(begin: Any, end: Any, state: Any, moments: Any) -> None:
 
 @inner(parallel=True)
 def collect_fields(dt: Any, layout: Any, work: Any, params: Any) -> None:
-    """Tiles to fields: sums, gravity, contact. One group of fields is one task."""
+    """Combine tiles into fields: sums, gravity, contact. Each group of fields is one task."""
     groups = len(layout.group_start) - 1
     for group in prange(groups):
         begin, end = layout.group_start[group], layout.group_start[group + 1]
@@ -315,8 +315,10 @@ def collect_fields(dt: Any, layout: Any, work: Any, params: Any) -> None:
 
 @inner()
 def overlap(offset: Any) -> Any:
-    """(first, end, shift): nodes of a block that lie on a tile ``offset`` blocks below; tile index
-    is node + shift."""
+    """Nodes of a block on the tile of the block at ``offset`` below it.
+
+    Returns (first, end, shift); the tile index is node + shift.
+    """
     if offset < 0:
         return BLOCK - 1, BLOCK, 1 - BLOCK
     if offset > 0:
@@ -336,7 +338,7 @@ def collect(field: Any, field_blocks: Any, tiles: Any, out: Any) -> None:
 
 @inner()
 def add_tile(tile: Any, o: Any, out: Any) -> None:
-    """Add a tile to a field; the tile's block lies at offset number ``o``."""
+    """Add a tile to a field; ``o``: number of the offset of the tile's block."""
     i0, i1, si = overlap(1 - o // 9)
     j0, j1, sj = overlap(1 - o // 3 % 3)
     k0, k1, sk = overlap(1 - o % 3)
@@ -351,7 +353,7 @@ def add_tile(tile: Any, o: Any, out: Any) -> None:
 
 @inner()
 def collect_moments(field: Any, layout: Any, work: Any) -> None:
-    """Sum the first moments of a field; every block around a near field has some."""
+    """Sum the first moments of a field; every block around a field near contact has some."""
     out = work.offset[field]
     out[:] = ZERO
     for o in range(27):
@@ -362,7 +364,7 @@ def collect_moments(field: Any, layout: Any, work: Any) -> None:
 
 @inner()
 def to_velocity(field: Any, dt: Any, gravity: Any) -> None:
-    """Momentum to velocity, with gravity."""
+    """Convert momentum to velocity and add gravity."""
     gx, gy, gz = dt * gravity[0], dt * gravity[1], dt * gravity[2]
     for node in range(NODES):
         m = field[node, 3]
@@ -377,10 +379,9 @@ def to_velocity(field: Any, dt: Any, gravity: Any) -> None:
 def gather_blocks(
     dt: Any, state: Any, layout: Any, work: Any, params: Any, moving: Any, scatter_next: Any
 ) -> None:
-    """Fields to particles when ``moving``, then stress.
+    """Transfer fields to particles if ``moving``, then compute stress.
 
-    When ``scatter_next``, already the scattering of the next substep, while a block's particles
-    are in the cache.
+    With ``scatter_next``, also scatter for the next substep while a block's particles are cached.
     """
     for chunk in prange(CHUNKS):
         for block in range(layout.chunk_start[chunk], layout.chunk_start[chunk + 1]):
@@ -396,20 +397,20 @@ def gather_blocks(
                 )
             deform_all(begin, end, dt, state, params.table, work.scratch[chunk])
             set_flag(work.needs_resort, block, left_tile)
-            # Particles that left the tile cannot be scattered to it; all are sorted first.
+            # Particles that left the tile cannot be scattered to it; sort all particles first.
             if scatter_next and not left_tile:
                 scatter_block(block, dt, state, layout, work, params)
 
 
 @inner()
 def set_flag(flags: Any, index: Any, flag: Any) -> None:
-    """Store a flag. As a plain assignment in the parallel loop Numba takes it for dead code."""
+    """Store a flag. Numba would remove a plain assignment in the parallel loop as dead code."""
     flags[index] = flag
 
 
 @inner()
 def copy_field(field: Any, o: Any, tile: Any) -> None:
-    """Copy to a tile the nodes of the field at offset number ``o`` from the block."""
+    """Copy the nodes of the field at offset number ``o`` from the block to a tile."""
     i0, i1, si = overlap(o // 9 - 1)
     j0, j1, sj = overlap(o // 3 % 3 - 1)
     k0, k1, sk = overlap(o % 3 - 1)
@@ -426,7 +427,7 @@ def copy_field(field: Any, o: Any, tile: Any) -> None:
 def gather_particles(
     begin: Any, end: Any, dt: Any, dx: Any, state: Any, tile: Any, moving: Any
 ) -> Any:
-    """Move the particles of one block; returns whether one left its tile."""
+    """Move the particles of one block; return whether one left its tile."""
     needs_resort = False
     if moving:
         for p in range(begin, end):
@@ -441,7 +442,7 @@ def gather_particles(
 
 @inner()
 def gather_obstructed(block: Any, dt: Any, state: Any, layout: Any, work: Any, params: Any) -> Any:
-    """The same for a block near thin colliders, which its particles touch themselves."""
+    """``gather_particles`` for a block near thin colliders, with contact of its particles."""
     tile, dx = work.tiles[block].reshape(-1), params.dx
     needs_resort = False
     for p in range(layout.block_start[block], layout.block_start[block + 1]):

@@ -31,11 +31,11 @@ SIDE = 8
 TILE = SIDE**3
 NODES = BLOCK**3
 LOW, HIGH = F32(-0.5), F32(5.5)
-"""Cells from the start of its block between which a particle's nodes stay on the tile."""
+"""Bounds of positions whose nodes are all on the tile, from the start of the block [cells]."""
 MASS, CENTRE, MOMENTUM, SPIN, KINETIC, ELASTIC = 0, 1, 4, 7, 10, 11
 SPEED_SQUARE, WAVE_SQUARE, VOLUME_RATIO = 12, 13, 14
 SUMS, COLUMNS = 12, 15
-"""The first SUMS columns of a row of sums are added up, the others are bounds."""
+"""Columns of a row of sums: the first SUMS are added up, the others are bounds."""
 
 
 class ParticleState(NamedTuple):
@@ -68,18 +68,19 @@ class ParticleState(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Space for one layout.
+    """Work space for one layout.
 
     Attributes:
         tiles: [P, 512, 4] momentum and mass, then velocities.
         moments: [Q, 512, 4] first moment of volume about the nodes [m^3 cells], and volume [m^3].
         velocity: [M, 64, 4] velocity and mass of the fields.
         offset: [M, 64, 4] first moments of the fields.
-        scratch: [CHUNKS, SCRATCH], see ``cpu.deform``; the CPU's only.
+        scratch: [CHUNKS, SCRATCH], CPU only, see ``cpu.deform``.
         needs_resort: [P] bool, whether a particle left its block's reach.
-        by_collider: [T, TOTALS] float64, of each near collider of each field.
-        by_thin: [S, TOTALS] float64, of each near thin collider of each block.
-        by_body: [M, B, TOTALS] float64, on a field from each body; [0, B, TOTALS] for one body.
+        by_collider: [T, TOTALS] float64, for each near collider of each field.
+        by_thin: [S, TOTALS] float64, for each near thin collider of each block.
+        by_body: [M, B, TOTALS] float64, effect of each body on a field; [0, B, TOTALS] for one
+            body.
     """
 
     tiles: NDArray[Any]
@@ -137,7 +138,7 @@ def obstructed(
 ) -> Any:
     """Velocity of a particle of a block after contact with nearby thin colliders.
 
-    With several colliders, two passes are made: one may push the particle into another.
+    Makes two passes for several colliders, because one may push the particle into another.
 
     Args:
         totals: [S, TOTALS] rows to add to.
@@ -159,8 +160,8 @@ def obstructed(
 
 @device_function
 def first_node(x: Any) -> Any:
-    """First node along one axis that a particle at ``x`` [cells] sees, and its distance from it."""
-    # On a device floor gives no whole number.
+    """First node within reach of a particle at ``x`` [cells] along one axis, and its distance."""
+    # On a device, floor does not return an integer.
     node = int(math.floor(x - HALF))  # noqa: RUF046
     return node, x - F32(node)
 
@@ -206,7 +207,7 @@ def momentum(p: Any, dt: Any, dx: Any, f: Any, state: Any) -> Any:
 def velocity_gradient(g: Any, dx: Any, f: Any) -> Any:
     """Velocity gradient (9) [1/s] from the twelve sums over nodes.
 
-    g: sum w v (3), then the sums of w v times the offset i, j and k of each node (3 each).
+    ``g``: sum w v (3), then the sums of w v times the offset i, j and k of each node (3 each).
     """
     s = FOUR / dx
     return (
@@ -264,7 +265,7 @@ def deform(p: Any, dt: Any, state: Any, row: Any) -> None:
 
 @device_function
 def add_motion(p: Any, block: Any, state: Any, dx: Any, out: Any) -> None:
-    """Mass, momentum, angular momentum and kinetic energy, with APIC's affine part."""
+    """Add mass, momentum, angular momentum and kinetic energy, including APIC's affine part."""
     m = float(state.mass[p])
     x = (
         (block[0] * BLOCK + float(state.xi[p, 0])) * dx,
@@ -286,13 +287,13 @@ def add_motion(p: Any, block: Any, state: Any, dx: Any, out: Any) -> None:
     out[SPIN + 1] += m * (x[2] * v[0] - x[0] * v[2]) + affine * (L[2] - L[6])
     out[SPIN + 2] += m * (x[0] * v[1] - x[1] * v[0]) + affine * (L[3] - L[1])
     out[KINETIC] += 0.5 * (m * square + affine * gradient_square)
-    # Maxima ignore NaN, so it is added instead.
+    # Maxima ignore NaN, so this adds it instead.
     out[SPEED_SQUARE] = max(out[SPEED_SQUARE], square) + (square - square)
 
 
 @device_function
 def add_material(p: Any, state: Any, row: Any, out: Any) -> None:
-    """Stored energy, wave speed in the present shape, volume ratio."""
+    """Add stored energy, wave speed in the deformed material, and volume ratio."""
     out[ELASTIC] += float(state.volume[p]) * float(state.energy[p])
     f = state.F[p]
     F = (f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8])

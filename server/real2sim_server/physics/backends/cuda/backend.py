@@ -1,9 +1,9 @@
 """The CUDA backend: particles, their order, the grid and all sums stay on an NVIDIA GPU.
 
-Between two checks of the solver, the host queues launches that are independent of particle motion
-and reads one report. A particle that leaves its tile stops the remaining substeps on the device;
-the host sees that in the report, sorts all particles and continues. This is rare: the host bounds
-particle motion from the last report and sorts in time.
+Between two checks of the solver, the host queues launches that do not depend on particle motion and
+reads one report. A particle that leaves its tile stops the remaining substeps on the device. The
+host sees that in the report, sorts all particles and continues. This is rare, because the host
+bounds particle motion from the last report and sorts in time.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from .launcher import CudaLauncher, Launch, Launcher
 from .memory import SolverMemory, advancing, arranging, flushing, measuring, substeps
 
 INTERVAL = 16
-"""Substeps that are queued at once: the solver checks as often, and sequences of launches that come
-again are captured."""
+"""Substeps per queued batch, equal to the solver's check interval; repeated launch sequences are
+captured."""
 TILE_REACH, SORTED_REACH = 3.0, 2.0
-"""How far particles may be from the middle of their block along an axis [cells]: at most, and after
-they have been sorted."""
+"""Maximum distance of particles from the middle of their block along an axis [cells]: in general,
+and after sorting."""
 CAUTION = 1.25
-"""Particles are taken to come so much further than at the speed of the last check."""
+"""Safety factor on particle motion at the last reported speed."""
 
 
 class CudaSolverBackend:
@@ -89,9 +89,9 @@ class CudaSimulation:
         self._memory = SolverMemory(launcher, model, rows, heights)
         self._memory.upload(self._memory.sets[0], self._loaded(model.start))
         self._report = np.zeros(len(self._memory.report), np.uint8)
-        self._keep = False  # Whether sorting leaves particles in the blocks that they are in.
-        self._stale = True  # Whether they must be sorted before anything else.
-        self._moved = 0.0  # How far colliders may have come since they were sorted [m].
+        self._keep = False  # Whether sorting keeps particles in their current blocks.
+        self._stale = True  # Whether particles must be sorted first.
+        self._moved = 0.0  # Maximum collider motion since the last sort [m].
         self._memory.upload_step(0.0, False, rows)
         done = 0
         while done == 0:
@@ -184,7 +184,7 @@ class CudaSimulation:
         return {"particles": self._sizes.particles, **named}
 
     def save(self) -> _Saved:
-        """Copy the mutable state, on the device."""
+        """Copy the mutable state on the device."""
         memory = self._memory
         return _Saved(memory.sets[self._current].clone(), memory.report.clone(), self._report)
 
@@ -304,7 +304,7 @@ def _largest(values: Float) -> float:
 
 
 def _fitting(room: float, stride: float) -> int:
-    """How many strides fit."""
+    """Number of strides that fit."""
     if not stride > 0:
         return 1 << 16 if room >= 0 else 0
     return max(0, min(1 << 16, math.floor(room / stride)))

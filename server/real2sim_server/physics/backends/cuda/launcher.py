@@ -26,7 +26,7 @@ DIGITS = 256
 DIVERGED, TOO_FAR, OVERFLOW = 1, 2, 4
 XI, VELOCITY, GRADIENT, ELASTIC_F, STRESS, ENERGY = 0, 3, 6, 15, 24, 30
 HISTORY, MASS, VOLUME, TOTAL_F = 31, 32, 33, 34
-"""First of the numbers of a particle that a name stands for."""
+"""Index of the first number of a particle for each quantity."""
 MOVES, DEFORMS, SCATTERS = 1 << 16, 1 << 17, 1 << 18
 BY_LAW, FLIPPED = 15, 16
 BLOCKS, FIELDS, LISTS = range(3)
@@ -38,7 +38,7 @@ LAYOUT = (
     *("tiles", "moments", "velocity", "offset"),
     *("by_collider", "by_pair", "by_thin", "touched", "rows"),
 )
-"""Arrays that grow with what particles touch."""
+"""Arrays whose size depends on the number of occupied blocks."""
 CAPACITIES = ("blocks", "fields", "contacts", "pairs", "thins")
 _COUNTS = (
     *("particles", "pitch", "plastic", "bodies", "colliders", "sort_blocks"),
@@ -95,14 +95,14 @@ def _source(precision: str) -> KernelSource:
         kept_as=f"solver-{precision}",
         text=solver_source(precision),
         folder=FOLDER,
-        fma=True,  # As the CPU's kernels do.
-        diag_suppress=39,  # A law that is none divides by zero on purpose.
+        fma=True,  # As in the CPU's kernels.
+        diag_suppress=39,  # The code for an unknown law divides by zero on purpose.
         error=SolverError,
     )
 
 
 GRAPHS = 32
-"""Sequences of launches that are kept as graphs, of each simulation."""
+"""Maximum number of launch sequences kept as graphs, per simulation."""
 
 
 class Launch(NamedTuple):
@@ -110,7 +110,7 @@ class Launch(NamedTuple):
 
     Attributes:
         kernel: one of KERNELS.
-        blocks: of THREADS threads, at least one.
+        blocks: number of blocks of THREADS threads, at least one.
         argument: see the kernel.
     """
 
@@ -178,7 +178,7 @@ class CudaLauncher:
 
         index = torch.cuda.current_device()
         self.device = torch.device("cuda", index)
-        torch.cuda.synchronize(self.device)  # torch makes the context that all share.
+        torch.cuda.synchronize(self.device)  # Makes torch create the context that both share.
         Device(index).set_current()
         self._kernels = _loaded_kernels(precision, index)
         self._graphs: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
@@ -196,7 +196,7 @@ class CudaLauncher:
                     self._graphs[key] = self._captured(device, launches, space)
                 self._graphs[key].launch(stream)
         except Exception as error:
-            # In torch's wording, by which a worker detects a lost device.
+            # Torch's wording, which lets a worker detect a lost device.
             raise RuntimeError(f"CUDA error at the solver's launches: {error}") from error
         self._graphs.move_to_end(key)
         if len(self._graphs) > GRAPHS:
@@ -232,7 +232,7 @@ class CudaLauncher:
 
         device = Device(self.device.index)
         if not getattr(self._threads, "ready", False):
-            # A driver's context is one of a thread.
+            # A driver context belongs to one thread.
             device.set_current()
             self._threads.ready = True
         return device
@@ -241,5 +241,5 @@ class CudaLauncher:
         from cuda.core import LEGACY_DEFAULT_STREAM, Stream
 
         handle = torch.cuda.current_stream(self.device).cuda_stream
-        # torch calls the default stream 0, which is no handle.
+        # torch calls the default stream 0, and this is no valid handle.
         return Stream.from_handle(handle) if handle else LEGACY_DEFAULT_STREAM

@@ -47,7 +47,7 @@ class Sizes:
 
     @property
     def listed(self) -> int:
-        """Longest list that is summed up."""
+        """Length of the longest list that is summed up."""
         return max(self.particles, records.AROUND * self.blocks, 3 * self.fields + self.blocks)
 
 
@@ -62,7 +62,7 @@ def arranging(sizes: Sizes, *, keep: bool, step: int) -> list[Launch]:
     by_particle = _groups(sizes.particles)
     launches = [Launch("find_keys", by_particle, int(keep))]
     passes = [records.BY_LAW] if sizes.laws > 1 else []
-    # Of one body all keys end alike.
+    # With one body, all keys have the same low byte.
     passes += range(0 if sizes.bodies > 1 else 1, KEY_BYTES)
     for number, one in enumerate(passes):
         argument = one | (records.FLIPPED if number % 2 else 0)
@@ -89,7 +89,12 @@ def arranging(sizes: Sizes, *, keep: bool, step: int) -> list[Launch]:
 
 
 def substeps(sizes: Sizes, first: int, end: int) -> list[Launch]:
-    """Substeps of these numbers: one launch, and two for each; more where colliders are thin."""
+    """Launches of substeps: one for the start and two each, more with thin colliders.
+
+    Args:
+        sizes: sizes of the simulation.
+        first, end: index of the first substep, and of the one after the last.
+    """
     groups = _groups(sizes.fields * records.NODES)
     launches = advancing(sizes, records.SCATTERS | first)
     for step in range(first, end):
@@ -100,7 +105,7 @@ def substeps(sizes: Sizes, first: int, end: int) -> list[Launch]:
 
 
 def advancing(sizes: Sizes, does: int) -> list[Launch]:
-    """Advance the particles of all blocks through the requested parts."""
+    """Advance the particles of all blocks through the requested stages."""
     launches = [Launch("advance_blocks", sizes.blocks, does)]
     if sizes.obstructed:
         launches.append(Launch("advance_obstructed", sizes.blocks, does))
@@ -118,7 +123,7 @@ def flushing(sizes: Sizes) -> list[Launch]:
 
 
 def measuring(sizes: Sizes) -> list[Launch]:
-    """Sums and bounds of the particles."""
+    """Compute sums and bounds of the particles."""
     return [Launch("measure_blocks", sizes.blocks), Launch("measure_bodies", sizes.bodies)]
 
 
@@ -136,7 +141,7 @@ def _groups(threads: int) -> int:
 
 
 SORT_BLOCKS = 512
-"""At most so many blocks of threads share the list of particles."""
+"""Maximum number of thread blocks that share the list of particles."""
 ALIGNMENT = 256
 _U4, _U8, _F8 = 4, 8, 8
 
@@ -146,10 +151,10 @@ class SolverMemory:
 
     Attributes:
         sizes: capacities.
-        pitch: length of the array of one number of all particles.
+        pitch: length of the array of one number for all particles.
         numbers: number of values per particle.
         sets: [bytes] uint8 each, see ``kernels/space.h``.
-        report: [bytes] uint8, Held, sums of bodies, and totals of contacts.
+        report: [bytes] uint8, Held, sums of bodies, and contact totals.
     """
 
     def __init__(self, launcher: Launcher, model: Model, rows: Float, heights: Float) -> None:
@@ -218,7 +223,7 @@ class SolverMemory:
         if len(self._staged) < values.nbytes:
             self._staged = self._launcher.host_memory(2 * values.nbytes)
         else:
-            self._launcher.wait()  # What was staged before may still be on its way.
+            self._launcher.wait()  # An earlier upload from this buffer may still be running.
         self._staged.numpy()[: values.nbytes] = values.reshape(-1).view(np.uint8)
         target[: values.nbytes].copy_(self._staged[: values.nbytes], non_blocking=True)
 
@@ -249,7 +254,7 @@ class SolverMemory:
         return values.reshape(-1, records.COLUMNS)
 
     def totals(self, report: NDArray[np.uint8]) -> tuple[Float, Float]:
-        """Totals of contacts in a report, [B, K, TOTALS] and [B, B, TOTALS]."""
+        """Contact totals in a report, [B, K, TOTALS] and [B, B, TOTALS]."""
         bodies, colliders = self.sizes.bodies, self.sizes.colliders
         on, between = report[self._places[2] : self._places[3]], report[self._places[3] :]
         return (
@@ -262,17 +267,17 @@ class SolverMemory:
         return self.sets[which].cpu().numpy()
 
     def keys(self, memory: NDArray[np.uint8]) -> NDArray[np.uint64]:
-        """[N] keys of a set on the host."""
+        """[N] keys of a set, on the host."""
         return memory[: 8 * self.pitch].view(np.uint64)[: self.sizes.particles]
 
     def words(self, memory: NDArray[np.uint8], which: int) -> NDArray[np.uint32]:
-        """[N] materials (0) or places in the model (1)."""
+        """[N] materials (0) or indices in the model (1)."""
         first = (8 + 4 * which) * self.pitch
         values: NDArray[np.uint32] = memory[first : first + 4 * self.pitch].view(np.uint32)
         return values[: self.sizes.particles]
 
     def values(self, memory: NDArray[np.uint8]) -> NDArray[Any]:
-        """[numbers, N] of a set on the host."""
+        """[numbers, N] values of a set, on the host."""
         values = memory[16 * self.pitch :].view(self._model.dtype)
         return values.reshape(self.numbers, self.pitch)[:, : self.sizes.particles]
 
@@ -362,22 +367,22 @@ class SolverMemory:
         return torch.zeros(nbytes, dtype=torch.uint8, device=self._launcher.device)
 
 
-# Bytes that a substep moves between memory and multiprocessors, counted rather than measured.
+# Bytes that a substep moves between memory and multiprocessors, calculated, not measured.
 
 _KEYS, _INDEX = 8, 4
 
 
 @dataclass(frozen=True)
 class Traffic:
-    """Of one substep, every array read or written by a kernel counted whole.
+    """Memory traffic of one substep [bytes]; arrays read or written by a kernel count in full.
 
     Attributes:
         particles: positions, deformation, stress, velocities of particles.
-        tiles: what blocks scatter, written and read.
-        velocities: of nodes, written once and read by each block around them.
+        tiles: scattered data of blocks, written and read.
+        velocities: node velocities, written once and read by each block around them.
         indices: neighbours of blocks and fields.
-        floor: what no order of work can save: position and deformation of a particle read and
-            written, its mass, volume and material read, and a node of the grid written and read.
+        floor: minimum for any algorithm: position and deformation of a particle read and written,
+            its mass, volume and material read, and a node of the grid written and read.
     """
 
     particles: int
@@ -388,24 +393,24 @@ class Traffic:
 
     @property
     def moved(self) -> int:
-        """All together."""
+        """Total traffic [bytes]."""
         return self.particles + self.tiles + self.velocities + self.indices
 
 
 def substep_traffic(
     *, particles: int, blocks: int, fields: int, nodes: int, plastic: bool, itemsize: int = 4
 ) -> Traffic:
-    """What a substep in the middle of an interval moves where nothing touches.
+    """Traffic of a substep in the middle of an interval without contact.
 
     Args:
-        particles: number of them.
-        blocks, fields: of the layout.
-        nodes: of the grid that particles give to.
-        plastic: whether particles have a total deformation and a history of their own.
-        itemsize: bytes of a number, 4 in single precision.
+        particles: number of particles.
+        blocks, fields: number of blocks and fields of the layout.
+        nodes: number of grid nodes with mass.
+        plastic: whether particles have a separate total deformation and history.
+        itemsize: bytes per number, 4 in single precision.
     """
-    # Position, F, mass, volume, history are read; position, velocity, gradient, F, stress, energy
-    # are written. Material is a word.
+    # Read: position, F, mass, volume, history. Written: position, velocity, gradient, F, stress,
+    # energy. The material is one word.
     numbers = 3 + 9 + 3 + (3 + 3 + 9 + 9 + 6 + 1)
     least = 2 * (3 + 9) + 2
     if plastic:

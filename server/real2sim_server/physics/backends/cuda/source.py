@@ -1,10 +1,10 @@
 """The kernels' source text: constants and functions shared with the CPU, translated to C++.
 
-Functions marked by ``numerics.device_function`` use a small part of Python: numbers, tuples of
+Functions marked by ``numerics.device_function`` use a small subset of Python: numbers, tuples of
 numbers, rows of arrays that are read or added to, ``if``, ``for`` over a range, ``while``, and
-calls of such functions. All fractional numbers share one type, which the caller names; integers
-stay integers. The translator refuses anything else by name and line, so that compiling the kernels,
-not running them on a device, shows a function that outgrows this subset.
+calls of such functions. All floating point numbers have one type, chosen by the caller; integers
+stay integers. The translator rejects anything else with its name and line, so errors show up at
+compile time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from ... import contact, numerics, stress
 # The translator.
 
 Kind = str | tuple[Any, ...]
-"""``real``, ``int``, ``bool``, ``rows`` (read), ``row`` (and written), ``void``, or a tuple."""
+"""``real``, ``int``, ``bool``, ``rows`` (read-only), ``row`` (read and written), ``void``, or a
+tuple."""
 
 _OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "/"}
 _OPERATORS |= {ast.Mod: "%"}
@@ -40,7 +41,7 @@ class Untranslatable(TypeError):
 
 @dataclass(frozen=True)
 class Value:
-    """C++ of an expression, and its kind."""
+    """A C++ expression and its kind."""
 
     text: str
     kind: Kind
@@ -50,8 +51,8 @@ class Translator:
     """Collects functions together with their callees.
 
     Args:
-        real: C++ type of every number with a fraction.
-        prefix: of names of the types that tuples become.
+        real: C++ type of floating point numbers.
+        prefix: prefix of the names of tuple types.
     """
 
     def __init__(self, real: str, prefix: str) -> None:
@@ -68,10 +69,10 @@ class Translator:
         return "\n".join(self._text)
 
     def add(self, function: Callable[..., Any], kinds: Sequence[Kind]) -> tuple[str, Kind]:
-        """Translate a function for arguments of these kinds; its name and the kind it returns.
+        """Translate a function for arguments of these kinds; return its name and result kind.
 
         Raises:
-            Untranslatable: with the place of what is not known.
+            Untranslatable: with the position of the unsupported code.
         """
         key = (function, tuple(kinds))
         if key not in self._made:
@@ -98,7 +99,7 @@ class Translator:
         return self._tables[id(values)]
 
     def write(self, text: str) -> None:
-        """Add a function whose callees are there."""
+        """Add the text of a function whose callees have been added."""
         self._text.append(text)
 
     def _structure(self, kind: tuple[Kind, ...]) -> str:
@@ -125,7 +126,7 @@ class _Function:
             raise self._refused(node, f"{len(kinds)} arguments")
         self._arguments = dict(zip(self._names, kinds, strict=True))
         self._kinds: dict[str, Kind] = dict(self._arguments)
-        # A name that stands for things of two kinds becomes two variables.
+        # A name that holds values of two kinds becomes two variables.
         self._now: dict[str, str] = {}
         self._returned: Kind = "void"
         self._lines: list[str] = []
@@ -133,7 +134,7 @@ class _Function:
         self._temporaries = 0
 
     def translated(self) -> tuple[str, Kind]:
-        # Kinds of variables settle as they are read; two readings are enough for what is here.
+        # Kinds of variables are found by reading the code twice, enough for these functions.
         before: Any = None
         while before != (before := (dict(self._kinds), self._returned)):
             self._lines, self._temporaries, self._depth, self._now = [], 0, 1, {}
@@ -167,7 +168,7 @@ class _Function:
         self._depth += 1
         before = dict(self._now)
         self._block(statements)
-        # What a name stands for in a part that returns does not concern what follows.
+        # A branch that returns does not affect the variables after it.
         if isinstance(statements[-1], ast.Return):
             self._now = before
         self._depth -= 1
@@ -235,7 +236,7 @@ class _Function:
                 raise self._refused(target, f"this assignment to {ast.unparse(target)}")
 
     def _variable(self, name: str, kind: Kind) -> tuple[str, Kind]:
-        """The variable that a name stands for from here on, and the kind that it holds."""
+        """The variable that a name refers to from here on, and its kind."""
         for number in range(9):
             variable = f"{name}_{number}" if number else name
             try:
@@ -249,7 +250,7 @@ class _Function:
         raise self._refused(self._node, f"this number of kinds of {name}")
 
     def _both(self, node: ast.AST, one: Kind, other: Kind) -> Kind:
-        """A kind that holds values of either."""
+        """A kind that holds values of either kind."""
         if one in {other, "void"}:
             return other
         if {one, other} <= {"real", "int", "bool"}:
@@ -278,7 +279,7 @@ class _Function:
         return found
 
     def _plain(self, node: ast.expr) -> Value | None:
-        """Numbers, names, and parts of them."""
+        """Numbers, names, and their elements."""
         found = None
         match node:
             case ast.Constant(value=value):
@@ -289,7 +290,7 @@ class _Function:
             case ast.Name(id=name) if name in self._function.__globals__:
                 found = self._constant(node, self._function.__globals__[name])
             case ast.Name(id=name):
-                found = Value(name, "int")  # What a loop counts.
+                found = Value(name, "int")  # Loop variable.
             case ast.Attribute(attr="inf"):
                 found = Value("INFINITE", "real")
             case ast.Tuple(elts=parts):
@@ -299,7 +300,7 @@ class _Function:
         return found
 
     def _composed(self, node: ast.expr) -> Value | None:
-        """What is made of other values."""
+        """Operators, calls and other compound expressions."""
         found = None
         match node:
             case ast.UnaryOp(op=op, operand=operand):
@@ -451,7 +452,7 @@ def solver_source(precision: str) -> str:
 
 
 def _laws() -> str:
-    """What happens at one particle, in the precision of the state."""
+    """Functions of one particle, in the precision of the state."""
     made = Translator("real", "law_")
     made.add(stress.stress_update, (_NINE, "real", "rows", "real"))
     made.add(stress.add_viscosity, (_SIX, _NINE, "real", "real"))
@@ -462,7 +463,7 @@ def _laws() -> str:
 
 
 def _contact() -> str:
-    """What happens at one node, or one particle near a thin collider, in double precision."""
+    """Functions of one node, or of one particle near a thin collider, in double precision."""
     made = Translator("double", "contact_")
     place: tuple[Kind, ...] = ("rows", "rows", "real", "real", _THREE, "row", "rows", "row")
     made.add(contact.resolve_node_collider, place)
