@@ -179,8 +179,8 @@ def recorded() -> bytes:
     from real2sim_proto.operations import Delete
     from real2sim_proto.plans import TrajectoryPlan
     from real2sim_server.edit import ScenarioState
-    from real2sim_server.world.recording.recording import record, to_bytes
-    from real2sim_server.world.recording.replay import (
+    from real2sim_server.world.recording import record, to_bytes
+    from real2sim_server.world.replay import (
         Entry,
         Replayer,
         action_payload,
@@ -200,8 +200,8 @@ def recorded() -> bytes:
 
 
 def mcap_sample(folder: Path) -> list[Parts]:
-    from real2sim_server.world.recording.mcap_file import mcap_bytes
-    from real2sim_server.world.recording.recording import load_recording
+    from real2sim_server.world.mcap_file import mcap_bytes
+    from real2sim_server.world.recording import load_recording
 
     (folder / "a.r2e").write_bytes(recorded())
     return [{"file": mcap_bytes(load_recording(folder / "a.r2e"))}]
@@ -302,13 +302,13 @@ def read_asset_bundle(path: Path) -> None:
 
 
 def read_recording(path: Path) -> None:
-    from real2sim_server.world.recording.recording import load_recording
+    from real2sim_server.world.recording import load_recording
 
     load_recording(path).rescore()
 
 
 def read_mcap(path: Path) -> None:
-    from real2sim_server.world.recording.mcap_file import recording_in
+    from real2sim_server.world.mcap_file import recording_in
 
     recording_in(path)
 
@@ -399,7 +399,7 @@ def _targets() -> list[Target]:
     from real2sim_server.logs import LogError
     from real2sim_server.reconstruct.imports.checkpoint import TorchFileError
     from real2sim_server.scenarios import ScenarioError
-    from real2sim_server.world.recording.recording import RecordingError
+    from real2sim_server.world.recording import RecordingError
 
     scene_errors, log_errors = (SceneError,), (LogError,)
     splat = read_splats_as_asset

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from ..scene import Scene
     from ..sweeps.episode import Driven
     from ..world.agents import Event
-    from ..world.recording.recording import Recording
-    from ..world.recording.replay import Replayer
+    from ..world.recording import Recording
+    from ..world.replay import Replayer
 
 
 # --- run ------------------------------------------------------------------------------------------
@@ -87,7 +87,7 @@ def run(
     """Run a scenario file with a planner and report what happened."""
     from ..scenarios.flat_scene import fitted_to_scene
     from ..sweeps.episode import recording_of
-    from ..world.recording.recording import save_recording
+    from ..world.recording import save_recording
 
     board, road_file, notes = _storyboard(file, values or [], frozenset(leave_out or ()), ego)
     if speed is not None:
@@ -308,8 +308,8 @@ def replay(
 ) -> None:
     """Score a recorded episode; with its scene, verify and film it."""
     from ..policies.page import film_episode
-    from ..world.recording.mcap_file import save_mcap
-    from ..world.recording.recording import first_difference, load_recording
+    from ..world.mcap_file import save_mcap
+    from ..world.recording import first_difference, load_recording
 
     recording = load_recording(episode)
     figures: dict[str, object] = {
@@ -358,7 +358,7 @@ def _replay_factory(
     """A factory of the session as it was before its first entry."""
     from ..edit import EditError
     from ..service.library.assets import AssetLibrary
-    from ..world.recording.recording import RecordingError
+    from ..world.recording import RecordingError
 
     library = AssetLibrary(assets) if assets is not None else None
 
@@ -466,8 +466,8 @@ def search(
     """
     from ..console import write_json
     from ..sweeps import load_space
-    from ..sweeps.search.optimise import SearchBudget
-    from ..sweeps.search.run import SearchOptions, run_search
+    from ..sweeps.optimise import SearchBudget
+    from ..sweeps.search import SearchOptions, run_search
 
     options = SearchOptions(
         budget=SearchBudget(episodes=episodes, seed=seed),

@@ -440,7 +440,7 @@ def _drive(
     """The exported drive, and the inputs that determine it."""
     from ..datasets.drive import EpisodeDrive, ScenarioDrive
     from ..service.library.assets import AssetLibrary
-    from ..world.recording.recording import load_recording
+    from ..world.recording import load_recording
 
     lookup = AssetLibrary(assets).find if assets is not None else None
     if episode is not None:

@@ -17,7 +17,7 @@ from ..render.cast.call import SweepScene, incidence_of, sensor_poses, transform
 from ..render.types import Instance
 from ..scene import Lidar, Scene, Stride, Trajectory
 from ..world import World
-from ..world.recording.recording import Recording
+from ..world.recording import Recording
 
 # --- Errors --------------------------------------------------------------------------------------
 

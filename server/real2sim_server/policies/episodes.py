@@ -19,7 +19,7 @@ from real2sim._protocol import valid_plan
 from real2sim.planners import load_planner, needs_of, run_episode
 from real2sim.planners.planner import forward_camera
 
-from ..world.recording.recording import Recording, load_recording
+from ..world.recording import Recording, load_recording
 from .suite import Case, EpisodeGrid
 
 if TYPE_CHECKING:

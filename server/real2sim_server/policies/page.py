@@ -23,8 +23,8 @@ from ..render import RasterOptions, render_cameras, select_backend
 from ..render.images import video_file
 from ..scene import Scene
 from ..world import World
-from ..world.recording.recording import Recording, load_recording
-from ..world.recording.replay import Replayer
+from ..world.recording import Recording, load_recording
+from ..world.replay import Replayer
 from ..world.scoring import METRICS, metric_versions
 from .episodes import EpisodeResult
 

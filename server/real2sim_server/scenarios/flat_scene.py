@@ -25,7 +25,7 @@ from ..scene import Camera, CameraRig, GaussianCloud, Ground, Scene, SceneObject
 from ..scene.asset import person_asset
 from ..scene.lane_graph import LaneGraph
 from ..world.boxes import REAR_OVERHANG
-from ..world.ego.motion import Motion
+from ..world.ego_motion import Motion
 from ..world.path import LoggedPath
 from ..world.storyboard.roads import GraphNetwork, Place, RoadNetwork, RouteNetwork, Way, straight
 from ..world.storyboard.run import BOXES, StoryboardRun, own_centre

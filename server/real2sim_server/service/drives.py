@@ -23,8 +23,8 @@ from ..datasets.drive import EpisodeDrive
 from ..edit import AssetLookup
 from ..geometry import matrix_to_quaternion
 from ..world import World, plan_in_world
-from ..world.ego.plan import PlannedTrajectory
-from ..world.recording.recording import Recording, load_recording, to_bytes
+from ..world.plan import PlannedTrajectory
+from ..world.recording import Recording, load_recording, to_bytes
 from .http.requests import IdempotentRequest
 from .http.responses import ServiceError
 from .jobs.exports import VideoSource

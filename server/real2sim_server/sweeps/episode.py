@@ -32,8 +32,8 @@ from ..render.images import to_uint8
 from ..scene import Camera, Scene
 from ..service.library.views import camera_infos
 from ..world import World, WorldError
-from ..world.recording.recording import Recording, record
-from ..world.recording.replay import Entry, Replayer, action_payload, edit_payload, reset_payload
+from ..world.recording import Recording, record
+from ..world.replay import Entry, Replayer, action_payload, edit_payload, reset_payload
 from ..world.scoring import metrics_version
 from ..world.scoring.instant import STOPPED
 from ..world.storyboard.run import object_ids_of

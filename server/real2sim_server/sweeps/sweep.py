@@ -21,7 +21,7 @@ from ..console import CommandError
 from ..executors import Executor, Recipe
 from ..scene import Scene
 from ..world import warm_up
-from ..world.recording.recording import save_recording
+from ..world.recording import save_recording
 from ..world.scoring import metrics_version
 from .episode import CameraFeed, Drive, Driven, drive_episode, recording_of
 from .parameters import Choice, IntRange, Value, drawn_parameters, points_of, values_at

@@ -2,8 +2,8 @@
 
 from .agents import Agents, Event, agent_fields
 from .common import WorldError
-from .ego.controller import Plan, plan_in_world
-from .ego.motion import Motion
+from .controller import Plan, plan_in_world
+from .ego_motion import Motion
 from .observation import Observation, ego_fields
 from .path import LoggedPath
 from .scoring import Score, metrics_version

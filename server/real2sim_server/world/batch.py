@@ -41,11 +41,11 @@ from .batch_kernels import (
 from .collision.contact_state import ContactState
 from .collision.sweep import EgoContacts, StepStart
 from .common import WorldError
+from .controller import EgoController
 from .driving import HOLD, KINDS, PLANNING_AHEAD, vehicle_parameters
-from .ego.controller import EgoController
-from .ego.motion import LEVEL, BodyAttitude, Motion, sprung_side_by_side, tilted
-from .ego.plan import SinglePose, can_reverse, may_lead_backwards
+from .ego_motion import LEVEL, BodyAttitude, Motion, sprung_side_by_side, tilted
 from .path import WAYPOINT_SPACING, WAYPOINTS, Float, LoggedPath
+from .plan import SinglePose, can_reverse, may_lead_backwards
 from .scoring import ScoringContext
 from .scoring.instant import ego_at_fault
 from .traffic.driver import Idm, desired_speed

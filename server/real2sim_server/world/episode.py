@@ -26,7 +26,7 @@ from ..edit.tracks import PackedTracks
 from ..geometry import boxes_overlap, yaw_quaternion
 from ..scene import Ground, Scene, Trajectory
 from .common import Draws, WorldError
-from .ego.motion import Motion
+from .ego_motion import Motion
 from .path import Float, LoggedPath, LoopTransform, PathPoint
 from .traffic.driver import desired_speed, highest_speed
 

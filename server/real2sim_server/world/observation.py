@@ -25,10 +25,10 @@ from .boxes import REAR_OVERHANG, headings
 from .collision.contact_state import StepContacts
 from .collision.sweep import StepStart
 from .common import cache_by_identity
-from .ego.motion import Motion, logged_motion
-from .ego.plan import PlannedTrajectory
+from .ego_motion import Motion, logged_motion
 from .episode import EpisodeClock
 from .path import Command, Float, LoggedPath, LoopTransform, PathPoint
+from .plan import PlannedTrajectory
 from .scoring import EgoSample, ObjectSamples, ScoringContext
 from .scoring.comfort import comfort_window
 from .scoring.instant import VEHICLES

@@ -19,10 +19,10 @@ from .collision.bodies import BodyProperties, BodyState, Impact, ImpactParticipa
 from .collision.contact import ObstacleGrid
 from .collision.deformation import DeformationTracker
 from .collision.sweep import StepStart, swept_contacts
+from .controller import make_tracker
 from .driving import KINDS, PLANNING_AHEAD, advance_vehicle, prepare_schedule
-from .ego.controller import make_tracker
-from .ego.motion import Motion
-from .ego.plan import PlannedTrajectory, ReferenceTrajectory
+from .ego_motion import Motion
+from .plan import PlannedTrajectory, ReferenceTrajectory
 from .scoring.comfort import windowed_sum
 from .scoring.metric import NONE_AGAINST
 from .world import World

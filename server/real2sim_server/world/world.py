@@ -31,9 +31,8 @@ from .collision.contact_state import (
 from .collision.deformation import Deformation, DeformationTracker
 from .collision.sweep import StepStart, overlapping_rows
 from .common import Draws, WorldError, copy_with
-from .ego.controller import EgoController, Plan, emergency_brake
-from .ego.motion import LEVEL, Motion, logged_motion, sprung, tilted
-from .ego.plan import PlannedTrajectory
+from .controller import EgoController, Plan, emergency_brake
+from .ego_motion import LEVEL, Motion, logged_motion, sprung, tilted
 from .episode import (
     EpisodeRoute,
     RandomizedIdm,
@@ -55,6 +54,7 @@ from .observation import (
     scoring_context,
 )
 from .path import Float, LoggedPath, LoopTransform, PathPoint, command_ahead, route_ahead
+from .plan import PlannedTrajectory
 from .ranging import MotionHistory, MotionSegment, Mounted, mounted_sensors
 from .scoring import Instant, MetricAccumulator, Score
 from .storyboard.program import ShownSignal

@@ -20,8 +20,8 @@ from real2sim_server.datasets.export import estimate, export_dataset, work_folde
 from real2sim_server.datasets.plan import planned_clips
 from real2sim_server.edit import ScenarioState
 from real2sim_server.scene.io import load_scene, save_scene
-from real2sim_server.world.recording.recording import record
-from real2sim_server.world.recording.replay import KEPT_PLAN, Entry, Replayer, reset_payload
+from real2sim_server.world.recording import record
+from real2sim_server.world.replay import KEPT_PLAN, Entry, Replayer, reset_payload
 
 
 def contents(folder: Path) -> dict[str, str]:

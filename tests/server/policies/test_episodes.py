@@ -16,7 +16,7 @@ from real2sim_server.policies.page import (
     report_figures,
     unconfirmed_scores,
 )
-from real2sim_server.world.recording.recording import load_recording
+from real2sim_server.world.recording import load_recording
 from real2sim_server.world.scoring import METRICS
 
 pytestmark = pytest.mark.network

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from real2sim.cli import build_app
-from real2sim_server.world.recording.recording import Recording, load_recording
+from real2sim_server.world.recording import Recording, load_recording
 
 DT = 0.1
 """Step of an episode [s]."""

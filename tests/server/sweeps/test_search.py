@@ -15,7 +15,7 @@ from real2sim.planners import Needs, load_planner
 from real2sim_server.policies.suite import Case
 from real2sim_server.scene.io import load_scene
 from real2sim_server.sweeps.episode import Danger, Drive, adversaries_of, begin, drive_episode
-from real2sim_server.sweeps.search.evaluation import (
+from real2sim_server.sweeps.evaluation import (
     SIDEWAYS,
     Evaluation,
     Evaluator,
@@ -23,15 +23,15 @@ from real2sim_server.sweeps.search.evaluation import (
     manoeuvres,
     plan_of,
 )
-from real2sim_server.sweeps.search.failure import boundaries
-from real2sim_server.sweeps.search.optimise import (
+from real2sim_server.sweeps.failure import boundaries
+from real2sim_server.sweeps.optimise import (
     Archive,
     GaussianProcess,
     SearchBudget,
     random_search,
     search,
 )
-from real2sim_server.sweeps.search.run import (
+from real2sim_server.sweeps.search import (
     FAILURES,
     PAGE,
     SearchOptions,
@@ -41,7 +41,7 @@ from real2sim_server.sweeps.search.run import (
     wilson,
 )
 from real2sim_server.sweeps.spec import SHIPPED_SPACES, Space, load_space
-from real2sim_server.world.recording.recording import first_difference, load_recording
+from real2sim_server.world.recording import first_difference, load_recording
 
 BRAKES = Space.model_validate(
     {

@@ -14,9 +14,9 @@ from real2sim_server.scenarios.gallery import corner_case
 from real2sim_server.scenarios.openscenario import write_openscenario
 from real2sim_server.sweeps import load_space
 from real2sim_server.sweeps.episode import adversaries_of
+from real2sim_server.sweeps.optimise import SearchBudget
 from real2sim_server.sweeps.parameters import drawn_parameters, values_at
-from real2sim_server.sweeps.search.optimise import SearchBudget
-from real2sim_server.sweeps.search.run import FAILURES, SearchOptions, run_search
+from real2sim_server.sweeps.search import FAILURES, SearchOptions, run_search
 
 SPACE = """
 storyboard: brakes.xosc

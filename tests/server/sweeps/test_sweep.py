@@ -25,7 +25,7 @@ from real2sim_server.executors import Executor, InProcess, executor_of
 from real2sim_server.sweeps import load_sweep, run_sweep
 from real2sim_server.sweeps.episode import signed_gaps
 from real2sim_server.sweeps.sweep import FORMAT, JOURNAL, RECORDINGS, TABLE, Journal
-from real2sim_server.world.recording.recording import first_difference, load_recording
+from real2sim_server.world.recording import first_difference, load_recording
 
 SWEEP = {
     "case": {

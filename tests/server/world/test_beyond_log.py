@@ -16,14 +16,8 @@ from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import Trajectory
 from real2sim_server.world import World, WorldError
 from real2sim_server.world.path import LoggedPath
-from real2sim_server.world.recording.recording import digest, record, recording_of_bytes, to_bytes
-from real2sim_server.world.recording.replay import (
-    Entry,
-    Replayer,
-    action_payload,
-    reset_payload,
-    stored_spec,
-)
+from real2sim_server.world.recording import digest, record, recording_of_bytes, to_bytes
+from real2sim_server.world.replay import Entry, Replayer, action_payload, reset_payload, stored_spec
 
 COAST = Control(acceleration=0.0, steering=0.0)
 CONTROL = {"action": "control", "privileged": True}

@@ -16,7 +16,7 @@ from real2sim_server.geometry import transform_from, yaw_quaternion
 from real2sim_server.scene import GaussianCloud, SceneObject
 from real2sim_server.simulation import impact as crash
 from real2sim_server.world import World
-from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
+from real2sim_server.world.replay import Entry, Replayer, action_payload, reset_payload
 
 SIZE = (4.2, 1.8, 1.5)
 MASS = 1500.0

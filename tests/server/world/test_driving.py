@@ -44,7 +44,7 @@ from real2sim_server.world.driving.trackers import (
     TIME,
 )
 from real2sim_server.world.driving.vehicle import integrate
-from real2sim_server.world.ego.motion import Motion
+from real2sim_server.world.ego_motion import Motion
 
 IDEAL = {"steering_lag": 0.0, "drive_lag": 0.0}
 VEHICLE = vehicle_parameters(EgoSpec(actuators=IDEAL))

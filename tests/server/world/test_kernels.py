@@ -24,7 +24,7 @@ from real2sim_server.geometry import (
 from real2sim_server.world import boxes as world_boxes
 from real2sim_server.world import path, warm_up
 from real2sim_server.world.driving import entries
-from real2sim_server.world.ego.plan import PlannedTrajectory
+from real2sim_server.world.plan import PlannedTrajectory
 from real2sim_server.world.scoring import comfort, instant, road
 from real2sim_server.world.scoring.comfort import ComfortAccumulator, plans_agree
 from real2sim_server.world.warm_up import warm_up_planning

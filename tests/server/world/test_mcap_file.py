@@ -16,15 +16,10 @@ from real2sim_proto.episode import ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.geometry import transform_from
+from real2sim_server.world.mcap_file import cloud_document, mcap_bytes, recording_in, save_mcap
 from real2sim_server.world.ranging import Cloud
-from real2sim_server.world.recording.mcap_file import (
-    cloud_document,
-    mcap_bytes,
-    recording_in,
-    save_mcap,
-)
-from real2sim_server.world.recording.recording import RecordingError, record, to_bytes
-from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
+from real2sim_server.world.recording import RecordingError, record, to_bytes
+from real2sim_server.world.replay import Entry, Replayer, action_payload, reset_payload
 
 CLOUD = Cloud(
     sensor="top",

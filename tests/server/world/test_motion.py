@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from real2sim_proto.episode import EgoSpec
 from real2sim_server.world.driving import Command
-from real2sim_server.world.ego.motion import (
+from real2sim_server.world.ego_motion import (
     Motion,
     advance_motion,
     constant_law,

@@ -30,7 +30,7 @@ from real2sim_server.world.collision.contact import (
     yielding_patch,
 )
 from real2sim_server.world.collision.solver_state import advance_face_pulse, face_contact
-from real2sim_server.world.recording.replay import Entry, recorded_spec, reset_payload, stored_spec
+from real2sim_server.world.replay import Entry, recorded_spec, reset_payload, stored_spec
 
 COAST = Control(acceleration=0.0, steering=0.0)
 GO_ON = {"action": "control", "on_collision": "continue", "privileged": True, "dt_us": 20_000}

@@ -10,14 +10,14 @@ from real2sim_proto.plans import Control
 from real2sim_server.edit import ScenarioState
 from real2sim_server.world import World, WorldError
 from real2sim_server.world.common import Draws
-from real2sim_server.world.recording.recording import (
+from real2sim_server.world.recording import (
     digest,
     first_difference,
     record,
     recording_of_bytes,
     to_bytes,
 )
-from real2sim_server.world.recording.replay import Entry, Replayer, action_payload, reset_payload
+from real2sim_server.world.replay import Entry, Replayer, action_payload, reset_payload
 
 COAST = Control(acceleration=0.0, steering=0.0)
 CONTROL = {"action": "control", "privileged": True}

@@ -17,8 +17,8 @@ from real2sim_proto.operations import Delete, Translate
 from real2sim_proto.plans import TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.edit.apply import replay_operations
-from real2sim_server.world.recording import recording as recording_module
-from real2sim_server.world.recording.recording import (
+from real2sim_server.world import recording as recording_module
+from real2sim_server.world.recording import (
     RecordingError,
     first_difference,
     load_recording,
@@ -26,7 +26,7 @@ from real2sim_server.world.recording.recording import (
     save_recording,
     to_bytes,
 )
-from real2sim_server.world.recording.replay import (
+from real2sim_server.world.replay import (
     Entry,
     Replayer,
     action_payload,

@@ -12,11 +12,11 @@ from real2sim_proto.plans import Control, TrajectoryPlan
 from real2sim_server.edit import ScenarioState
 from real2sim_server.world import World, WorldError
 from real2sim_server.world.batch import BatchWorld
+from real2sim_server.world.controller import EgoController
 from real2sim_server.world.driving import VEHICLE_MODELS
-from real2sim_server.world.ego.controller import EgoController
-from real2sim_server.world.ego.motion import Motion
-from real2sim_server.world.ego.plan import PlannedTrajectory
-from real2sim_server.world.recording.replay import stored_spec
+from real2sim_server.world.ego_motion import Motion
+from real2sim_server.world.plan import PlannedTrajectory
+from real2sim_server.world.replay import stored_spec
 
 BEHIND, ASIDE = 11.0, 2.5
 """A gap beside the road, from where the vehicle has stopped [m]."""

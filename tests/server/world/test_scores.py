@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from real2sim_server.world import scoring
-from real2sim_server.world.ego.plan import PlannedTrajectory
+from real2sim_server.world.plan import PlannedTrajectory
 from real2sim_server.world.scoring import (
     ContactRecord,
     Instant,

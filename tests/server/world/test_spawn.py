@@ -18,8 +18,8 @@ from real2sim_server.edit import (
     unpack_state,
 )
 from real2sim_server.world import World
-from real2sim_server.world.recording.recording import digest, first_difference, record
-from real2sim_server.world.recording.replay import (
+from real2sim_server.world.recording import digest, first_difference, record
+from real2sim_server.world.replay import (
     Entry,
     Replayer,
     action_payload,

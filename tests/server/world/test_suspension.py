@@ -12,8 +12,8 @@ from real2sim_proto.episode import EgoSpec, ResetSpec
 from real2sim_proto.plans import Control, PoseCommand
 from real2sim_server.world.driving import GRAVITY, vehicle_parameters
 from real2sim_server.world.driving.vehicle import axle_forces
-from real2sim_server.world.ego.motion import LEVEL, BodyAttitude, Motion, sprung, tilted
-from real2sim_server.world.recording.replay import reset_payload, stored_spec
+from real2sim_server.world.ego_motion import LEVEL, BodyAttitude, Motion, sprung, tilted
+from real2sim_server.world.replay import reset_payload, stored_spec
 
 SPRUNG = EgoSpec(suspension={})
 BRAKING = Motion(0, 0, 0, 20.0, acceleration=-4.0)

@@ -19,8 +19,8 @@ from real2sim_server.geometry import yaw_quaternion
 from real2sim_server.scene import CameraRig, GaussianCloud, Scene, Trajectory
 from real2sim_server.world import World
 from real2sim_server.world.boxes import first_contacts
-from real2sim_server.world.recording.recording import first_difference, record
-from real2sim_server.world.recording.replay import (
+from real2sim_server.world.recording import first_difference, record
+from real2sim_server.world.replay import (
     Entry,
     Replayer,
     action_payload,

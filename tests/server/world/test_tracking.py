@@ -14,7 +14,7 @@ from real2sim_server.geometry import quaternion_yaw, yaw_quaternion
 from real2sim_server.logs import open_log
 from real2sim_server.scene import Trajectory
 from real2sim_server.world import World
-from real2sim_server.world.recording.replay import stored_spec
+from real2sim_server.world.replay import stored_spec
 
 START_US = 5_000_000
 IDEAL = {"actuators": {"steering_lag": 0.0, "drive_lag": 0.0}}

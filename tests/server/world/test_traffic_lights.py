@@ -11,7 +11,7 @@ import pytest
 from real2sim_server.scene import Signal
 from real2sim_server.scene.lane import StopLine
 from real2sim_server.world import scoring
-from real2sim_server.world.recording.recording import instant_row, read_instant
+from real2sim_server.world.recording import instant_row, read_instant
 from real2sim_server.world.scoring.instant import shows_red
 from real2sim_server.world.scoring.metrics import light_compliance, lights
 from real2sim_server.world.scoring.road import RoadMap

@@ -10,12 +10,12 @@ from scipy.linalg import solve_continuous_are
 
 from real2sim_proto.episode import EgoSpec
 from real2sim_proto.plans import TrajectoryPlan
+from real2sim_server.world.controller import make_tracker
 from real2sim_server.world.driving import GRAVITY, Command, vehicle_parameters
 from real2sim_server.world.driving.trackers import lagging_gains
 from real2sim_server.world.driving.vehicle import axle_forces, fiala
-from real2sim_server.world.ego.controller import make_tracker
-from real2sim_server.world.ego.motion import Motion, advance_motion, constant_law
-from real2sim_server.world.ego.plan import PlannedTrajectory, ReferenceTrajectory
+from real2sim_server.world.ego_motion import Motion, advance_motion, constant_law
+from real2sim_server.world.plan import PlannedTrajectory, ReferenceTrajectory
 
 IDEAL = {"steering_lag": 0.0, "drive_lag": 0.0}
 NUPLAN = {"steering_lag": 0.05, "drive_lag": 0.2}

@@ -16,7 +16,7 @@ import numpy as np
 from ...geometry import Float, matrix_to_quaternion
 from ...render import encode_image
 from ...scene import Camera
-from ...world.recording.mcap_file import json_channel, stamp_of
+from ...world.mcap_file import json_channel, stamp_of
 from ..clips import Clip
 from ..drive import DatasetError
 from .writer import LabelledDrive, objects_of

@@ -27,7 +27,7 @@ from ...physics.errors import PhysicsError
 from ...render import RenderError
 from ...scene import BundleError, SceneError, TimeOutOfRangeError, UnknownObjectError
 from ...world import WorldError
-from ...world.recording.recording import RecordingError
+from ...world.recording import RecordingError
 from ..accounts import Limit, OverLimitError, RevokedError, seconds_to_wait
 from ..engine import DeviceLostError, EngineStoppedError, QueueFullError
 from ..storage.connection import (

@@ -25,7 +25,7 @@ from ...datasets.drive import EpisodeDrive, ScenarioDrive
 from ...datasets.plan import Variant, swept
 from ...edit import ScenarioState, instances_at
 from ...scene import Scene
-from ...world.recording.recording import Recording, RecordingError, recording_of_bytes
+from ...world.recording import Recording, RecordingError, recording_of_bytes
 from ..http.auth import TokenRoute, bearer_token, unauthorized
 from ..http.requests import ClientName, IdempotencyKey
 from ..http.responses import cancel_on_disconnect, event_stream, info_response

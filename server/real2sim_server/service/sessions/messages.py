@@ -24,7 +24,7 @@ from real2sim_proto.codec import MAX_CLIENT_MESSAGE_BYTES, unpack
 from real2sim_proto.drive import CLIENT_MESSAGE, Action, ClientMessage, Envelope, Hello
 
 from ..._records import made_quickly
-from ...world.recording.replay import plan_payload
+from ...world.replay import plan_payload
 from ..http.auth import secrets_equal, unauthorized
 from ..http.responses import ServiceError
 from ..storage.store import SessionRow

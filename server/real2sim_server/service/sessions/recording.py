@@ -8,10 +8,10 @@ from dataclasses import replace
 from real2sim_proto import ErrorCode, encode
 
 from ...world import World
+from ...world.mcap_file import cloud_document
 from ...world.ranging import MountedLidar, MountedRadar, RangingSensors
-from ...world.recording.mcap_file import cloud_document
-from ...world.recording.recording import Recording, record, to_bytes
-from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact
+from ...world.recording import Recording, record, to_bytes
+from ...world.replay import Entry, Replayer, last_episode, no_action_impact
 from ..frames import EncodedFrame
 from ..http.responses import ServiceError
 from .pipeline import EncodedObservation, StepPipeline

@@ -23,7 +23,7 @@ from real2sim_proto.sessions import SessionInfo
 from ...edit import LogEntry, Scenario, ScenarioState
 from ...scene import Camera, Scene
 from ...world import Score, World
-from ...world.recording.replay import Entry, Replayer, last_episode, no_action_impact, plan_payload
+from ...world.replay import Entry, Replayer, last_episode, no_action_impact, plan_payload
 from ...world.scoring import scores_of
 from .. import clock
 from ..accounts import Accounts, owner_name, token_hash

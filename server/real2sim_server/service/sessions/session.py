@@ -33,8 +33,8 @@ from ...world import (
     metrics_version,
     plan_in_world,
 )
-from ...world.ego.plan import PlannedTrajectory
 from ...world.path import whole_route
+from ...world.plan import PlannedTrajectory
 from .. import clock
 from ..accounts import token_hash
 from ..http.auth import secrets_equal

@@ -19,7 +19,7 @@ from real2sim_proto.operations import Operation
 from ...edit import EditOutcome
 from ...scene import Camera
 from ...world import Event, Plan, World
-from ...world.recording.replay import (
+from ...world.replay import (
     KEPT_PLAN,
     action_payload,
     agent_payload,

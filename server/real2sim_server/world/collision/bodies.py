@@ -12,7 +12,7 @@ from ...edit import ObjectState
 from ...simulation.structure import STRUCTURES, default_mass, stiffness_of, yaw_inertia
 from ..boxes import REAR_OVERHANG
 from ..driving import GRAVITY, vehicle_parameters
-from ..ego.motion import Motion
+from ..ego_motion import Motion
 from ..scoring.instant import Side
 from ..traffic.driver import AgentPose, Surroundings
 

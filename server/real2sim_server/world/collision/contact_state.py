@@ -11,9 +11,9 @@ from real2sim_proto.episode import EgoSpec, ResetSpec
 
 from ..agents import Agents, Event, rows_in
 from ..boxes import REAR_OVERHANG, may_meet_any, may_overlap
+from ..controller import EgoController
 from ..driving import Command
-from ..ego.controller import EgoController
-from ..ego.motion import Motion
+from ..ego_motion import Motion
 from ..path import Float
 from ..scoring.instant import ContactRecord
 from ..traffic import Traffic

@@ -11,7 +11,7 @@ import numpy as np
 from ...geometry import Float, multiply_quaternions, quaternion_yaw, yaw_quaternion
 from ..agents import rows_of
 from ..boxes import first_contacts
-from ..ego.motion import Motion
+from ..ego_motion import Motion
 from ..traffic.driver import AgentPose
 from .bodies import (
     BodyProperties,

@@ -12,7 +12,7 @@ from real2sim_proto.episode import ContactSpec, EgoSpec
 from ..agents import Agents
 from ..boxes import REAR_OVERHANG
 from ..driving import Command
-from ..ego.motion import Motion
+from ..ego_motion import Motion
 from ..scoring.instant import Side, side_of_contact
 from .bodies import MUTUAL_STIFFNESS, BodyProperties, BodyState, ImpactedObject, ImpactParticipant
 from .contact import (

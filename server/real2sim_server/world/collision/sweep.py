@@ -22,7 +22,7 @@ from ...geometry import boxes_overlap, quaternion_yaw
 from ...scene.ground import OBSTACLE_CELL
 from ..agents import Agents, rows_in
 from ..boxes import REAR_OVERHANG, ego_box, first_contacts, first_occupied, holds_any, within_reach
-from ..ego.motion import Motion
+from ..ego_motion import Motion
 from ..path import Float
 from ..scoring.instant import ContactRecord, side_of_contact
 from .bodies import BodyProperties, BodyState, ego_body, ego_properties

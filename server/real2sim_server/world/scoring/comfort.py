@@ -12,8 +12,8 @@ import numpy as np
 
 from ..._numba import kernel
 from ..._records import made_quickly
-from ..ego.plan import PlannedTrajectory
 from ..path import Float
+from ..plan import PlannedTrajectory
 from .instant import EgoSample, Instant, ScoringContext
 
 T = TypeVar("T")

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ..._numba import kernel
 from ..._records import made_quickly
 from ...scene import LaneGraph, Signal
-from ..ego.plan import PlannedTrajectory
 from ..path import Float, LoopTransform
+from ..plan import PlannedTrajectory
 from ..storyboard.program import ShownSignal
 from .road import DENSITY, RoadMap, in_lane, off_road
 

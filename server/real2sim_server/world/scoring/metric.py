@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ..common import copy_with
-from ..ego.plan import PlannedTrajectory
 from ..path import Float, LoopTransform
+from ..plan import PlannedTrajectory
 from .comfort import (
     WINDOW_S,
     ComfortAccumulator,

@@ -33,7 +33,7 @@ from ...scene.lane_graph import LaneGraph
 from ...scene.scene import MAX_OBJECTS
 from ..boxes import REAR_OVERHANG
 from ..common import Draws, WorldError, copy_with
-from ..ego.motion import Motion
+from ..ego_motion import Motion
 from ..traffic.driver import ScriptedEntity, Surroundings, recorded_pose
 from .program import PLACING, Program, ShownSignal, program_of, shown_at
 from .progress import COMPLETE, ElementChange, Progress, ProgressState

@@ -25,7 +25,7 @@ from ...scene import Ground, Trajectory
 from ...scene.lane_graph import LaneGraph
 from ..agents import Agents, rows_of
 from ..boxes import REAR_OVERHANG, headings
-from ..ego.motion import Motion
+from ..ego_motion import Motion
 from ..path import Float, LoggedPath, PathPoint, next_in_strip, previous_in_strip
 
 

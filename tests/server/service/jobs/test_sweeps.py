@@ -15,7 +15,7 @@ from real2sim_server.scenarios.openscenario import read_openscenario_text, write
 from real2sim_server.service import drives
 from real2sim_server.service.sweeps import write_spec
 from real2sim_server.sweeps import load_sweep, run_sweep
-from real2sim_server.world.recording.recording import recording_of_bytes
+from real2sim_server.world.recording import recording_of_bytes
 from tests.waiting import wait_until
 
 from ..waiting import finished

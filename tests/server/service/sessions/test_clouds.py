@@ -10,7 +10,7 @@ import pytest
 import real2sim
 from real2sim_proto import decode
 from real2sim_server.render.cast.call import warm_up_casting
-from real2sim_server.world.recording.recording import load_recording
+from real2sim_server.world.recording import load_recording
 from tests.waiting import wait_until
 
 pytestmark = pytest.mark.network

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 import real2sim
 from real2sim.cli import build_app
 from real2sim_server.service.sessions.session import ClockHold
-from real2sim_server.world.recording.recording import recording_of_bytes
+from real2sim_server.world.recording import recording_of_bytes
 
 from ..waiting import finished
 

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 import real2sim
 from real2sim.cli import build_app
-from real2sim_server.world.recording.mcap_file import recording_in
-from real2sim_server.world.recording.recording import load_recording, to_bytes
+from real2sim_server.world.mcap_file import recording_in
+from real2sim_server.world.recording import load_recording, to_bytes
 
 pytestmark = pytest.mark.network
 

@@ -10,8 +10,8 @@ import pytest
 from real2sim_proto import decode
 from real2sim_proto.drive import SERVER_MESSAGE
 from real2sim_proto.sessions import SessionEdited, SessionInfo, SessionState
-from real2sim_server.world.recording.recording import first_difference, recording_of_bytes
-from real2sim_server.world.recording.replay import Replayer
+from real2sim_server.world.recording import first_difference, recording_of_bytes
+from real2sim_server.world.replay import Replayer
 
 pytestmark = pytest.mark.network
 

@@ -10,7 +10,7 @@ from real2sim_proto.storyboard import Storyboard
 from real2sim_server.edit import EditError, ScenarioState, apply_operations
 from real2sim_server.edit.state import pack_state, unpack_state
 from real2sim_server.world import World
-from real2sim_server.world.recording.replay import stored_spec
+from real2sim_server.world.replay import stored_spec
 
 from .boards import action_at, board
 

@@ -31,17 +31,18 @@ from numpy.typing import NDArray
 
 from real2sim_proto import decode, encode
 
-from ..._files import atomic_file
-from ..._npy import read_entries
-from ...edit import AssetLookup, EditError, ScenarioState, pack_state, unpack_state
-from ...geometry import Float
-from ...scene import Scene
-from .. import scoring
-from ..common import WorldError
-from ..ego.plan import PlannedTrajectory
-from ..observation import reactive
-from ..path import LoopTransform
-from ..scoring import (
+from .._files import atomic_file
+from .._npy import read_entries
+from ..edit import AssetLookup, EditError, ScenarioState, pack_state, unpack_state
+from ..geometry import Float
+from ..scene import Scene
+from . import scoring
+from .common import WorldError
+from .observation import reactive
+from .path import LoopTransform
+from .plan import PlannedTrajectory
+from .replay import KINDS, Entry, Replayer, recorded_spec
+from .scoring import (
     ContactRecord,
     EgoSample,
     Instant,
@@ -51,10 +52,9 @@ from ..scoring import (
     ScoringContext,
     metrics_version,
 )
-from ..scoring.instant import Side
-from ..storyboard.program import ShownSignal
-from ..world import World
-from .replay import KINDS, Entry, Replayer, recorded_spec
+from .scoring.instant import Side
+from .storyboard.program import ShownSignal
+from .world import World
 
 # --- Plain values --------------------------------------------------------------------------------
 

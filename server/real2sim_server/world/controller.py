@@ -12,13 +12,13 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import EgoSpec, ResetSpec
 from real2sim_proto.plans import Control, Gear, PoseCommand, TrajectoryPlan
 
-from ..._records import made_quickly
-from ...edit.tracks import sample
-from ...scene import Trajectory
-from ..common import WorldError, copy_with
-from ..driving import KINDS, LQR, MOVING, Command
-from ..path import LoopTransform
-from .motion import Motion, advance_motion, commanded, constant_law, teleported
+from .._records import made_quickly
+from ..edit.tracks import sample
+from ..scene import Trajectory
+from .common import WorldError, copy_with
+from .driving import KINDS, LQR, MOVING, Command
+from .ego_motion import Motion, advance_motion, commanded, constant_law, teleported
+from .path import LoopTransform
 from .plan import (
     Leg,
     PlannedTrajectory,

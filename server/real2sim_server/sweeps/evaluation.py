@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from real2sim.planners import Needs, load_planner
 from real2sim_proto.plans import TrajectoryPlan
 
-from ...scene import Scene
-from ...world import World
-from ..episode import OPERATIONS, Drive, Driven, adversaries_of, begin, drive_episode, signed_gaps
-from ..parameters import Value, drawn_parameters, values_at
-from ..spec import Space
+from ..scene import Scene
+from ..world import World
+from .episode import OPERATIONS, Drive, Driven, adversaries_of, begin, drive_episode, signed_gaps
+from .parameters import Value, drawn_parameters, values_at
+from .spec import Space
 
 # --- Reference driver ----------------------------------------------------------------------------
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...console import CommandError
-from ..parameters import spread
+from ..console import CommandError
 from .evaluation import Cell, Evaluation, Evaluator
+from .parameters import spread
 
 # --- Archive -------------------------------------------------------------------------------------
 

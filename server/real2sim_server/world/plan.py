@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from real2sim_proto.episode import EgoSpec
 
-from ..._records import made_quickly
-from ..common import cache_by_identity
-from ..driving import (
+from .._records import made_quickly
+from .common import cache_by_identity
+from .driving import (
     GRAVITY,
     HOLD,
     NO_POSE,
@@ -27,8 +27,8 @@ from ..driving import (
     plan_curve,
     vehicle_parameters,
 )
-from ..path import Float, LoopTransform
-from .motion import ControlLaw, Motion, advance_motion, commanded, constant_law
+from .ego_motion import ControlLaw, Motion, advance_motion, commanded, constant_law
+from .path import Float, LoopTransform
 
 Pose = tuple[float, float, float]
 """x, y [m], yaw [rad], world frame."""

@@ -17,12 +17,12 @@ import numpy as np
 from real2sim.planners import load_planner
 from real2sim_proto.episode import ResetSpec
 
-from ...policies.page import STYLE
-from ...world.recording.recording import Recording
-from ..episode import Drive, Driven, drive_episode
-from ..parameters import Value, drawn_parameters, values_at
-from ..spec import read_scenario, run_options, write_scenario_file
+from ..policies.page import STYLE
+from ..world.recording import Recording
+from .episode import Drive, Driven, drive_episode
 from .evaluation import Evaluation, Evaluator, impact_of
+from .parameters import Value, drawn_parameters, values_at
+from .spec import read_scenario, run_options, write_scenario_file
 
 # --- Shrinking -----------------------------------------------------------------------------------
 

@@ -14,9 +14,9 @@ from real2sim_proto.operations import Operation, stored_operations
 from real2sim_proto.plans import PLAN, Plan
 from real2sim_proto.storyboard import stored_storyboard
 
-from ...edit import ScenarioState
-from ...scene import Scene
-from ..world import World
+from ..edit import ScenarioState
+from ..scene import Scene
+from .world import World
 
 # --- Stored specs --------------------------------------------------------------------------------
 

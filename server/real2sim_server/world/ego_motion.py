@@ -10,10 +10,10 @@ import numpy as np
 
 from real2sim_proto.episode import EgoSpec, SuspensionSpec
 
-from ...geometry import quaternion_yaw
-from ...scene import Trajectory
-from ..common import cache_by_identity
-from ..driving import (
+from ..geometry import quaternion_yaw
+from ..scene import Trajectory
+from .common import cache_by_identity
+from .driving import (
     GRAVITY,
     HOLD,
     NO_SCHEDULE,
@@ -27,7 +27,7 @@ from ..driving import (
     vehicle_parameters,
     wheel_load,
 )
-from ..path import Float
+from .path import Float
 
 SLOW = 0.1
 """Minimum speed at which the steering angle can be derived from the motion [m/s]."""

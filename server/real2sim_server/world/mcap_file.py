@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from real2sim_proto import CodecError, decode
 
-from ..._files import atomic_file
-from ...geometry import are_rigid, matrix_to_quaternion
-from .. import scoring
-from ..ranging import Cloud
-from ..scoring import Instant
+from .._files import atomic_file
+from ..geometry import are_rigid, matrix_to_quaternion
+from . import scoring
+from .ranging import Cloud
 from .recording import Recording, RecordingError, recording_of_bytes, to_bytes
+from .scoring import Instant
 
 # --- Point clouds --------------------------------------------------------------------------------
 

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from real2sim.planners import load_planner, needs_of
 
-from ..._files import atomic_file
-from ...console import CommandError
-from ...policies.page import film_episode
-from ...scene import Scene
-from ...world.recording.recording import first_difference, save_recording
-from ..episode import CameraFeed, Driven, drive_episode, recording_of
-from ..parameters import drawn_parameters
-from ..spec import Space, open_scene
+from .._files import atomic_file
+from ..console import CommandError
+from ..policies.page import film_episode
+from ..scene import Scene
+from ..world.recording import first_difference, save_recording
+from .episode import CameraFeed, Driven, drive_episode, recording_of
 from .evaluation import REFUSED, Evaluation, Evaluator, drive_reference
 from .failure import Failure, boundaries, render_page, write_scenario
 from .optimise import SearchBudget, SearchState, search
+from .parameters import drawn_parameters
+from .spec import Space, open_scene
 
 # --- Statistics ----------------------------------------------------------------------------------
 

@@ -1,1 +1,0 @@
-"""The ego vehicle: plans, trackers and dynamics."""

@@ -1,1 +1,0 @@
-"""Recording, replay and export of episodes."""
