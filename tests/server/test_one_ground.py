@@ -22,7 +22,7 @@ from real2sim_server.reconstruct.initialise.stage0 import initialise_scene
 from real2sim_server.scene import Scene
 from real2sim_server.scene.io import load_scene, save_scene
 from real2sim_server.service.app import create_app
-from real2sim_server.service.jobs.rollouts import colliders_of
+from real2sim_server.service.rollouts import colliders_of
 from real2sim_server.settings import Settings
 from real2sim_server.simulation.experiments import scene_road
 from real2sim_server.simulation.rigid import clearance

@@ -18,7 +18,8 @@ Its parts, lowest first. Each imports only earlier ones; there are no import cyc
 - ``renderer``: render requests.
 - ``scenario_cache``: scenarios and sessions' states in memory.
 - ``scenarios``: edits under one lock per scenario, stored before they take effect.
-- ``jobs``: long-running work: rollouts, videos, data sets.
+- ``jobs``: long-running work and its queue.
+- ``exports``, ``rollouts``: the work of jobs: videos, data sets, physics, calibration.
 - ``sessions``: closed loops; ``pipeline`` processes a step from the socket to the encoded reply.
 - ``drives``: jobs in which planners drive sessions.
 - ``sweeps``: sweeps and searches as jobs, in separate processes.

@@ -27,7 +27,7 @@ from .http.openapi import document, published, text_of
 from .http.requests import BodyLimit, RequestContext, install_replay_handler
 from .http.responses import install_problem_handlers
 from .http.telemetry import Tracing, engine_spans, traces_to
-from .jobs.jobs import Work
+from .jobs import Work
 from .routes import assets, jobs, scenarios, scenes, server, sessions, sockets
 from .worker import Worker
 

@@ -25,10 +25,10 @@ from ..geometry import matrix_to_quaternion
 from ..world import World, plan_in_world
 from ..world.plan import PlannedTrajectory
 from ..world.recording import Recording, load_recording, to_bytes
+from .exports import VideoSource
 from .http.requests import IdempotentRequest
 from .http.responses import ServiceError
-from .jobs.exports import VideoSource
-from .jobs.jobs import JobContext, JobResult, Jobs, NewJob, require_success
+from .jobs import JobContext, JobResult, Jobs, NewJob, require_success
 from .library.scenes import SceneCache
 from .sessions import Sessions
 from .sessions.recording import RECORDING, episode_of

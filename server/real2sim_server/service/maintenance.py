@@ -13,7 +13,7 @@ import structlog
 from .._files import sweep_leftovers
 from ..settings import Settings
 from .clock import now_us
-from .jobs.jobs import Jobs
+from .jobs import Jobs
 from .sessions import Sessions
 from .sessions.shared_memory import sweep_segments
 from .storage import schema as t

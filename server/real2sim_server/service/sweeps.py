@@ -17,10 +17,10 @@ from ..scenarios import ScenarioError
 from ..scenarios.gallery import corner_case
 from ..scenarios.openscenario import ReadOptions, read_openscenario_text
 from .drives import CommandProcess
+from .exports import pack
 from .http.requests import IdempotentRequest
 from .http.responses import ServiceError
-from .jobs.exports import pack
-from .jobs.jobs import JobContext, JobResult, Jobs, NewJob, Work
+from .jobs import JobContext, JobResult, Jobs, NewJob, Work
 from .library.scenes import SceneCache
 from .sessions.recording import RECORDING
 

@@ -28,13 +28,12 @@ from .accounts import Accounts, worker_key
 from .audit import Audit, AuditLog
 from .drives import Drives
 from .engine import Engine
+from .exports import VideoSource
 from .http.connections import ConnectionLimits, Connections, connection_limit
 from .http.requests import Idempotency
 from .http.responses import ServiceError
 from .http.telemetry import Metrics
-from .jobs.exports import VideoSource
-from .jobs.jobs import Jobs
-from .jobs.rollouts import Calibrations, Simulations
+from .jobs import Jobs
 from .library.assets import AssetLibrary
 from .library.imports import ImportQueue, import_scene
 from .library.scenes import MemoryBudget, Quota, SceneCache, SceneCatalog
@@ -42,6 +41,7 @@ from .library.views import SplatFiles
 from .maintenance import Maintenance
 from .membership import Agent, Membership, Prewarming, Sharing, Willingness, takes_work
 from .renderer import Renderer
+from .rollouts import Calibrations, Simulations
 from .scenarios import Scenarios
 from .sessions import SessionLimits, Sessions
 from .sessions.pipeline import StepPipeline

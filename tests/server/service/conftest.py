@@ -19,8 +19,8 @@ import pytest
 import structlog
 from fastapi.testclient import TestClient
 
+from real2sim_server.service import exports
 from real2sim_server.service.app import create_app
-from real2sim_server.service.jobs import exports
 from real2sim_server.settings import Settings
 
 from .manual_clock import manual_clock

@@ -26,10 +26,7 @@ from ...datasets.plan import Variant, swept
 from ...edit import ScenarioState, instances_at
 from ...scene import Scene
 from ...world.recording import Recording, RecordingError, recording_of_bytes
-from ..http.auth import TokenRoute, bearer_token, unauthorized
-from ..http.requests import ClientName, IdempotencyKey
-from ..http.responses import cancel_on_disconnect, event_stream, info_response
-from ..jobs.exports import (
+from ..exports import (
     DatasetSource,
     EngineBackend,
     VideoSource,
@@ -40,7 +37,10 @@ from ..jobs.exports import (
     make_dataset,
     plan_of,
 )
-from ..jobs.jobs import JobContext, JobResult, Jobs, NewJob, Work, accepted_headers
+from ..http.auth import TokenRoute, bearer_token, unauthorized
+from ..http.requests import ClientName, IdempotencyKey
+from ..http.responses import cancel_on_disconnect, event_stream, info_response
+from ..jobs import JobContext, JobResult, Jobs, NewJob, Work, accepted_headers
 from ..renderer import FRAME_RESPONSES, RenderRequest, frame_response
 from ..sessions.recording import RECORDING, episode_of
 from ..sessions.registry import check_not_closed

@@ -40,7 +40,7 @@ from ...scenarios.openscenario import ReadOptions, read_openscenario_text, write
 from ..http.auth import TokenRoute
 from ..http.requests import ClientName, IdempotencyKey, IdempotentRequest
 from ..http.responses import ServiceError, cancel_on_disconnect, etag, info_response, large_response
-from ..jobs.jobs import accepted_headers
+from ..jobs import accepted_headers
 from ..renderer import FRAME_RESPONSES, frame_response
 from ..scenarios import created_headers, tag
 from ..worker import Worker, WorkerOf

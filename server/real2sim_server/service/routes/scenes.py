@@ -34,7 +34,7 @@ from ...scene.io.spz import Spz
 from ..http.auth import TokenRoute
 from ..http.requests import ClientName, IdempotencyKey, form_digest
 from ..http.responses import ServiceError, cancel_on_disconnect, etag, info_response, large_response
-from ..jobs.jobs import JobContext, JobResult, NewJob, accepted_headers
+from ..jobs import JobContext, JobResult, NewJob, accepted_headers
 from ..library.imports import (
     drop_claim,
     import_errors,

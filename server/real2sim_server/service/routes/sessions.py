@@ -40,7 +40,7 @@ from ..http.auth import (
 )
 from ..http.requests import ClientName, IdempotencyKey, IdempotentRequest
 from ..http.responses import ServiceError, choose_among, etag, info_response, large_response
-from ..jobs.jobs import accepted_headers
+from ..jobs import accepted_headers
 from ..renderer import CODEC_OF, choose_media_type
 from ..sessions.pipeline import StepPipeline
 from ..sessions.recording import RECORDING, recording_of

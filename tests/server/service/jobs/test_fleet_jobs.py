@@ -9,8 +9,8 @@ import pytest
 import sqlalchemy as sa
 
 from real2sim_proto.jobs import JobInfo, JobState
-from real2sim_server.service.jobs import jobs as module
-from real2sim_server.service.jobs.jobs import MAX_DEATHS, JobResult, Jobs, NewJob
+from real2sim_server.service import jobs as module
+from real2sim_server.service.jobs import MAX_DEATHS, JobResult, Jobs, NewJob
 from real2sim_server.service.library.scenes import Quota
 from real2sim_server.service.storage import job_log, schema
 from real2sim_server.service.storage.fleet import Leases

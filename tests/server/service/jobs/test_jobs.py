@@ -10,7 +10,7 @@ import pytest
 from real2sim_proto import ErrorCode
 from real2sim_proto.jobs import JobInfo, JobState
 from real2sim_server.service.http.responses import ServiceError
-from real2sim_server.service.jobs.jobs import JobResult, Jobs, NewJob
+from real2sim_server.service.jobs import JobResult, Jobs, NewJob
 from real2sim_server.service.library.scenes import Quota
 from real2sim_server.service.storage.job_log import JobLog
 from real2sim_server.service.storage.store import Store

@@ -8,7 +8,7 @@ import pytest
 from real2sim_proto.jobs import SimulateRequest
 from real2sim_server.edit import ScenarioState
 from real2sim_server.service.http.responses import ServiceError
-from real2sim_server.service.jobs.rollouts import RolloutPlayback, plan_rollout, run_rollout
+from real2sim_server.service.rollouts import RolloutPlayback, plan_rollout, run_rollout
 from real2sim_server.simulation.result import SimulationResult
 
 SHORT = {"end_us": 100_000, "frame_us": 100_000}

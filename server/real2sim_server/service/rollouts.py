@@ -27,10 +27,10 @@ from real2sim_proto.operations import (
     PlaneShape,
 )
 
-from ...edit import ObjectState, ScenarioState
-from ...edit.compose import composed_background, contact_shadows
-from ...geometry import Float, quaternion_to_matrix, transform_from
-from ...physics.colliders import (
+from ..edit import ObjectState, ScenarioState
+from ..edit.compose import composed_background, contact_shadows
+from ..geometry import Float, quaternion_to_matrix, transform_from
+from ..physics.colliders import (
     Box,
     Capsule,
     Collider,
@@ -41,27 +41,27 @@ from ...physics.colliders import (
     TriangleMesh,
     TriangleSurface,
 )
-from ...render import Instance
-from ...scene import Scene, SceneObject
-from ...simulation.background import ground_collider
-from ...simulation.calibration import (
+from ..render import Instance
+from ..scene import Scene, SceneObject
+from ..simulation.background import ground_collider
+from ..simulation.calibration import (
     CalibrationCancelled,
     ObjectCalibration,
     Observation,
     calibrate_object,
     observations_of,
 )
-from ...simulation.experiments.setups import set_up
-from ...simulation.result import ENERGIES, PlacedObjects, Playback, SimulationResult
-from ...simulation.rollout import SimulateOptions, simulate
-from ...simulation.spawn import EGO, with_ego
-from ...simulation.structure import ObjectPhysics, with_values
-from ..http.requests import IdempotentRequest
-from ..http.responses import ServiceError
-from ..library.scenes import SceneCache
-from ..scenarios import Scenarios
+from ..simulation.experiments.setups import set_up
+from ..simulation.result import ENERGIES, PlacedObjects, Playback, SimulationResult
+from ..simulation.rollout import SimulateOptions, simulate
+from ..simulation.spawn import EGO, with_ego
+from ..simulation.structure import ObjectPhysics, with_values
 from .exports import VideoSource
+from .http.requests import IdempotentRequest
+from .http.responses import ServiceError
 from .jobs import JobCancelled, JobContext, JobResult, Jobs, NewJob, Work, require_success
+from .library.scenes import SceneCache
+from .scenarios import Scenarios
 
 NEARBY_DISTANCE = 25.0
 """Objects within this distance of a moving one take part [m], up to ``MAX_NEARBY_OBJECTS``."""

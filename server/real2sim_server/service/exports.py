@@ -19,23 +19,23 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import SensorSpec
 from real2sim_proto.jobs import DatasetRequest, ExportRequest
 
-from ...datasets.export import MANIFEST, PREVIEW, Estimate, estimate, export_dataset, work_folder
-from ...datasets.labels.boxes import BoxNoise
-from ...datasets.perturbed import Perturbation
-from ...datasets.plan import ExportPlan, Variant, planned_cameras, planned_lidar, planned_shards
-from ...datasets.writers import writer_of
-from ...geometry import Float
-from ...render import Backend, Instance, RenderOutput
-from ...render.backend import RasterRequest
-from ...render.cast import CastRequest, Echo, select_caster
-from ...render.images import VideoError, VideoFile
-from ...scene import Scene
-from ..engine import Engine, Priority, QueueFullError
-from ..frames import EncodedFrame
-from ..http.responses import ServiceError
-from ..library.scenes import Quota
-from ..renderer import Renderer, RenderRequest, check_sensors
+from ..datasets.export import MANIFEST, PREVIEW, Estimate, estimate, export_dataset, work_folder
+from ..datasets.labels.boxes import BoxNoise
+from ..datasets.perturbed import Perturbation
+from ..datasets.plan import ExportPlan, Variant, planned_cameras, planned_lidar, planned_shards
+from ..datasets.writers import writer_of
+from ..geometry import Float
+from ..render import Backend, Instance, RenderOutput
+from ..render.backend import RasterRequest
+from ..render.cast import CastRequest, Echo, select_caster
+from ..render.images import VideoError, VideoFile
+from ..scene import Scene
+from .engine import Engine, Priority, QueueFullError
+from .frames import EncodedFrame
+from .http.responses import ServiceError
 from .jobs import JobContext, JobResult
+from .library.scenes import Quota
+from .renderer import Renderer, RenderRequest, check_sensors
 
 VIDEO = "video.webm"
 VIDEO_TYPE = "video/webm"

@@ -19,14 +19,14 @@ import structlog
 from real2sim_proto import ErrorCode, Problem
 from real2sim_proto.jobs import JobFile, JobInfo, JobKind, JobState
 
-from ..accounts import ACCOUNT, owner_name
-from ..clock import now_us
-from ..http.requests import IdempotentRequest
-from ..http.responses import ServiceError, problem_of, service_error
-from ..library.scenes import Quota
-from ..scenario_cache import iso_time
-from ..storage.job_log import ClaimedJob, JobLog
-from ..storage.store import FencedError, StoreError, StoreTroubleError
+from .accounts import ACCOUNT, owner_name
+from .clock import now_us
+from .http.requests import IdempotentRequest
+from .http.responses import ServiceError, problem_of, service_error
+from .library.scenes import Quota
+from .scenario_cache import iso_time
+from .storage.job_log import ClaimedJob, JobLog
+from .storage.store import FencedError, StoreError, StoreTroubleError
 
 # --- Ends of jobs --------------------------------------------------------------------------------
 

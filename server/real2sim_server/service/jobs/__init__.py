@@ -1,1 +1,0 @@
-"""Long-running work: jobs reply immediately, report progress, and store their results."""
