@@ -334,7 +334,7 @@ class SessionBase(Handle):
             UnreachableError: it is not to be had, and the session must have it.
         """
         offer = self.welcome.shared_memory
-        if self._wants_memory is False or self._plan.role != "controller":
+        if self._uses_shared_memory is False or self._plan.role != "controller":
             return None
         reason = "the worker offers none"
         if offer is not None:
@@ -347,7 +347,7 @@ class SessionBase(Handle):
 
     def _without_memory(self, reason: str) -> None:
         """Continue over the socket. Raises UnreachableError if shared memory is required."""
-        if self._wants_memory:
+        if self._uses_shared_memory:
             raise UnreachableError(
                 f"no shared memory with the worker at {self._target.url}: {reason}",
                 hint="worker and client need one /dev/shm and one user; in containers one IPC "
@@ -355,7 +355,7 @@ class SessionBase(Handle):
             )
 
     @property
-    def _wants_memory(self) -> bool | None:
+    def _uses_shared_memory(self) -> bool | None:
         own = self._plan.shared_memory
         return self._target.shared_memory if own is None else own
 

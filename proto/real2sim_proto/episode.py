@@ -578,7 +578,7 @@ class ResetSpec(Model):
 
     @model_validator(mode="before")
     @classmethod
-    def _goes_on_beyond_the_log(cls, fields: Any) -> Any:
+    def _default_horizon(cls, fields: Any) -> Any:
         if not isinstance(fields, Mapping) or fields.get("horizon") is not None:
             return fields
         dt_us = fields.get("dt_us", 100_000)

@@ -145,7 +145,7 @@ def staged_progress() -> Iterator[Callable[..., None]]:
 
 
 @contextmanager
-def told_progress(*, follow: bool) -> Iterator[Callable[..., None]]:
+def reported_progress(*, follow: bool) -> Iterator[Callable[..., None]]:
     """Progress bars as :func:`staged_progress`, or JSON lines for a program that follows.
 
     With ``follow``, each report is one line of JSON on standard output, and the process ends when

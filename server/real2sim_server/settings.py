@@ -177,7 +177,7 @@ class Settings(BaseSettings):
         return bearer_token(given) if isinstance(given, str) else given
 
     @property
-    def wants_token(self) -> bool:
+    def needs_token(self) -> bool:
         """Whether requests need a token."""
         return self.token is not None or self.tokens_file is not None
 

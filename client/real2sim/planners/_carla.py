@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .._session_state import Matrix
 
-WAY_BETWEEN = 50.0
+MAX_POINT_SPACING = 50.0
 """Spacing of an agent's route points [m]; points where the option changes are added."""
 
 
@@ -133,13 +133,13 @@ def _thinned(route: Sequence[Any]) -> list[int]:
     kept, way = [0], 0.0
     for k in range(1, len(route)):
         way += route[k][0].location.distance(route[k - 1][0].location)
-        if route[k][1] != route[k - 1][1] or way > WAY_BETWEEN or k == len(route) - 1:
+        if route[k][1] != route[k - 1][1] or way > MAX_POINT_SPACING or k == len(route) - 1:
             kept.append(k)
             way = 0.0
     return kept
 
 
-STAND_INS: dict[str, tuple[Any, ...]] = {
+STUBS: dict[str, tuple[Any, ...]] = {
     "carla": (Vector3D, Location, Rotation, Transform, VehicleControl),
     "agents.navigation.local_planner": (RoadOption,),
     "leaderboard.autoagents.autonomous_agent": (AutonomousAgent, Track),
@@ -147,9 +147,9 @@ STAND_INS: dict[str, tuple[Any, ...]] = {
 """Members of the stand-in modules."""
 
 
-def offer_stand_ins() -> None:
-    """Make the modules of :data:`STAND_INS` importable; installed ones take precedence."""
-    for name, members in STAND_INS.items():
+def install_stubs() -> None:
+    """Make the modules of :data:`STUBS` importable; installed ones take precedence."""
+    for name, members in STUBS.items():
         try:
             importlib.import_module(name)
         except ImportError:

@@ -149,11 +149,11 @@ class AlpasimDriver:
             # NVIDIA's models report this while their history is too short.
             if refusal.status != "FAILED_PRECONDITION" or self._planned:
                 raise
-            return self._meanwhile(obs, refusal.details)
+            return self._continue_on_route(obs, refusal.details)
         if answer.terminate_session:
             raise PeerError(f"the driver at {self.target} ends the session at {obs.t_us} us")
         if not answer.trajectory.poses and not self._planned:
-            return self._meanwhile(obs, "an empty trajectory")
+            return self._continue_on_route(obs, "an empty trajectory")
         self._planned = True
         return self._plan_in(answer, obs.t_us)
 
@@ -224,7 +224,7 @@ class AlpasimDriver:
             request = m.RolloutCameraImage(session_uuid=self._session, camera_image=image)
             self._call("submit_image_observation", request)
 
-    def _meanwhile(self, obs: Observation, said: str) -> TrajectoryPlan:
+    def _continue_on_route(self, obs: Observation, said: str) -> TrajectoryPlan:
         """On along the route at the speed of now."""
         if not obs.warming_up:
             self._without_plan += 1

@@ -27,7 +27,7 @@ from real2sim_proto.plans import Control
 
 from .._session_state import Matrix
 from ..images import Frame
-from ._carla import Lookup, PinholeView, lookup_of, offer_stand_ins
+from ._carla import Lookup, PinholeView, install_stubs, lookup_of
 from .peer import PeerError, T_ego_camera, rgb_frames
 from .planner import Needs
 
@@ -120,14 +120,14 @@ class CarlaAgent:
         self._origin = float(options.pop("lat", 42.0)), float(options.pop("lon", 2.0))
         if options:
             raise ValueError(f"options {', '.join(options)} are unknown; there: config, lat, lon")
-        offer_stand_ins()
+        install_stubs()
         self._class = _agent_class(where)
         self._agent: Any = None
         self._route: Matrix | None = None
         self._lookups: dict[str, Lookup] = {}
         self._start_us = 0
-        self._spare = self._made()
-        self._sensors = self._asked_for(self._spare)
+        self._next_agent = self._made()
+        self._sensors = self._asked_for(self._next_agent)
         cameras = {s["id"]: wanted_view(s) for s in self._sensors if s["type"] == CAMERA}
         modalities: Any = ("rgb",) if cameras else ()
         self.needs: Needs = _AgentNeeds(modalities=modalities, action="control", views=cameras)
@@ -139,7 +139,7 @@ class CarlaAgent:
 
     def reset(self, obs: Observation) -> None:
         """Create a new agent for the episode, with its route."""
-        agent, self._spare = self._spare or self._made(), None
+        agent, self._next_agent = self._next_agent or self._made(), None
         self.close()
         self._agent, self._start_us = agent, obs.t_us
         route = self._route if self._route is not None else _route_seen(obs)
@@ -163,10 +163,10 @@ class CarlaAgent:
 
     def close(self) -> None:
         """Call the agent's cleanup."""
-        for agent in (self._agent, self._spare):
+        for agent in (self._agent, self._next_agent):
             if agent is not None:
                 agent.destroy()
-        self._agent = self._spare = None
+        self._agent = self._next_agent = None
 
     @staticmethod
     def _asked_for(agent: Any) -> list[dict[str, Any]]:

@@ -117,7 +117,7 @@ class DepthSampling:
         best = np.inf
         chosen: tuple[float, Array] = (0.0, np.zeros((len(self._times), 2)))
         for acceleration in lattice.accelerations:
-            way = _way(speed, acceleration, self._times, limit=limit)
+            way = _profile(speed, acceleration, self._times, limit=limit)
             hits = self._hits(path, self._stop(speed, acceleration, limit), points, obs.ego)
             for offset, hit in zip(lattice.offsets, hits, strict=True):
                 cost = self._cost(acceleration, offset, way, hit, speed)
@@ -134,11 +134,11 @@ class DepthSampling:
         """[K, 2] metres travelled and speed while going on for a moment and then braking."""
         lattice = self.lattice
         on = np.arange(DT, lattice.reaction + 1e-9, DT)
-        first = _way(speed, acceleration, on, limit=limit)
+        first = _profile(speed, acceleration, on, limit=limit)
         start, left = first[-1]
         braking = max(lattice.stopping, -acceleration)
         after = np.arange(1, int(left / braking / DT) + 2) * DT
-        held = _way(left, -braking, after, limit=np.inf)
+        held = _profile(left, -braking, after, limit=np.inf)
         held[:, 0] += start
         return np.concatenate([first, held])
 
@@ -214,7 +214,7 @@ def _rotation(quaternion: tuple[float, float, float, float]) -> Array:
     )
 
 
-def _way(speed: float, acceleration: float, times: Array, *, limit: float) -> Array:
+def _profile(speed: float, acceleration: float, times: Array, *, limit: float) -> Array:
     """[K, 2] metres travelled and speed [m/s] at ``times``; speed between 0 and ``limit``.
 
     Above the limit the drive brakes at least gently until it is reached.

@@ -15,8 +15,8 @@ from ..console import (
     CommandError,
     console,
     print_figures,
+    reported_progress,
     staged_progress,
-    told_progress,
     write_json,
 )
 from .common import Follow, JsonFile, command
@@ -424,7 +424,7 @@ def sweep(
     asked = load_sweep(spec, scenes)
     try:
         who = executor_of(executor, workers=workers, address=ray_address)
-        with told_progress(follow=follow) as report:
+        with reported_progress(follow=follow) as report:
             figures = run_sweep(asked, out, who, scenes=scenes, on_progress=report)
     except ExecutorError as error:
         raise CommandError(str(error)) from error
@@ -477,7 +477,7 @@ def search(
         scenes=scenes,
     )
     asked = [load_space(name, scenes) for name in spaces]
-    with told_progress(follow=follow) as report:
+    with reported_progress(follow=follow) as report:
         found = run_search(asked, planner, out, options, on_progress=report)
     write_json(json, found)
     if follow:

@@ -263,7 +263,7 @@ def film(
 
 # --- ground ---------------------------------------------------------------------------------------
 
-SWEEPS_MAX = 12
+MAX_SWEEPS = 12
 POINTS_DRAWN = 60_000
 BOX_MARGIN = 0.3
 """Points closer to a box than this belong to its object, not to the ground [m]."""
@@ -362,7 +362,7 @@ def _lidar_points(log: DrivingLog) -> Float:
 
     from ..geometry import apply_transform, invert_transform
 
-    frames = np.unique(np.linspace(0, log.frame_count - 1, SWEEPS_MAX).astype(int))
+    frames = np.unique(np.linspace(0, log.frame_count - 1, MAX_SWEEPS).astype(int))
     kept = []
     for frame in frames.tolist():
         t_us = int(log.frame_times_us[frame])

@@ -30,14 +30,14 @@ from .writers.plain import labels_sheet
 
 # Some sheets of labels over pictures, to look at first.
 
-MOST = 6
+MAX_PREVIEWS = 6
 QUALITY = 85
 
 
 def write_previews(clips: Sequence[Clip], cameras: Sequence[Camera], folder: Path) -> None:
-    """Sheets of up to MOST frames, spread evenly over clips and cameras, as jpg in ``folder``."""
+    """Write sheets of up to 6 frames, evenly over clips and cameras, as jpg into ``folder``."""
     frames = [(clip, frame) for clip in clips for frame in clip.frames]
-    count = min(MOST, len(frames) * len(cameras))
+    count = min(MAX_PREVIEWS, len(frames) * len(cameras))
     folder.mkdir(exist_ok=True)
     for number in range(count):
         clip, frame = frames[(2 * number + 1) * len(frames) // (2 * count)]

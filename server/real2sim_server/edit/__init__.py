@@ -7,9 +7,9 @@ from .compose import (
     compose,
     figure_of,
     instances_at,
+    instances_at_start,
+    instances_of,
     posed_instances,
-    things_at_start,
-    things_of,
 )
 from .scenario import LogEntry, PlannedEntry, Scenario
 from .state import (
@@ -40,11 +40,11 @@ __all__ = [
     "compose",
     "figure_of",
     "instances_at",
+    "instances_at_start",
+    "instances_of",
     "pack_state",
     "posed_instances",
     "replay_operations",
-    "things_at_start",
-    "things_of",
     "unpack_state",
     "vacated_parking",
 ]

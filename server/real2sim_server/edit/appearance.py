@@ -40,7 +40,7 @@ RIM = 1.2
 LOW = 0.25
 """The ground's Gaussians are less than this above or below the box's bottom [m]."""
 
-FEWEST = 6
+MIN_POINTS = 6
 NEIGHBOURS = 48
 """Number of neighbours for the median colour, so that neither a line nor a shadow next to the box
 is extended under it.
@@ -113,7 +113,7 @@ def _away(pose: Float, parked: ObjectState) -> bool:
 def _recolour(sh: Tensor, places: Tensor, unknown: Tensor, known: Tensor) -> None:
     """Give those of ``unknown`` [N] bool the median ``sh`` of the nearest ``known``, in place."""
     count = min(NEIGHBOURS, int(known.sum()))
-    if count < FEWEST or not bool(unknown.any()):
+    if count < MIN_POINTS or not bool(unknown.any()):
         return
     distances = torch.cdist(places[unknown], places[known])
     nearest = distances.topk(count, largest=False).indices

@@ -143,7 +143,7 @@ def _off_ground(
 ) -> Iterator[EditWarning]:
     usual = 0.0
     if recorded is not None:
-        usual = _usual_clearance(recorded, ground)
+        usual = _recorded_clearance(recorded, ground)
     off = _clearance(own, subject, ground) - usual
     worst = float(off[np.argmax(np.abs(off))])
     if abs(worst) > OFF_GROUND:
@@ -157,7 +157,7 @@ def _off_ground(
 
 
 @lru_cache(maxsize=REMEMBERED)
-def _usual_clearance(recorded: ObjectState, ground: Ground) -> float:
+def _recorded_clearance(recorded: ObjectState, ground: Ground) -> float:
     track = recorded.trajectory
     theirs, _ = _sampled(track, track.start_us, track.end_us)
     return float(np.median(_clearance(theirs, recorded, ground)))

@@ -77,7 +77,7 @@ def compose(
     return instances + contact_shadows(scene, edited, t_us)
 
 
-def things_of(
+def instances_of(
     scene: Scene, state: ScenarioState, objects: Iterable[ObjectState]
 ) -> tuple[Instance, ...] | None:
     """The background and ``objects`` as :func:`compose` renders them, independent of their poses.
@@ -97,9 +97,9 @@ def things_of(
     return (Instance(scene.background), *_anywhere(scene, shown))
 
 
-def things_at_start(scene: Scene, state: ScenarioState) -> list[Instance]:
+def instances_at_start(scene: Scene, state: ScenarioState) -> list[Instance]:
     """Everything that a scenario renders at its start or later, except shadows: the background and
-    every visible object, at any pose. Raises like :func:`things_of`.
+    every visible object, at any pose. Raises like :func:`instances_of`.
     """
     placed = state.tracks.at(scene.start_us)
     poses = {o.object_id: T for o, T in zip(placed.objects, placed.transforms, strict=True)}

@@ -24,7 +24,7 @@ GROUND_CELL = 1.0
 WINDOW = 7
 """Window size in cells; wider than any vehicle, so that no roof counts as road."""
 
-LOWEST = 10.0
+GROUND_PERCENTILE = 10.0
 """Percentile of heights in a cell that counts as its ground height; lower points are noise."""
 
 
@@ -69,7 +69,7 @@ def _lowest(heights: Float, index: NDArray[np.intp], cells: int) -> Float:
     index, heights = index[order], heights[order]
     used, starts, counts = np.unique(index, return_index=True, return_counts=True)
     lowest = np.full(cells, np.nan)
-    lowest[used] = heights[starts + (counts * LOWEST / 100).astype(int)]
+    lowest[used] = heights[starts + (counts * GROUND_PERCENTILE / 100).astype(int)]
     return lowest
 
 

@@ -25,8 +25,8 @@ MIN_LENGTH_M = 8.0
 BRIDGED_M = 40.0
 SMOOTH_M = 4.0
 WIDTH_M, WIDTHS_M = 3.4, (2.5, 4.5)
-BESIDE_M = (2.2, 5.0)
-SWEEPS_MAX = 40
+LANE_OFFSETS_M = (2.2, 5.0)
+MAX_SWEEPS = 40
 REACH_M, FLAT_M = 4.0, 0.25
 BIN_M, WINDOW_M = 0.05, 20.0
 BRIGHT_SHARE, BRIGHT_MADS, POINTS_MIN = 0.12, 5.0, 200
@@ -207,7 +207,7 @@ def _even(line: Float) -> Float:
 
 def _ground_returns(log: DrivingLog) -> tuple[Float, Float]:
     """LiDAR points [N, 3] about the height of the road, in the world, and their intensities."""
-    frames = np.unique(np.linspace(0, log.frame_count - 1, SWEEPS_MAX).astype(int))
+    frames = np.unique(np.linspace(0, log.frame_count - 1, MAX_SWEEPS).astype(int))
     places, levels = [], []
     for frame in frames.tolist():
         sweep = log.lidar(frame)
@@ -322,7 +322,7 @@ def _neighbours(lanes: list[Lane]) -> list[Lane]:
                 continue
             offset, same = float(np.median(left[near])), float(np.median(agree[near])) > 0
             side = ("left" if offset > 0 else "right") if same else "opposite"
-            fits = BESIDE_M[0] < abs(offset) < BESIDE_M[1] and (same or offset > 0)
+            fits = LANE_OFFSETS_M[0] < abs(offset) < LANE_OFFSETS_M[1] and (same or offset > 0)
             if fits and abs(offset) < nearest[side]:
                 beside[side], nearest[side] = other.lane_id, abs(offset)
         found.append(replace(lane, **beside))  # type: ignore[arg-type]

@@ -174,7 +174,7 @@ def _splats(
     cloud, camera = instance.cloud, optics.camera
     linear, offset = placement.linear[0, index], placement.offset[0, index]
     own = cloud.means.double() @ linear.mT
-    centres, ways = own + offset, _ways(instance, optics, own)
+    centres, ways = own + offset, _readout_displacements(instance, optics, own)
     axes, positions = _derivatives(optics, centres.detach().numpy(), ways.detach().numpy())
     depths = positions.norm(dim=-1) if camera.shows_ranges else positions[:, 2]
     covars = linear.to(dtype) @ covars @ linear.to(dtype).mT
@@ -201,7 +201,7 @@ def _splats(
     return splats.select((kept & (opacities >= ALPHA_MIN)).nonzero()[:, 0])
 
 
-def _ways(instance: Instance, optics: LensView, own: Tensor) -> Tensor:
+def _readout_displacements(instance: Instance, optics: LensView, own: Tensor) -> Tensor:
     """Displacement of centres relative to the camera over the readout [m].
 
     ``own`` [N, 3] are the centres relative to the origin of their instance.

@@ -361,7 +361,7 @@ def _check_poses(instances: Sequence[Instance], *, trusted: bool) -> None:
         f"instances[{index}].T_world_object": _values(instance.T_world_object)
         for index, instance in enumerate(instances)
         if instance.T_world_object is not None
-        and not (trusted and _lies_elsewhere(instance.T_world_object))
+        and not (trusted and _on_other_device(instance.T_world_object))
     }
     shaped = all(pose.shape == (4, 4) for pose in poses.values())
     if poses and not (shaped and are_rigid(np.stack(list(poses.values()))).all()):
@@ -369,7 +369,7 @@ def _check_poses(instances: Sequence[Instance], *, trusted: bool) -> None:
             _check_rigid(pose, name)
 
 
-def _lies_elsewhere(matrix: Tensor | ArrayLike) -> bool:
+def _on_other_device(matrix: Tensor | ArrayLike) -> bool:
     return isinstance(matrix, Tensor) and matrix.device.type != "cpu"
 
 

@@ -164,7 +164,7 @@ def _origin(
 BEFORE, SECONDS = 60.0, 40.0
 """Length of the road behind the ego's start [m]; duration of the recorded drive [s]."""
 
-SLOWEST, GAIN = 5.0, 1.0
+MIN_EGO_SPEED, GAIN = 5.0, 1.0
 """The recorded drive speeds up to this at least, so that it leads somewhere [m/s], [m/s^2]."""
 
 STEP_US = 100_000
@@ -204,7 +204,7 @@ def flat_scene(
     way = _way(start, graph)
     times = np.arange(int(seconds * 1e6) // STEP_US + 1, dtype=np.int64) * STEP_US
     near = way.path.nearest(start.x, start.y)
-    places = [way.path.at(near.s + _gone(speed, t * 1e-6)) for t in times.tolist()]
+    places = [way.path.at(near.s + _distance_driven(speed, t * 1e-6)) for t in times.tolist()]
     points = np.array([(x, y, 0.0) for x, y, _, _ in places])
     quaternions = np.array([yaw_quaternion(h) for *_, h in places])
     drive = Trajectory(times, points, quaternions)
@@ -239,19 +239,19 @@ def _graph(board: Storyboard, road_file: Path | None) -> LaneGraph | None:
 def _start(run: StoryboardRun) -> tuple[Place, float, dict[str, Any]]:
     """Start of the recorded drive, its speed, and further ego properties of the scene."""
     if run.ego is None:
-        return Place(0.0, 0.0, 0.0), SLOWEST, {}
+        return Place(0.0, 0.0, 0.0), MIN_EGO_SPEED, {}
     ego = run.entities[run.ego]
-    (x, y), speed = ego.axle, ego.speed if run.ego_put else SLOWEST
+    (x, y), speed = ego.axle, ego.speed if run.ego_put else MIN_EGO_SPEED
     if ego.trajectory is not None and ego.trajectory.timing is not None:
         speed = ego.trajectory.step(0.0, STEP_US * 1e-6)[0] / (STEP_US * 1e-6)
     return Place(x, y, ego.h), max(speed, 0.0), {"ego_size": ego.size}
 
 
-def _gone(speed: float, t: float) -> float:
-    """Distance after ``t`` seconds [m], with the initial speed raised to at least ``SLOWEST``."""
-    gaining = min(max(t - STEP_US * 1e-6, 0.0), max(SLOWEST - speed, 0.0) / GAIN)
+def _distance_driven(speed: float, t: float) -> float:
+    """Distance after ``t`` seconds [m], from at least ``MIN_EGO_SPEED``."""
+    gaining = min(max(t - STEP_US * 1e-6, 0.0), max(MIN_EGO_SPEED - speed, 0.0) / GAIN)
     after = max(t - STEP_US * 1e-6 - gaining, 0.0)
-    return speed * (t - after) + GAIN * gaining**2 / 2 + max(speed, SLOWEST) * after
+    return speed * (t - after) + GAIN * gaining**2 / 2 + max(speed, MIN_EGO_SPEED) * after
 
 
 def _way(start: Place, graph: LaneGraph | None) -> Way:

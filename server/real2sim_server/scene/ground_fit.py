@@ -130,7 +130,7 @@ UNDER_WHEELS = (1.25, 2.0)
 """The ground is the plane under the path up to the first distance from it, and the surface fitted
 to points beyond the second [m].
 """
-BESIDE = 8.0
+FADE_WIDTH = 8.0
 """The surface fitted to points is raised or lowered to meet the path, fading up to this distance
 [m].
 """
@@ -332,13 +332,13 @@ def _through_path(surface: Ground, distance: NDArray[np.float32], path: DrivenPa
     """
     from scipy.ndimage import gaussian_filter1d
 
-    near = np.flatnonzero(distance.ravel() < BESIDE + surface.cell)
+    near = np.flatnonzero(distance.ravel() < FADE_WIDTH + surface.cell)
     xy = surface.centres[near]
     apart, nearest = path.nearest(xy)
     rise = path.driven - surface.height_at(path.points[:, :2])
     rise = gaussian_filter1d(rise, SMOOTHED, mode="nearest")
     inner, outer = UNDER_WHEELS
-    beside = surface.heights.ravel()[near] + _fade(apart, inner, BESIDE) * rise[nearest]
+    beside = surface.heights.ravel()[near] + _fade(apart, inner, FADE_WIDTH) * rise[nearest]
     normal = path.leaning[nearest]
     slope = ((xy - path.points[nearest, :2]) * normal[:, :2]).sum(axis=1) / normal[:, 2]
     under = path.driven[nearest] - slope

@@ -462,17 +462,17 @@ class LaneGraph:
             SceneError: there is no such lane.
         """
         found: list[tuple[str, ...]] = []
-        open_ways: list[tuple[tuple[str, ...], float]] = [
+        open_paths: list[tuple[tuple[str, ...], float]] = [
             ((lane_id,), self.lane(lane_id).length - s)
         ]
-        while open_ways and len(found) < limit:
-            way, reached = open_ways.pop()
+        while open_paths and len(found) < limit:
+            way, reached = open_paths.pop()
             onward = [n for n in self.lanes[way[-1]].successors if n not in way]
             if reached >= length or not onward:
                 found.append(way)
                 continue
             for name in reversed(onward):
-                open_ways.append(((*way, name), reached + self.lanes[name].length))
+                open_paths.append(((*way, name), reached + self.lanes[name].length))
         return found
 
     def route(self, start: str, goal: str, *, change_cost: float = 20.0) -> tuple[str, ...] | None:

@@ -406,7 +406,7 @@ class Accounts:
 
     def __init__(self, *, token: str | None, file: Path | None) -> None:
         self.default = Account(DEFAULT_NAME)
-        self.wants_token = token is not None or file is not None
+        self.needs_token = token is not None or file is not None
         self._file = file
         self._by_name = {DEFAULT_NAME: self.default}
         self._own = {token_hash(token): self.default} if token is not None else {}
@@ -423,7 +423,7 @@ class Accounts:
 
         If the worker requires no token, this is the default account.
         """
-        if not self.wants_token:
+        if not self.needs_token:
             return self.default
         # Looked up by hash, so that the duration reveals nothing about existing tokens.
         return self._by_hash.get(token_hash(given)) if given is not None else None

@@ -116,7 +116,7 @@ def create_app(settings: Settings) -> FastAPI:
     install_problem_handlers(app)
     install_replay_handler(app, worker.replayed)
     app.add_middleware(BodyLimit, limit=settings.max_request_bytes, uploads=uploads)
-    if not settings.wants_token:
+    if not settings.needs_token:
         app.add_middleware(LoopbackOnly)
     app.add_middleware(OwnPagesOnly)
     if settings.traces_url is not None:

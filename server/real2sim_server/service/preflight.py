@@ -131,7 +131,7 @@ def begin_compiling() -> None:
     """Start the second process if there are no kernels of an earlier run. Reads no kernel sources:
     whether the cached ones are valid is checked later."""
     if (os.cpu_count() or 1) > 1 and not _any_on_disk():
-        _begun.append(compile_beside("warm_up"))
+        _begun.append(compile_in_background("warm_up"))
 
 
 def take_begun() -> subprocess.Popen[bytes] | None:
@@ -139,7 +139,7 @@ def take_begun() -> subprocess.Popen[bytes] | None:
     return _begun.pop() if _begun else None
 
 
-def compile_beside(
+def compile_in_background(
     function: str, *arguments: str, package: str = "world", niceness: int = 0
 ) -> subprocess.Popen[bytes]:
     """A process that runs a warm-up of ``package``. Its failure is reported by the later load.
@@ -166,7 +166,7 @@ async def awaited(process: subprocess.Popen[bytes]) -> AsyncIterator[None]:
 
 
 class Counter:
-    """Progress of a process of :func:`compile_beside`.
+    """Progress of a process of :func:`compile_in_background`.
 
     Attributes:
         done: number of kernels that are ready.

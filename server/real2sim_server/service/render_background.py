@@ -34,7 +34,7 @@ from ..scene import Camera
 from .engine import Engine
 from .http.responses import ServiceError
 from .library.scenes import IdleItem, MemoryBudget
-from .preflight import awaited, compile_beside
+from .preflight import awaited, compile_in_background
 
 log = structlog.get_logger(__name__)
 
@@ -84,7 +84,7 @@ class BackgroundCompile:
     async def _make(self) -> None:
         if self._compiles and not await asyncio.to_thread(self._on_disk):
             log.info(COMPILING, of=self._what)
-            beside = compile_beside(
+            beside = compile_in_background(
                 self._warm_up.__name__,
                 *("cpu" for _ in self._arguments),
                 package=self._warm_up.__module__.removeprefix("real2sim_server."),

@@ -41,12 +41,12 @@ YOUNG = 20_000
 reference counting."""
 
 
-def search_seldom() -> None:
+def collect_rarely() -> None:
     """Raise the thresholds, so that collections are many steps apart."""
     gc.set_threshold(YOUNG, *gc.get_threshold()[1:])
 
 
-def spare_what_is_there() -> None:
+def freeze_objects() -> None:
     """Exclude all current objects from collections. Call once, when a worker has started: current
     objects that become cyclic garbage are never freed."""
     gc.collect(1)
@@ -136,7 +136,7 @@ def run(settings: Settings) -> int:
         StateFolderError: another worker uses the state folder, or it is not writable.
         StoreError: the store cannot be opened.
     """
-    check_bind(settings.host, settings.wants_token)
+    check_bind(settings.host, settings.needs_token)
     check_scenes(settings)
     configure_logging(level=settings.log_level, log_format=settings.log_format)
     listener = bind(settings.host, settings.port)
@@ -147,11 +147,11 @@ def run(settings: Settings) -> int:
     server = DrainingServer(server_config(app, settings), worker)
     # A lost device makes the process unusable: it ends, and its supervisor starts a new one.
     worker.engine.on_failure = lambda: setattr(server, "should_exit", True)
-    search_seldom()
-    worker.on_ready = spare_what_is_there
+    collect_rarely()
+    worker.on_ready = freeze_objects
     # The server stops gracefully at a signal and then raises it again for us.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with contextlib.suppress(KeyboardInterrupt), _start_errors_told_once(worker):
+    with contextlib.suppress(KeyboardInterrupt), _start_errors_logged_once(worker):
         server.run(sockets=[listener])
     if worker.start_error is not None:
         raise worker.start_error
@@ -172,7 +172,7 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
         AddressError: the address is in use, or not of this machine.
         RuntimeError: it ended, or was not ready in time; with its reasons.
     """
-    check_bind(settings.host, settings.wants_token)
+    check_bind(settings.host, settings.needs_token)
     check_scenes(settings)
     listener = bind(settings.host, settings.port)
     app = create_app(settings)
@@ -181,7 +181,7 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
     worker: Worker = app.state.worker
 
     def serve() -> None:
-        with _start_errors_told_once(worker):
+        with _start_errors_logged_once(worker):
             server.run(sockets=[listener])
 
     thread = threading.Thread(target=serve, name="worker", daemon=True)
@@ -196,7 +196,7 @@ def running_worker(settings: Settings, *, timeout_s: float = 120.0) -> Iterator[
 
 
 @contextmanager
-def _start_errors_told_once(worker: Worker) -> Iterator[None]:
+def _start_errors_logged_once(worker: Worker) -> Iterator[None]:
     """Report startup errors once, without an additional traceback in the log."""
 
     def is_news(_record: logging.LogRecord) -> bool:

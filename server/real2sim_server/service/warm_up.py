@@ -24,7 +24,7 @@ from ..world import (
     warm_up_planning,
 )
 from ..world import warm_up as warm_up_world
-from .preflight import LOWEST_PRIORITY, Counter, awaited, compile_beside, take_begun
+from .preflight import LOWEST_PRIORITY, Counter, awaited, compile_in_background, take_begun
 
 TELL_EVERY_S = 0.5
 
@@ -72,7 +72,7 @@ class KernelWarmUp:
         """
         try:
             if not planning_on_disk():
-                beside = compile_beside("warm_up_planning", niceness=LOWEST_PRIORITY)
+                beside = compile_in_background("warm_up_planning", niceness=LOWEST_PRIORITY)
                 async with awaited(beside):
                     pass
             await asyncio.to_thread(warm_up_planning)
@@ -89,7 +89,7 @@ class KernelWarmUp:
     async def _run_first(self, warm_up_renderer: Callable[[], Awaitable[None]]) -> None:
         begun = take_begun()
         if begun is not None or (not kernels_on_disk() and (os.cpu_count() or 1) > 1):
-            process = begun or compile_beside("warm_up")
+            process = begun or compile_in_background("warm_up")
             self._beside = Counter(process)
             with _no_collections():
                 async with awaited(process):
@@ -146,7 +146,7 @@ class DeformationKernels:
         try:
             if not await asyncio.to_thread(deformation_on_disk):
                 log.info("compiling kernels of deformation, on the first run only")
-                beside = compile_beside("warm_up_deformation", niceness=LOWEST_PRIORITY)
+                beside = compile_in_background("warm_up_deformation", niceness=LOWEST_PRIORITY)
                 async with awaited(beside):
                     pass
             await asyncio.to_thread(warm_up_deformation)

@@ -35,7 +35,7 @@ from .tyres import TyreReaction, Tyres, advance_on_wheels
 NO_TYRES = Tyres(np.zeros((0, 3)), np.zeros(0), rest=np.zeros(0))
 
 SURFACE_POINTS = 600
-BESIDE = 1.3
+NEIGHBOUR_SPACINGS = 1.3
 """Maximum distance of neighbours in a lattice of particles [spacings]."""
 NEAR_MAX = 4.0
 """Maximum distance of solids in gap queries [m]."""
@@ -578,7 +578,7 @@ def _shell(positions: Float, spacing: float) -> NDArray[np.int64]:
     from scipy.spatial import cKDTree
 
     neighbours = cKDTree(positions).query_ball_point(
-        positions, BESIDE * spacing, return_length=True
+        positions, NEIGHBOUR_SPACINGS * spacing, return_length=True
     )
     shell: NDArray[np.int64] = np.flatnonzero(neighbours < 7)
     return shell

@@ -111,7 +111,7 @@ ELASTIC = 0.03
 """Shortening without folds, as a fraction."""
 KEPT = 0.5
 """Fraction of the largest shortening that stays folded when the body springs back."""
-STEEPEST = 0.75
+MAX_SHORTENING = 0.75
 """Maximum shortening by folds: flanks at 66 degrees."""
 SKIN = (0.25, 0.7)
 """Distances [spacings] to the mean of nearby particles: a point is inside below the first and on
@@ -200,7 +200,7 @@ class Sheet:
 
     def shortening(self, F: Float) -> Float:
         """[G, 3] relative shortening of the sheet along the vehicle axes."""
-        shorter: Float = np.clip(1 - np.linalg.norm(F, axis=1) - ELASTIC, 0.0, STEEPEST)
+        shorter: Float = np.clip(1 - np.linalg.norm(F, axis=1) - ELASTIC, 0.0, MAX_SHORTENING)
         return shorter
 
     def fold(self, body: Deformed, most: Float, rows: NDArray[np.int64]) -> FoldedSheet:
@@ -308,7 +308,7 @@ def _triangle(phase: Float) -> tuple[Float, Float]:
 
 def _lengthened(F: Float, shortened: Float) -> Float:
     """F without the shortening that folds represent."""
-    factors = 1 / np.maximum(1 - shortened, 1 - STEEPEST)
+    factors = 1 / np.maximum(1 - shortened, 1 - MAX_SHORTENING)
     longer: Float = F * factors[:, None, :]
     return longer
 

@@ -28,7 +28,7 @@ from .structure import VEHICLES, preset_of
 PARTICLES = 1000
 """Approximate number of particles per body. Twice as many take twice the time and change residual
 crush by up to a fifth, and the impulse by less. A step of a closed loop waits for the result."""
-FINEST = 0.1
+MIN_SPACING = 0.1
 """Minimum particle spacing [m]."""
 HOOD, UNDER, CABIN = 0.95, 0.2, (0.22, 0.84)
 """Plain vehicle: height of its hood and of its underside [m]; start and end of its cabin, as
@@ -157,7 +157,7 @@ def vehicle_body(
 
 
 def _spacing(size: Sequence[float]) -> float:
-    return max(FINEST, float(np.cbrt(np.prod(size) / PARTICLES)))
+    return max(MIN_SPACING, float(np.cbrt(np.prod(size) / PARTICLES)))
 
 
 def _body(rest: Particles, category: str, spacing: float, friction: float) -> CrashBody:

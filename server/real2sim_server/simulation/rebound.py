@@ -41,7 +41,7 @@ NOTHING = 1e-3
 """Fraction of the previous impulse below which there is none."""
 EXACT = 0.01
 """Tolerance of the separation speed, as a fraction of the approach; no correction within it."""
-SLOWEST = 0.3
+MIN_APPROACH = 0.3
 """Minimum initial approach of a bounce [m/s]."""
 ELASTIC = 0.8
 """Minimum restitution between undamped bodies without a requested one: that of elastic cubes with a
@@ -115,7 +115,7 @@ class _Meeting:
         point, normal: contact point [m], and unit normal towards the body.
         requested: requested restitution.
         still: speed of a collider along the normal, at the start and now [m/s].
-        hands_on: whether no side has a requested restitution; waves then pass without loss between
+        lossless: whether no side has a requested restitution; waves then pass without loss between
             sides that touched before the chain began.
     """
 
@@ -125,7 +125,7 @@ class _Meeting:
     normal: Float
     requested: float
     still: tuple[float, float]
-    hands_on: bool
+    lossless: bool
 
     def apart(self, motions: Mapping[str, RigidMotion]) -> float:
         """Separation speed of the sides, or of the body from a collider [m/s]."""
@@ -275,19 +275,19 @@ class Bounces:
         approaches, after = _one_after_the_other(meetings, before)
         now = {side.name: side.motion for m in meetings for side in m.sides}
         speeds = np.array([m.apart(now) - m.still[1] for m in meetings])
-        if max(approaches) < SLOWEST or (len(meetings) == 1 and speeds[0] <= 0):
+        if max(approaches) < MIN_APPROACH or (len(meetings) == 1 and speeds[0] <= 0):
             return
         give = np.array([m.apart(after) - m.still[0] for m in meetings]) - speeds
         # Impacts that are already elastic enough on the grid remain unchanged.
-        given = [not m.hands_on for m in meetings]
+        given = [not m.lossless for m in meetings]
         if any(given):
             give = np.where(given, give, np.maximum(give, 0.0))
         elif np.all(give <= 0.0) or _kinetic(after) <= _kinetic(now):
             give = np.zeros(len(meetings))
-        if np.all(np.abs(give) < EXACT * np.maximum(approaches, SLOWEST)):
+        if np.all(np.abs(give) < EXACT * np.maximum(approaches, MIN_APPROACH)):
             give = np.zeros(len(meetings))
         for m, approach, speed, more in zip(meetings, approaches, speeds, give, strict=True):
-            if approach >= SLOWEST:
+            if approach >= MIN_APPROACH:
                 self.log.append(
                     Bounce(
                         m.sides[0].name,
@@ -344,13 +344,13 @@ def _one_after_the_other(
     fastest = [0.0] * len(meetings)
     first = [m.still[0] - m.apart(motions) for m in meetings]
     touching = [
-        m.hands_on and a <= EXACT * max(first) for m, a in zip(meetings, first, strict=True)
+        m.lossless and a <= EXACT * max(first) for m, a in zip(meetings, first, strict=True)
     ]
     for _ in range(ROUNDS):
         approaches = [m.still[0] - m.apart(motions) for m in meetings]
         fastest = [max(f, a) for f, a in zip(fastest, approaches, strict=True)]
         k = int(np.argmax(approaches))
-        if approaches[k] <= EXACT * max(*fastest, SLOWEST):
+        if approaches[k] <= EXACT * max(*fastest, MIN_APPROACH):
             break
         m = meetings[k]
         restitution = 1.0 if touching[k] else m.requested
@@ -411,7 +411,7 @@ STRIDE = 0.5
 """Maximum distance between two checks along the path [cells]."""
 SLOW = 0.1
 """Minimum approach speed of an impact [m/s]."""
-USUAL_SPEED = 2.0
+DEFAULT_SPEED = 2.0
 """Approach speed for fitting the restitution of stationary objects [m/s]."""
 
 
@@ -451,7 +451,7 @@ def fit_rebound(
     if touch is None:
         speed = float(np.linalg.norm(body.motion.velocity))
         along = body.motion.velocity / speed if speed > SLOW else body.motion.rotation[:, 0]
-        normal, speed = -along, speed if speed > SLOW else USUAL_SPEED
+        normal, speed = -along, speed if speed > SLOW else DEFAULT_SPEED
         fit = fit_restitution(_still(trial), requested, speed=speed, normal=normal, options=options)
     else:
         trial.motion = touch.motion

@@ -195,7 +195,7 @@ SPEED_MAX = 200.0
 """Maximum speed [m/s]; faster bodies would pass through others within a step."""
 SPIN_MAX = 100.0
 """Maximum angular speed [rad/s]."""
-COARSEST = 4.0
+MIN_PARTICLES_ACROSS = 4.0
 """Minimum number of particles across the shortest side of a body that deforms."""
 PENETRATION_MAX = 0.3
 """Maximum initial penetration [m]; deeper bodies were placed by mistake."""
@@ -319,7 +319,7 @@ def filled_as_wanted(
             f"more than {most:,}; take a smaller grid, fewer objects, or raise max_particles"
         )
     for subject, size in zip(subjects, sizes, strict=True):
-        if size.min() < COARSEST * spacing:
+        if size.min() < MIN_PARTICLES_ACROSS * spacing:
             raise PhysicsError(
                 f"grid {grid} of {finest!r} puts particles {spacing:.2g} m apart, too coarse for "
                 f"{subject.object_id!r} of {size.min():.2g} m; take a larger grid"
@@ -334,7 +334,7 @@ def _limit_particles(preset: Preset, subjects: Sequence[PlacedObject], most: int
     spacing = max(preset.spacing, float(np.cbrt(sizes.prod(axis=1).sum() / most)))
     needed = int(np.ceil(sizes.prod(axis=1).sum() / preset.spacing**3))
     for subject, size in zip(subjects, sizes, strict=True):
-        if spacing > preset.spacing and size.min() < COARSEST * spacing:
+        if spacing > preset.spacing and size.min() < MIN_PARTICLES_ACROSS * spacing:
             raise PhysicsError(
                 f"{len(subjects)} objects would take {needed:,} particles {preset.spacing} m "
                 f"apart; {most:,} of them are {spacing:.2g} m apart, too coarse for "

@@ -140,7 +140,7 @@ second.
 """
 SHARPNESS = 16.0
 """Sharpness of the smooth minimum over time [1/s]."""
-FARTHEST = 100.0
+MAX_MARGIN = 100.0
 """Maximum margin [s], reached at half as many metres."""
 AT_FAULT, PER_SPEED = 0.5, 0.05
 """Criticality of an at-fault collision, and additional criticality per m/s of its speed."""
@@ -187,7 +187,7 @@ class Danger:
 
     adversaries: frozenset[str] = frozenset()
     gap: float = math.inf
-    margin: float = FARTHEST
+    margin: float = MAX_MARGIN
     _margins: list[float] = field(default_factory=list)
 
     def add(self, world: World) -> None:
@@ -216,7 +216,7 @@ class Danger:
             ego.speed * sin + ego.lateral_speed * cos,
         )
         theirs = (*(values[meant] for values in where), others.velocities[meant])
-        margin = min(float(least_margin(bumper, velocity, theirs, PER_METRE)), FARTHEST)
+        margin = min(float(least_margin(bumper, velocity, theirs, PER_METRE)), MAX_MARGIN)
         self.margin = min(self.margin, margin)
         self._margins.append(margin)
 
@@ -228,7 +228,7 @@ class Danger:
         """
         if sum(world.accumulator.at_fault.values()):
             return AT_FAULT + PER_SPEED * (world.accumulator.first_impact or 0.0)
-        margins = np.array(self._margins or [FARTHEST])
+        margins = np.array(self._margins or [MAX_MARGIN])
         least = float(margins.min())
         smooth = least - math.log(np.exp(-SHARPNESS * (margins - least)).sum()) / SHARPNESS
         # A collision without fault is not a failure.

@@ -218,7 +218,7 @@ ORDINARY = 3.0
 
 
 @dataclass(frozen=True)
-class Manners:
+class DrivingStatistics:
     """Driving statistics of the log: mean and spread of speed and accelerations.
 
     Attributes:
@@ -229,7 +229,7 @@ class Manners:
     spread: Array | None
 
     @classmethod
-    def of(cls, scene: Scene) -> Manners:
+    def of(cls, scene: Scene) -> DrivingStatistics:
         """Statistics of the objects of a scene and of its recording vehicle."""
         tracks = [o.trajectory for o in scene.objects.values()] + [scene.ego]
         rows = []
@@ -262,11 +262,11 @@ class Watch:
 
     Attributes:
         names: object ids of the adversaries.
-        manners: driving statistics of the log.
+        statistics: driving statistics of the log.
     """
 
     names: frozenset[str]
-    manners: Manners
+    statistics: DrivingStatistics
     _tracks: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     _dt: float = 0.1
     _start_gap: float = math.inf
@@ -302,7 +302,7 @@ class Watch:
             )
             curvature = across / np.maximum(speed[moving], 0.5) ** 2
             found += _beyond(curvature[speed[moving] > 1.0], TIGHTEST)
-            found += 0.2 * self.manners.distance(_features(motion))
+            found += 0.2 * self.statistics.distance(_features(motion))
         return found
 
 
@@ -402,7 +402,7 @@ class Evaluator:
         self, scene: Scene, spaces: Sequence[Space], planner: str, *, seed: int = 0
     ) -> None:
         self.scene, self.spaces, self.planner, self.seed = scene, list(spaces), planner, seed
-        self.manners = Manners.of(scene)
+        self.statistics = DrivingStatistics.of(scene)
         self.done = 0
 
     def dimensions(self, space: int) -> int:
@@ -417,7 +417,7 @@ class Evaluator:
         values = values_at(asked.parameters, inside)
         case = asked.case_at(values)
         drive = Drive.of(case, self.planner, self.seed)
-        watch = Watch(adversaries_of(drive.reset), self.manners)
+        watch = Watch(adversaries_of(drive.reset), self.statistics)
         driven = drive_episode(self.scene, drive, load_planner(self.planner), on_world=watch.add)
         given: dict[str, Any] = {"space": space, "point": inside, "values": values, "drive": drive}
         if driven.world is None or driven.error is not None:

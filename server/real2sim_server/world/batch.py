@@ -18,7 +18,7 @@ from real2sim_proto import ErrorCode
 from real2sim_proto.episode import AgentsSpec, IdmDriver, ResetSpec
 from real2sim_proto.plans import Control, TrajectoryPlan
 
-from ..edit import ObjectState, ScenarioState, compose, things_of
+from ..edit import ObjectState, ScenarioState, compose, instances_of
 from ..geometry import transform_from
 from ..render.types import Instance
 from ..scene import Ground, Scene
@@ -238,7 +238,7 @@ class _Instant:
 
 
 @dataclass(frozen=True, eq=False)
-class ThingsInWorlds:
+class WorldInstances:
     """Render instances of W worlds.
 
     Attributes:
@@ -312,7 +312,7 @@ class BatchWorld:
         first = self._begin(spec.start_us)
         self.objects, self._tracks = tracks_of(self.state, spec)
         self._rows = {o.object_id: k for k, o in enumerate(self.objects)}
-        self._things = things_of(scene, self.state, self.objects)
+        self._instances = instances_of(scene, self.state, self.objects)
         self._road = road_of(scene.ground, first.route, first.context)
         self._vehicle = tuple(vehicle_parameters(spec.ego))
         ego = spec.ego
@@ -446,22 +446,22 @@ class BatchWorld:
         shown_us = min(int(self.times_us[w]), self.scene.end_us)
         return compose(self.scene, self.state, self.agents(w), shown_us)
 
-    def shown(self, worlds: Sequence[int]) -> ThingsInWorlds | None:
+    def shown(self, worlds: Sequence[int]) -> WorldInstances | None:
         """The :meth:`instances` of some worlds as arrays.
 
         None if edits make background or shadows differ between worlds.
         """
-        if self._things is None:
+        if self._instances is None:
             return None
         chosen = np.asarray(worlds, np.int64)
         rows = self._now.objects[chosen]
         present = self._now.present[chosen]
-        poses = np.empty((len(chosen), len(self._things), 4, 4))
+        poses = np.empty((len(chosen), len(self._instances), 4, 4))
         poses[:, 0] = np.eye(4)
         quaternions = np.where(present[..., None], rows[..., 3:7], (1.0, 0.0, 0.0, 0.0))
         poses[:, 1:] = transform_from(rows[..., :3], quaternions)
-        return ThingsInWorlds(
-            things=self._things,
+        return WorldInstances(
+            things=self._instances,
             poses=poses,
             there=np.concatenate([np.ones((len(chosen), 1), np.bool_), present], axis=1),
             times_us=np.minimum(self.times_us[chosen], self.scene.end_us),

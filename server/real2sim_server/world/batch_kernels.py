@@ -20,7 +20,7 @@ from .driving.curve import NO_POSE
 from .driving.entries import advance_vehicle, plan_curve, world_poses
 from .path import nearest_point, next_in_strip, point_at, sharpest_turn, waypoints
 from .scoring.road import off_road
-from .traffic.driver import BACK_TO_LANE, HARDEST, STANDSTILL
+from .traffic.driver import BACK_TO_LANE, MAX_BRAKING, STANDSTILL
 
 # --- Objects -------------------------------------------------------------------------------------
 
@@ -119,7 +119,7 @@ def advance_driver(k, dt, bodies, own, tracks, driver, pose):
     if not math.isinf(free):
         dynamic = speed * headway + speed * (speed - leader_speed) / (2 * math.sqrt(most * braking))
         wish -= ((gap + max(0.0, dynamic)) / max(free, 0.1)) ** 2
-    acceleration = max(most * wish, -HARDEST)
+    acceleration = max(most * wish, -MAX_BRAKING)
     if acceleration < 0 and speed + acceleration * dt <= 0:
         s, speed = s + speed * speed / (-2 * acceleration), 0.0
     else:

@@ -67,9 +67,9 @@ class ControlledTracker:
         """The command for a motion, ``t`` seconds after the start of the reference."""
         return commanded(motion, self.reference.control_law(self.kind), self.spec, since=t)
 
-    def put_back(self, seam: LoopTransform) -> Self:
+    def looped(self, loop: LoopTransform) -> Self:
         """The tracker after a loop reset of the vehicle."""
-        return replace(self, reference=self.reference.put_back(seam))
+        return replace(self, reference=self.reference.looped(loop))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +101,9 @@ class PerfectTracker:
         """The LQR command; used for vehicles pushed by an impact."""
         return commanded(motion, self.reference.control_law(LQR), self.spec, since=t)
 
-    def put_back(self, seam: LoopTransform) -> Self:
+    def looped(self, loop: LoopTransform) -> Self:
         """The tracker after a loop reset of the vehicle."""
-        return replace(self, reference=self.reference.put_back(seam))
+        return replace(self, reference=self.reference.looped(loop))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +161,9 @@ class GearedTracker:
         since = t - leg.begin_us * 1e-6
         return command_in_gear(motion, law, self.spec, since=since, backwards=leg.backwards)
 
-    def put_back(self, seam: LoopTransform) -> Self:
+    def looped(self, loop: LoopTransform) -> Self:
         """The tracker after a loop reset of the vehicle."""
-        legs = [replace(leg, reference=leg.reference.put_back(seam)) for leg in self.legs]
+        legs = [replace(leg, reference=leg.reference.looped(loop)) for leg in self.legs]
         return replace(self, legs=tuple(legs))
 
     def _leg_at(self, at_us: int) -> GearedLeg:
@@ -240,7 +240,7 @@ class Controller(Protocol):
     def command(self, motion: Motion, t: float) -> Command:
         """The command for a motion, ``t`` seconds after the controller's start."""
 
-    def put_back(self, seam: LoopTransform) -> Self:
+    def looped(self, loop: LoopTransform) -> Self:
         """The controller after a loop reset of the ego."""
 
 
@@ -277,7 +277,7 @@ class ConstantCommand:
     def _backwards(self, motion: Motion) -> bool:
         return self.gear == "reverse" if self.gear is not None else motion.reversing
 
-    def put_back(self, seam: LoopTransform) -> Self:
+    def looped(self, loop: LoopTransform) -> Self:
         """Returns itself: a command is independent of the position."""
         return self
 
@@ -297,9 +297,9 @@ class Teleport:
         """Brakes: a teleported vehicle has no controller."""
         return Command(-EMERGENCY_BRAKING, motion.steering)
 
-    def put_back(self, seam: LoopTransform) -> Self:
+    def looped(self, loop: LoopTransform) -> Self:
         """The pose after a loop reset."""
-        x, y, yaw = seam.poses(np.array([self.pose]))[0].tolist()
+        x, y, yaw = loop.poses(np.array([self.pose]))[0].tolist()
         return replace(self, pose=(x, y, yaw))
 
 
@@ -321,12 +321,12 @@ class PendingPlan:
         """The plan if it is a trajectory, else None."""
         return self.plan if isinstance(self.plan, PlannedTrajectory) else None
 
-    def put_back(self, seam: LoopTransform) -> PendingPlan:
+    def looped(self, loop: LoopTransform) -> PendingPlan:
         """The plan after a loop reset of the ego."""
         if isinstance(self.plan, PlannedTrajectory):
-            return replace(self, plan=replace(self.plan, poses=seam.poses(self.plan.poses)))
+            return replace(self, plan=replace(self.plan, poses=loop.poses(self.plan.poses)))
         if isinstance(self.plan, PoseCommand):
-            (x, y), yaw = seam.place(self.plan.x, self.plan.y), self.plan.yaw + seam.turn
+            (x, y), yaw = loop.place(self.plan.x, self.plan.y), self.plan.yaw + loop.turn
             return replace(self, plan=self.plan.model_copy(update={"x": x, "y": y, "yaw": yaw}))
         return self
 
@@ -403,11 +403,11 @@ class EgoController:
             t_us = until
         return current, motion
 
-    def put_back(self, seam: LoopTransform) -> EgoController:
+    def looped(self, loop: LoopTransform) -> EgoController:
         """The controller and its plans after a loop reset of the ego."""
-        controller = self.controller.put_back(seam) if self.controller is not None else None
-        pending = tuple(plan.put_back(seam) for plan in self.pending)
-        single = self.single and self.single.put_back(seam)
+        controller = self.controller.looped(loop) if self.controller is not None else None
+        pending = tuple(plan.looped(loop) for plan in self.pending)
+        single = self.single and self.single.looped(loop)
         return replace(self, controller=controller, pending=pending, single=single)
 
     def command(self, motion: Motion, t_us: int) -> Command:

@@ -168,11 +168,11 @@ SPACING, FADED = 2.0, 160.0
 MAX_ROUTE = 100_000.0
 """Maximum length of a route [m]."""
 
-FASTEST = 15.0
+MIN_ROUTE_SPEED = 15.0
 """Minimum speed for which an extended route is long enough [m/s]; 1.5 times the highest recorded
 speed, if greater."""
 
-SHORTEST_LOOP = 20.0
+MIN_LOOP_LENGTH = 20.0
 """Minimum length of a recorded drive for a loop [m]."""
 
 STANDING = 2.0
@@ -189,15 +189,15 @@ def driven_route(scene: Scene, spec: ResetSpec, horizon: int) -> LoggedPath:
     if spec.beyond_log == "end":
         return recorded
     spawn = spec.agents.spawn
-    if spec.beyond_log == "loop" and recorded.length < SHORTEST_LOOP:
+    if spec.beyond_log == "loop" and recorded.length < MIN_LOOP_LENGTH:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
             f"the recorded drive is {recorded.length:.1f} m long, too short to be driven in a loop",
-            hint=f"a loop takes {SHORTEST_LOOP:g} m; choose beyond_log 'extend'",
+            hint=f"a loop takes {MIN_LOOP_LENGTH:g} m; choose beyond_log 'extend'",
         )
     reach = max(FADED, spawn.ahead + spawn.margin if spawn is not None else 0.0)
     if spec.beyond_log == "extend":
-        speed = max(1.5 * highest_speed(scene.ego), FASTEST)
+        speed = max(1.5 * highest_speed(scene.ego), MIN_ROUTE_SPEED)
         reach = min(max(horizon * spec.dt_us * 1e-6 * speed, reach), MAX_ROUTE)
     return continued(recorded, reach, scene.ground)
 
@@ -324,14 +324,14 @@ class LoopReset(NamedTuple):
         laps: number of completed laps.
         way: total length of these laps [m].
         motion, point: motion of the ego after the reset, and its route position.
-        seam: transform from before to after the reset.
+        loop: transform from before to after the reset.
     """
 
     laps: int
     way: float
     motion: Motion
     point: PathPoint
-    seam: LoopTransform
+    loop: LoopTransform
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +372,7 @@ class EpisodeRoute:
             return state.tracks
         return tracks_beyond_log(state, self.until_us, self._prolonged, left=left)
 
-    def put_back(self, motion: Motion, point: PathPoint) -> LoopReset | None:
+    def looped(self, motion: Motion, point: PathPoint) -> LoopReset | None:
         """The reset of a loop if the ego has reached its end, else None."""
         laps = max(math.floor(point.s / self.lap_length), 0)
         if laps == 0:

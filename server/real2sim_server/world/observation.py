@@ -46,14 +46,14 @@ class PendingStep(NamedTuple):
         plan: new trajectory of the ego, or None.
         events: events of the move.
         contacts: contacts of its impacts; None without collision response.
-        seam: loop reset before the move, or None.
+        loop: loop reset before the move, or None.
     """
 
     start: StepStart
     plan: PlannedTrajectory | None
     events: tuple[Event, ...]
     contacts: StepContacts | None
-    seam: LoopTransform | None = None
+    loop: LoopTransform | None = None
 
 
 LANE_LENGTH = 5.0

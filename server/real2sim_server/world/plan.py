@@ -74,7 +74,9 @@ class PlannedTrajectory:
         if len(self.poses) < 2:
             return False
         return (
-            self.is_clear or _leads_ahead(self.poses) or float(ways_along(self.poses).min()) >= 0.0
+            self.is_clear
+            or _leads_ahead(self.poses)
+            or float(distances_along(self.poses).min()) >= 0.0
         )
 
     def after(self, t_us: int) -> PlannedTrajectory:
@@ -90,7 +92,7 @@ class PlannedTrajectory:
 def _leads_ahead(poses: Float) -> bool:
     """Quick test whether a short plan clearly leads forwards, as nearly all plans do.
 
-    Twice as fast as the arrays of :func:`ways_along`.
+    Twice as fast as the arrays of :func:`distances_along`.
     """
     if len(poses) > FEW:
         return False
@@ -104,7 +106,7 @@ def _leads_ahead(poses: Float) -> bool:
     return True
 
 
-def ways_along(poses: Float) -> Float:
+def distances_along(poses: Float) -> Float:
     """[..., N - 1] distances between consecutive poses [..., N, 3] along their mean heading [m]."""
     x, y, yaw = poses[..., 0], poses[..., 1], poses[..., 2]
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -151,12 +153,12 @@ class SinglePose(NamedTuple):
         """
         if not 0 < at_us - self.at_us <= MAX_GAP_US:
             return None
-        way = ways_along(np.array([self[1:], pose]))
+        way = distances_along(np.array([self[1:], pose]))
         return way.item() / ((at_us - self.at_us) * 1e-6)
 
-    def put_back(self, seam: LoopTransform) -> SinglePose:
+    def looped(self, loop: LoopTransform) -> SinglePose:
         """The pose after a loop reset of the vehicle."""
-        return SinglePose(self.at_us, *seam.poses(np.array([self[1:]]))[0].tolist())
+        return SinglePose(self.at_us, *loop.poses(np.array([self[1:]]))[0].tolist())
 
 
 class ReferenceTrajectory:
@@ -201,12 +203,12 @@ class ReferenceTrajectory:
         _, x, y, yaw, _, _ = self._curve[0][-1].tolist()
         return x, y, yaw
 
-    def put_back(self, seam: LoopTransform) -> ReferenceTrajectory:
+    def looped(self, loop: LoopTransform) -> ReferenceTrajectory:
         """The curve after a loop reset of the vehicle."""
         knots = self._curve[0].copy()
-        knots[:, 1:4] = seam.poses(knots[:, 1:4])
+        knots[:, 1:4] = loop.poses(knots[:, 1:4])
         # Tangents are only rotated.
-        vx, vy, cos, sin = knots[:, 4], knots[:, 5], math.cos(seam.turn), math.sin(seam.turn)
+        vx, vy, cos, sin = knots[:, 4], knots[:, 5], math.cos(loop.turn), math.sin(loop.turn)
         knots[:, 4:6] = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
         moved = copy.copy(self)
         moved._curve = (knots, *self._curve[1:])
@@ -275,7 +277,7 @@ def legs_of(
         return (Leg(backwards, trajectory),)
     if not motion.reversing and trajectory.leads_forwards:
         return (Leg(False, trajectory),)
-    turns = _turns(ways_along(poses), backwards=motion.reversing)
+    turns = _turns(distances_along(poses), backwards=motion.reversing)
     legs = []
     for k, (begin, backwards) in enumerate(turns):
         end = turns[k + 1][0] if k + 1 < len(turns) else len(poses) - 1
@@ -300,7 +302,7 @@ def may_lead_backwards(plans: Float) -> NDArray[np.bool_]:
         x, y, yaw = plans[:, 0].T
         behind: NDArray[np.bool_] = np.less(x * (1 + np.cos(yaw)) + y * np.sin(yaw), 0.0)
         return behind
-    against: NDArray[np.bool_] = np.any(ways_along(plans) < 0, axis=1)
+    against: NDArray[np.bool_] = np.any(distances_along(plans) < 0, axis=1)
     return against
 
 

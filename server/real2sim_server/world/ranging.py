@@ -70,7 +70,7 @@ def in_frame(points: Float, frame: str, T_vehicle_sensor: Float) -> NDArray[np.f
     return points.astype(np.float32)
 
 
-SHORTEST_US = 100_000
+MIN_HISTORY_US = 100_000
 """Minimum duration of the history, whatever the sensors [us]."""
 
 
@@ -105,7 +105,7 @@ class MotionHistory:
     @classmethod
     def of(cls, longest_us: int) -> MotionHistory:
         """An empty history for an episode whose sweeps take up to ``longest_us``."""
-        return cls(max(longest_us, SHORTEST_US))
+        return cls(max(longest_us, MIN_HISTORY_US))
 
     def after(self, segment: MotionSegment) -> MotionHistory:
         """The history with one more step."""

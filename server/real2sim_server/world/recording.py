@@ -61,7 +61,7 @@ from .world import World
 # All values are validated on reading: scoring kernels do not check indices, so shapes, lengths and
 # values must be right.
 
-MAX_WAY_M = 1e6
+MAX_LENGTH_M = 1e6
 """Maximum length of a route or lane [m]; they are divided into segments of less than a metre."""
 
 MAX_NUMBER = 1e12
@@ -87,8 +87,8 @@ def instant_row(instant: Instant, digest: str) -> dict[str, Any]:
     }
     if instant.plan is not None:
         row["plan"] = [instant.plan.times_us.tolist(), instant.plan.poses.tolist()]
-    if instant.seam is not None:
-        row["seam"] = list(instant.seam)
+    if instant.loop is not None:
+        row["seam"] = list(instant.loop)
     if instant.signals:
         row["signals"] = [[s.signal_id, s.state, s.stop_line] for s in instant.signals]
     return row
@@ -120,7 +120,7 @@ def read_instant(row: Mapping[str, Any]) -> tuple[Instant, str]:
         contacts=tuple(_contact(c) for c in _list(row["contacts"])),
         secondary=_integer(row["secondary"]),
         plan=_plan(row["plan"]) if "plan" in row else None,
-        seam=LoopTransform(*_numbers(row["seam"], (3,), "seam").tolist())
+        loop=LoopTransform(*_numbers(row["seam"], (3,), "seam").tolist())
         if "seam" in row
         else None,
         signals=tuple(_signal(s) for s in _list(row.get("signals", []))),
@@ -161,8 +161,8 @@ def read_context(fields: Mapping[str, Any]) -> ScoringContext:
 def _way(value: Any, what: str) -> Float:
     points = _numbers(value, (None, 2), what)
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-    if length > MAX_WAY_M:
-        raise ValueError(f"a {what} of {length:.0f} m; allowed are {MAX_WAY_M:.0f} m")
+    if length > MAX_LENGTH_M:
+        raise ValueError(f"a {what} of {length:.0f} m; allowed are {MAX_LENGTH_M:.0f} m")
     return points
 
 

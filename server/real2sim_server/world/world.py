@@ -156,7 +156,7 @@ class World:
         self._edit_events: tuple[Event, ...] = ()
         self._pending: PendingStep | None = None
         self._context = scoring_context(scene, spec, self._clock, self._path, self._path_point.s)
-        self._seam: LoopTransform | None = None
+        self._last_loop: LoopTransform | None = None
         self.instant = self._instant(StepContacts())
         self.accumulator: MetricAccumulator = scoring.begin_accumulator(self.instant, self._context)
 
@@ -257,7 +257,7 @@ class World:
             self.spec.randomization.latency_us if plan is not None else 0, self._draws, self.steps
         )
         controller = self._with_plan(plan, latency_us, jitter_us)
-        controller, loop_events = self._put_back(controller)
+        controller, loop_events = self._loop(controller)
         trajectory = controller.pending[-1].trajectory if plan is not None else None
         controller, late_events = self._with_fallback(controller, missed=missed)
         reaction_events = self._let_agents_react()
@@ -280,7 +280,7 @@ class World:
             *reaction_events,
             *storyboard_events,
         )
-        self._pending = PendingStep(start, trajectory, events, contacts, self._seam)
+        self._pending = PendingStep(start, trajectory, events, contacts, self._last_loop)
         self._edit_events = ()
 
     def evaluate(self) -> list[Event]:
@@ -289,12 +289,12 @@ class World:
         It changes nothing visible in images, so they can be rendered concurrently.
         """
         if self._pending is not None:
-            start, plan, events, contacts, seam = self._pending
+            start, plan, events, contacts, loop = self._pending
             self._pending = None
             contacts = self._overlap_contacts(start) if contacts is None else contacts
             if contacts.touching != self._contacts.touching:
                 self._contacts = copy_with(self._contacts, touching=contacts.touching)
-            self.instant = self._instant(contacts, plan, seam)
+            self.instant = self._instant(contacts, plan, loop)
             self.accumulator = scoring.update_accumulator(
                 self.accumulator, self.instant, self._context
             )
@@ -481,10 +481,10 @@ class World:
             controller = replace(controller, controller=brake, since_us=self.t_us, pending=())
         return controller, [Event("deadline_missed", self.t_us)]
 
-    def _put_back(self, controller: EgoController) -> tuple[EgoController, list[Event]]:
+    def _loop(self, controller: EgoController) -> tuple[EgoController, list[Event]]:
         """In a loop, reset an ego at the end of the recorded drive to its start."""
-        put = self._episode_route.put_back(self.motion, self._path_point)
-        self._seam = put.seam if put is not None else None
+        put = self._episode_route.looped(self.motion, self._path_point)
+        self._last_loop = put.loop if put is not None else None
         if put is None:
             return controller, []
         surroundings = self._surroundings(self.agents)
@@ -493,9 +493,9 @@ class World:
         self.T_world_body = tilted(self.T_world_vehicle, self._attitude, self.spec.ego)
         self.lap += put.laps
         self._tracks = self._tracks_of(self.state)
-        self.traffic = self.traffic.put_back(self._tracks, surroundings, put.way)
-        data = {"lap": float(self.lap), **put.seam._asdict()}
-        return controller.put_back(put.seam), [Event("looped", self.t_us, data=data)]
+        self.traffic = self.traffic.looped(self._tracks, surroundings, put.way)
+        data = {"lap": float(self.lap), **put.loop._asdict()}
+        return controller.looped(put.loop), [Event("looped", self.t_us, data=data)]
 
     def _let_agents_react(self) -> list[Event]:
         """Switch objects from replay to reactive driving once the ego is too far off its log."""
@@ -716,7 +716,7 @@ class World:
         self,
         contacts: StepContacts,
         plan: PlannedTrajectory | None = None,
-        seam: LoopTransform | None = None,
+        loop: LoopTransform | None = None,
     ) -> Instant:
         height = float(self.T_world_vehicle[2, 3])
         laps = self.lap * self._episode_route.lap_length if self.lap else 0.0
@@ -728,7 +728,7 @@ class World:
             contacts=contacts.records,
             secondary=contacts.secondary,
             plan=plan,
-            seam=seam,
+            loop=loop,
             signals=self._signals(),
         )
 

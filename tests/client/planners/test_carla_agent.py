@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from real2sim.planners import load_planner, needs_of
-from real2sim.planners._carla import STAND_INS, PinholeView, VehicleControl, lookup_of
+from real2sim.planners._carla import STUBS, PinholeView, VehicleControl, lookup_of
 from real2sim.planners.carla_agent import (
     CarlaAgent,
     camera_rotation,
@@ -175,7 +175,7 @@ def test_installed_modules_are_left_alone(agent_file, monkeypatch):
     CarlaAgent(str(agent_file))
 
     assert sys.modules["carla"] is own
-    assert set(STAND_INS) <= set(sys.modules)
+    assert set(STUBS) <= set(sys.modules)
 
 
 def test_the_route_is_carlas(planner):

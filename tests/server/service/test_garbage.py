@@ -6,7 +6,7 @@ import gc
 
 import pytest
 
-from real2sim_server.service.serve import search_seldom, spare_what_is_there
+from real2sim_server.service.serve import collect_rarely, freeze_objects
 
 
 @pytest.fixture(autouse=True)
@@ -19,7 +19,7 @@ def settings_of_before():
 
 def test_what_was_there_at_the_start_is_searched_through_no_more():
     there = [[] for _ in range(1000)]
-    spare_what_is_there()
+    freeze_objects()
     assert gc.get_freeze_count() >= len(there)
 
 
@@ -30,8 +30,8 @@ def test_many_steps_pass_between_searches_and_later_garbage_is_found_still():
         def __init__(self) -> None:
             self.own = self
 
-    search_seldom()
+    collect_rarely()
     assert gc.get_threshold()[0] > 100 * 100
-    spare_what_is_there()
+    freeze_objects()
     Knot()
     assert gc.collect() > 0

@@ -151,7 +151,7 @@ def test_kernels_that_the_other_process_has_made_ready_count(monkeypatch):
 
 
 def test_the_other_process_tells_how_many_it_has_made_ready(worker_kernels):
-    process = preflight.compile_beside("warm_up")
+    process = preflight.compile_in_background("warm_up")
     written, _ = process.communicate(timeout=LIMIT_S)
     assert written.split()[-2:] == [b"28", b"28"]
 
@@ -182,7 +182,7 @@ def test_what_names_the_kernel_on_disk_names_it_as_numba_does():
 
 def test_a_worker_that_ends_early_takes_the_second_process_with_it(monkeypatch):
     monkeypatch.setattr(preflight, "_PROGRAM", "import time; time.sleep(3600)")
-    process = preflight.compile_beside("warm_up")
+    process = preflight.compile_in_background("warm_up")
     monkeypatch.setattr(preflight, "_begun", [process])
 
     async def ended_early() -> None:

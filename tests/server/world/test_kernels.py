@@ -312,7 +312,7 @@ def test_comfort_looked_at_once_is_that_of_both(history):
         with_history = with_history.updated(speed, yaw, dt)
     shared = alone = (ComfortAccumulator(), with_history)
     for speed, yaw in numbers[history:].tolist():
-        shared = shared[0].updated_beside(shared[1], speed, yaw, dt)
+        shared = shared[0].updated_with(shared[1], speed, yaw, dt)
         alone = tuple(comfort.updated(speed, yaw, dt) for comfort in alone)
         for one, other in zip(shared, alone, strict=True):
             assert (one.samples == other.samples).all()

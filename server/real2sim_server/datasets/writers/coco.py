@@ -38,7 +38,7 @@ COCO_NAMES = {"pedestrian": "person", "traffic_light": "traffic light"}
 STUFF_FROM = 200
 """A category of the background is this plus its semantic class."""
 
-THINGS_FROM = 1 << 16
+INSTANCES_FROM = 1 << 16
 """The panoptic id of an object is this plus its number; the id of background is its category."""
 
 QUALITY = 95
@@ -173,7 +173,7 @@ class _Split:
         for subject in frame["objects"]:
             own = instance == subject["instance_id"]
             if own.any():
-                segment = THINGS_FROM + subject["instance_id"]
+                segment = INSTANCES_FROM + subject["instance_id"]
                 ids[own] = segment
                 category[segment] = self._category(subject["category"])
         segments = [

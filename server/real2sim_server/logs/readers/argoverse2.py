@@ -111,11 +111,11 @@ class Argoverse2Reader:
                 "frames_without_all_images": len(times_us) - len(frames),
             },
             image_times_us=image_times,
-            logged_map=_map_beside(folder, T_world_city),
+            logged_map=_find_map(folder, T_world_city),
         )
 
 
-def _map_beside(folder: Path, T_world_city: Float) -> LoggedMap | None:
+def _find_map(folder: Path, T_world_city: Float) -> LoggedMap | None:
     maps = folder / "map"
     return LoggedMap(maps, T_world_city) if any(maps.glob("log_map_archive_*.json")) else None
 

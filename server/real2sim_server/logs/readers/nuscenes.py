@@ -114,11 +114,11 @@ class NuScenesReader:
                 "frames_without_all_images": len(front) - len(times_us),
             },
             image_times_us=matched.times_us,
-            logged_map=_map_beside(path, folder, tables.row("scene", scenes[name]), ego.to_log),
+            logged_map=_find_map(path, folder, tables.row("scene", scenes[name]), ego.to_log),
         )
 
 
-def _map_beside(
+def _find_map(
     root: Path, folder: Path, scene: Mapping[str, Any], T_world_map: Float
 ) -> LoggedMap | None:
     """The map expansion of a scene's location, if it was unpacked next to the tables."""

@@ -150,7 +150,7 @@ class _Unpickler(pickle.Unpickler):
     """
 
     def find_class(self, module: str, name: str) -> Any:
-        found = _STAND_INS.get((module.replace("numpy._core", "numpy.core"), name))
+        found = _STUBS.get((module.replace("numpy._core", "numpy.core"), name))
         if found is None:
             raise pickle.UnpicklingError(f"it contains {module}.{name}, which is not an array")
         return found
@@ -234,7 +234,7 @@ def _type_of(text: Any, align: Any = False, copy: Any = False) -> _Type:
     return _Type(text)
 
 
-_STAND_INS: Final = {
+_STUBS: Final = {
     ("numpy", "ndarray"): _ArrayClass(),
     ("numpy", "dtype"): _type_of,
     ("numpy.core.multiarray", "_reconstruct"): _reconstruct,

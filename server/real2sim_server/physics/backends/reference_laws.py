@@ -358,21 +358,21 @@ def first_touch(solid: Solid, x: Tensor, way: Tensor, half: Tensor) -> tuple[Ten
     at_once = gap < -near
     if not solid.separable:
         at_once = at_once | (gap <= near)
-    open_ways = ~at_once
+    pending = ~at_once
     found = torch.where(at_once, t, torch.full_like(t, MISSES))
     for _ in range(LOOKS):
         inward = -(way * n).sum(-1)
-        reached = open_ways & (gap <= near)
+        reached = pending & (gap <= near)
         met = reached & (inward > 0)
         found = torch.where(met, t, found)
         n = torch.where(met[:, None], _face_on(solid, way / length[:, None], n, half), n)
-        open_ways = open_ways & ~reached
-        t = torch.where(open_ways, t + gap / length, t)
-        open_ways = open_ways & (t <= 1.0)
+        pending = pending & ~reached
+        t = torch.where(pending, t + gap / length, t)
+        pending = pending & (t <= 1.0)
         distance, ahead = collider_distance(solid, x + t[:, None] * way)
-        n = torch.where(open_ways[:, None], ahead, n)
-        gap = torch.where(open_ways, distance - half, gap)
-    return torch.where(open_ways, t, found), n
+        n = torch.where(pending[:, None], ahead, n)
+        gap = torch.where(pending, distance - half, gap)
+    return torch.where(pending, t, found), n
 
 
 def _face_on(solid: Solid, along: Tensor, n: Tensor, half: Tensor) -> Tensor:

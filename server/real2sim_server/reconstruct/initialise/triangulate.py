@@ -16,7 +16,7 @@ from ..logged_view import resized, still_surfaces
 
 # Triangulation of features matched between known poses.
 
-WIDEST = 1280
+MAX_WIDTH = 1280
 """Images are made smaller to this width [px]."""
 FEATURES = 4000
 """Features of an image at most, the strongest."""
@@ -130,7 +130,7 @@ def _pose(log: DrivingLog, camera: Camera, frame: int) -> Float:
 def _features(log: DrivingLog, camera: Camera, frame: int) -> _Features:
     import cv2
 
-    small = camera.resized(min(WIDEST, camera.width))
+    small = camera.resized(min(MAX_WIDTH, camera.width))
     image = resized(log.image(camera.name, frame), small)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     free = still_surfaces(log, small, frame, image)

@@ -116,7 +116,7 @@ class Part(IntEnum):
     OTHER = 9
 
 
-USUAL: dict[Part, tuple[float, float, float]] = {
+DEFAULT_COLOURS: dict[Part, tuple[float, float, float]] = {
     Part.GLASS: (0.2, 0.23, 0.27),
     Part.TRIM: (0.13, 0.13, 0.14),
     Part.TYRE: (0.1, 0.1, 0.1),
@@ -134,10 +134,10 @@ PAINTED = (Part.PAINT, Part.CARGO)
 """Parts in a vehicle's own paints."""
 
 
-def usual_palette() -> Colours:
+def default_palette() -> Colours:
     """Default colours [10, 3] by part; 0 for parts without a default."""
     palette = np.zeros((len(Part), 3), dtype=np.float32)
-    for part, colour in USUAL.items():
+    for part, colour in DEFAULT_COLOURS.items():
         palette[part] = colour
     return palette
 
@@ -151,7 +151,7 @@ def fit_palette(
         parts: per vehicle, [N] parts of the seen points.
         colours: per vehicle, [N, 3] of these points, without the light.
     """
-    palette = usual_palette()
+    palette = default_palette()
     for part in FITTED:
         members = [c[p == part] for p, c in zip(parts, colours, strict=True)]
         shown = [modal_colour(c) for c in members if len(c) >= MIN_OBSERVED]
@@ -188,7 +188,7 @@ def with_paints(
 def palette_of(reconstruction: object) -> Colours:
     """The palette [10, 3] in a scene's provenance; the default one if it is missing."""
     known = reconstruction.get(PARTS) if isinstance(reconstruction, dict) else None
-    palette = usual_palette()
+    palette = default_palette()
     if known is not None:
         palette[: len(known)] = np.asarray(known, dtype=np.float32)
     return palette

@@ -19,7 +19,7 @@ from ...scene.range_sensors import wrapped
 
 FAR = 250.0
 """Recorded points beyond this range are dropped [m]."""
-SEES_ALL = Detection(range_m=2000.0, reflectivity=1e-6)
+DETECTS_ALL = Detection(range_m=2000.0, reflectivity=1e-6)
 """The limit of the sensor is unknown; the scene determines where beams are lost."""
 
 
@@ -79,7 +79,7 @@ def recorded_rays(log: DrivingLog, frame: int) -> RecordedRays | None:
         T_vehicle_lidar=_shift(sweep.origin),
         min_range=0.1,
         max_range=FAR,
-        detection=SEES_ALL,
+        detection=DETECTS_ALL,
     )
     return RecordedRays(lidar, distance[kept], sweep.intensity[kept], world[kept])
 
@@ -97,7 +97,7 @@ def _shift(origin: NDArray[np.float32]) -> Float:
 # about the sensor's axis, the direction of least scatter about the mean. The lasers leave the
 # sensor at different heights, so a ring is the line z = offset + slope rho.
 
-FALLS_BACK = np.pi
+RING_STEP = np.pi
 """A step back by more than this is the begin of a ring [rad]."""
 MIN_RING = 50
 """Fewer points make no ring."""
@@ -196,7 +196,7 @@ def fit_rings(rays: RecordedRays) -> Rings | None:
     turned = rays.lidar.beams.azimuth % (2 * np.pi)
     step = np.diff(turned)
     rises = np.median(step) > 0
-    begins = np.flatnonzero((-step if rises else step) > FALLS_BACK) + 1
+    begins = np.flatnonzero((-step if rises else step) > RING_STEP) + 1
     ring = np.zeros(len(turned), np.int32)
     ring[begins] = 1
     ring = np.cumsum(ring).astype(np.int32)

@@ -38,7 +38,7 @@ OBJECT_VOXEL = 0.05
 MAX_BACKGROUND, MAX_OBJECT = 300_000, 40_000
 MAX_OBJECT_SURFEL = 0.15
 """Scale along surfaces of objects, at most [m]."""
-SMALLEST = 0.004
+MIN_SCALE = 0.004
 """Minimum scale along normals [m]; beams measure to millimetres."""
 FLATTER = 0.3
 """Remaining share of the thickness of neighbourhoods; most of it is noise of single beams."""
@@ -98,7 +98,7 @@ class MeasuredPoints:
             points = thin_to(points, OBJECT_VOXEL, MAX_OBJECT)
             return _filled(
                 points,
-                fit_surfels(points.points, largest=MAX_OBJECT_SURFEL, smallest=SMALLEST),
+                fit_surfels(points.points, largest=MAX_OBJECT_SURFEL, smallest=MIN_SCALE),
                 completion,
                 np.zeros(len(completion), np.float32),
             )
@@ -111,7 +111,7 @@ class MeasuredPoints:
         if len(points):
             distance = path_distance(points.points, self._path)
         largest = (VOXEL + 0.03 + 0.008 * distance).astype(np.float32)
-        surfels = fit_surfels(points.points, largest=largest, smallest=SMALLEST)
+        surfels = fit_surfels(points.points, largest=largest, smallest=MIN_SCALE)
         away = path_distance(completion.means.numpy(), self._path)
         return _filled(points, surfels, completion, away)
 
@@ -196,7 +196,7 @@ WITHOUT_LOOKS = InitialiseOptions(
     lanes="none",
 )
 """Shapes alone, for where no beam measured anything: beams see no colours."""
-GONE = 0.02
+MIN_OPACITY = 0.02
 """Gaussians with less opacity are removed at the end."""
 
 
@@ -281,7 +281,7 @@ def fit_lidar_surfaces(
         table = SurfaceTable.of(points.clouds(surfaces), tuple(surfaces.objects))
     with stages("learn") as report_step:
         cost = learn_surfaces(table, scene, log, sweeps, steps=steps, on_step=report_step)
-    table = table.select(table.opacities > GONE)
+    table = table.select(table.opacities > MIN_OPACITY)
     with stages("light") as report_step:
         lit = light_of(table, scene, log, sweeps, on_sweep=report_step)
     with stages("reflectivity"):

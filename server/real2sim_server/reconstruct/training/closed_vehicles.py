@@ -45,7 +45,7 @@ EDGE_ON = 0.2
 """Gaussians follow the surface up to this cosine between normal and ray; beyond it they face the
 ray.
 """
-THINNEST = 2e-3
+MIN_SPREAD = 2e-3
 """Minimum standard deviation of projected Gaussians [m]."""
 SHADOW = 0.3
 """The ground plate that carries shadows extends this far beyond the box [m]."""
@@ -201,7 +201,7 @@ def _press(
     squares, turns = torch.linalg.eigh(axes @ axes.transpose(1, 2))
     turns = turns * torch.linalg.det(turns).sign()[:, None, None]
     quats = torch.from_numpy(matrix_to_quaternion(turns.numpy()))
-    scales = squares.clamp(min=THINNEST**2).sqrt()
+    scales = squares.clamp(min=MIN_SPREAD**2).sqrt()
     changed = {
         "means": means + rays * (distance * (1 - KEPT_DEPTH))[:, None],
         "quats": quats,

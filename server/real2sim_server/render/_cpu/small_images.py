@@ -585,7 +585,7 @@ def _world_draws(worlds: WorldViews, like: RasterRequest) -> _Draws:
     rows = np.cumsum(filled) - 1
     cameras = len(worlds.Ks)
     shown = np.repeat(worlds.shown & filled, cameras, axis=0)
-    image_of, thing_of = np.nonzero(shown)
+    image_of, instance_of = np.nonzero(shown)
     world_of = image_of // cameras
     viewmats = worlds.viewmats.reshape(-1, 4, 4)
     ids = np.array([thing.instance_id for thing in worlds.things], np.int64)
@@ -598,9 +598,9 @@ def _world_draws(worlds: WorldViews, like: RasterRequest) -> _Draws:
     return _Draws(
         held=held,
         table=table_of(held),
-        tones=_tones(worlds, thing_of, worlds.times_us[world_of]),
-        draws=np.stack([rows[thing_of], ids[thing_of]], axis=1),
-        **_places(viewmats[image_of] @ worlds.poses[world_of, thing_of], scales[thing_of]),
+        tones=_tones(worlds, instance_of, worlds.times_us[world_of]),
+        draws=np.stack([rows[instance_of], ids[instance_of]], axis=1),
+        **_places(viewmats[image_of] @ worlds.poses[world_of, instance_of], scales[instance_of]),
         first_draws=np.append(0, np.cumsum(shown.sum(1))).astype(np.int64),
         views=np.tile(views, (images // cameras, 1)),
         sky_matrices=(
@@ -611,18 +611,18 @@ def _world_draws(worlds: WorldViews, like: RasterRequest) -> _Draws:
 
 
 def _tones(
-    worlds: WorldViews, thing_of: NDArray[np.int64], times_us: NDArray[np.int64]
+    worlds: WorldViews, instance_of: NDArray[np.int64], times_us: NDArray[np.int64]
 ) -> NDArray[np.float32]:
     """Time basis [D, F] of each draw."""
     counts = [
         0 if thing.colour is None else int(thing.colour.coefficients.shape[1])
         for thing in worlds.things
     ]
-    tones = np.zeros((len(thing_of), max(counts, default=0)), np.float32)
+    tones = np.zeros((len(instance_of), max(counts, default=0)), np.float32)
     for k, thing in enumerate(worlds.things):
         if thing.colour is None:
             continue
-        own = thing_of == k
+        own = instance_of == k
         tones[own, : counts[k]] = thing.colour.tones_of(times_us[own])
     return tones
 

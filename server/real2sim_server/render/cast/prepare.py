@@ -252,7 +252,7 @@ PI, HALF_PI, TURN = F32(np.pi), F32(np.pi / 2), F32(2 * np.pi)
 A0, A1, A2, A3, A4, A5 = (F32(a) for a in ARC)
 ROUNDS = 2
 """Iterations for the scan time of a point; each leaves 1/50 of the error."""
-NO_SEAM = 3.5
+SEAMLESS = 3.5
 FIELDS = tuple(field for field in range(RECORD) if field not in {BODY, MEMBER, REFLECTIVITY, LOSS})
 
 
@@ -276,7 +276,7 @@ def prepare_body(body, sensor, layout, base, records):
         for first in range(chunk * CHUNK, stop, LANES):
             count = min(stop - first, LANES)
             gather(body, first, count, planes)
-            pending, seamless = np.int64((1 << count) - 1), layout.seam >= NO_SEAM
+            pending, seamless = np.int64((1 << count) - 1), layout.seam >= SEAMLESS
             seamless = seamless or (body.speed == 0 and body.turn == 0)
             for side in range(3):
                 look(body, layout, count, side, planes)

@@ -398,7 +398,7 @@ def _position(parent: Element, p: Mapping[str, Any]) -> None:
         tag, attributes = _PLAIN[kind](p)
         part = _add(parent, tag, **attributes)
     orientation = p["orientation"]
-    if orientation is not None and orientation != _BESIDE.get(kind):
+    if orientation is not None and orientation != _DEFAULT_ORIENTATIONS.get(kind):
         kind = "relative" if orientation["relative"] else "absolute"
         found = _add(part, "Orientation", type=kind, h=orientation["h"])
         if part.tag in {"RoutePosition", "TrajectoryPosition"}:
@@ -406,7 +406,7 @@ def _position(parent: Element, p: Mapping[str, Any]) -> None:
             part.insert(1, found)
 
 
-_BESIDE = {
+_DEFAULT_ORIENTATIONS = {
     "relative_world": {"h": 0.0, "relative": True},
     "relative_object": {"h": 0.0, "relative": True},
 }

@@ -34,12 +34,12 @@ from ...scene.io import (
     stage_asset,
 )
 from ..http.responses import ServiceError
-from .imports import bears_claim, import_errors, put_claim, staging_folder
+from .imports import has_claim, import_errors, put_claim, staging_folder
 from .scenes import IdleItem, MemoryBudget, Quota, folder_usage
 
 ASSET_SUFFIX = ".r2a"
 
-USUAL_LENGTHS = {
+DEFAULT_LENGTHS = {
     "car": 4.5,
     "van": 5.2,
     "truck": 8.0,
@@ -216,7 +216,7 @@ class AssetLibrary:
 
     def made_by(self, claim: str | None, asset_id: str) -> AssetInfo | None:
         """The asset, if the same request has already created it."""
-        return self.info(asset_id) if bears_claim(self.bundle(asset_id), claim) else None
+        return self.info(asset_id) if has_claim(self.bundle(asset_id), claim) else None
 
     def check_free(self, asset_id: str) -> None:
         """Raises ServiceError: ALREADY_EXISTS if the id is taken."""
@@ -398,7 +398,7 @@ def import_asset(
         "category": upload.category,
         "up_axis": upload.up_axis,
         "yaw": upload.yaw,
-        "length": upload.length or USUAL_LENGTHS.get(upload.category),
+        "length": upload.length or DEFAULT_LENGTHS.get(upload.category),
     }
     with import_errors(source, setting="MAX_ASSET_BYTES"):
         stage_asset(source, staged, asset_id=asset_id, options=options, limits=limits)

@@ -46,7 +46,7 @@ def put_claim(bundle: Path, claim: str | None) -> None:
         (bundle / CLAIM_FILE).write_text(claim, encoding="utf-8")
 
 
-def bears_claim(bundle: Path, claim: str | None) -> bool:
+def has_claim(bundle: Path, claim: str | None) -> bool:
     """Whether the bundle exists and comes from that request, whose reply was not stored."""
     try:
         return claim is not None and (bundle / CLAIM_FILE).read_text(encoding="utf-8") == claim
@@ -108,7 +108,7 @@ def import_scene(
             content, ALREADY_EXISTS if the name is taken, QUOTA_EXCEEDED.
     """
     folder = bundle_folder(scenes, name)
-    if bears_claim(folder, claim):
+    if has_claim(folder, claim):
         return
     _check_name(folder, name)
     quota.check()

@@ -349,7 +349,7 @@ def _made_of(entries: list[dict[str, Any]]) -> dict[str, Any]:
 async def _session_source(worker: Worker, session_id: str, request: Request) -> DatasetSource:
     row = check_not_closed(await worker.sessions.row(session_id))
     # If the worker requires a token, the route has checked one: it opens every session.
-    if not worker.accounts.wants_token and not opens_session(bearer_token(request), row):
+    if not worker.accounts.needs_token and not opens_session(bearer_token(request), row):
         error = unauthorized("the data set of a session wants the session's token")
         error.hint = "send 'Authorization: Bearer <token>'; POST /v1/sessions gave the token"
         raise error

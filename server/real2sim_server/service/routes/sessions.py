@@ -89,11 +89,11 @@ class SessionRoute(TokenRoute):
 async def _check_session_token(request: Request, session_id: str) -> None:
     worker: Worker = request.app.state.worker
     given, accounts = bearer_token(request), worker.accounts
-    if accounts.wants_token and (account := accounts.of_token(given)) is not None:
+    if accounts.needs_token and (account := accounts.of_token(given)) is not None:
         act_for(request, account)
         return
     row = None
-    if given is not None or not accounts.wants_token:
+    if given is not None or not accounts.needs_token:
         # The row is sufficient: no session is rebuilt for unauthorised requests.
         row = check_not_closed(await worker.sessions.row(session_id))
     if row is None or not opens_session(given, row):

@@ -143,7 +143,7 @@ def account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
         ServiceError: UNAUTHORIZED for a wrong token.
     """
     given = bearer_token(socket)
-    if given is None or not worker.accounts.wants_token:
+    if given is None or not worker.accounts.needs_token:
         return None
     account = worker.accounts.of_token(given)
     if account is None:
@@ -154,7 +154,7 @@ def account_of_handshake(socket: WebSocket, worker: Worker) -> Account | None:
 
 def account_of_token(worker: Worker, token: str | None) -> Account | None:
     """The account of a worker's token; None for other tokens."""
-    return worker.accounts.of_token(token) if worker.accounts.wants_token else None
+    return worker.accounts.of_token(token) if worker.accounts.needs_token else None
 
 
 @contextlib.contextmanager

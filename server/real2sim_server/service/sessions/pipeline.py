@@ -32,7 +32,7 @@ from typing import Any, TypeVar
 
 from real2sim_proto.episode import SensorSpec
 
-from ...edit import ScenarioState, compose, instances_at, things_at_start
+from ...edit import ScenarioState, compose, instances_at, instances_at_start
 from ...render import Instance
 from ...scene import Camera, Scene
 from ...world import World
@@ -233,7 +233,7 @@ class StepPipeline:
             ServiceError: OUT_OF_MEMORY.
         """
         sizes = [cameras[sensor.camera] for sensor in sensors]
-        await self._renderer.ready(sensors, sizes, lambda: things_at_start(scene, state))
+        await self._renderer.ready(sensors, sizes, lambda: instances_at_start(scene, state))
 
     async def edit_ready(self, world: World, cameras: Mapping[str, Camera]) -> None:
         """As :meth:`levels_ready` for an edited world, for its current and later objects."""
@@ -242,7 +242,7 @@ class StepPipeline:
         def shown() -> list[Instance]:
             scene, state = world.scene, world.state
             now = compose(scene, state, world.agents, min(world.t_us, scene.end_us))
-            return [*now, *things_at_start(scene, state)]
+            return [*now, *instances_at_start(scene, state)]
 
         await self._renderer.ready(sensors, [cameras[s.camera] for s in sensors], shown)
 
@@ -405,7 +405,7 @@ class StepPipeline:
             QueueFullError: the engine's queue is full.
         """
         cameras = cameras_of(world.scene, sensors, max_pixels=self._max_pixels)
-        things = partial(things_at_start, world.scene, world.state)
+        things = partial(instances_at_start, world.scene, world.state)
         await self._renderer.ready(sensors, cameras, things)
         await self._clouds.ready(ranging, image_bytes=raw_image_bytes(sensors, cameras))
         step = Step(lambda: world, {}, slot=slot, world=world)

@@ -225,7 +225,7 @@ class Sessions:
         self._rebuilding: dict[str, asyncio.Task[Session]] = {}
         self._closing: set[asyncio.Future[None]] = set()
         # All sessions on a bare scene share its objects.
-        self._bare_states: WeakKeyDictionary[Scene, ScenarioState] = WeakKeyDictionary()
+        self._unedited_states: WeakKeyDictionary[Scene, ScenarioState] = WeakKeyDictionary()
         self._warm: WeakSet[Scene] = WeakSet()
         metrics.watch(metrics.sessions, lambda: len(self._open))
 
@@ -576,7 +576,7 @@ class Sessions:
                 if row.scenario_id is not None and row.scenario_revision is not None:
                     state = await state_at(self._scenarios, row.scenario_id, row.scenario_revision)
                 else:
-                    state = await self._bare_state(pinned)
+                    state = await self._unedited_state(pinned)
                 start = EpisodeStart(pinned, summary, state)
                 session = self._session(row, start)
                 await rebuild(session, store=self._store, pipeline=self.pipeline)
@@ -606,7 +606,7 @@ class Sessions:
         pinned = await self._scene_cache.pin(name)
         try:
             summary = await self._scene_cache.summary(name)
-            state = view.state if view is not None else await self._bare_state(pinned)
+            state = view.state if view is not None else await self._unedited_state(pinned)
         except BaseException:
             self._scene_cache.unpin(name)
             raise
@@ -623,12 +623,12 @@ class Sessions:
         )
         return row, EpisodeStart(pinned, summary, state)
 
-    async def _bare_state(self, scene: Scene) -> ScenarioState:
-        state = self._bare_states.get(scene)
+    async def _unedited_state(self, scene: Scene) -> ScenarioState:
+        state = self._unedited_states.get(scene)
         if state is None:
             assets = self._scenarios.assets
             state = await asyncio.to_thread(lambda: ScenarioState.of(scene, assets=assets))
-            self._bare_states[scene] = state
+            self._unedited_states[scene] = state
         return state
 
     async def _evict_idle(self) -> None:

@@ -74,7 +74,7 @@ POINT_BYTES = 40
 """Upper bound for a point with all its columns, or a radar detection [bytes]."""
 
 
-async def mounted_beside(
+async def mount_sensors(
     lidars: Sequence[LidarSpec], radars: Sequence[RadarSpec], dt_us: int
 ) -> RangingSensors:
     """As :func:`.mounted_sensors`, and prepares their rays, off the event loop and the engine.
@@ -95,7 +95,7 @@ async def mounted_beside(
 
 async def looking(world: World, asked: SessionRender | Render) -> RangingSensors:
     """LiDARs and radars of a render request. Raises WorldError: INVALID_REQUEST."""
-    return await mounted_beside(asked.lidars, asked.radars, world.spec.dt_us)
+    return await mount_sensors(asked.lidars, asked.radars, world.spec.dt_us)
 
 
 class WorldClouds:

@@ -34,7 +34,7 @@ from ..storage.connection import FencedError, StoreTroubleError, StoreUnavailabl
 from ..storage.store import SessionEntry, Store, StoredReply
 from ..warm_up import KernelWarmUp
 from .pipeline import EncodedObservation, LogWrite, Step, StepPipeline
-from .sensors import mounted_beside
+from .sensors import mount_sensors
 from .session import NewestPlan, Session
 from .shared_memory import FrameSlot
 from .wire import EncodedMessage
@@ -116,7 +116,7 @@ class Stepper:
         """Cameras of an episode, once everything that its steps would wait for is ready."""
         start = session.start
         cameras = self._pipeline.cameras(start.scene, spec.sensors)
-        ranging = await mounted_beside(spec.lidars, spec.radars, spec.dt_us)
+        ranging = await mount_sensors(spec.lidars, spec.radars, spec.dt_us)
         await self._pipeline.ranging_ready(ranging, spec.sensors, cameras)
         await self._kernels.ready(spec)
         await self._pipeline.levels_ready(start.scene, start.state, spec.sensors, cameras)

@@ -196,7 +196,7 @@ HARD_SHARE = 0.05
 AFTERWARDS = 0.25
 """Time of the still between the impact and the end, as a fraction of the time from impact to end.
 """
-WAY_PLACES = 8
+PATH_POSES = 8
 """Number of positions of a moving camera at which occluding background is searched."""
 CLEAR = 0.8
 """Radius cleared around a near camera, as a fraction of its distance from the focus."""
@@ -286,7 +286,7 @@ def _before(
     Removes trees, posts and the like along the camera's path.
     """
     means = cloud.means.detach().cpu().numpy()
-    way = np.zeros((1, 3)) if moved is None else moved[:: max(len(moved) // WAY_PLACES, 1)]
+    way = np.zeros((1, 3)) if moved is None else moved[:: max(len(moved) // PATH_POSES, 1)]
     near = np.zeros(len(means), dtype=bool)
     for step in way:
         near |= np.linalg.norm(means - (viewer + step), axis=1) < CLEAR * plan.distance

@@ -582,7 +582,7 @@ def _pair(request: Request) -> Experiment:
         target[:3, 3] += (0.25 - 0.5 * (k % 2)) * hit.scaled_size[1] * np.cross([0, 0, 1], forward)
         target[2, 3] += (hit.scaled_size[2] - runner.scaled_size[2]) / 2
         sizes = np.asarray(runner.scaled_size), np.asarray(hit.scaled_size)
-        shift = _way_aside([(own, sizes[0]), (target, sizes[1])], placed, forward)
+        shift = _lateral_shift([(own, sizes[0]), (target, sizes[1])], placed, forward)
         own, target = _moved(own, shift), _moved(target, shift)
         placed += [(own, sizes[0]), (target, sizes[1])]
         objects[runner.object_id] = ObjectPhysics(velocity=speed * forward, T_world_object=own)
@@ -607,7 +607,7 @@ def _pair(request: Request) -> Experiment:
     )
 
 
-def _way_aside(
+def _lateral_shift(
     pair: Sequence[tuple[Float, Float]], placed: Sequence[tuple[Float, Float]], forward: Float
 ) -> Float:
     """Shortest lateral shift [3] that separates a pair's boxes from all placed ones [m]."""

@@ -42,7 +42,7 @@ from .solver_state import (
 
 # Bodies that pass through each other's corner between two substeps.
 
-SLOWEST = 0.05
+MIN_MOTION = 0.05
 """Minimum relative motion in a substep that needs this check [m]."""
 
 HEIGHT = 1.0
@@ -58,7 +58,7 @@ def crossing(first: Way, second: Way, shapes: tuple[BodyProperties, BodyProperti
     inf if they never do or hardly move relative to each other.
     """
     (a, b), (c, d) = first, second
-    if math.hypot((b.x - a.x) - (d.x - c.x), (b.y - a.y) - (d.y - c.y)) < SLOWEST:
+    if math.hypot((b.x - a.x) - (d.x - c.x), (b.y - a.y) - (d.y - c.y)) < MIN_MOTION:
         return math.inf
     ego, other = shapes
     way = np.array([(k, *_centre(body, ego), body.yaw, 0.0) for k, body in enumerate(first)])

@@ -257,7 +257,7 @@ class _Sweep:
         self._low = _height(start.T_world_vehicle, self._axle)
         self._low_after = _height(T_world_vehicle, self._axle)
         self._rows = rows_in(start.agents, agents)
-        self._rough = self._way([start.motion, motion])
+        self._rough = self._motion_rows([start.motion, motion])
         self._exact: Float | None = self._rough
         self._slack = 0.0
         if start.at is not None and start.dt_us > PIECE_US:
@@ -341,14 +341,14 @@ class _Sweep:
             assert at is not None
             pieces = -(-dt_us // PIECE_US)
             between = [at(dt_us * k // pieces) for k in range(1, pieces)]
-            self._exact = self._way([self._start.motion, *between, self._motion])
+            self._exact = self._motion_rows([self._start.motion, *between, self._motion])
         return self._exact
 
     @property
     def _axle(self) -> float:
         return self._size[0] / 2 - REAR_OVERHANG
 
-    def _way(self, motions: list[Motion]) -> Float:
+    def _motion_rows(self, motions: list[Motion]) -> Float:
         """Rows for the kernels, evenly spaced over the step."""
         rows, yaw, axle, last = [], motions[0].yaw, self._axle, len(motions) - 1
         for k, motion in enumerate(motions):

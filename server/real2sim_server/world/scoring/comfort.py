@@ -116,7 +116,7 @@ PLAN_BOUNDS = (0.7, 0.5, 0.1, 0.1)
 (NAVSIM v2, extended comfort)."""
 
 PLAN_STEP = 0.1
-SHORTEST_OVERLAP = 6
+MIN_OVERLAP = 6
 """Minimum number of common times for a comparison."""
 
 
@@ -186,7 +186,7 @@ def plans_alike(times_a, poses_a, times_b, poses_b):
     """
     first, last = max(times_a[0], times_b[0]), min(times_a[-1], times_b[-1])
     count = int((last - first) * 1e-6 / PLAN_STEP + 1e-6) + 1
-    if count < SHORTEST_OVERLAP:
+    if count < MIN_OVERLAP:
         return -1
     poses_a, poses_b = poses_a.copy(), poses_b.copy()
     make_continuous(poses_a)
@@ -322,7 +322,7 @@ class ComfortAccumulator:
         """[n, 2] float64, the rows of the window."""
         return self.window.rows
 
-    def begun_anew(self) -> ComfortAccumulator:
+    def restarted(self) -> ComfortAccumulator:
         """The accumulator with the same samples and reset results."""
         return ComfortAccumulator(self.window)
 
@@ -330,7 +330,7 @@ class ComfortAccumulator:
         """The accumulator one clock step later."""
         return self._with(*_newest(self.window, speed, yaw, dt))
 
-    def updated_beside(
+    def updated_with(
         self, other: ComfortAccumulator, speed: float, yaw: float, dt: float
     ) -> tuple[ComfortAccumulator, ComfortAccumulator]:
         """This accumulator and another one after one more clock step.
@@ -414,7 +414,7 @@ STEP_S = 0.1
 """Minimum interval [s]; shorter clock steps are combined, because position noise would look like
 acceleration."""
 
-SLOWEST_CURVATURE = 0.5
+MIN_CURVATURE_SPEED = 0.5
 """Minimum speed at which curvature is evaluated [m/s]."""
 
 PLACE_NOISE = 0.03
@@ -427,7 +427,7 @@ of the rear axle is rarely known more accurately."""
 SPIN_S, SPIN_NOISE = 1.0, 0.1
 """Turning on the spot: time window [s], and heading noise in it [rad]."""
 
-FASTEST_BACKWARDS = 8.0
+MAX_REVERSE_SPEED = 8.0
 """Maximum reverse speed [m/s], above that of a car's reverse gear."""
 
 SETTLED = 0.2
@@ -491,13 +491,13 @@ def _follows(before: EgoSample, now: EgoSample, h: float) -> bool:
     """Whether a car can get from one sample to another in ``h`` seconds."""
     if abs(now.speed - before.speed) > MAX_ACCELERATION * h * (1 + 1e-9):
         return False
-    if now.speed < -FASTEST_BACKWARDS and now.speed < before.speed:
+    if now.speed < -MAX_REVERSE_SPEED and now.speed < before.speed:
         return False
     speed = max(
         math.hypot(before.speed, before.lateral_speed), math.hypot(now.speed, now.lateral_speed)
     )
     turn = math.remainder(now.yaw - before.yaw, math.tau)
-    if speed > SLOWEST_CURVATURE and abs(turn) > MAX_CURVATURE * speed * h:
+    if speed > MIN_CURVATURE_SPEED and abs(turn) > MAX_CURVATURE * speed * h:
         return False
     cos, sin = math.cos(before.yaw + turn / 2), math.sin(before.yaw + turn / 2)
     dx, dy = now.x - before.x, now.y - before.y

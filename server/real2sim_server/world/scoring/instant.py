@@ -107,7 +107,7 @@ class Instant:
         contacts: ego contacts of the last step.
         secondary: new contacts between objects in the last step.
         plan: new trajectory used for the last step, or None.
-        seam: loop reset before the last move, to be applied to positions of the previous instant;
+        loop: loop reset before the last move, to be applied to positions of the previous instant;
             None without a reset.
         signals: traffic signals of the storyboard with their states.
     """
@@ -119,7 +119,7 @@ class Instant:
     contacts: tuple[ContactRecord, ...] = ()
     secondary: int = 0
     plan: PlannedTrajectory | None = None
-    seam: LoopTransform | None = None
+    loop: LoopTransform | None = None
     signals: tuple[ShownSignal, ...] = ()
 
 
@@ -219,7 +219,7 @@ class ScoringContext:
         """Offset from the centre of the map lane, else of the route, positive left [m]."""
         return ego.offset if self.road_map is None else self.road_map.lane_offset(ego)
 
-    def way_against(self, ego: EgoSample, way: float, gain: float) -> float:
+    def distance_against_traffic(self, ego: EgoSample, way: float, gain: float) -> float:
         """Distance driven against traffic in a step of length ``way`` [m].
 
         With a map, the distance in oncoming lanes; otherwise the loss of route progress.
@@ -235,9 +235,9 @@ class ScoringContext:
         return self.road_map.speed_limit(ego)
 
     @property
-    def knows_limits(self) -> bool:
+    def has_speed_limits(self) -> bool:
         """Whether any speed limit is known."""
-        known = self.road_map is not None and self.road_map.knows_limits
+        known = self.road_map is not None and self.road_map.has_speed_limits
         return self.speed_limit is not None or known
 
     def fields(self) -> dict[str, Any]:

@@ -413,32 +413,32 @@ def metrics_version() -> str:
 # Running episodes and recordings use the same code.
 
 
-def put_back(accumulator: MetricAccumulator, seam: LoopTransform) -> MetricAccumulator:
+def looped(accumulator: MetricAccumulator, loop: LoopTransform) -> MetricAccumulator:
     """The accumulator after a loop reset, so that the reset does not count as motion.
 
     Route distances continue. The plan before the reset is not compared with the next one.
     """
     assert accumulator.ego is not None
     position, found = accumulator.impact_position, accumulator.feasibility
-    samples = found.samples.mapped(lambda sample: (_moved(sample[0], seam), sample[1]))
+    samples = found.samples.mapped(lambda sample: (_moved(sample[0], loop), sample[1]))
     return replace(
         accumulator,
-        ego=_moved(accumulator.ego, seam),
-        impact_position=None if position is None else seam.place(*position),
-        comfort=_turned(accumulator.comfort, seam),
-        comfort_with_history=_turned(accumulator.comfort_with_history, seam),
+        ego=_moved(accumulator.ego, loop),
+        impact_position=None if position is None else loop.place(*position),
+        comfort=_turned(accumulator.comfort, loop),
+        comfort_with_history=_turned(accumulator.comfort_with_history, loop),
         feasibility=replace(found, samples=samples),
         plan=None,
     )
 
 
-def _moved(ego: EgoSample, seam: LoopTransform) -> EgoSample:
-    x, y = seam.place(ego.x, ego.y)
-    return ego._replace(x=x, y=y, yaw=ego.yaw + seam.turn, path_yaw=ego.path_yaw + seam.turn)
+def _moved(ego: EgoSample, loop: LoopTransform) -> EgoSample:
+    x, y = loop.place(ego.x, ego.y)
+    return ego._replace(x=x, y=y, yaw=ego.yaw + loop.turn, path_yaw=ego.path_yaw + loop.turn)
 
 
-def _turned(comfort: ComfortAccumulator, seam: LoopTransform) -> ComfortAccumulator:
-    return replace(comfort, window=RowWindow(comfort.samples + np.array([0.0, seam.turn])))
+def _turned(comfort: ComfortAccumulator, loop: LoopTransform) -> ComfortAccumulator:
+    return replace(comfort, window=RowWindow(comfort.samples + np.array([0.0, loop.turn])))
 
 
 NUPLAN_DRIVABLE_TOLERANCE = 0.3
@@ -495,10 +495,10 @@ def update_accumulator(
     accumulator: MetricAccumulator, instant: Instant, context: ScoringContext
 ) -> MetricAccumulator:
     """The accumulator one step later; warm-up steps only extend the comfort history."""
-    if instant.seam is not None:
-        accumulator = put_back(accumulator, instant.seam)
+    if instant.loop is not None:
+        accumulator = looped(accumulator, instant.loop)
     if instant.step <= context.warmup_steps:
-        return _begun(instant, context, accumulator.comfort_with_history.begun_anew())
+        return _begun(instant, context, accumulator.comfort_with_history.restarted())
     ego, dt = instant.ego, context.dt
     assert accumulator.ego is not None
     before = accumulator.ego
@@ -507,14 +507,14 @@ def update_accumulator(
     off_lane = off_road or bool(_in_several_lanes(ego, context))
     accumulator = _with_contacts(_with_pushes(accumulator, instant, context), instant, context)
     ttc = time_to_collision(instant, context, off_lane=off_lane, hit=accumulator.hit)
-    comfort, comfort_with_history = accumulator.comfort.updated_beside(
+    comfort, comfort_with_history = accumulator.comfort.updated_with(
         accumulator.comfort_with_history, ego.speed, ego.yaw, dt
     )
     way = math.hypot(ego.x - before.x, ego.y - before.y)
     left_out = _left_out(ego.s - before.s, way)
     gain, cut = ego.s - before.s - left_out, accumulator.cut + left_out
     backward, oncoming = _against_route(
-        accumulator.backward, context.way_against(ego, way, gain), dt
+        accumulator.backward, context.distance_against_traffic(ego, way, gain), dt
     )
     lane_run = accumulator.lane_run + dt if abs(context.lane_offset(ego)) > LANE_OFFSET else 0.0
     backing = ego.speed < 0 and math.cos(ego.yaw - ego.path_yaw) < 0

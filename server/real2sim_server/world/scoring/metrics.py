@@ -22,7 +22,7 @@ TTC_BOUND = 0.95
 """Bound of nuPlan [s]; NAVSIM's projections at 0, 0.3, 0.6 and 0.9 s are equivalent on a grid of
 0.1 s."""
 
-NAVSIM_SEES: tuple[Aspect, ...] = ("progress", "comfort", "near_misses", "road", "fault")
+NAVSIM_ASPECTS: tuple[Aspect, ...] = ("progress", "comfort", "near_misses", "road", "fault")
 CARLA_PENALTIES = {"vru": 0.5, "vehicle": 0.6, "object": 0.65}
 NO_MAP = "no map: corridor and lanes come from the recorded drive"
 
@@ -163,7 +163,7 @@ def nuplan_progress(accumulator: MetricAccumulator, context: ScoringContext) -> 
 
 def speed_limits(accumulator: MetricAccumulator, context: ScoringContext) -> float:
     """SL of nuPlan; 1 if no limit is known."""
-    if not context.knows_limits:
+    if not context.has_speed_limits:
         return 1.0
     seconds = max(accumulator.steps * context.dt, context.dt)
     return max(0.0, 1 - accumulator.overspeed / (2.23 * seconds))
@@ -219,7 +219,7 @@ def pdms_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> floa
     return possible * weighted / 12
 
 
-@metric("pdms", version="5", running=pdms_so_far, sees=NAVSIM_SEES)
+@metric("pdms", version="5", running=pdms_so_far, sees=NAVSIM_ASPECTS)
 def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC (5 EP + 5 TTC + 2 C) / 12 (Dauner et al. 2024, NAVSIM v1), on the executed drive.
 
@@ -239,7 +239,7 @@ def pdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue
     )
 
 
-@metric("epdms", version="5", sees={*NAVSIM_SEES, "lane", "direction", "lights"})
+@metric("epdms", version="5", sees={*NAVSIM_ASPECTS, "lane", "direction", "lights"})
 def epdms(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC DDC TLC (5 EP + 5 TTC + 2 LK + 2 HC + 2 EC) / 16 (Cao et al. 2025, NAVSIM v2),
     without the penalty filter by the human drive."""
@@ -282,7 +282,7 @@ def nuplan_so_far(accumulator: MetricAccumulator, context: ScoringContext) -> fl
     "nuplan_cls",
     version="5",
     running=nuplan_so_far,
-    sees={*NAVSIM_SEES, "direction", "speed_limit"},
+    sees={*NAVSIM_ASPECTS, "direction", "speed_limit"},
 )
 def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricValue:
     """F NC DAC DDC [EP >= 0.2] (5 EP + 5 TTC + 4 SL + 2 C) / 16 (Karnchanachari et al. 2024)."""
@@ -299,7 +299,7 @@ def nuplan(accumulator: MetricAccumulator, context: ScoringContext) -> MetricVal
     }
     value = nuplan_so_far(accumulator, context)
     road = roads(context)
-    assumed = road if context.knows_limits else ("SL: no speed limit known", *road)
+    assumed = road if context.has_speed_limits else ("SL: no speed limit known", *road)
     if expert < MIN_ROUTE:
         assumed = (*assumed, *assumed_progress(accumulator, context))
     return MetricValue(value, terms, assumed=assumed)

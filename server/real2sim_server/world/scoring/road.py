@@ -218,7 +218,7 @@ class RoadMap:
         return None if found is None else self.graph.lanes[found.lane_id].speed_limit
 
     @cached_property
-    def knows_limits(self) -> bool:
+    def has_speed_limits(self) -> bool:
         """Whether any lane has a speed limit."""
         return any(lane.speed_limit is not None for lane in self.graph.lanes.values())
 

@@ -44,12 +44,12 @@ from .motion import (
     lane_offset,
 )
 from .roads import Place, RoadPoint, Trajectory, Way, course_of, path_through
-from .view import ACROSS, EntityState, PositionResolver, View, across, ahead_on_way
+from .view import ACROSS, EntityState, PositionResolver, View, across, distance_ahead
 
-BESIDE_ROUTE = 10.0
+MAX_ROUTE_OFFSET = 10.0
 """Maximum distance from its assigned route at which a teleported entity keeps the route [m]."""
 
-SLOWEST_DESIRED = 3.0
+DEFAULT_DESIRED_SPEED = 3.0
 """Desired speed of an entity at rest when its controller is activated [m/s]."""
 
 
@@ -153,7 +153,7 @@ def _longitudinal_distance(
 ) -> EntityState:
     actor = _freed(actor)
     other = at.view.entities[action.entity]
-    ahead = ahead_on_way(actor, other.x, other.y, at.view.network)
+    ahead = distance_ahead(actor, other.x, other.y, at.view.network)
     leading = ahead < 0.0 if action.place == "any" else action.place == "leading"
     return copy_with(actor, longitudinal=KeepDistance(at.token, action, leading))
 
@@ -269,7 +269,7 @@ def _follow_trajectory(
         return actor
     if timing is not None:
         time = elapsed * float(timing.scale) + float(timing.offset)
-        following = Trajectory(at.token, course, timing, course.way_at(time), elapsed)
+        following = Trajectory(at.token, course, timing, course.distance_at(time), elapsed)
         actor = copy_with(actor, trajectory=following)
     place = following.place()
     return copy_with(actor, x=place.x, y=place.y, h=place.h)
@@ -300,19 +300,19 @@ def _teleport(actor: EntityState, action: TeleportAction, at: Beginning) -> Enti
     place = at.places.of(action.position)
     put = actor.put(place, at.view.network)
     route = actor.way
-    if at.version >= 2 and route is not None and route.assigned and _is_beside(place, route):
+    if at.version >= 2 and route is not None and route.assigned and _is_near_route(place, route):
         put = put.on_way(route)
     return _done(put, at, lateral=None)
 
 
-def _is_beside(place: Place, route: Way) -> bool:
+def _is_near_route(place: Place, route: Way) -> bool:
     """Whether a place is near enough to a route, and roughly along it, to start driving it."""
     near = route.path.nearest(place.x, place.y)
     # Use points of the route: its headings change between places that may be far apart.
     (x0, y0, *_), (x1, y1, *_) = (route.path.at(near.s + ds) for ds in (-0.5, 0.5))
     turn = math.remainder(math.atan2(y1 - y0, x1 - x0) - place.h, math.tau)
     away = math.dist((place.x, place.y), near.position[:2])
-    return away <= BESIDE_ROUTE and abs(turn) <= ACROSS
+    return away <= MAX_ROUTE_OFFSET and abs(turn) <= ACROSS
 
 
 def _visibility(actor: EntityState, action: VisibilityAction, at: Beginning) -> EntityState:
@@ -324,7 +324,7 @@ def _controller(actor: EntityState, action: ControllerAction, at: Beginning) -> 
     if not action.active:
         return _done(actor, at, longitudinal=None)
     desired = action.idm.desired_speed
-    desired = max(actor.speed, SLOWEST_DESIRED) if desired is None else desired
+    desired = max(actor.speed, DEFAULT_DESIRED_SPEED) if desired is None else desired
     return _done(actor, at, longitudinal=FollowIdm(at.token, _idm(action), desired))
 
 

@@ -18,7 +18,7 @@ from ..common import copy_with
 from ..traffic.driver import acceleration as idm_acceleration
 from ..traffic.driver import advance_along, leading_agent
 from .roads import Place
-from .view import EntityState, Moved, Shifted, View, across, ahead_on_way, coasting
+from .view import EntityState, Moved, Shifted, View, across, coasting, distance_ahead
 
 STEEPEST = {"linear": 1.0, "cubic": 1.5, "sinusoidal": math.pi / 2, "quintic": 1.875}
 """Maximum slope of each shape f(u), u from 0 to 1."""
@@ -164,7 +164,7 @@ DONE = 1e-9
 AT_PLACE, AT_SPEED = 0.05, 0.05
 """Tolerances of a target distance and speed [m], [m/s]."""
 
-SLOWEST_MASTER = 0.05
+MIN_MASTER_SPEED = 0.05
 """Minimum speed of a master with a known arrival time [m/s]."""
 
 
@@ -247,7 +247,7 @@ class KeepDistance:
     def step(self, actor: EntityState, view: View, h: float) -> Moved:
         """The motion after ``h`` seconds, as fast as the limits allow without overshoot."""
         other = view.entities[self.action.entity]
-        ahead = ahead_on_way(actor, other.x, other.y, view.network)
+        ahead = distance_ahead(actor, other.x, other.y, view.network)
         error = ahead - self._wanted(actor, other)
         closing = error + other.speed * h
         limits = self.action.limits
@@ -320,7 +320,7 @@ class Synchronize:
         v = actor.speed
         if to_go <= self.tolerances[0] + DONE or left <= self.tolerances[1] + DONE:
             return Moved(v * h, self._final(master, v), None)
-        if master.speed <= SLOWEST_MASTER:
+        if master.speed <= MIN_MASTER_SPEED:
             return Moved(v * h, v, self)
         time = to_go / master.speed
         rate = self._solved(left, v, time)
@@ -389,7 +389,7 @@ def _left(actor: EntityState, target: Place, view: View) -> float:
     """Remaining distance to a place [m]."""
     if actor.trajectory is not None:
         return actor.trajectory.ahead(target.x, target.y)
-    return ahead_on_way(actor, target.x, target.y, view.network)
+    return distance_ahead(actor, target.x, target.y, view.network)
 
 
 @dataclass(frozen=True)

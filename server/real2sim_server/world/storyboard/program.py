@@ -599,9 +599,7 @@ def _traversed(
     return (any(outcomes) if test.of == "any" else all(outcomes)), began
 
 
-def _stand_still(
-    test: StandStill, context: ConditionContext, since: Mapping[str, float]
-) -> Outcome:
+def _standstill(test: StandStill, context: ConditionContext, since: Mapping[str, float]) -> Outcome:
     return _lasting(test, context, since, lambda a: abs(a.speed) < STANDING)
 
 
@@ -669,7 +667,7 @@ _TESTS: Mapping[type[Any], Callable[[Any, ConditionContext, Mapping[str, float]]
     Acceleration: _acceleration,
     Collision: _collision,
     TraversedDistance: _traversed,
-    StandStill: _stand_still,
+    StandStill: _standstill,
     Offroad: _offroad,
     EndOfRoad: _end_of_road,
     Angle: _angle,

@@ -27,7 +27,7 @@ from ...scene.lane import LANE_KINDS, Road
 from ...scene.lane_graph import LaneGraph
 from ..common import WorldError
 from ..path import Float, LoggedPath
-from ..traffic.driver import STRAIGHT, lane_beside
+from ..traffic.driver import STRAIGHT, parallel_lane
 
 
 class Place(NamedTuple):
@@ -119,7 +119,7 @@ class RouteNetwork:
     def of(cls, spec: RouteLanes, route: LoggedPath) -> RouteNetwork:
         """Lanes along a route."""
         shift = (abs(spec.ego_lane) - 0.5) * spec.lane_width
-        return cls(spec, route, lane_beside(route, shift))
+        return cls(spec, route, parallel_lane(route, shift))
 
     @property
     def _shift(self) -> float:
@@ -157,7 +157,7 @@ class RouteNetwork:
         if known is None:
             shift = (abs(self.spec.ego_lane) - 0.5) * self.spec.lane_width
             offset = shift + self.middle(road, lane, s)
-            path = lane_beside(self.route_path, offset, oncoming=not along)
+            path = parallel_lane(self.route_path, offset, oncoming=not along)
             known = self.ways[lane, along] = Way("route", lane, along, path)
         return known
 
@@ -369,7 +369,7 @@ class SampledCurve:
         k = int(np.searchsorted(self.s, s, side="right")) - 1
         return Place(x, y, float(self.h[min(max(k, 0), len(self.h) - 1)]))
 
-    def way_at(self, time: float) -> float:
+    def distance_at(self, time: float) -> float:
         """Distance from the start at a time; the curve must have times."""
         assert self.times is not None
         return float(np.interp(time, self.times, self.s))
@@ -417,7 +417,7 @@ class Trajectory:
             return way, None if over else replace(self, s=s)
         elapsed = self.elapsed + h
         time = elapsed * float(self.timing.scale) + float(self.timing.offset)
-        s = self.course.way_at(time)
+        s = self.course.distance_at(time)
         assert self.course.times is not None
         over = time >= self.course.times[-1] - 1e-9
         return s - self.s, None if over else replace(self, s=s, elapsed=elapsed)

@@ -223,7 +223,7 @@ def coasting(actor: EntityState, h: float) -> EntityState:
     )
 
 
-BESIDE = 8.0
+MAX_LANE_OFFSET = 8.0
 """Maximum distance of places from a path for distances along it [m]."""
 
 CLOSED = 1e-9
@@ -248,7 +248,7 @@ class View:
     surroundings: Surroundings
 
 
-def ahead_on_way(actor: EntityState, x: float, y: float, network: RoadNetwork) -> float:
+def distance_ahead(actor: EntityState, x: float, y: float, network: RoadNetwork) -> float:
     """Distance ahead to a place along an entity's path [m]; along its heading if off the path."""
     way = actor.way if actor.trajectory is None else None
     if way is None:
@@ -256,7 +256,7 @@ def ahead_on_way(actor: EntityState, x: float, y: float, network: RoadNetwork) -
     assert way is not None
     here = way.path.nearest(actor.x, actor.y).s if actor.way is not way else actor.s
     near = way.path.nearest(x, y)
-    if abs(near.offset) > BESIDE or way.lane == 0:
+    if abs(near.offset) > MAX_LANE_OFFSET or way.lane == 0:
         return along(actor.h, x - actor.x, y - actor.y)
     beyond = 0.0
     if near.s <= 0.0 or near.s >= way.path.length:

@@ -207,7 +207,7 @@ def pose_on_path(
     )
 
 
-def pose_put_back(pose: AgentPose, route: LoggedPath, way: float) -> AgentPose:
+def pose_moved_back(pose: AgentPose, route: LoggedPath, way: float) -> AgentPose:
     """The pose moved ``way`` metres back along a route, with the same offset and relative heading.
 
     The height is unchanged.
@@ -453,7 +453,7 @@ STRAIGHT = 600.0
 """Straight extension of lanes before and beyond the route [m]."""
 
 
-def lane_beside(route: LoggedPath, offset: float, *, oncoming: bool = False) -> LoggedPath:
+def parallel_lane(route: LoggedPath, offset: float, *, oncoming: bool = False) -> LoggedPath:
     """The lane ``offset`` metres to the left of a route; ``oncoming`` reverses its direction."""
     (x, y, z), (ex, ey, ez) = route.positions[0].tolist(), route.positions[-1].tolist()
     first, last = float(route.yaws[0]), float(route.yaws[-1])
@@ -470,10 +470,10 @@ def lane_beside(route: LoggedPath, offset: float, *, oncoming: bool = False) -> 
 def lane_of(route: LoggedPath, x: float, y: float, yaw: float) -> LoggedPath:
     """The lane parallel to a route through x, y [m], in the direction of ``yaw``."""
     near = route.nearest(x, y)
-    return lane_beside(route, near.offset, oncoming=math.cos(yaw - near.yaw) < 0.0)
+    return parallel_lane(route, near.offset, oncoming=math.cos(yaw - near.yaw) < 0.0)
 
 
-HARDEST = 8.0
+MAX_BRAKING = 8.0
 """Maximum deceleration by the brakes [m/s^2]."""
 
 BACK_TO_LANE = 2.0
@@ -482,7 +482,7 @@ BACK_TO_LANE = 2.0
 STANDSTILL = 0.1
 """Desired speed below which an object is stationary [m/s]."""
 
-SLOWEST_DESIRED = 3.0
+MIN_DESIRED_SPEED = 3.0
 """Desired speed of objects that hardly moved in the recording [m/s]."""
 
 
@@ -553,9 +553,9 @@ class Idm:
         z = ground.height(x, y) + self.subject.scaled_size[2] / 2
         return replace(self, pose=self.pose._replace(position=(x, y, z)))
 
-    def put_back(self, route: LoggedPath, way: float, ground: Ground) -> Self:
+    def looped(self, route: LoggedPath, way: float, ground: Ground) -> Self:
         """The driver moved ``way`` metres back along the route, with its offset and heading."""
-        pose = pose_put_back(self.pose, route, way)
+        pose = pose_moved_back(self.pose, route, way)
         near = self.path.nearest(pose.position[0], pose.position[1])
         return replace(self, s=near.s, offset=near.offset, pose=pose).on(ground)
 
@@ -591,14 +591,14 @@ def acceleration(spec: IdmParameters, speed: float, desired: float, leader: Lead
     """IDM acceleration [m/s^2], limited to the braking capability."""
     free = 1.0 - (speed / max(desired, STANDSTILL)) ** 4
     if leader is None:
-        return max(spec.acceleration * free, -HARDEST)
+        return max(spec.acceleration * free, -MAX_BRAKING)
     closing = speed - leader.speed
     dynamic = speed * spec.headway + speed * closing / (
         2 * math.sqrt(spec.acceleration * spec.braking)
     )
     wanted = spec.gap + max(0.0, dynamic)
     interaction = (wanted / max(leader.gap, 0.1)) ** 2
-    return max(spec.acceleration * (free - interaction), -HARDEST)
+    return max(spec.acceleration * (free - interaction), -MAX_BRAKING)
 
 
 def advance_along(s: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
@@ -612,7 +612,7 @@ def desired_speed(subject: ObjectState, spec: IdmParameters) -> float:
     """Desired speed on a free, straight road [m/s]: from the spec, else the highest recorded."""
     if spec.desired_speed is not None:
         return spec.desired_speed
-    return max(highest_speed(subject.trajectory), SLOWEST_DESIRED)
+    return max(highest_speed(subject.trajectory), MIN_DESIRED_SPEED)
 
 
 def highest_speed(trajectory: Trajectory) -> float:

@@ -49,7 +49,7 @@ AHEAD, BEHIND = 600.0, 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class LaneWay:
+class LaneChain:
     """A chain of consecutive lanes; at forks, the lane that turns least.
 
     Attributes:
@@ -69,18 +69,18 @@ class LaneWay:
         return self.lanes[max(bisect_right(self.starts, s) - 1, 0)]
 
 
-_WAYS: WeakKeyDictionary[LaneGraph, dict[str, LaneWay]] = WeakKeyDictionary()
+_CHAINS: WeakKeyDictionary[LaneGraph, dict[str, LaneChain]] = WeakKeyDictionary()
 
 
-def way_through(graph: LaneGraph, lane_id: str) -> LaneWay:
+def chain_through(graph: LaneGraph, lane_id: str) -> LaneChain:
     """The lane chain through a lane, cached per graph. Raises SceneError."""
-    known = _WAYS.setdefault(graph, {})
+    known = _CHAINS.setdefault(graph, {})
     if lane_id not in known:
         known[lane_id] = _made(graph, lane_id)
     return known[lane_id]
 
 
-def _made(graph: LaneGraph, lane_id: str) -> LaneWay:
+def _made(graph: LaneGraph, lane_id: str) -> LaneChain:
     lane = graph.lane(lane_id)
     before = _chain(graph, lane, BEHIND, lambda at: graph.predecessors[at.lane_id])
     after = _chain(graph, lane, AHEAD, lambda at: at.successors)
@@ -95,7 +95,7 @@ def _made(graph: LaneGraph, lane_id: str) -> LaneWay:
         starts.append(reached)
         reached += one.length
     onward = _travelled(graph, lanes[-1].successors)
-    return LaneWay(path, lanes, tuple(starts), any(one not in lanes for one in onward))
+    return LaneChain(path, lanes, tuple(starts), any(one not in lanes for one in onward))
 
 
 def _chain(
@@ -117,13 +117,13 @@ def _travelled(graph: LaneGraph, names: Iterable[str]) -> list[Lane]:
     return [lane for lane in map(graph.lane, names) if lane.kind in TRAVELLED]
 
 
-FARTHEST = 3.0
+MAX_LANE_OFFSET = 3.0
 """Maximum distance from the centre of a lane at the start of a driver [m]."""
 HEADED = 0.7
 """Minimum cosine between a vehicle's heading and the lane that it drives along."""
 SETTLES = 2.0
 """Minimum time between two lane changes [s]."""
-SLOWEST = 3.0
+MIN_CHANGE_SPEED = 3.0
 """Minimum speed for lane changes [m/s]."""
 DECIDES_EVERY = 1.0
 """Interval between lane change decisions [s]. Each driver decides at its own phase: two that always
@@ -152,7 +152,7 @@ class LaneChanger:
 
     subject: ObjectState
     spec: LaneDriver
-    way: LaneWay
+    way: LaneChain
     s: float
     offset: float
     speed: float
@@ -170,11 +170,11 @@ class LaneChanger:
         x, y, _ = now.position
         place = None
         if graph is not None:
-            place = graph.nearest(x, y, now.yaw, kinds=TRAVELLED, within=FARTHEST)
+            place = graph.nearest(x, y, now.yaw, kinds=TRAVELLED, within=MAX_LANE_OFFSET)
         if graph is None or place is None or math.cos(place.heading - now.yaw) < HEADED:
             known = spec.model_dump(include=set(IdmDriver.model_fields) - {"kind"})
             return Idm.begin(subject, IdmDriver(**known), surroundings)
-        way = way_through(graph, place.lane_id)
+        way = chain_through(graph, place.lane_id)
         near = way.path.nearest(x, y)
         vx, vy, _ = now.velocity
         speed = max(vx * math.cos(near.yaw) + vy * math.sin(near.yaw), 0.0)
@@ -188,17 +188,17 @@ class LaneChanger:
 
     def advance(self, surroundings: Surroundings) -> Self:
         """The driver one step later."""
-        driver = self._on_a_long_way(surroundings)._in_the_better_lane(surroundings)
+        driver = self._renewed(surroundings)._in_the_better_lane(surroundings)
         return driver._moved(surroundings)
 
-    def _on_a_long_way(self, surroundings: Surroundings) -> Self:
+    def _renewed(self, surroundings: Surroundings) -> Self:
         if not self.way.goes_on or self.way.path.length - self.s > RENEWED:
             return self
         graph = surroundings.lanes
         assert graph is not None
-        return self._onto(way_through(graph, self.way.lane_at(self.s).lane_id))
+        return self._onto(chain_through(graph, self.way.lane_at(self.s).lane_id))
 
-    def _onto(self, way: LaneWay) -> Self:
+    def _onto(self, way: LaneChain) -> Self:
         near = way.path.nearest(self.pose.position[0], self.pose.position[1])
         return replace(self, way=way, s=near.s, offset=near.offset)
 
@@ -207,13 +207,13 @@ class LaneChanger:
     def _in_the_better_lane(self, surroundings: Surroundings) -> Self:
         """The driver at the start of a lane change, if that pays; the left lane wins ties."""
         graph, lane = surroundings.lanes, self.way.lane_at(self.s)
-        ready = self.changing is None and self.settled >= SETTLES and self.speed > SLOWEST
+        ready = self.changing is None and self.settled >= SETTLES and self.speed > MIN_CHANGE_SPEED
         if graph is None or not (ready and self.spec.changes and self._decides(surroundings)):
             return self
         names = [lane.left if lane.may_change_left else None]
         names += [lane.right if lane.may_change_right else None]
         beside = [graph.lane(name) for name in names if name is not None]
-        tried = [self._onto(way_through(graph, n.lane_id)) for n in beside if n.kind in TRAVELLED]
+        tried = [self._onto(chain_through(graph, n.lane_id)) for n in beside if n.kind in TRAVELLED]
         if not tried:
             return self
         length = self.subject.scaled_size[0]
@@ -312,7 +312,7 @@ class LaneChanger:
         if graph is None or self.way.goes_on or self.way.path.length - self.s > RENEWED:
             return []
         names = [name for name in (lane.left, lane.right) if name is not None]
-        return [self._onto(way_through(graph, name)) for name in names]
+        return [self._onto(chain_through(graph, name)) for name in names]
 
     def _desired(self, lane: Lane) -> float:
         if self.spec.desired_speed is None and lane.speed_limit is not None:

@@ -20,7 +20,7 @@ from ...scene.scene import MAX_OBJECTS
 from ..agents import Agents
 from ..common import Draws, WorldError
 from ..path import LoggedPath
-from .driver import AgentDriver, Idm, Surroundings, highest_speed, lane_beside, level_quaternion
+from .driver import AgentDriver, Idm, Surroundings, highest_speed, level_quaternion, parallel_lane
 
 PREFIX = DRAWN_PREFIX
 """Prefix of the ids of spawned objects; ids on the wire have no colon, so it cannot clash."""
@@ -31,7 +31,7 @@ LOOKS = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle"})
 SIDE = 0.3
 """Lateral clearance of a box that counts as blocked [m]."""
 
-SLOWEST = 3.0
+MIN_DESIRED_SPEED = 3.0
 """Minimum desired speed, for recorded drives that hardly moved [m/s]."""
 
 
@@ -105,7 +105,7 @@ class Spawner:
         if desired is None:
             desired = highest_speed(ego)
         lanes = tuple(_lane(lane, route, looks) for lane in spec.lanes)
-        return cls(spec, lanes, max(desired, SLOWEST), draws, state.ground)
+        return cls(spec, lanes, max(desired, MIN_DESIRED_SPEED), draws, state.ground)
 
     def filled(self, agents: Agents, surroundings: Surroundings) -> tuple[Spawner, list[Idm]]:
         """Fill the range around the ego to the requested density, at the start."""
@@ -246,7 +246,7 @@ def begin_spawner(
 
 
 def _lane(spec: LaneSpec, route: LoggedPath, looks: tuple[ObjectState, ...]) -> Lane:
-    path = lane_beside(route, spec.offset, oncoming=spec.oncoming)
+    path = parallel_lane(route, spec.offset, oncoming=spec.oncoming)
     alike = tuple(o for o in looks if _faces_along(o, path))
     return Lane(path, spec.oncoming, alike or looks)
 

@@ -242,7 +242,7 @@ class Traffic:
             and isinstance(self.drivers.get(o.object_id), (*SCRIPTED, type(None)))
         )
 
-    def put_back(
+    def looped(
         self, tracks: PackedTracks[ObjectState], surroundings: Surroundings, way: float
     ) -> Traffic:
         """Objects after a loop reset of the ego by ``way`` metres along its route.
@@ -257,7 +257,7 @@ class Traffic:
         here = {o.object_id for o in tracks.objects}
         route, ground = surroundings.route, surroundings.ground
         drivers = {
-            i: d.put_back(route, way, ground) if isinstance(d, Idm) and d.along_route else d
+            i: d.looped(route, way, ground) if isinstance(d, Idm) and d.along_route else d
             for i, d in self.drivers.items()
             if i.startswith(SPAWNED)
             or (i in here and (d.subject.edited or not isinstance(d, SCRIPTED)))

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from real2sim_server.reconstruct.initialise.accumulate import PointSet
 from real2sim_server.reconstruct.initialise.vehicle_body import body_colours, faced, fitted_body
-from real2sim_server.reconstruct.initialise.vehicle_parts import Part, usual_palette, wheel_parts
+from real2sim_server.reconstruct.initialise.vehicle_parts import Part, default_palette, wheel_parts
 from real2sim_server.synthetic.vehicles import SHAPES
 
 from ..conftest import painted_log
@@ -94,7 +94,7 @@ def test_a_trucks_cargo_has_a_paint_of_its_own():
     points = body.points.astype(np.float32)
     shown = np.where((body.parts == Part.CARGO)[:, None], (0.6, 0.1, 0.1), (0.1, 0.1, 0.6))
     colours = body_colours(
-        body, points, shown.astype(np.float32), light=np.zeros(3), palette=usual_palette()
+        body, points, shown.astype(np.float32), light=np.zeros(3), palette=default_palette()
     )
     for part, paint in ((Part.CARGO, (0.6, 0.1, 0.1)), (Part.PAINT, (0.1, 0.1, 0.6))):
         mine = colours[body.parts == part]
@@ -111,7 +111,7 @@ def test_the_dark_plate_under_a_vehicle_is_not_its_paint():
         np.concatenate([few, plate.astype(np.float32)]),
         colours.astype(np.float32),
         light=np.zeros(3),
-        palette=usual_palette(),
+        palette=default_palette(),
     )
     np.testing.assert_allclose(found[body.is_paint], 0.6, atol=0.02)
 

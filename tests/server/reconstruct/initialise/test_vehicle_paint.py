@@ -16,10 +16,10 @@ from real2sim_server.reconstruct.initialise.vehicle_parts import (
     PARTS,
     Part,
     brightness,
+    default_palette,
     fit_light,
     light_on,
     palette_of,
-    usual_palette,
 )
 from real2sim_server.reconstruct.initialise.vehicle_parts import LIGHT as LIGHT_KEY
 from real2sim_server.scene import GaussianCloud, SceneObject, Trajectory
@@ -119,7 +119,7 @@ def test_glass_is_as_dark_as_the_logs_own(body):
         )
 
     filled, _, palette = fill_vehicles([glazed(True)] * 8 + [glazed(False)])
-    usual = usual_palette()
+    usual = default_palette()
     assert palette[Part.GLASS].max() < 0.1 < usual[Part.GLASS].min()
     # A vehicle whose glass nobody saw has the others'; lamps, lit or not, are never learnt.
     glass = filled[-1][body.parts == Part.GLASS]
@@ -128,8 +128,8 @@ def test_glass_is_as_dark_as_the_logs_own(body):
 
 
 def test_a_scene_without_colours_of_parts_has_the_usual_ones():
-    np.testing.assert_array_equal(palette_of(None), usual_palette())
-    kept = usual_palette() * 0.5
+    np.testing.assert_array_equal(palette_of(None), default_palette())
+    kept = default_palette() * 0.5
     np.testing.assert_allclose(palette_of({PARTS: kept.tolist()}), kept)
 
 

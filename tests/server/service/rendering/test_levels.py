@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from real2sim_proto.episode import SensorSpec
-from real2sim_server.edit import ScenarioState, things_at_start
+from real2sim_server.edit import ScenarioState, instances_at_start
 from real2sim_server.render import levels_bytes, scene_levels_bytes, select_backend
 from real2sim_server.render._cpu import detail_levels
 from real2sim_server.service.http.responses import ServiceError
@@ -38,7 +38,7 @@ def makers(monkeypatch) -> list[str]:
 def make_ready(scene, levels: DetailLevels, **sensor: object) -> None:
     spec = SensorSpec(camera="front", **({"detail": "auto"} | sensor))
     camera = scene.rig["front"].resized(spec.width or scene.rig["front"].width)
-    things = things_at_start(scene, ScenarioState.of(scene))
+    things = instances_at_start(scene, ScenarioState.of(scene))
     try:
         asyncio.run(levels.ready([spec], [camera], lambda: things))
     finally:
