@@ -221,7 +221,7 @@ def test_figures_without_truth_say_why_and_hold_no_shifted_views():
     result = evaluate_scene(scene, log, options=replace(ONCE, shifts=(1.0,)))
     values = json.loads(json.dumps(result.as_json(), allow_nan=False))
     assert "shifted" not in values
-    assert "no truth exists" in values["no_shifted"]
+    assert "no ground truth exists" in values["no_shifted"]
     assert values["psnr_objects"] is None
 
 
