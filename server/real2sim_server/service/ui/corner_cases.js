@@ -25,7 +25,7 @@ export function cornerCases(draw) {
   const select = el(
     "select",
     { id: "corner-case", class: "wide", "aria-label": "corner case" },
-    new Option("choose a corner case", ""),
+    new Option("Select a corner case", ""),
     ...families().map(([family, members]) =>
       el(
         "optgroup",
@@ -43,7 +43,7 @@ export function cornerCases(draw) {
   });
   const now = written ? `Now: ${written.name || "a storyboard of your own"}.` : "";
   return [
-    row("what happens", [select]),
+    row("description", [select]),
     ...(chosen ? choice() : []),
     ...(now ? [el("small", { id: "corner-case-now", textContent: now }), nothing()] : []),
   ];
@@ -69,7 +69,7 @@ function choice() {
   ];
 }
 const nothing = () =>
-  act("drop-case", "Let nothing happen", () => edit([{ op: "set_storyboard", storyboard: null }]));
+  act("drop-case", "Remove the corner case", () => edit([{ op: "set_storyboard", storyboard: null }]));
 const act = (id, label, change) =>
   el(
     "div",

@@ -71,7 +71,7 @@ function form() {
   return [
     el("p", {
       textContent:
-        "Images of all cameras with boxes, masks, depth, flow, points and tracks, as the scenario is now.",
+        "Images of all cameras with boxes, masks, depth, flow, points and tracks, for the current scenario.",
     }),
     el("div", { class: "formats" }, ...boxes),
     row("every [s]", [period]),
@@ -82,7 +82,7 @@ function form() {
       el("button", {
         id: "make-dataset",
         class: "primary",
-        textContent: "Make data set",
+        textContent: "Export data set",
         disabled: !idle,
         onclick: attempt(() => make(false)),
       }),
@@ -203,7 +203,7 @@ function statistics(found) {
   return [
     table("Boxes", ["class", "boxes", "tracks"], rows),
     shares("By distance", classes, found.boxes_by_distance),
-    shares("Seen in images by", classes, found.boxes_in_images_by_visibility),
+    shares("Visible in images of", classes, found.boxes_in_images_by_visibility),
   ];
 }
 function table(title, heads, rows) {

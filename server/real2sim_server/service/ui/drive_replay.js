@@ -19,7 +19,7 @@ export function replay(leave) {
       "div",
       { class: "actions" },
       button("drive-leave", "Back to the scenario", leave),
-      button("drive-fork", "Take the wheel here", goOn),
+      button("drive-fork", "Take over here", goOn),
     ),
     el(
       "fieldset",
@@ -30,7 +30,7 @@ export function replay(leave) {
     el(
       "fieldset",
       {},
-      el("legend", { textContent: "At the time shown" }),
+      el("legend", { textContent: "At the current time" }),
       el("dl", { id: "drive-figures", class: "figures" }),
     ),
     ...eventList(events, setTime),
@@ -60,7 +60,7 @@ async function goOn() {
   const job = await get(`/v1/jobs/${model.job}`);
   if (!isMine(job.request.session_id)) {
     throw new Error(
-      "The session of this drive is gone, or belongs to another tab: drive again, and take the wheel then",
+      "The session of this drive is closed or belongs to another tab. Start a new drive to take over.",
     );
   }
   await takeTheWheel(job.request.session_id, model.playback.steps[instant()]);

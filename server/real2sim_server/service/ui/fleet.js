@@ -48,7 +48,7 @@ async function look() {
     summary.textContent = `Workers there: ${there.length} of ${workers.length}. Sessions: ${open}.`;
     document.getElementById("workers").replaceChildren(...workers.map(line));
   } catch (error) {
-    summary.textContent = `${error.message} What you see is from before.`;
+    summary.textContent = `${error.message} The page shows the last state.`;
   }
   setTimeout(look, LOOK_MS);
 }

@@ -119,5 +119,5 @@ export function asCurl(batches) {
 }
 async function copy(text) {
   await navigator.clipboard.writeText(text);
-  notify("Copied: all changes that are in effect.");
+  notify("Copied all changes in effect.");
 }

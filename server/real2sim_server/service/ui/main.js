@@ -141,7 +141,7 @@ function lost(error) {
     el("p", { textContent: error.message }),
     el("p", {
       textContent:
-        "The scenario may have been deleted, or belong to another worker. Ask whoever sent the link, or choose another one.",
+        "The scenario may have been deleted or belong to another worker. Ask the sender of the link, or select another scenario.",
     }),
     el("a", { href: "./", textContent: "All scenarios and scenes" }),
   );

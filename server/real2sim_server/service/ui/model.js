@@ -218,7 +218,7 @@ async function change(rest, body) {
     const stale = error instanceof ApiError && error.status === 412;
     notify(
       stale
-        ? "Somebody else changed the scenario meanwhile; their changes are shown now. Please do it again."
+        ? "Somebody else has changed the scenario. Their changes are now shown; please repeat yours."
         : error.message,
       "bad",
     );

@@ -76,13 +76,13 @@ function panel(id) {
       "div",
       { class: "actions" },
       action("Duplicate", "duplicate", () => duplicate(id)),
-      action("To the ground", "snap", () => edit([{ op: "translate", object_id: id, snap: true }])),
+      action("Put on ground", "snap", () => edit([{ op: "translate", object_id: id, snap: true }])),
       action("Delete", "delete", () => edit([{ op: "delete", object_id: id }]), "danger"),
     ),
     el(
       "fieldset",
       {},
-      el("legend", { textContent: "Pose now" }),
+      el("legend", { textContent: "Current pose" }),
       row(
         "x y z [m]",
         ["x", "y", "z"].map((axis, k) =>
@@ -143,7 +143,7 @@ function ofScenario(id) {
       "fieldset",
       {},
       el("legend", { textContent: "Timing" }),
-      row("begins at [s]", [
+      row("start [s]", [
         number("begins", 0, (v) => v !== null && beginAt(id, v), { class: "wide" }),
       ]),
       row("speed [× recorded]", [
@@ -182,7 +182,7 @@ function ofScenario(id) {
     el(
       "fieldset",
       {},
-      el("legend", { textContent: "Velocity on entering the physics" }),
+      el("legend", { textContent: "Velocity at the start of physics" }),
       velocity(id),
     ),
   ];
@@ -229,7 +229,7 @@ const WHEN = {
   always: "at all times",
   on: "from now on",
   until: "until now",
-  around: "for 2 s around now",
+  around: "2 s around the current time",
 };
 // For how long a move or turn holds, also one made with the mouse: said beside the map as well,
 // while it is anything but the usual.
@@ -250,7 +250,7 @@ function when() {
   };
   return el(
     "select",
-    { id: "when", class: "wide", onchange: choose, "aria-label": "when moves hold" },
+    { id: "when", class: "wide", onchange: choose, "aria-label": "time range of edits" },
     ...Object.entries(WHEN).map(([value, textContent]) =>
       el("option", { value, textContent, selected: value === model.when }),
     ),
@@ -264,7 +264,7 @@ function velocity(id) {
     "select",
     {
       id: "velocity-frame",
-      "aria-label": "axes of the velocity",
+      "aria-label": "frame of the velocity",
       onchange: () => object(id).velocity && commit(),
       class: "wide",
     },

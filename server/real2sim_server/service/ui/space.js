@@ -44,7 +44,7 @@ async function begun() {
     return true;
   }
   if (!hasWebGl()) {
-    notify("This browser has no WebGL2: the worker's picture stays. F flies in it.", "warm");
+    notify("This browser has no WebGL2, so the worker's picture is shown. Press F to fly.", "warm");
     return false;
   }
   const { SplatWorld } = await import("./splat_world.js");
@@ -64,7 +64,7 @@ function leaveToWorker() {
   model.remote = true;
   $("space").classList.add("remote");
   notify(
-    "This browser draws without a graphics card: in 3D the worker's picture is shown.",
+    "This browser renders without a GPU, so 3D shows the worker's picture.",
     "warm",
   );
   if (model.space) {

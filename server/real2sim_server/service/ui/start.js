@@ -30,7 +30,7 @@ async function listScenarios() {
       .reverse()
       .filter((s) => !isInBin(pathOf(s)))
       .map(scenarioCard),
-    "No scenario yet. The first edit of a scene begins one.",
+    "No scenario yet. The first edit of a scene creates one.",
   );
 }
 function fill(id, cards, otherwise, ...more) {

@@ -48,7 +48,7 @@ function draw() {
         id: "make-video",
         class: "primary",
         textContent: model.job ? "Film of this run" : "Film of the scenario",
-        title: "As the camera chosen above sees it",
+        title: "From the selected camera",
         onclick: attempt(film),
       }),
       el("label", { class: "check" }, others, " work of all scenarios"),
@@ -58,7 +58,7 @@ function draw() {
       : [
           el("p", {
             textContent:
-              "No work yet. Physics runs, drives, films and data sets are listed here while they are made, and kept with what they left.",
+              "No jobs yet. Physics runs, drives, films and data sets are listed here with their progress and results.",
           }),
         ]),
     ...group("Now", running),
@@ -97,7 +97,7 @@ function nameOf({ kind, request }) {
 }
 function stateOf(job) {
   if (job.state === "queued") {
-    return "waits for its turn";
+    return "queued";
   }
   if (job.state !== "running") {
     return { succeeded: "done", interrupted: "the worker stopped" }[job.state] ?? job.state;
@@ -145,7 +145,7 @@ function actions(job) {
   made.push(
     active(job)
       ? button("Cancel", () => end(job))
-      : button("Delete", () => end(job), "Delete it with its files", "danger"),
+      : button("Delete", () => end(job), "Delete with files", "danger"),
   );
   return made;
 }
@@ -173,7 +173,7 @@ async function film() {
   await listWork();
   for await (const now of events(`/v1/jobs/${job.job_id}/events`)) {
     if (now.state === "succeeded") {
-      notify("The film is ready: Work has it.");
+      notify("The film is ready, see Work.");
     }
   }
 }
