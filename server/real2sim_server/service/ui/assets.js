@@ -1,4 +1,4 @@
-// The library: put an asset in front of the recording vehicle, in place of the selection, or add one.
+// The asset library: insert an asset, place it in front of the vehicle, or replace the selection.
 import { model, on, edit, object } from "./model.js";
 import { call, get, post, picture } from "./api.js";
 import { poseAt, yawOf } from "./poses.js";

@@ -1,5 +1,4 @@
-// What happens in the scenario: corner cases of the gallery, each with a picture; taking one over is
-// an edit, which is undone as others are.
+// Corner cases of the gallery, each with a picture. Choosing one is an edit that can be undone.
 import { model, edit, letHappen, isRecorded } from "./model.js";
 import { get, picture } from "./api.js";
 import { el, number, row } from "./dom.js";
@@ -12,7 +11,7 @@ let chosen = null;
 let values = {};
 let seen = null;
 
-// The gallery, which is the same for as long as the page is open, and what is written now.
+// The gallery, constant while the page is open, and the current storyboard.
 export async function lookUp() {
   if (!cases.length) {
     ({ cases } = await get("/v1/gallery"));
@@ -20,7 +19,7 @@ export async function lookUp() {
   const path = `/v1/scenarios/${encodeURIComponent(model.scenario.scenario_id)}/storyboard`;
   written = isRecorded() ? null : await get(path);
 }
-// Rows of a form; `draw` draws it anew.
+// Rows of a form; `draw` redraws it.
 export function cornerCases(draw) {
   const select = el(
     "select",

@@ -1,4 +1,4 @@
-// Data sets of the scenario: made as jobs; labels over pictures, and what is in them by class.
+// Data sets of the scenario: exported by jobs; labels over pictures, and statistics by class.
 import { model, own } from "./model.js";
 import { call, events, get, picture, post, sentence } from "./api.js";
 import { el, number, row } from "./dom.js";
@@ -182,7 +182,7 @@ function contents(job) {
     ),
   ];
 }
-// Boxes, instances, classes and flow of one frame; a click shows it large.
+// Boxes, instances, classes and flow of one frame; a click enlarges it.
 function sheet(job, file) {
   const image = el("img", { alt: "Labels over a picture", title: "Show it large" });
   picture(`/v1/jobs/${job.job_id}/files/${file.name}`).then(
@@ -213,7 +213,7 @@ function table(title, heads, rows) {
   const head = el("tr", {}, ...heads.map((h) => el("th", { textContent: h })));
   return el("fieldset", {}, el("legend", { textContent: title }), el("table", {}, head, ...lines));
 }
-// A line for each class, as long as the shares of its boxes.
+// One bar per class, divided by the shares of its boxes.
 function shares(title, classes, counts) {
   const lines = classes
     .filter((name) => counts[name])

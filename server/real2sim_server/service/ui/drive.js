@@ -1,4 +1,4 @@
-// Drive: a planner or a person in the scenario, watched live; then the recording, read at any instant.
+// Drive: a planner or a person drives the scenario, watched live; then the recording, at any time.
 import { model, on, egoPoseAt, stopRun } from "./model.js";
 import { el, row } from "./dom.js";
 import { attempt } from "./messages.js";
@@ -54,7 +54,7 @@ export function startDrive() {
   on("time layout", () => isReplay() && replayed());
   draw();
 }
-// What was driven; one that goes on in this tab is watched again after a reload.
+// The last drive; a drive that runs in this tab is watched again after a reload.
 export const listDrives = attempt(async () => {
   [drives] = await Promise.all([drivesOf(model.scenario.scenario_id), lookUp()]);
   const going = drives.find((job) => job.state === "running" && isMine(job.request.session_id));

@@ -1,4 +1,4 @@
-// What is told of a drive: scores, events, words; of the instant that is shown.
+// Scores, events and texts of a drive at the current time.
 import { model } from "./model.js";
 import { el } from "./dom.js";
 import { attempt } from "./messages.js";

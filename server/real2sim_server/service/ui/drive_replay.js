@@ -1,4 +1,4 @@
-// A recorded drive at any of its instants: plan, speed, scores, events.
+// A recorded drive at any time: plan, speed, scores, events.
 import { model, setTime } from "./model.js";
 import { get } from "./api.js";
 import { el } from "./dom.js";
@@ -71,7 +71,7 @@ export const instant = () =>
     0,
     model.playback.times_us.findLastIndex((t) => t <= model.t),
   );
-// Along the ground; of a drive that is replayed, since pictures of a live one tell no pose.
+// On the ground, and only for replayed drives, because live pictures come without a pose.
 export function planInPicture(pen, toStage) {
   if (!isReplay()) {
     return;

@@ -1,4 +1,4 @@
-// The page of the fleet: what each worker on this one's store last told of itself.
+// The fleet page: the last report of each worker on the same store.
 import { get } from "./api.js";
 import { el } from "./dom.js";
 

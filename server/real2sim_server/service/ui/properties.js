@@ -1,4 +1,4 @@
-// The property panel: shows the selected object, turns each changed field into one operation.
+// The property panel: shows the selected object and turns each changed field into one operation.
 import {
   model,
   on,
@@ -30,7 +30,7 @@ export function startProperties() {
   on("when", drawWhen);
   draw();
 }
-// A panel stays while its object does, so that whoever is typing or tabbing through it can go on.
+// The panel persists while its object does, to keep focus and input.
 let drawn = null;
 let drawnOf = "";
 const ofNow = () => {
@@ -101,7 +101,7 @@ function panel(id) {
       : ofScenario(id)),
   ];
 }
-// What an object of the scenario has beyond its pose.
+// Properties of a scenario's object beyond its pose.
 function ofScenario(id) {
   const setPhysics = (name, value) =>
     edit(() => {
@@ -187,7 +187,7 @@ function ofScenario(id) {
     ),
   ];
 }
-// What is typed is where the object will be, also while a run shows it elsewhere.
+// Input sets the object's own pose, even while a run shows another one.
 function moveTo(id, axis, k, value) {
   const time_range = timeRange();
   return edit(() => {
@@ -208,7 +208,7 @@ const beginAt = (id, seconds) =>
     const delay_us = Math.round((seconds - beginsAt(object(id))) * 1e6);
     return delay_us === 0 ? [] : [{ op: "retime", object_id: id, delay_us }];
   });
-// Times that the object is as fast as it was recorded; 1 where nobody recorded it.
+// Ratio to the recorded speed; 1 without a recording.
 function speedOf(o) {
   const recorded = model.scene.objects.find((r) => r.object_id === (o.recorded_id ?? o.object_id));
   const lasts = o.end_us - o.start_us;
@@ -231,8 +231,8 @@ const WHEN = {
   until: "until now",
   around: "2 s around the current time",
 };
-// For how long a move or turn holds, also one made with the mouse: said beside the map as well,
-// while it is anything but the usual.
+// The time range of edits, including edits with the mouse; shown next to the map too if it is not
+// the default.
 function drawWhen() {
   const chip = document.getElementById("when-mode");
   chip.hidden = model.when === "always";

@@ -1,4 +1,4 @@
-// What belongs to no object: when the scenario plays, boxes hidden from the background, colliders.
+// Settings of the scenario: time span, erased boxes of the background, colliders.
 import { model, edit, emit } from "./model.js";
 import { poseAt } from "./poses.js";
 import { el, number, row } from "./dom.js";

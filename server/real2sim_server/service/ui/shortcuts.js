@@ -1,4 +1,4 @@
-// Keys, and the page that lists them.
+// Keyboard shortcuts, and the page that lists them.
 import { model, undo, redo, edit, select, rotation } from "./model.js";
 import { toggle, step } from "./timeline.js";
 import { toggleFree, toggleUncertainty } from "./camera_view.js";
@@ -63,8 +63,8 @@ const TYPED =
   "input:not([type=range], [type=checkbox], [type=radio], [type=button]), select, textarea, [contenteditable]";
 const PRESSED = "button, a[href], summary, input[type=checkbox], input[type=radio], input[type=button]";
 const MOVED = "[role=tab], [role=separator], input[type=radio], input[type=range]:not(#time)";
-// Whether a key is for the control that has the focus: what is typed there, what presses or moves
-// it. Delete never means the selected object there. The slider of the time goes by frames.
+// Whether a key belongs to the focused control, for example typing or pressing it. Delete then
+// never deletes the selected object. The time slider moves by frames.
 function isNative({ target, key, ctrlKey, metaKey }) {
   if (target.closest(TYPED)) {
     return true;

@@ -1,4 +1,4 @@
-// The first page: scenarios that exist, and scenes to begin one on.
+// The first page: existing scenarios, and scenes to create one for.
 import { call, get, picture, post } from "./api.js";
 import { isInBin, putInBin } from "./bin.js";
 import { el } from "./dom.js";

@@ -1,5 +1,5 @@
-// Work: jobs of this scenario or of all, with what is left of them; runs, drives and videos are
-// opened from here, also after a reload.
+// Jobs of this scenario or of all, with their results; runs, drives and videos open from here, also
+// after a reload.
 import { model, own } from "./model.js";
 import { call, events, get, post, sentence } from "./api.js";
 import { el } from "./dom.js";
@@ -26,7 +26,7 @@ export const listWork = attempt(async () => {
 });
 const active = (job) => job.state === "queued" || job.state === "running";
 
-// What a job works on: the scenario, or a run of it.
+// Subject of a job: the scenario, or a run of it.
 function ofScenario(job) {
   const { scenario_id: id } = model.scenario;
   const runs = jobs.filter((j) => j.subject === id).map((j) => j.job_id);
@@ -105,7 +105,7 @@ function stateOf(job) {
   const left = secondsLeft(job);
   return `${Math.round(job.progress * 100)} %${left === null ? "" : ` · ${duration(left)} left`}`;
 }
-// As it went so far; nothing before it has gone anywhere.
+// Estimated from the progress so far.
 function secondsLeft({ started_at: started, progress }) {
   if (!started || progress < 0.03) {
     return null;
