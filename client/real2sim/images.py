@@ -82,7 +82,6 @@ class Image(Handle):
         data: encoded bytes; of codec ``raw`` the array in C order, little-endian.
         codec: ``raw``, ``jpeg`` or ``png``.
         modality: ``rgb`` (uint8 [H, W, 3]), ``depth`` or ``median_depth`` (float32 [H, W], metres
-            along the camera z axis, 0 where nothing was hit), ``instance`` (uint16 [H, W], 0 is
             along the camera z axis, 0 without a hit), ``instance`` (uint16 [H, W], 0 is
             background), ``semantic`` (uint8 [H, W], numbers of
             ``real2sim_proto.SEMANTIC_CLASSES``) or ``uncertainty`` (float32 [H, W], expected

@@ -217,7 +217,6 @@ def _rotation(quaternion: tuple[float, float, float, float]) -> Array:
 def _profile(speed: float, acceleration: float, times: Array, *, limit: float) -> Array:
     """[K, 2] metres travelled and speed [m/s] at ``times``; speed between 0 and ``limit``.
 
-    Above the limit the drive brakes at least gently until it is reached.
     Above the limit the drive brakes at least gently until the limit is reached.
     """
     if speed > limit:

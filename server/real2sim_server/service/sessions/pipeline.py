@@ -270,7 +270,6 @@ class StepPipeline:
 
         Evaluation has ended when this returns or raises. If it raises, nothing has changed, except
         that the change may be stored.
-        that the change may be on record.
 
         Raises:
             QueueFullError: the thread's queue is full.

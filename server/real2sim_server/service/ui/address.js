@@ -1,4 +1,4 @@
-// What is open, in the address: a link shows the same to somebody else.
+// The state of the studio in the address, so that a link opens the same view.
 import { model, on, isRecorded } from "./model.js";
 export const addressParameters = () => Object.fromEntries(new URLSearchParams(location.search));
 let waiting = null;

@@ -1,4 +1,4 @@
-// The library: put an asset in front of the recording vehicle, in place of the selection, or add one.
+// The asset library: insert an asset, place it in front of the vehicle, or replace the selection.
 import { model, on, edit, object } from "./model.js";
 import { call, get, post, picture } from "./api.js";
 import { poseAt, yawOf } from "./poses.js";
@@ -16,7 +16,7 @@ async function draw() {
   const assets = all.filter((asset) => !isInBin(pathOf(asset.asset_id)));
   const subject = object(model.selected);
   const cut = el("button", {
-    textContent: subject ? `Keep ${subject.object_id} as asset` : "Keep the selection as asset",
+    textContent: subject ? `Save ${subject.object_id} as an asset` : "Save the selection as an asset",
     disabled: !subject?.recorded_id,
     onclick: attempt(() => keep(subject)),
   });
@@ -27,7 +27,7 @@ async function draw() {
       : [
           el("p", {
             textContent:
-              "The library is empty. Select a recorded object and keep it, or upload a splat file with POST /v1/assets.",
+              "The library is empty. Select a recorded object and save it, or upload a splat file with POST /v1/assets.",
           }),
         ]),
     el("div", { class: "cards" }, ...assets.map(card)),
@@ -50,7 +50,7 @@ function card(asset) {
     el("button", { textContent: "Insert", onclick: () => insert(asset) }),
     el("button", {
       textContent: "Replace",
-      title: "Give the selected object this look",
+      title: "Use this appearance for the selected object",
       disabled: !model.selected,
       onclick: () => edit([{ op: "replace", object_id: model.selected, asset_id: asset.asset_id }]),
     }),

@@ -1,5 +1,4 @@
-// Many Gaussians an instance instead of one: what draws in software pays for each instance, and
-// graphics cards are fuller.
+// Groups Gaussians into instances: software renderers pay per instance, and GPUs are better used.
 import * as THREE from "three";
 
 const EACH = 128;

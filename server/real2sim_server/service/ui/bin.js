@@ -1,4 +1,4 @@
-// Deleting can be taken back for a while: it is done once the message is gone, or the page is left.
+// Deletion with undo: the object is deleted when the message disappears or the page closes.
 import { call, token } from "./api.js";
 import { attempt, notify } from "./messages.js";
 
@@ -6,7 +6,7 @@ const AFTER_MS = 8000;
 const KEY = "real2sim-deleted";
 const waiting = new Map();
 
-// What is as good as gone: the worker may list it for a moment after the page was left.
+// Ids being deleted; the worker may still list them after the page was left.
 export const isInBin = (path) =>
   waiting.has(path) || JSON.parse(sessionStorage.getItem(KEY) ?? "[]").includes(path);
 

@@ -1,4 +1,4 @@
-// The camera picture: asks for frames, selects on a click, outlines the selection, flies freely.
+// The camera picture: requests frames, selects on click, outlines the selection, flies freely.
 import {
   model,
   on,
@@ -27,8 +27,8 @@ let url;
 let still;
 let arrivals = [];
 const layers = [];
-// Others draw over the picture too: with the pen, and what turns metres into pixels of the stage
-// (null behind the camera).
+// Other modules draw over the picture too. They get the context and a function from metres to
+// pixels of the stage (null behind the camera).
 export const addPictureLayer = (layer) => layers.push(layer);
 
 export function startView() {
@@ -65,7 +65,7 @@ function viewRequest(width) {
 
 const drawnHere = () => model.space && !model.remote;
 
-// Small pictures while something moves, a full one as soon as it rests.
+// Small pictures while something moves, a full one afterwards.
 function requestFrame(moving) {
   clearTimeout(still);
   if (model.mosaic || model.live || drawnHere()) {
@@ -79,7 +79,7 @@ function requestFrame(moving) {
     moving ? STILL_AFTER_MS : 0,
   );
 }
-// Gaussians have no pixels of their own: the picture at rest is as fine as the stage shows it.
+// Gaussians have no pixels of their own, so the final picture has the resolution of the stage.
 function fullWidth() {
   const { width, height } = model.scene.cameras.find((c) => c.name === model.camera);
   const { clientWidth, clientHeight } = $("stage");
@@ -97,7 +97,7 @@ function show(head, blob) {
   $("picture").onload = () => old && URL.revokeObjectURL(old);
   $("picture").src = url;
   $("picture").dataset.seq = head.seq;
-  // A picture may be the first to tell of somebody else's edit; nothing else tells of it again.
+  // A picture may be the first sign of another client's edit.
   if (head.revision > model.scenario.revision) {
     socket.onChanged();
   }
@@ -110,7 +110,7 @@ function show(head, blob) {
   outline();
 }
 
-// A picture of a session that is driven; nothing is drawn over it, since no pose comes with it.
+// A picture of a driven session, without overlays: it comes without a pose.
 export function showLive(blob, goesOn) {
   if (!goesOn()) {
     return;
@@ -125,14 +125,14 @@ export function showLive(blob, goesOn) {
   outline();
 }
 
-// The page has drawn a picture of its own; head: its size [css px], K and T_world_camera.
+// For pictures rendered by the page; head: size [css px], K and T_world_camera.
 export function showSpace(head) {
   header = head;
   outline();
 }
 export const requestPicture = () => requestFrame(false);
 
-// Place of the picture inside the stage: it is fitted with its own proportions.
+// Rectangle of the picture inside the stage, fitted with its aspect ratio.
 function frameBox() {
   const { clientWidth: w, clientHeight: h } = $("stage");
   const scale = Math.min(w / header.width, h / header.height);
@@ -144,7 +144,7 @@ function toStage(point) {
   const { scale, left, top } = frameBox();
   return pixel && [left + pixel[0] * scale, top + pixel[1] * scale];
 }
-// Where the centre of an object is inside the stage [CSS px]; null when it is out of sight.
+// Centre of an object on the stage [CSS px]; null if it is not visible.
 export const stagePlace = (id) => toStage(poseOf(object(id)).position);
 
 function outline() {
@@ -199,7 +199,7 @@ export function strokeBox(pen, subject, placeOf) {
   }
 }
 
-// Only of scenes that know it.
+// Only for scenes that have it.
 export function toggleUncertainty() {
   if (model.scene.has_uncertainties) {
     model.shows = model.shows === "rgb" ? "uncertainty" : "rgb";
@@ -223,7 +223,7 @@ const pressed = (id, on_) => {
   $(id).setAttribute("aria-pressed", on_);
 };
 
-// What is clicked, or tapped, is asked for.
+// Ask the worker for the object at a click or tap.
 function pickAt(e) {
   if (!header) {
     return;

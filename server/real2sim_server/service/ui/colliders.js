@@ -1,7 +1,7 @@
-// Colliders as the map shows them.
+// Colliders on the map.
 import { rotate } from "./poses.js";
 
-// The size of a box about the collider's own axes, or lines in the world.
+// The size of a box in the collider's own frame, or lines in the world.
 export function fromAbove(shape) {
   const across = 2 * shape.radius;
   switch (shape.kind) {

@@ -1,5 +1,4 @@
-// What happens in the scenario: corner cases of the gallery, each with a picture; taking one over is
-// an edit, which is undone as others are.
+// Corner cases of the gallery, each with a picture. Choosing one is an edit that can be undone.
 import { model, edit, letHappen, isRecorded } from "./model.js";
 import { get, picture } from "./api.js";
 import { el, number, row } from "./dom.js";
@@ -12,7 +11,7 @@ let chosen = null;
 let values = {};
 let seen = null;
 
-// The gallery, which is the same for as long as the page is open, and what is written now.
+// The gallery, constant while the page is open, and the current storyboard.
 export async function lookUp() {
   if (!cases.length) {
     ({ cases } = await get("/v1/gallery"));
@@ -20,12 +19,12 @@ export async function lookUp() {
   const path = `/v1/scenarios/${encodeURIComponent(model.scenario.scenario_id)}/storyboard`;
   written = isRecorded() ? null : await get(path);
 }
-// Rows of a form; `draw` draws it anew.
+// Rows of a form; `draw` redraws it.
 export function cornerCases(draw) {
   const select = el(
     "select",
     { id: "corner-case", class: "wide", "aria-label": "corner case" },
-    new Option("choose a corner case", ""),
+    new Option("Select a corner case", ""),
     ...families().map(([family, members]) =>
       el(
         "optgroup",
@@ -43,7 +42,7 @@ export function cornerCases(draw) {
   });
   const now = written ? `Now: ${written.name || "a storyboard of your own"}.` : "";
   return [
-    row("what happens", [select]),
+    row("description", [select]),
     ...(chosen ? choice() : []),
     ...(now ? [el("small", { id: "corner-case-now", textContent: now }), nothing()] : []),
   ];
@@ -69,7 +68,7 @@ function choice() {
   ];
 }
 const nothing = () =>
-  act("drop-case", "Let nothing happen", () => edit([{ op: "set_storyboard", storyboard: null }]));
+  act("drop-case", "Remove the corner case", () => edit([{ op: "set_storyboard", storyboard: null }]));
 const act = (id, label, change) =>
   el(
     "div",

@@ -1,4 +1,4 @@
-// Data sets of the scenario: made as jobs; labels over pictures, and what is in them by class.
+// Data sets of the scenario: exported by jobs; labels over pictures, and statistics by class.
 import { model, own } from "./model.js";
 import { call, events, get, picture, post, sentence } from "./api.js";
 import { el, number, row } from "./dom.js";
@@ -71,7 +71,7 @@ function form() {
   return [
     el("p", {
       textContent:
-        "Images of all cameras with boxes, masks, depth, flow, points and tracks, as the scenario is now.",
+        "Images of all cameras with boxes, masks, depth, flow, points and tracks, for the current scenario.",
     }),
     el("div", { class: "formats" }, ...boxes),
     row("every [s]", [period]),
@@ -82,7 +82,7 @@ function form() {
       el("button", {
         id: "make-dataset",
         class: "primary",
-        textContent: "Make data set",
+        textContent: "Export data set",
         disabled: !idle,
         onclick: attempt(() => make(false)),
       }),
@@ -182,7 +182,7 @@ function contents(job) {
     ),
   ];
 }
-// Boxes, instances, classes and flow of one frame; a click shows it large.
+// Boxes, instances, classes and flow of one frame; a click enlarges it.
 function sheet(job, file) {
   const image = el("img", { alt: "Labels over a picture", title: "Show it large" });
   picture(`/v1/jobs/${job.job_id}/files/${file.name}`).then(
@@ -203,7 +203,7 @@ function statistics(found) {
   return [
     table("Boxes", ["class", "boxes", "tracks"], rows),
     shares("By distance", classes, found.boxes_by_distance),
-    shares("Seen in images by", classes, found.boxes_in_images_by_visibility),
+    shares("Visible in images of", classes, found.boxes_in_images_by_visibility),
   ];
 }
 function table(title, heads, rows) {
@@ -213,7 +213,7 @@ function table(title, heads, rows) {
   const head = el("tr", {}, ...heads.map((h) => el("th", { textContent: h })));
   return el("fieldset", {}, el("legend", { textContent: title }), el("table", {}, head, ...lines));
 }
-// A line for each class, as long as the shares of its boxes.
+// One bar per class, divided by the shares of its boxes.
 function shares(title, classes, counts) {
   const lines = classes
     .filter((name) => counts[name])

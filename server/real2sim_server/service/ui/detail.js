@@ -1,5 +1,5 @@
-// How much of a scene a picture shows: all of it at rest; while something moves, what is drawn in
-// time. Gaussians are in the order of what covers most, so that the first of them tell the most.
+// Number of Gaussians in a picture: all at rest; while something moves, as many as fit the frame
+// time. Gaussians are ordered by covered area, so the first ones matter most.
 const IN_TIME = 34; // ms
 const FIRST = 24_000;
 const LEAST = 16_000;
@@ -12,14 +12,14 @@ export class Detail {
     this.budget = FIRST;
     this.shown = 0;
   }
-  // For a picture while something moves, out of so many Gaussians.
+  // For a picture while something moves, given the number of Gaussians.
   moving(total) {
-    // Powers of two, since another number has all of them sorted anew.
+    // Powers of two, because any other number sorts all Gaussians again.
     const step = 2 ** Math.round(Math.log2(this.budget));
     this.shown = step > 0.7 * total ? total : step;
     return this.now(total);
   }
-  // For the next picture at rest: in steps where all at once would take long.
+  // For the next picture at rest, in steps if all at once would take too long.
   resting(total) {
     const next = this.budget >= total ? total : this.shown * STEP;
     this.shown = next > 0.6 * total ? total : next;
@@ -32,7 +32,7 @@ export class Detail {
   whole(total) {
     return this.shown >= total;
   }
-  // A picture of what was chosen last has taken so long.
+  // Report the duration of the last picture.
   took(ms, { resting }) {
     const fitting = (this.shown * IN_TIME) / Math.max(1, ms);
     if (ms <= IN_TIME) {

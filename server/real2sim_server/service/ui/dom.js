@@ -1,4 +1,4 @@
-// Elements from a short description.
+// Creates elements from a short description.
 export function el(tag, given = {}, ...children) {
   const node = document.createElement(tag);
   for (const [key, value] of Object.entries(given)) {
@@ -16,8 +16,8 @@ export function el(tag, given = {}, ...children) {
 export const row = (label, inputs) =>
   el("div", { class: "row" }, el("label", { textContent: label }), ...inputs);
 
-// A number field; `change` gets the number, or null where it was emptied. What is being typed and
-// not yet entered is marked, so that nobody writes over it.
+// A number field. `change` gets the number, or null if the field is empty. Unfinished input is
+// marked, so that it is not overwritten.
 export function number(id, value, change, { min, max, placeholder = "", class: kind = "" } = {}) {
   const input = el("input", {
     id,

@@ -1,4 +1,4 @@
-// Drive: a planner or a person in the scenario, watched live; then the recording, read at any instant.
+// Drive: a planner or a person drives the scenario, watched live; then the recording, at any time.
 import { model, on, egoPoseAt, stopRun } from "./model.js";
 import { el, row } from "./dom.js";
 import { attempt } from "./messages.js";
@@ -13,18 +13,18 @@ import { button, eventList, figures, said } from "./drive_figures.js";
 import { instant, isReplay, planInPicture, replay, replayed } from "./drive_replay.js";
 
 const WHO = [
-  ["idm", "idm: keeps its distance"],
-  ["follow_route", "follow_route: along the route"],
-  ["pid", "pid: along the recording"],
-  ["depth_sampling", "depth_sampling: by depth images"],
-  ["hand", "me, by arrow keys"],
-  ["other", "a planner of mine, elsewhere"],
+  ["idm", "idm: follows the lead vehicle"],
+  ["follow_route", "follow_route: follows the route"],
+  ["pid", "pid: follows the recording"],
+  ["depth_sampling", "depth_sampling: plans with depth images"],
+  ["hand", "me, with the arrow keys"],
+  ["other", "an external planner"],
 ];
 const PACES = [
   ["1", "real time"],
-  ["2", "twice as fast"],
+  ["2", "twice real time"],
   ["0.25", "a quarter"],
-  ["", "as fast as it can"],
+  ["", "maximum speed"],
 ];
 const chosen = { who: "idm", pace: "1", onCollision: "terminate" };
 const page = () => document.getElementById("drive");
@@ -54,7 +54,7 @@ export function startDrive() {
   on("time layout", () => isReplay() && replayed());
   draw();
 }
-// What was driven; one that goes on in this tab is watched again after a reload.
+// The last drive; a drive that runs in this tab is watched again after a reload.
 export const listDrives = attempt(async () => {
   [drives] = await Promise.all([drivesOf(model.scenario.scenario_id), lookUp()]);
   const going = drives.find((job) => job.state === "running" && isMine(job.request.session_id));
@@ -83,15 +83,15 @@ function draw() {
 function choice() {
   return [
     el("p", {
-      textContent: "Somebody drives the recording vehicle through the scenario as it is now.",
+      textContent: "Drive the recording vehicle through the current scenario.",
     }),
     ...cornerCases(draw),
     row("who", [pick("who", WHO)]),
     row("pace", [pick("pace", PACES)]),
     row("a crash", [
       pick("onCollision", [
-        ["terminate", "ends the drive"],
-        ["continue", "goes on"],
+        ["terminate", "stop the drive"],
+        ["continue", "continue"],
       ]),
     ]),
     el(
@@ -153,7 +153,7 @@ function driving() {
       button("drive-step", "One step", () => hold(true, 1)),
       who === "hand"
         ? null
-        : button("drive-wheel", "Take the wheel", () => takeTheWheel(session, model.live.step)),
+        : button("drive-wheel", "Take over", () => takeTheWheel(session, model.live.step)),
       button("drive-end", "End", end, "danger"),
     ),
     who === "hand" ? wheel() : null,
@@ -179,7 +179,7 @@ function live() {
           ? ` · plans in ${state.planning_ms.toFixed(0)} ms`
           : ""
       }`
-    : seat.stage || "The session begins";
+    : seat.stage || "Starting the session";
   if (!state) {
     return;
   }

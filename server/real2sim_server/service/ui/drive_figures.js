@@ -1,4 +1,4 @@
-// What is told of a drive: scores, events, words; of the instant that is shown.
+// Scores, events and texts of a drive at the current time.
 import { model } from "./model.js";
 import { el } from "./dom.js";
 import { attempt } from "./messages.js";
@@ -38,7 +38,7 @@ export function eventList(events, jump) {
   ];
 }
 export const seconds = (us) => (us / 1e6).toFixed(1);
-const SAID = { horizon: "to the end", stopped: "ended by hand" };
-export const said = (word) => SAID[word] ?? (word ?? "not over").replaceAll("_", " ");
+const SAID = { horizon: "to the end", stopped: "stopped" };
+export const said = (word) => SAID[word] ?? (word ?? "running").replaceAll("_", " ");
 export const button = (id, label, act, kind = id === "drive-start" ? "primary" : "") =>
   el("button", { id, textContent: label, class: kind, onclick: attempt(act) });

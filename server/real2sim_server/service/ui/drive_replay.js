@@ -1,4 +1,4 @@
-// A recorded drive at any of its instants: plan, speed, scores, events.
+// A recorded drive at any time: plan, speed, scores, events.
 import { model, setTime } from "./model.js";
 import { get } from "./api.js";
 import { el } from "./dom.js";
@@ -19,7 +19,7 @@ export function replay(leave) {
       "div",
       { class: "actions" },
       button("drive-leave", "Back to the scenario", leave),
-      button("drive-fork", "Take the wheel here", goOn),
+      button("drive-fork", "Take over here", goOn),
     ),
     el(
       "fieldset",
@@ -30,7 +30,7 @@ export function replay(leave) {
     el(
       "fieldset",
       {},
-      el("legend", { textContent: "At the time shown" }),
+      el("legend", { textContent: "At the current time" }),
       el("dl", { id: "drive-figures", class: "figures" }),
     ),
     ...eventList(events, setTime),
@@ -60,7 +60,7 @@ async function goOn() {
   const job = await get(`/v1/jobs/${model.job}`);
   if (!isMine(job.request.session_id)) {
     throw new Error(
-      "The session of this drive is gone, or belongs to another tab: drive again, and take the wheel then",
+      "The session of this drive is closed or belongs to another tab. Start a new drive to take over.",
     );
   }
   await takeTheWheel(job.request.session_id, model.playback.steps[instant()]);
@@ -71,7 +71,7 @@ export const instant = () =>
     0,
     model.playback.times_us.findLastIndex((t) => t <= model.t),
   );
-// Along the ground; of a drive that is replayed, since pictures of a live one tell no pose.
+// On the ground, and only for replayed drives, because live pictures come without a pose.
 export function planInPicture(pen, toStage) {
   if (!isReplay()) {
     return;

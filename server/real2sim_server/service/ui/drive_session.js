@@ -1,4 +1,4 @@
-// A session that is driven: begun, watched, held, ended; the wheel by hand, as plans of its own.
+// A driven session: started, watched, paused, ended; manual driving sends plans.
 import { call, get, post } from "./api.js";
 
 const KEY = "real2sim-sessions";
@@ -7,7 +7,7 @@ const DT_US = 100_000;
 const HORIZON = 20;
 const WHEELBASE = 2.8;
 
-// Tokens of sessions stay in the tab, so that a reload goes on; the oldest sessions are let go.
+// Session tokens stay in the tab, so that a reload can continue; the oldest ones are dropped.
 const kept = () => JSON.parse(sessionStorage.getItem(KEY) ?? "[]");
 function keep({ session_id: id, token }) {
   const all = [...kept(), { id, token }];
@@ -53,8 +53,8 @@ export const drivesOf = async (scenario) =>
     (job) => job.kind === "drive",
   );
 
-// Where a vehicle comes that keeps its acceleration [m/s^2] and steering [rad]: a plan that its
-// tracker follows, in the frame of the vehicle.
+// Motion of a vehicle with constant acceleration [m/s^2] and steering [rad], in its own frame: a
+// plan for its tracker.
 export function planByHand({ t_us: t, ego }, acceleration, steering) {
   let [x, y, yaw, speed] = [0, 0, 0, ego.speed];
   const [times_us, poses] = [[], []];

@@ -1,4 +1,4 @@
-// Who drives now: a planner on the worker, or whoever holds the arrow keys; and what is seen of it.
+// The current driver: a planner on the worker or the arrow keys; and the observed state.
 import { model, object, own, on, emit, setTime, stopRun } from "./model.js";
 import { events, get } from "./api.js";
 import { notify } from "./messages.js";
@@ -13,7 +13,7 @@ const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 const pressed = new Set();
 export let seat = null;
 
-// Who: the name of a planner; "hand" for the keyboard; "other" for a planner from elsewhere.
+// who: the name of a planner; "hand" for the keyboard; "other" for an external planner.
 export async function start({ who, pace, onCollision }) {
   stopRun();
   const session = await sessions.begin(await own(), { on_collision: onCollision });
@@ -22,7 +22,7 @@ export async function start({ who, pace, onCollision }) {
   }
   await sit(session, who);
 }
-// Goes on by hand from a step of a session, in a session of its own.
+// Continue manually from a step of a session, in a new session.
 export async function takeTheWheel(session, step) {
   const forked = await sessions.fork(session, step);
   if (seat) {
@@ -35,7 +35,7 @@ async function sit(session, who) {
   const planner = who === "hand" || who === "other" ? null : who;
   await take(await sessions.drive(session, planner), who);
 }
-// Looks on at a drive that has begun, and drives it where that is done by hand.
+// Watch a running drive, and drive it if it is manual.
 export async function take(job, who) {
   const { session_id: session } = job.request;
   seat = { session, job: job.job_id, who, held: false };
@@ -51,7 +51,7 @@ export async function take(job, who) {
     }
   }
 }
-// A promise that settles only where the given one fails.
+// A promise that settles only if the given one fails.
 const failed = (promise) => new Promise((_, no) => promise?.catch(no));
 
 export async function hold(held, steps = null) {
@@ -142,7 +142,7 @@ async function byHand(mine) {
     await pause(Math.max(0, TICK_MS - (performance.now() - began)));
   }
 }
-// Null once the episode is over: by itself, or ended while the step was on its way.
+// Null once the episode is over.
 async function oneStep({ session }, plan) {
   try {
     const state = await sessions.advance(session, plan);
@@ -156,7 +156,7 @@ async function oneStep({ session }, plan) {
 }
 const accelerated = (speed) =>
   pressed.has("ArrowDown") ? -5 : pressed.has("ArrowUp") ? 2.5 : speed > 0.5 ? -0.4 : 0;
-// The wheel goes to where the keys want it, less far when it is fast.
+// Move the wheel towards the pressed keys, less at high speed.
 function turned(steering, speed) {
   const wanted = Number(pressed.has("ArrowLeft")) - Number(pressed.has("ArrowRight"));
   const most = 0.5 / (1 + speed / 6);
@@ -176,5 +176,5 @@ export function startDriving() {
   addEventListener("blur", () => pressed.clear());
   on("scenario", () => model.live && emit("drive-step"));
 }
-// The buttons of the wheel, for fingers.
+// Buttons of the wheel, for touch.
 export const press = (key, down) => pressed[down ? "add" : "delete"](key);

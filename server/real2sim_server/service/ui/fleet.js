@@ -1,4 +1,4 @@
-// The page of the fleet: what each worker on this one's store last told of itself.
+// The fleet page: the last report of each worker on the same store.
 import { get } from "./api.js";
 import { el } from "./dom.js";
 
@@ -48,7 +48,7 @@ async function look() {
     summary.textContent = `Workers there: ${there.length} of ${workers.length}. Sessions: ${open}.`;
     document.getElementById("workers").replaceChildren(...workers.map(line));
   } catch (error) {
-    summary.textContent = `${error.message} What you see is from before.`;
+    summary.textContent = `${error.message} The page shows the last state.`;
   }
   setTimeout(look, LOOK_MS);
 }

@@ -1,4 +1,4 @@
-// The free camera: drags look, right drags and two fingers move, the wheel and a pinch go.
+// The free camera: drag to look, right-drag or two fingers to move, scroll or pinch to go forward.
 import { model, emit } from "./model.js";
 
 const LOOK = 0.004; // rad of a pixel
@@ -6,7 +6,7 @@ const MOVE = 0.02; // m of a pixel
 const fingers = new Map();
 let moved = 0;
 
-// tapped: called with what was neither dragged nor pinched.
+// tapped: callback for pointers that neither dragged nor pinched.
 export function startFlight(stage, tapped) {
   stage.addEventListener("contextmenu", (e) => e.preventDefault());
   stage.addEventListener("pointerdown", (e) => {

@@ -1,4 +1,4 @@
-// Lanes of the scene's map from above: surface, middle, direction, stop lines, signals.
+// Lanes of the scene's map, seen from above: surface, centre, direction, stop lines, signals.
 import { ink } from "./theme.js";
 
 export function drawLanes(pen, toScreen, lanes) {
@@ -34,7 +34,7 @@ export function drawLanes(pen, toScreen, lanes) {
   }
 }
 
-// Half the width to each side of the centre line, across the mean of its neighbouring pieces.
+// Offset of half the width from the centre line, normal to the mean of adjacent segments.
 function rims({ centre, widths }) {
   const left = [];
   const right = [];

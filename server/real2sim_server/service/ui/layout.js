@@ -1,4 +1,4 @@
-// Sizes of the panels: dragged or set by arrow keys, and the same when one comes back.
+// Panel sizes: set by dragging or arrow keys, and restored later.
 import { emit } from "./model.js";
 
 const KEY = "real2sim-layout";
@@ -14,7 +14,7 @@ export function startLayout() {
   $("swap").onclick = swap;
   apply();
 }
-// The map takes the place of the picture, or gives it back.
+// Swap the map and the picture.
 export function swap() {
   kept.swapped = !kept.swapped;
   save();

@@ -1,4 +1,4 @@
-// What was done: every revision, as Python and as curl.
+// The history: every revision, as Python and as curl.
 import { model, on } from "./model.js";
 import { el } from "./dom.js";
 import { notify, attempt } from "./messages.js";
@@ -119,5 +119,5 @@ export function asCurl(batches) {
 }
 async function copy(text) {
   await navigator.clipboard.writeText(text);
-  notify("Copied: all changes that are in effect.");
+  notify("Copied all changes in effect.");
 }

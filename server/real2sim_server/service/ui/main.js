@@ -1,4 +1,4 @@
-// Opens what the address names, or the first page.
+// Opens the view named by the address, or the first page.
 import { addressParameters, startAddress } from "./address.js";
 import { call } from "./api.js";
 import {
@@ -78,7 +78,7 @@ async function main() {
   document.body.dataset.ready = "yes";
   return null;
 }
-// The camera that looks ahead.
+// The forward camera.
 function forward() {
   const aside = ({ T_vehicle_camera: T }) => Math.abs(Math.atan2(T[1][2], T[0][2]));
   return model.scene.cameras.toSorted((a, b) => aside(a) - aside(b))[0].name;
@@ -132,7 +132,7 @@ async function download() {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
-// A link to what is not here leads to a page that says so.
+// The page for a link to something that does not exist here.
 function lost(error) {
   $("studio").hidden = true;
   $("lost").hidden = false;
@@ -141,7 +141,7 @@ function lost(error) {
     el("p", { textContent: error.message }),
     el("p", {
       textContent:
-        "The scenario may have been deleted, or belong to another worker. Ask whoever sent the link, or choose another one.",
+        "The scenario may have been deleted or belong to another worker. Ask the sender of the link, or select another scenario.",
     }),
     el("a", { href: "./", textContent: "All scenarios and scenes" }),
   );

@@ -1,4 +1,4 @@
-// The map from above: what is where. `map_hands` moves and turns it.
+// The map from above. `map_hands` handles dragging and turning.
 import { model, on, object, isHere, poseOf, egoPoseAt } from "./model.js";
 import { yawOf } from "./poses.js";
 import { fromAbove } from "./colliders.js";
@@ -20,7 +20,8 @@ import {
 let canvas;
 let pen;
 const layers = [];
-// Others draw on the map too: after the objects, with the pen and what turns metres into pixels.
+// Other modules draw on the map too, after the objects. They get the context and a function from
+// metres to pixels.
 export const addLayer = (layer) => layers.push(layer);
 
 export function startMap() {
@@ -39,7 +40,7 @@ export function fit() {
   lookAtEverything();
   draw();
 }
-// Where somebody drives, the map goes along.
+// The map follows the driven vehicle.
 export function follow(position) {
   keepInView(position);
   draw();

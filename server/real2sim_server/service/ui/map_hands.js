@@ -1,4 +1,5 @@
-// Hands on the map: a drag moves, the handle ahead of a box turns it, two fingers or the wheel zoom.
+// Pointer input of the map: drag to move, the handle in front of a box to turn it, two fingers or
+// scroll to zoom.
 import { model, emit, object, poseOf, select, edit, draftOperations } from "./model.js";
 import { yawOf } from "./poses.js";
 import { handleAt } from "./map.js";
@@ -58,7 +59,7 @@ function down(e) {
   drag = { kind: "pan" };
 }
 const placeOf = ({ offsetX, offsetY }) => ({ offsetX, offsetY });
-// What was begun with one finger is not meant once there are two.
+// A second finger cancels the action of the first.
 function forget() {
   drag = null;
   if (model.draft) {
@@ -118,7 +119,7 @@ function move(e) {
   emit("draft");
   return null;
 }
-// The box lies along the axes of the world, and belongs to no object: nothing is committed.
+// The box is aligned with the world axes and belongs to no object, so nothing is committed.
 const inside = (at) =>
   [0, 1].every((k) => Math.abs(at[k] - model.box.position[k]) < model.box.size[k] / 2);
 function moveBox(dx, dy) {

@@ -1,4 +1,4 @@
-// Where the map looks: world x to the right, y up.
+// View of the map: world x to the right, y up.
 import { model, object, objects, isHere, poseOf, egoPoseAt } from "./model.js";
 
 const SCALES = [0.5, 120];
@@ -20,7 +20,7 @@ export const toWorld = ({ offsetX, offsetY }) => [
   view.x + (offsetX - canvas.clientWidth / 2) / view.scale,
   view.y - (offsetY - canvas.clientHeight / 2) / view.scale,
 ];
-// What is under the pointer stays there.
+// The point under the pointer stays in place.
 export function zoomAt(place, factor) {
   const [x, y] = toWorld(place);
   const [least, most] = SCALES;
@@ -42,7 +42,7 @@ export function lookAtEverything() {
   );
   lookAt({ x: (x0 + x1) / 2, y: (y0 + y1) / 2, scale: Math.min(40, fitting) });
 }
-// Moves on once something comes near the rim.
+// Scroll when something comes near the border.
 export function keepInView([x, y]) {
   const [across, down] = toScreen([x, y]);
   const rim = 0.2;

@@ -1,6 +1,6 @@
-// Sentences for the person, shown for a while.
+// Messages that disappear after a while.
 import { sentence } from "./api.js";
-// An action is a button in the message, which stays for so long and goes once it is pressed.
+// An action is a button in the message; the message disappears when it is pressed.
 export function notify(text, kind = "", action = null) {
   const box = document.createElement("div");
   box.className = `message ${kind}`;

@@ -1,4 +1,4 @@
-// What is open: scenario, selection, time. Everything else listens.
+// The open scenario, selection and time. All other modules listen to changes.
 import { call, get, post, ApiError } from "./api.js";
 import { editDrive, stateAfter } from "./drive_session.js";
 import { poseAt, present, aboutZ, multiply } from "./poses.js";
@@ -41,14 +41,14 @@ export async function open(id) {
   model.history = await get(path("/operations"));
 }
 
-// Looking needs no scenario: the scene as it was recorded is one that nobody made.
+// Viewing needs no scenario: the recorded scene has a built-in one.
 const RECORDED = "recorded.";
 export const isRecorded = () => model.scenario.scenario_id.startsWith(RECORDED);
 export async function look(scene) {
   const { content_hash: hash } = await get(`/v1/scenes/${encodeURIComponent(scene)}`);
   await open(`${RECORDED}${hash}`);
 }
-// What is changed or worked on is a scenario of one's own; its id.
+// Id of the user's scenario for changes and jobs, created on first use.
 let making = null;
 export async function own() {
   if (isRecorded()) {
@@ -67,7 +67,7 @@ async function turnTo(id) {
   emit("begun");
   await refresh();
 }
-// Of a change that was refused, nothing stays.
+// A rejected change leaves nothing behind.
 async function unmake(recorded) {
   const made = path();
   await turnTo(recorded);
@@ -82,8 +82,8 @@ export async function refresh() {
   emit("scenario");
 }
 
-// The objects of the scenario; of a drive that is watched those in its world, among them what a
-// storyboard brought and what was put there while driving.
+// The objects of the scenario, or of the world of a watched drive, including objects of a
+// storyboard and those added while driving.
 export function objects() {
   const { objects: all } = model.scenario;
   return model.live ? model.live.agents.map((a) => ({ ...find(all, a.object_id), ...a })) : all;
@@ -92,7 +92,7 @@ const find = (list, id) => list.find((o) => o.object_id === id);
 export const object = (id) => find(objects(), id);
 export const isHere = (subject) => !!model.live || present(subject, model.t);
 
-// Pose as shown: of a physics run while one is played, else with what is being dragged.
+// The shown pose: of a physics run while it plays, otherwise including the current drag.
 export function poseOf(subject) {
   const run = model.playback?.tracks[subject.object_id];
   if (model.job && run) {
@@ -110,11 +110,11 @@ export function poseOf(subject) {
   };
 }
 
-// Of the ego: as it was recorded, or as it drives in the drive that is shown.
+// The pose of the ego: recorded, or in the shown drive.
 export const egoPoseAt = (t) =>
   model.live?.ego ?? poseAt(model.playback?.ego ?? model.scene.ego, t);
 
-// The pose that an edit starts from: in the drive that is watched, else in the scenario.
+// The pose that an edit starts from: in the watched drive, otherwise in the scenario.
 export const editedPoseOf = (subject) =>
   find(model.live?.agents ?? [], subject.object_id) ?? poseAt(subject.trajectory, model.t);
 
@@ -141,20 +141,20 @@ export function draftOperations() {
   return list;
 }
 
-// Turns an object [rad] with the path that it follows, where it is now; for a short while it turns
-// in place.
+// Rotate an object [rad] together with its path, at the current time; with a short time range, in
+// place.
 export function rotation(object_id, angle, time_range) {
   const passes = time_range && "start_us" in time_range && "end_us" in time_range;
   const about_us = passes ? undefined : model.t;
   return { op: "rotate", object_id, angle, time_range, about_us };
 }
 
-// For how long moves hold, until another object is selected: nobody remembers for longer.
+// The time range of edits, reset when another object is selected.
 export function setWhen(when) {
   model.when = when;
   emit("when");
 }
-// When a move holds; it is whole at the time shown, and blends in before or out after it.
+// The time range of an edit: fully applied at the current time, blended at its open end.
 export function timeRange() {
   const blend_us = 500_000;
   const [start_us, end_us] = [model.t - blend_us, model.t + blend_us];
@@ -170,8 +170,8 @@ export function timeRange() {
   return undefined;
 }
 
-// Operations, or a function that makes them when their turn has come, of what is there then. While
-// a drive is watched they change that drive, and the scenario stays.
+// Apply operations, or a function that creates them from the state at their turn. While a drive is
+// watched they edit that drive and not the scenario.
 export async function edit(operations) {
   stopRun();
   const made = typeof operations === "function" ? operations : () => operations;
@@ -183,7 +183,7 @@ export async function edit(operations) {
     return model.live ? changeDrive(list) : change("/operations", { operations: list });
   });
 }
-// A corner case of the gallery, with other values for some parameters, is what happens from now on.
+// Set a corner case of the gallery, optionally with other parameter values.
 export const letHappen = (name, parameters) => {
   stopRun();
   return inTurn(() => change("/corner-case", { name, parameters }));
@@ -197,7 +197,7 @@ function stepBack(rest) {
   return !isRecorded() && change(rest);
 }
 
-// Changes of this page follow one another, so that each knows the revision that the last has made.
+// Changes of this page run in sequence, so that each uses the revision of the previous one.
 let turn = Promise.resolve();
 function inTurn(make) {
   turn = turn.then(make, make);
@@ -218,7 +218,7 @@ async function change(rest, body) {
     const stale = error instanceof ApiError && error.status === 412;
     notify(
       stale
-        ? "Somebody else changed the scenario meanwhile; their changes are shown now. Please do it again."
+        ? "Somebody else has changed the scenario. Their changes are now shown; please repeat yours."
         : error.message,
       "bad",
     );

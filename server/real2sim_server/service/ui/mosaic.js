@@ -1,4 +1,4 @@
-// Tabs of cameras, and all of them at once.
+// Camera tabs, and all cameras at once.
 import { model, on, emit } from "./model.js";
 import { picture } from "./api.js";
 import { pictureOf } from "./drive_session.js";
@@ -18,7 +18,7 @@ export function startMosaic() {
   on("time scenario run mosaic", attempt(draw));
   mark();
 }
-// As one turns round: what looks ahead from left to right, then what looks back.
+// Clockwise order: forward cameras from left to right, then backward ones.
 function inOrder() {
   const aside = ({ T_vehicle_camera: T }) => Math.atan2(T[1][2], T[0][2]);
   const ahead = (camera) => Math.abs(aside(camera)) <= Math.PI / 2 + 0.01;
@@ -76,7 +76,7 @@ async function draw() {
     draw();
   }
 }
-// Of the drive that is watched, of the run that is played, or of the scenario.
+// Pictures of the watched drive, the played run, or the scenario.
 async function pictureFrom(camera) {
   if (model.live) {
     return URL.createObjectURL(await pictureOf(model.live.session_id, camera, WIDTH));

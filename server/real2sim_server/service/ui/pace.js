@@ -1,18 +1,19 @@
-// When pictures are drawn, and how much of the scene they show: what a device takes is measured.
+// Scheduling of pictures and their number of Gaussians, from measured times of the device.
 import { Detail } from "./detail.js";
 
 const RESTS_AFTER_MS = 350;
 const ORDERED_MS = 4;
 
-// One picture at a time is under way, so that hands never wait for several.
+// One picture at a time is in progress, so that input never waits for several.
 export class Pace {
-  // world: what is drawn, by total(), show(), reorder(), ordering() and loading; picture: draws it.
+  // world: what to draw, with total(), show(), reorder(), ordering() and loading; picture: draws
+  // it.
   constructor(gl, world, picture) {
     Object.assign(this, { gl, world, picture, detail: new Detail(), begun: null, rests: 0 });
     Object.assign(this, { wanted: false, waiting: false, preparing: false, prepared: false });
     Object.assign(this, { stopped: false, onPicture: () => {} });
   }
-  // Something moves: pictures come in time, and show all once it rests.
+  // Something moves: pictures keep the frame time, and show everything once it rests.
   moved() {
     this.rests = performance.now() + RESTS_AFTER_MS;
     this.request();
@@ -40,12 +41,12 @@ export class Pace {
     const refines = resting && !this.wanted && !this.whole() && !this.world.ordering();
     if ((this.wanted && !resting) || refines) {
       const chosen = refines ? this.detail.resting(total) : this.detail.moving(total);
-      // At most once before a picture: who walks brings others at any time.
+      // At most once before a picture: walking people change Gaussians at any time.
       if (this.world.show(chosen) && !this.prepared) {
         this.prepare();
         return;
       }
-      // Draw even where the same Gaussians are shown: they may be the whole scene now.
+      // Draw even if the Gaussians are unchanged: they may now be the whole scene.
       this.wanted = true;
     }
     if (this.wanted) {
@@ -61,8 +62,8 @@ export class Pace {
   whole() {
     return !this.world.loading && this.detail.whole(this.world.total());
   }
-  // Others are shown from now on: the next picture waits until they are in order, since another
-  // one of those before would take as long as they do.
+  // The set of Gaussians has changed. The next picture waits until they are sorted, because a
+  // picture with the old ones would take as long.
   async prepare() {
     this.preparing = true;
     while (this.world.ordering()) {
@@ -93,11 +94,11 @@ export class Pace {
     this.onPicture(took);
     return true;
   }
-  // No more pictures.
+  // Stop drawing.
   stop() {
     this.stopped = true;
   }
-  // The quickest of the next few pictures [ms]; the first one of anything new waits for its programs.
+  // The fastest of the next few pictures [ms]; the first one compiles programs.
   async fastest(count) {
     let least = Infinity;
     for (let k = 0; k < count; k++) {

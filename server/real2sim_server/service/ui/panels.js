@@ -1,5 +1,5 @@
-// The panels beside the picture. A new one is a module and an entry here: `start` fills the page
-// of its id when the studio opens; `shown` is called each time that it is turned to.
+// The panels. To add one, write a module and add an entry here: `start` fills the element of its id
+// when the studio opens; `shown` runs each time the panel is opened.
 import { startProperties } from "./properties.js";
 import { startAssets } from "./assets.js";
 import { startPhysics } from "./physics.js";
@@ -102,7 +102,7 @@ function picture(path) {
   svg.append(line);
   return svg;
 }
-// Arrow keys go from tab to tab, as in any list of tabs.
+// Arrow keys move between tabs, as in any tab list.
 function walk(e) {
   const all = tabs();
   const here = all.indexOf(e.currentTarget);

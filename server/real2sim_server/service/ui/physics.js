@@ -1,4 +1,4 @@
-// Physics: run it as a job, watch its progress, play the result, read contacts and energies.
+// Physics: start a job, watch its progress, play the result, show contacts and energies.
 import { model, on, setTime, startSimulation, stopRun, emit } from "./model.js";
 import { call, events, get, sentence } from "./api.js";
 import { el } from "./dom.js";
@@ -12,7 +12,7 @@ let duration = 2;
 
 export function startPhysics() {
   on("scenario selection run", draw);
-  // A hidden plot has no size to be drawn at.
+  // A hidden plot has no size.
   on("time layout", () => model.playback?.energies && chart());
   draw();
 }
@@ -77,7 +77,7 @@ function draw() {
     chart();
   }
 }
-// Not the whole page: what is being typed or clicked stays where it is.
+// Update parts of the page only, to keep focus and input.
 function progress() {
   const bar = document.getElementById("progress");
   if (!bar) {
@@ -119,7 +119,7 @@ export async function show(job) {
   emit("run");
   setTime(model.playback.times_us[0]);
 }
-// What a contact changed beyond carrying a weight; runs of before tell all alike.
+// Changes by a contact beyond carrying a weight; older runs do not distinguish them.
 const struck = (contact) => contact.impact_delta_v ?? contact.delta_v;
 const CARRIED = 0.3;
 function results() {

@@ -1,4 +1,4 @@
-// Lines over time on a canvas.
+// Line plots over time on a canvas.
 import { ink } from "./theme.js";
 
 export function plot(canvas, xs, series, now) {

@@ -1,4 +1,4 @@
-// The property panel: shows the selected object, turns each changed field into one operation.
+// The property panel: shows the selected object and turns each changed field into one operation.
 import {
   model,
   on,
@@ -30,7 +30,7 @@ export function startProperties() {
   on("when", drawWhen);
   draw();
 }
-// A panel stays while its object does, so that whoever is typing or tabbing through it can go on.
+// The panel persists while its object does, to keep focus and input.
 let drawn = null;
 let drawnOf = "";
 const ofNow = () => {
@@ -76,13 +76,13 @@ function panel(id) {
       "div",
       { class: "actions" },
       action("Duplicate", "duplicate", () => duplicate(id)),
-      action("To the ground", "snap", () => edit([{ op: "translate", object_id: id, snap: true }])),
+      action("Put on ground", "snap", () => edit([{ op: "translate", object_id: id, snap: true }])),
       action("Delete", "delete", () => edit([{ op: "delete", object_id: id }]), "danger"),
     ),
     el(
       "fieldset",
       {},
-      el("legend", { textContent: "Pose now" }),
+      el("legend", { textContent: "Current pose" }),
       row(
         "x y z [m]",
         ["x", "y", "z"].map((axis, k) =>
@@ -101,7 +101,7 @@ function panel(id) {
       : ofScenario(id)),
   ];
 }
-// What an object of the scenario has beyond its pose.
+// Properties of a scenario's object beyond its pose.
 function ofScenario(id) {
   const setPhysics = (name, value) =>
     edit(() => {
@@ -143,7 +143,7 @@ function ofScenario(id) {
       "fieldset",
       {},
       el("legend", { textContent: "Timing" }),
-      row("begins at [s]", [
+      row("start [s]", [
         number("begins", 0, (v) => v !== null && beginAt(id, v), { class: "wide" }),
       ]),
       row("speed [× recorded]", [
@@ -182,12 +182,12 @@ function ofScenario(id) {
     el(
       "fieldset",
       {},
-      el("legend", { textContent: "Velocity on entering the physics" }),
+      el("legend", { textContent: "Velocity at the start of physics" }),
       velocity(id),
     ),
   ];
 }
-// What is typed is where the object will be, also while a run shows it elsewhere.
+// Input sets the object's own pose, even while a run shows another one.
 function moveTo(id, axis, k, value) {
   const time_range = timeRange();
   return edit(() => {
@@ -208,7 +208,7 @@ const beginAt = (id, seconds) =>
     const delay_us = Math.round((seconds - beginsAt(object(id))) * 1e6);
     return delay_us === 0 ? [] : [{ op: "retime", object_id: id, delay_us }];
   });
-// Times that the object is as fast as it was recorded; 1 where nobody recorded it.
+// Ratio to the recorded speed; 1 without a recording.
 function speedOf(o) {
   const recorded = model.scene.objects.find((r) => r.object_id === (o.recorded_id ?? o.object_id));
   const lasts = o.end_us - o.start_us;
@@ -229,10 +229,10 @@ const WHEN = {
   always: "at all times",
   on: "from now on",
   until: "until now",
-  around: "for 2 s around now",
+  around: "2 s around the current time",
 };
-// For how long a move or turn holds, also one made with the mouse: said beside the map as well,
-// while it is anything but the usual.
+// The time range of edits, including edits with the mouse; shown next to the map too if it is not
+// the default.
 function drawWhen() {
   const chip = document.getElementById("when-mode");
   chip.hidden = model.when === "always";
@@ -250,7 +250,7 @@ function when() {
   };
   return el(
     "select",
-    { id: "when", class: "wide", onchange: choose, "aria-label": "when moves hold" },
+    { id: "when", class: "wide", onchange: choose, "aria-label": "time range of edits" },
     ...Object.entries(WHEN).map(([value, textContent]) =>
       el("option", { value, textContent, selected: value === model.when }),
     ),
@@ -264,7 +264,7 @@ function velocity(id) {
     "select",
     {
       id: "velocity-frame",
-      "aria-label": "axes of the velocity",
+      "aria-label": "frame of the velocity",
       onchange: () => object(id).velocity && commit(),
       class: "wide",
     },

@@ -1,4 +1,4 @@
-// What belongs to no object: when the scenario plays, boxes hidden from the background, colliders.
+// Settings of the scenario: time span, erased boxes of the background, colliders.
 import { model, edit, emit } from "./model.js";
 import { poseAt } from "./poses.js";
 import { el, number, row } from "./dom.js";
@@ -9,7 +9,7 @@ export function scenePanel() {
     model.box = ahead();
   }
   return [
-    el("fieldset", {}, el("legend", { textContent: "Scenario plays" }), span()),
+    el("fieldset", {}, el("legend", { textContent: "Time span" }), span()),
     el(
       "fieldset",
       {},
@@ -26,22 +26,22 @@ export function scenePanel() {
       el(
         "div",
         { class: "actions" },
-        el("button", { textContent: "Erase background in it", id: "erase", onclick: erase }),
+        el("button", { textContent: "Erase background inside", id: "erase", onclick: erase }),
         el("button", {
           textContent: "Make it a wall",
-          title: "A solid, invisible box for the physics",
+          title: "A solid, invisible box for physics",
           id: "collide",
           onclick: collide,
         }),
         el("button", {
           textContent: "Make it a post",
-          title: "A solid, invisible upright cylinder for the physics, as wide as the box",
+          title: "A solid, invisible, upright cylinder for physics, as wide as the box",
           id: "post",
           onclick: post,
         }),
         el("button", {
           textContent: "Flat ground",
-          title: "The physics gets a level plane at the box's bottom",
+          title: "Physics uses a level plane at the bottom of the box",
           id: "plane",
           onclick: plane,
         }),

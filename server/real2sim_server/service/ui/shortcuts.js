@@ -1,4 +1,4 @@
-// Keys, and the page that lists them.
+// Keyboard shortcuts, and the page that lists them.
 import { model, undo, redo, edit, select, rotation } from "./model.js";
 import { toggle, step } from "./timeline.js";
 import { toggleFree, toggleUncertainty } from "./camera_view.js";
@@ -16,7 +16,7 @@ const nudge = (x, y) =>
 const flying = (r, d, f) => () => model.free && shift(r, d, f);
 const KEYS = [
   ["Space", "play, pause; holds a drive that is watched", " ", toggle],
-  ["← →", "one frame back, on", "ArrowLeft", () => step(-1)],
+  ["← →", "previous, next frame", "ArrowLeft", () => step(-1)],
   [null, "", "ArrowRight", () => step(1)],
   ["Ctrl Z", "undo", "ctrl+z", undo],
   ["Ctrl Y", "redo", "ctrl+y", redo],
@@ -44,27 +44,27 @@ const KEYS = [
     selected((id) => edit([rotation(id, 0.0872665)])),
   ],
   [null, "", "]", selected((id) => edit([rotation(id, -0.0872665)]))],
-  ["Arrows", "while you drive: faster, brake, left, right", "", null],
-  ["F", "free camera; drag looks, right drag moves, the wheel goes", "f", toggleFree],
-  ["3", "three dimensions, drawn by this page", "3", toggleSpace],
-  ["U", "uncertainty of what is shown, where the scene knows it", "u", toggleUncertainty],
+  ["Arrows", "while driving: accelerate, brake, left, right", "", null],
+  ["F", "free camera; drag to look, right-drag to move, scroll to go forward", "f", toggleFree],
+  ["3", "3D view, rendered by this page", "3", toggleSpace],
+  ["U", "uncertainty, if the scene has it", "u", toggleUncertainty],
   ["W A S D", "fly", "w", flying(0, 0, 0.5)],
   [null, "", "s", flying(0, 0, -0.5)],
   [null, "", "a", flying(-0.5, 0, 0)],
   [null, "", "d", flying(0.5, 0, 0)],
   ["M", "all cameras", "m", () => choose(model.mosaic ? model.camera : null)],
-  ["X", "picture and map change places", "x", swap],
-  ["0", "whole map", "0", fit],
-  ["C", "map to the selection", "c", centre],
-  ["Esc", "select nothing", "Escape", () => select(null)],
-  ["?", "this page", "?", () => help()],
+  ["X", "swap picture and map", "x", swap],
+  ["0", "fit the map", "0", fit],
+  ["C", "centre the map on the selection", "c", centre],
+  ["Esc", "clear the selection", "Escape", () => select(null)],
+  ["?", "this help", "?", () => help()],
 ];
 const TYPED =
   "input:not([type=range], [type=checkbox], [type=radio], [type=button]), select, textarea, [contenteditable]";
 const PRESSED = "button, a[href], summary, input[type=checkbox], input[type=radio], input[type=button]";
 const MOVED = "[role=tab], [role=separator], input[type=radio], input[type=range]:not(#time)";
-// Whether a key is for the control that has the focus: what is typed there, what presses or moves
-// it. Delete never means the selected object there. The slider of the time goes by frames.
+// Whether a key belongs to the focused control, for example typing or pressing it. Delete then
+// never deletes the selected object. The time slider moves by frames.
 function isNative({ target, key, ctrlKey, metaKey }) {
   if (target.closest(TYPED)) {
     return true;

@@ -1,4 +1,4 @@
-// The three-dimensional view: the page draws the scene itself, at the display's rate.
+// The 3D view: the page renders the scene itself, at the display's rate.
 import { model, on, emit, object, poseOf, egoPoseAt } from "./model.js";
 import { rotate, present } from "./poses.js";
 import { attempt, notify } from "./messages.js";
@@ -9,7 +9,7 @@ import { ink } from "./theme.js";
 
 const $ = (id) => document.getElementById(id);
 let world = null;
-// Gaussians of an object that are sent at once.
+// Number of Gaussians per request of an object.
 const MOST = 262_144;
 
 export function startSpace() {
@@ -38,13 +38,13 @@ export async function toggleSpace() {
   }
 }
 const hasWebGl = () => !!document.createElement("canvas").getContext("webgl2");
-// Whether there is something to draw with; it is fetched when it is first wanted.
+// Whether the renderer is available; loaded on first use.
 async function begun() {
   if (world) {
     return true;
   }
   if (!hasWebGl()) {
-    notify("This browser has no WebGL2: the worker's picture stays. F flies in it.", "warm");
+    notify("This browser has no WebGL2, so the worker's picture is shown. Press F to fly.", "warm");
     return false;
   }
   const { SplatWorld } = await import("./splat_world.js");
@@ -59,12 +59,12 @@ async function begun() {
   })();
   return true;
 }
-// Its pictures instead, of the same camera: hands and lines stay as they are.
+// Use the worker's pictures instead, with the same camera; input and overlays stay the same.
 function leaveToWorker() {
   model.remote = true;
   $("space").classList.add("remote");
   notify(
-    "This browser draws without a graphics card: in 3D the worker's picture is shown.",
+    "This browser renders without a GPU, so 3D shows the worker's picture.",
     "warm",
   );
   if (model.space) {
@@ -81,7 +81,7 @@ function show() {
   $("space-mode").setAttribute("aria-pressed", model.space);
   redraw();
 }
-// Where the chosen camera is at the time shown.
+// Pose of the selected camera at the current time.
 function recorded() {
   const { position, quaternion } = egoPoseAt(model.t);
   const { T_vehicle_camera: C } = camera();
@@ -90,7 +90,7 @@ function recorded() {
   return [...row(0), ...row(1), ...row(2), 0, 0, 0, 1];
 }
 const camera = () => model.scene.cameras.find((c) => c.name === model.camera);
-// The stage as a camera: that of the recording, fitted, with more at the sides.
+// The stage as a camera: the recorded camera, fitted, and wider at the sides.
 export function view() {
   const { K, width, height } = camera();
   const { clientWidth: w, clientHeight: h } = $("stage");
@@ -114,14 +114,14 @@ function place() {
       .map((o) => ({ id: o.object_id, ...lookOf(o), ...poseOf(o) })),
   );
 }
-// How much larger than it was recorded; null of what was not, or is larger along one side alone.
+// Scale relative to the recording; null if not recorded or not uniform.
 function scaleOf({ recorded_id: id, size }) {
   const before = model.scene.objects.find((o) => o.object_id === id);
   const [a, b, c] = size.map((side, axis) => side / before?.size[axis]);
   const even = Math.max(a, b, c) - Math.min(a, b, c) < 0.01 * a;
   return even ? a : null;
 }
-// As it was recorded, or as the scenario has it: another asset, stretched, in the midst of a stride.
+// Gaussians as recorded, or as in the scenario: another asset, stretched, or in mid-stride.
 function lookOf(subject) {
   const { object_id: id, recorded_id: source, asset_id: asset, size } = subject;
   const who = source ? `recorded ${source}` : `asset ${asset}`;
@@ -137,7 +137,7 @@ function lookOf(subject) {
   const key = fleeting ? `${scenario} ${revision} ${id} ${model.t}` : `${who} ${size}`;
   return { scale: 1, look: { key, who, path, fleeting } };
 }
-// What has no Gaussians yet.
+// Placeholder for objects whose Gaussians are not loaded.
 function drawBoxes(pen, toStage) {
   if (!seen() || model.remote) {
     return;
@@ -163,7 +163,7 @@ function draw() {
   showSpace({ width: now.width, height: now.height, K: now.K, T_world_camera: now.T });
   tell();
 }
-// How much of the scene the picture shows; numbers are there for whoever watches the page.
+// Fraction of the scene in the picture; numbers are in the page's data attributes.
 function tell() {
   const { pace, loading, received } = world;
   const [shown, total] = [pace.detail.shown, world.total()];
@@ -215,7 +215,7 @@ function drawFrusta(pen, toStage) {
   for (const { K, T_vehicle_camera: C, width, height } of model.scene.cameras) {
     const at = (x, y, z) =>
       toStage(inWorld([0, 1, 2].map((i) => C[i][0] * x + C[i][1] * y + C[i][2] * z + C[i][3])));
-    // Whoever looks through it has no use for its frame.
+    // The frame of the camera that is looked through is not drawn.
     const eye = inWorld([C[0][3], C[1][3], C[2][3]]);
     if (Math.hypot(...eye.map((v, i) => v - model.free[4 * i + 3])) < 1.2) {
       continue;

@@ -1,5 +1,5 @@
-// Hands in the three-dimensional view: an object is dragged on the ground, its ring turns it, and
-// what is dragged beside them goes round.
+// Pointer input of the 3D view: drag an object on the ground, its ring to turn it, elsewhere to
+// orbit.
 import { model, emit, object, poseOf, select, edit, draftOperations } from "./model.js";
 import { rotate, present, project } from "./poses.js";
 
@@ -14,7 +14,7 @@ export function startSpaceHands(canvas, view) {
   canvas.addEventListener("pointerup", up);
   canvas.addEventListener("pointercancel", letGo);
 }
-// Points of the ring that turns an object, closed, on the ground below it.
+// Points of the closed ring that turns an object, on the ground below it.
 export function ringOf(subject) {
   const { position } = poseOf(subject);
   const radius = radiusOf(subject);
@@ -26,7 +26,7 @@ export function ringOf(subject) {
 }
 const radiusOf = ({ size }) => 0.6 * Math.hypot(size[0], size[1]) + 0.3;
 
-// A ray of a pixel of the canvas: origin and direction in the world.
+// Ray of a pixel of the canvas: origin and direction in the world.
 function rayOf({ K, T }, { offsetX, offsetY }) {
   const [x, y] = [(offsetX - K[2]) / K[0], (offsetY - K[5]) / K[4]];
   return {
@@ -34,12 +34,12 @@ function rayOf({ K, T }, { offsetX, offsetY }) {
     along: [0, 1, 2].map((i) => T[4 * i] * x + T[4 * i + 1] * y + T[4 * i + 2]),
   };
 }
-// Where a ray meets a level; null where it does not, or too far off to drag there.
+// Intersection of a ray with a horizontal plane; null if there is none within reach.
 function onLevel({ from, along }, level) {
   const t = (level - from[2]) / along[2];
   return t > 0 && t < 500 ? [from[0] + t * along[0], from[1] + t * along[1]] : null;
 }
-// Distance along a ray to the box of an object; null where it misses.
+// Distance along a ray to the box of an object; null if it misses.
 function toBox({ from, along }, subject) {
   const { position, quaternion } = poseOf(subject);
   const [w, x, y, z] = quaternion;
@@ -100,7 +100,7 @@ function begin(kind, subject, ray) {
     drag = { kind, id: subject.object_id, level, at, centre: position, angle };
   }
 }
-// What one goes round: the selection, else the ground in the middle, else what is ahead.
+// Centre of the orbit: the selection, otherwise the ground at the centre, otherwise a point ahead.
 function pivotOf(view) {
   const subject = object(model.selected);
   if (subject && present(subject, model.t)) {
@@ -144,7 +144,7 @@ function orbit({ offsetX, offsetY }) {
   const pitch = quaternionAbout(about, -dy * ORBIT);
   const columns = (turned) => [0, 1, 2].map((k) => turned([T[k], T[4 + k], T[8 + k]]));
   const both = (v) => rotate(yaw, rotate(pitch, v));
-  // Not over the top: down stays down.
+  // No rotation over the top.
   const turned = columns(both)[1][2] < -0.02 ? both : (v) => rotate(yaw, v);
   const axes = columns(turned);
   const place = turned([0, 1, 2].map((i) => T[4 * i + 3] - drag.pivot[i])).map(

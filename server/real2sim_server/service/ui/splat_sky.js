@@ -53,7 +53,7 @@ export async function skyOf(blob) {
   plane.renderOrder = -1;
   return plane;
 }
-// As a camera sees it; T: 16 values, of a camera of so many rows of pixels.
+// The sky as seen by a camera; T: 16 values; rows: height in pixels.
 export function turnSky({ material }, { T, lens: focal, rows }) {
   const { turn, lens, height } = material.uniforms;
   turn.value.set(T[0], T[1], T[2], T[4], T[5], T[6], T[8], T[9], T[10]);

@@ -1,4 +1,4 @@
-// The scene as Gaussians that this page draws itself: background and objects by meshes of their own.
+// The scene as Gaussians rendered by this page: one mesh for the background and one per object.
 import * as THREE from "three";
 import { SparkRenderer, SplatMesh, SplatFileType } from "@sparkjsdev/spark";
 import { call } from "./api.js";
@@ -7,17 +7,17 @@ import { Pace } from "./pace.js";
 import { drawInBatches } from "./batches.js";
 import { skyOf, turnSky } from "./splat_sky.js";
 
-// The first part is small: it is the first picture.
+// The first part is small, for a fast first picture.
 const PARTS = [8_192, 32_768];
 const TOO_LONG = 700; // ms of a picture of everything
 const [NEAR, FAR] = [0.1, 4000];
 const BLUR = 0.3; // px^2, as the worker's renderer has it
-// Columns of a camera here are right, up, back; the studio's are right, down, forward.
+// Camera columns here are right, up, back; elsewhere right, down, forward.
 const TO_THREE = new THREE.Matrix4().makeScale(1, -1, -1);
 
 export class SplatWorld {
-  // draw: called for each picture, to look() and draw(); again: called where things have to be
-  // placed again, since somebody of them walks. Raises where the browser has no WebGL2.
+  // draw: called for each picture, with look() and draw(); again: called if objects must be placed
+  // again because someone walks. Throws without WebGL2.
   constructor(canvas, scene, { draw: picture, again }) {
     Object.assign(this, { scene, again, clouds: new Map(), groups: new Map(), splats: new Map() });
     this.walking = new Set();
@@ -63,9 +63,8 @@ export class SplatWorld {
     this.splats.set(mesh.extSplats, { count: mesh.extSplats.numSplats, uses: 0 });
     return mesh;
   }
-  // Everything, what covers most first; the next part is on its way while one is unpacked. False
-  // where all would take this device too long to draw, as it does without a graphics card: then it
-  // stops after the second part.
+  // Load everything, largest first; the next part downloads while one is unpacked. Returns false if
+  // drawing everything would be too slow, as without a GPU; it then stops after the second part.
   async load() {
     this.loading = true;
     const sky = this.loadSky();
@@ -97,7 +96,7 @@ export class SplatWorld {
     this.moved();
     return true;
   }
-  // Whether a picture of what is here, and so many Gaussians more, takes too long.
+  // Whether a picture with this many more Gaussians takes too long.
   async tooSlow(more) {
     const took = await this.pace.fastest(2);
     return (took * (this.total() + more)) / this.pace.detail.shown > TOO_LONG;
@@ -115,7 +114,7 @@ export class SplatWorld {
     this.sky = await skyOf(await answer.blob());
     this.world.add(this.sky);
   }
-  // Objects that look the same share their Gaussians; who walks has others at every instant.
+  // Objects with the same appearance share Gaussians; walking people have new ones at each time.
   cloud({ key, path, fleeting }) {
     if (fleeting) {
       return this.cloudAt(path);
@@ -127,15 +126,15 @@ export class SplatWorld {
   }
   async cloudAt(path) {
     const { figure, fileBytes } = await this.file(path);
-    // What is sent in the rest pose is no look of anybody's.
+    // The rest pose is not an appearance to show.
     const splats = figure === "rest" ? null : (await this.mesh({ fileBytes })).extSplats;
     if (splats) {
       splats.numSplats = Math.ceil(this.share * splats.numSplats);
     }
     return { splats, walks: figure !== null };
   }
-  // places: of what is there now: {id, look, position, quaternion, scale}; a look is {key, who,
-  // path, fleeting}: what it is called, whose it is, where it is, and whether only for now.
+  // places: current objects: {id, look, position, quaternion, scale}; a look is {key, who, path,
+  // fleeting}: its key, its object, its URL, and whether it is valid for this time only.
   place(places) {
     const there = new Set(places.map(({ id }) => id));
     for (const [id, group] of this.groups) {
@@ -156,7 +155,7 @@ export class SplatWorld {
     }
     this.moved();
   }
-  // One look at a time is under way; then the one that is wanted by then.
+  // One look at a time is loaded; then the one needed by then.
   async fill(group) {
     const now = group.userData;
     const { wanted } = now;
@@ -196,7 +195,7 @@ export class SplatWorld {
       group.userData.fleeting.dispose();
     }
   }
-  // Whether nothing can be seen of an object, though it is there.
+  // Whether an object exists but has nothing to show.
   isMissing(id) {
     return !this.groups.get(id)?.children.length;
   }
@@ -245,7 +244,7 @@ export class SplatWorld {
     }
     return changed;
   }
-  // The Gaussians that are shown now, without a picture of those before.
+  // The Gaussians shown from now on, without redrawing the previous picture.
   async reorder() {
     this.world.updateMatrixWorld();
     await this.spark.update({ scene: this.world, camera: this.camera });

@@ -1,4 +1,4 @@
-// The first page: scenarios that exist, and scenes to begin one on.
+// The first page: existing scenarios, and scenes to create one for.
 import { call, get, picture, post } from "./api.js";
 import { isInBin, putInBin } from "./bin.js";
 import { el } from "./dom.js";
@@ -30,7 +30,7 @@ async function listScenarios() {
       .reverse()
       .filter((s) => !isInBin(pathOf(s)))
       .map(scenarioCard),
-    "No scenario yet. The first edit of a scene begins one.",
+    "No scenario yet. The first edit of a scene creates one.",
   );
 }
 function fill(id, cards, otherwise, ...more) {

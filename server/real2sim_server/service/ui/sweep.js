@@ -1,4 +1,4 @@
-// The sweep of a LiDAR: asked for once the time rests, drawn on the map and in the picture.
+// The LiDAR sweep: requested when the time rests, drawn on the map and in the picture.
 import { model, on, emit } from "./model.js";
 import { call, get } from "./api.js";
 import { project } from "./poses.js";
@@ -25,7 +25,7 @@ export function chooseLidar(name) {
   emit("lidar");
   later();
 }
-// Points of another instant are worse than none.
+// Points of another time are not shown.
 function later() {
   clearTimeout(waiting);
   asked += 1;
@@ -49,14 +49,14 @@ async function ask() {
   }
 }
 
-// Near is warm, far is cold.
+// Near points are warm, far ones cold.
 const COLOURS = Array.from({ length: 32 }, (_, k) => `hsl(${(250 * k) / 31} 95% 60%)`);
 function colourAt(distance) {
   const level = Math.min(1, Math.sqrt(Math.max(0, distance) / FAR));
   return COLOURS[Math.round(level * (COLOURS.length - 1))];
 }
 
-// Every point by its colour, which changes seldom, then by its place.
+// All points sorted by colour, to change the colour rarely.
 function drawn(pen, size, placesOf) {
   const buckets = new Map();
   for (let i = 0; i < model.sweep.length; i += NUMBERS) {
@@ -87,7 +87,7 @@ export function drawSweepAbove(pen, toScreen, { position: ego }) {
   });
 }
 
-// header: of the picture; box: where it lies on the stage.
+// header: of the picture; box: its rectangle on the stage.
 export function drawSweepInPicture(pen, header, { scale, left, top }) {
   if (!model.sweep) {
     return;

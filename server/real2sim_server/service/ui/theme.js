@@ -1,4 +1,4 @@
-// Colours of what is drawn on canvases, dark and light as the page is.
+// Canvas colours, dark or light as the page.
 const DARK = {
   ground: "#0f141c",
   grid: "#1a2230",

@@ -1,4 +1,4 @@
-// The view socket: the newest request waits until the answer to the last one is here.
+// The view socket: the newest request is sent once the last answer has arrived.
 import { token } from "./api.js";
 
 export class ViewSocket {
@@ -35,7 +35,7 @@ export class ViewSocket {
       }
     };
   }
-  // Of another scenario from now on.
+  // Switch to another scenario.
   turnTo(id) {
     this.socket.onclose = this.socket.onmessage = null;
     this.socket.close();

@@ -1,5 +1,5 @@
-// Work: jobs of this scenario or of all, with what is left of them; runs, drives and videos are
-// opened from here, also after a reload.
+// Jobs of this scenario or of all, with their results; runs, drives and videos open from here, also
+// after a reload.
 import { model, own } from "./model.js";
 import { call, events, get, post, sentence } from "./api.js";
 import { el } from "./dom.js";
@@ -26,7 +26,7 @@ export const listWork = attempt(async () => {
 });
 const active = (job) => job.state === "queued" || job.state === "running";
 
-// What a job works on: the scenario, or a run of it.
+// Subject of a job: the scenario, or a run of it.
 function ofScenario(job) {
   const { scenario_id: id } = model.scenario;
   const runs = jobs.filter((j) => j.subject === id).map((j) => j.job_id);
@@ -48,7 +48,7 @@ function draw() {
         id: "make-video",
         class: "primary",
         textContent: model.job ? "Film of this run" : "Film of the scenario",
-        title: "As the camera chosen above sees it",
+        title: "From the selected camera",
         onclick: attempt(film),
       }),
       el("label", { class: "check" }, others, " work of all scenarios"),
@@ -58,7 +58,7 @@ function draw() {
       : [
           el("p", {
             textContent:
-              "No work yet. Physics runs, drives, films and data sets are listed here while they are made, and kept with what they left.",
+              "No jobs yet. Physics runs, drives, films and data sets are listed here with their progress and results.",
           }),
         ]),
     ...group("Now", running),
@@ -97,7 +97,7 @@ function nameOf({ kind, request }) {
 }
 function stateOf(job) {
   if (job.state === "queued") {
-    return "waits for its turn";
+    return "queued";
   }
   if (job.state !== "running") {
     return { succeeded: "done", interrupted: "the worker stopped" }[job.state] ?? job.state;
@@ -105,7 +105,7 @@ function stateOf(job) {
   const left = secondsLeft(job);
   return `${Math.round(job.progress * 100)} %${left === null ? "" : ` · ${duration(left)} left`}`;
 }
-// As it went so far; nothing before it has gone anywhere.
+// Estimated from the progress so far.
 function secondsLeft({ started_at: started, progress }) {
   if (!started || progress < 0.03) {
     return null;
@@ -145,7 +145,7 @@ function actions(job) {
   made.push(
     active(job)
       ? button("Cancel", () => end(job))
-      : button("Delete", () => end(job), "Delete it with its files", "danger"),
+      : button("Delete", () => end(job), "Delete with files", "danger"),
   );
   return made;
 }
@@ -173,7 +173,7 @@ async function film() {
   await listWork();
   for await (const now of events(`/v1/jobs/${job.job_id}/events`)) {
     if (now.state === "succeeded") {
-      notify("The film is ready: Work has it.");
+      notify("The film is ready, see Work.");
     }
   }
 }
