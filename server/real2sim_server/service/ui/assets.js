@@ -16,7 +16,7 @@ async function draw() {
   const assets = all.filter((asset) => !isInBin(pathOf(asset.asset_id)));
   const subject = object(model.selected);
   const cut = el("button", {
-    textContent: subject ? `Save ${subject.object_id} as an asset` : "Save the selection as an asset",
+    textContent: subject ? `Save ${subject.object_id} as asset` : "Save the selection as asset",
     disabled: !subject?.recorded_id,
     onclick: attempt(() => keep(subject)),
   });

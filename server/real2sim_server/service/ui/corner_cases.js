@@ -68,7 +68,7 @@ function choice() {
   ];
 }
 const nothing = () =>
-  act("drop-case", "Remove the corner case", () => edit([{ op: "set_storyboard", storyboard: null }]));
+  act("drop-case", "Remove corner case", () => edit([{ op: "set_storyboard", storyboard: null }]));
 const act = (id, label, change) =>
   el(
     "div",
