@@ -20,7 +20,7 @@ pytestmark = pytest.mark.network
 
 HOLD = """
 import asyncio, os
-from real2sim_server.service.jobs import exports
+from real2sim_server.service import exports
 
 drawn, render_frame = [], exports._render_frame
 

@@ -65,7 +65,7 @@ def test_a_planner_is_watched_held_and_relieved_and_the_drive_is_read_afterwards
 
 def test_work_shows_what_is_left_and_is_found_again_after_a_reload(studio):
     studio.click("[data-tab=work]")
-    studio.wait_for_selector("#work:has-text('No work yet')")
+    studio.wait_for_selector("#work:has-text('No jobs yet')")
     studio.click("#make-video")
     studio.wait_for_selector(".work.succeeded:has-text('Film')")
     studio.reload()

@@ -175,7 +175,7 @@ def test_a_device_that_is_too_slow_shows_the_workers_picture_of_the_same_camera(
     studio.set_viewport_size({"width": 700, "height": 560})
     studio.click("#space-mode")
     studio.wait_for_selector("#space.remote")
-    studio.wait_for_selector("#messages:has-text('graphics card')")
+    studio.wait_for_selector("#messages:has-text('without a GPU')")
     before = studio.get_attribute("#picture", "data-seq")
     x, y = middle_of(studio, "car_red")
     place = "model.scenario.objects.find((o) => o.object_id === 'car_red').trajectory.positions[0]"
