@@ -191,7 +191,7 @@ def _fields(field_class: Any, described: str) -> Iterator[Any]:
 # maps an angle t off the axis to the radius f tan(t); polynomials fit both directions.
 
 ODD_TERMS = 10
-"""Of the polynomials; their worst error is below a fiftieth of a pixel for 120 degrees."""
+"""Number of odd terms of the polynomials. Their error is below 1/50 pixel for 120 degrees."""
 SAMPLES = 2000
 
 
@@ -213,7 +213,7 @@ class Ftheta:
 
     @classmethod
     def of(cls, K: Matrix, width: int, height: int) -> Ftheta:
-        """Of a pinhole camera ``K`` [3, 3] and its image [px]."""
+        """The f-theta model of a pinhole camera with ``K`` [3, 3] and image size [px]."""
         focal, stretch = float(K[1, 1]), float(K[0, 0] / K[1, 1])
         x = max(K[0, 2], width - K[0, 2]) / K[0, 0]
         y = max(K[1, 2], height - K[1, 2]) / K[1, 1]

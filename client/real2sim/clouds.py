@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Columns = Mapping[str, NDArray[Any]]
 MAX_CLOUD_BYTES = 256 * 1024 * 1024
-"""Of a cloud when it is unpacked."""
+"""Maximum size of an unpacked cloud."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

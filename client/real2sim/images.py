@@ -63,13 +63,13 @@ def _coloured(array: NDArray[Any]) -> NDArray[np.uint8]:
 DEPTH_PNG_UNIT = 1 / 256
 """Metres of one level of depth sent as 16-bit png."""
 UNCERTAINTY_PNG_UNIT = 1 / 65535
-"""Of one level of uncertainty sent as 16-bit png."""
+"""Step of uncertainty in a 16-bit png."""
 PNG_UNITS = {
     "depth": DEPTH_PNG_UNIT,
     "median_depth": DEPTH_PNG_UNIT,
     "uncertainty": UNCERTAINTY_PNG_UNIT,
 }
-"""Of images of float32, by modality."""
+"""Units of 16-bit pngs of float32 images, by modality."""
 AS_SENT = {"jpeg": (".jpg", ".jpeg"), "png": (".png",), "raw": ()}
 """Suffixes of files that hold the bytes of a codec."""
 

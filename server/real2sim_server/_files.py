@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<purpose>tmp|old)-[0-9a-f]{12}")
-"""What :func:`_sibling` calls things."""
+"""Names made by :func:`_sibling`."""
 
 
 @contextmanager

@@ -21,7 +21,7 @@ MAX_TRIES = 3
 
 
 class ExecutorError(RuntimeError):
-    """Tasks cannot be done: nobody to do them, or whoever does them dies again and again."""
+    """Tasks cannot run: no workers are available, or workers die repeatedly."""
 
 
 class Worker(Protocol):

@@ -197,6 +197,12 @@ UNIT_CORNERS = np.array(
 NEXT, SECOND = [1, 2, 0], [2, 0, 1]
 """The coordinates after each, in their cycle."""
 
+MIN_OVERLAP = 1e-9
+"""Maximum overlap of boxes that only touch [m]."""
+
+PARALLEL = 1e-6
+"""Sine of the angle below which two edges span no axis."""
+
 
 def box_corners(T_world_box: ArrayLike, size: ArrayLike) -> Float:
     """Corners [..., 8, 3] [m] in the world of boxes centred on their own origin.
@@ -284,17 +290,10 @@ def _edge_overlaps(turn: Float, centre: Float, half_a: Float, half_b: Float) -> 
     reach_b = half_b[..., NEXT] * size[..., SECOND] + half_b[..., SECOND] * size[..., NEXT]
     length = np.sqrt(next_row * next_row + second_row * second_row)
     # Parallel edges span no axis; the face normals cover that case.
-    valid = length > 1e-6
+    valid = length > PARALLEL
     overlaps = np.where(valid, reach_a + reach_b - gap, np.inf) / np.where(valid, length, 1.0)
     least: Float = overlaps.min((-2, -1))
     return least
-
-
-MIN_OVERLAP = 1e-9
-"""Maximum overlap of boxes that only touch [m]."""
-
-PARALLEL = 1e-6
-"""Sine of the angle below which two edges span no axis."""
 
 
 @kernel

@@ -119,7 +119,7 @@ ACCELERATION, BRAKING, STEERING = 4.0, 8.0, 0.6
 ``real2sim.DriveEnv``.
 """
 FAULT, OFF_ROAD = 10.0, 0.1
-"""What a contact that the ego is to blame for costs [m], and a step once it was off the road."""
+"""Penalties [m] of an at-fault contact and of each step after leaving the road."""
 FAR = 1e4
 STATE_COLUMNS = (3, 7, 4, 5, 6)
 """Speed, lateral speed, acceleration, steering, yaw rate in a row of motions."""

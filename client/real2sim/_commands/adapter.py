@@ -84,7 +84,7 @@ def _read(links: Path | None) -> dict[str, SceneLink]:
 
 
 def _serve(what: str) -> None:
-    """Say what is served, and warnings as they come, until Ctrl+C or SIGTERM."""
+    """Print the address and any warnings until Ctrl+C or SIGTERM."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -1,4 +1,4 @@
-"""``real2sim drive``: run a planner in the loop and say what it cost."""
+"""``real2sim drive``: run a planner in the loop and report its timing."""
 
 from __future__ import annotations
 

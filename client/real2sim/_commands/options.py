@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they make of them."""
+"""Options shared by several commands, and their conversion."""
 
 from __future__ import annotations
 

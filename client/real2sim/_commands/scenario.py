@@ -183,7 +183,7 @@ def edit(
 def _edit_new(
     client: Client, scene: str, name: str, batch: list[Any], *, dry_run: bool
 ) -> tuple[str | None, OperationResult]:
-    """Id of a new scenario, None where it was not kept, and what the edit gave."""
+    """Id of the new scenario, None if it was not kept, and the result of the edit."""
     from .. import Real2SimError
 
     handle = client.scenarios.create(scene=scene, name=name)

@@ -66,7 +66,7 @@ def status(
 
 
 class Modality(StrEnum):
-    """What an image shows."""
+    """Modality of an image."""
 
     RGB = "rgb"
     DEPTH = "depth"

@@ -27,7 +27,7 @@ MAX_POINT_SPACING = 50.0
 
 @dataclass
 class Vector3D:
-    """Of Unreal's axes: x forward, y to the right, z up."""
+    """Unreal's axes: x forward, y to the right, z up."""
 
     x: float = 0.0
     y: float = 0.0

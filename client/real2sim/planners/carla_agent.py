@@ -59,7 +59,7 @@ TOP_SPEED = 50.0
 ROLLING, AIR = 0.15, 6e-4
 """Deceleration by rolling [m/s^2], and by the air per squared speed [1/m]."""
 STEER_ANGLE = math.radians(70.0)
-"""Of the road wheels at full steer, of most of CARLA's cars [rad]."""
+"""Road-wheel angle at full steer of most of CARLA's cars [rad]."""
 STEERING_CURVE = ((0.0, 20.0, 60.0, 120.0), (1.0, 0.9, 0.8, 0.7))
 """Fraction of full steering at speeds [km/h], as in CARLA."""
 

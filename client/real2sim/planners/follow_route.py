@@ -197,7 +197,7 @@ class Path:
         return step / length if length > 1e-9 else np.array([1.0, 0.0])
 
     def _slope(self, values: Array) -> Array:
-        """Of values [N, ...] along the path: central differences, one-sided at its ends."""
+        """Derivatives of values [N, ...] along the path, by central differences."""
         spacing = float(self.arc[1] - self.arc[0])
         slope = np.empty_like(values)
         slope[1:-1] = (values[2:] - values[:-2]) / (2.0 * spacing)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 STEP = 0.05
-"""Of the integration [s]."""
+"""Time step of the integration [s]."""
 
 
 @dataclass(frozen=True)

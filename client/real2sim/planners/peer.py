@@ -112,14 +112,14 @@ class Look:
 
     @classmethod
     def of(cls, K: Any, width: int, T_ego_camera: Any) -> Look:
-        """Of a pinhole camera on the vehicle."""
+        """The look of a pinhole camera on the vehicle."""
         K, pose = np.asarray(K, dtype=np.float64), np.asarray(T_ego_camera, dtype=np.float64)
         left, right = K[0, 2] / K[0, 0], (width - K[0, 2]) / K[0, 0]
         return cls(_turn(pose), math.atan(left) + math.atan(right))
 
 
 def looks_of(cameras: Iterable[CameraInfo]) -> dict[str, Look]:
-    """Of a scene's cameras, by their names."""
+    """The look of each camera of a scene, by name."""
     return {c.name: Look.of(c.K, c.width, c.T_vehicle_camera) for c in cameras}
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Gains:
-    """Of one PID controller, for its error, the error's integral and derivative."""
+    """Gains of a PID controller for its error, the error's integral and derivative."""
 
     proportional: float
     integral: float = 0.0

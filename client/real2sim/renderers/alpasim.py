@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..images import Frame
 
 API = (0, 54, 0)
-"""Of the messages that are spoken here, as AlpaSim counts it."""
+"""Version of the supported messages, as numbered by AlpaSim."""
 THREADS = 8
 CODECS = {0: "png", 1: "png", 2: "jpeg", 4: "raw"}
 """Codecs by AlpaSim's image format number; 0 is unspecified, and 4 is planar RGB."""

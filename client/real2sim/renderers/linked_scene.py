@@ -103,7 +103,7 @@ def _pairs(keys: Any) -> Iterable[tuple[str, Any]]:
 
 
 MAX_CAMERAS = 16
-"""Of one request to a worker."""
+"""Maximum number of cameras in a request to a worker."""
 
 
 @dataclass(frozen=True)

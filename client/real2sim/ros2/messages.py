@@ -36,7 +36,7 @@ ENCODINGS = {
     "semantic": "8UC1",
     "uncertainty": "32FC1",
 }
-"""Of images, by modality."""
+"""Encodings of images, by modality."""
 
 
 @dataclass(frozen=True)

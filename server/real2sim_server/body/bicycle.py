@@ -15,7 +15,7 @@ from .model import JOINTS, LATERAL, Body, Pose, about, aim, bend, chain_transfor
 
 FRAME, TYRE, RIM, CRANK, SADDLE = range(5)
 SURFACES = ("bicycle_frame", "tyre", "rim", "crank", "saddle")
-"""What triangles of a bicycle are, by their index in ``Bicycle.surfaces``."""
+"""Surfaces of a bicycle, by their index in ``Bicycle.surfaces``."""
 
 _RIGID, _REAR, _FRONT, _CRANKS, _PEDAL_L, _PEDAL_R = range(6)
 GEAR = 2.4

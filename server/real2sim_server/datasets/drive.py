@@ -1,4 +1,4 @@
-"""What is exported: a drive that can be looked at at any of its instants."""
+"""The exported drive, which can be viewed at any of its times."""
 
 from __future__ import annotations
 

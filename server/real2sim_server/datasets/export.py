@@ -109,7 +109,7 @@ OUTPUT_SHARE = 0.7
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an export will take, from frames labelled on this machine now.
+    """Estimated cost of an export, from frames labelled on this machine now.
 
     Attributes:
         frames, images: number of them.

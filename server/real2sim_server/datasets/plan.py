@@ -1,4 +1,4 @@
-"""What is exported: the sensors, instants, clips, splits and variants of a drive."""
+"""The plan of an export: sensors, times, clips, splits and variants of a drive."""
 
 from __future__ import annotations
 

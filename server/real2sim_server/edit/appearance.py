@@ -1,4 +1,4 @@
-"""What makes edits look right: ground under removed objects, contact shadows, lighting."""
+"""Appearance of edits: ground under removed objects, contact shadows, lighting."""
 
 from __future__ import annotations
 

@@ -222,7 +222,7 @@ _deriving = threading.Lock()
 
 
 def kept(scene: Scene, key: Hashable, make: Callable[[], T]) -> T:
-    """What ``make`` made of ``scene`` before, or makes now."""
+    """The cached result of ``make`` for ``scene``."""
     with _deriving:
         made = _derived.setdefault(scene, OrderedDict())
         if key not in made:

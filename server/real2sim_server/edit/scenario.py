@@ -156,7 +156,7 @@ class Scenario:
         return PlannedEntry(self._entry("edit", tuple(operations), None, who), outcome)
 
     def plan_undo(self, *, base_revision: int | None = None, who: str = "") -> PlannedEntry:
-        """What taking back the last edit in effect would lead to.
+        """The result of undoing the last edit in effect.
 
         Raises:
             EditError: NOTHING_TO_UNDO or STALE_REVISION.
@@ -175,7 +175,7 @@ class Scenario:
         base_revision: int | None = None,
         who: str = "",
     ) -> PlannedEntry:
-        """What bringing back the last undone edit would lead to.
+        """The result of redoing the last undone edit.
 
         Raises:
             EditError: NOTHING_TO_REDO or STALE_REVISION.

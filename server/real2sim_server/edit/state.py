@@ -35,7 +35,7 @@ class ObjectSource(Protocol):
 
 
 class AssetSource(Protocol):
-    """What is needed of an asset that objects may show."""
+    """The properties of an asset that objects need."""
 
     @property
     def asset_id(self) -> str: ...  # noqa: D102

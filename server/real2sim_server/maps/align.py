@@ -18,7 +18,7 @@ ROUNDS, HUBER_M = 40, 1.0
 NEAR_M = 6.0
 """A map with lanes this close to most of the path counts as almost aligned with the scene."""
 MEDIAN_M, WITHIN = 1.0, 0.75
-"""What a fit must reach: median distance from centre lines, share of poses inside a lane."""
+"""Acceptance limits of a fit: median distance from centre lines, share of poses inside a lane."""
 CANDIDATES, KEPT = 4000, 12
 SAME_M, SAME_YAW, AS_GOOD_M = 4.0, 0.1, 0.1
 

@@ -138,7 +138,7 @@ def _gathered(ways: list[Float]) -> list[Float]:
 
 
 def _bridged(lanes: list[Float]) -> list[Float]:
-    """Join lanes that continue each other across a section that nobody drove."""
+    """Join lanes that continue each other across an undriven section."""
     found = list(lanes)
     for a in range(len(found)):
         for b in range(len(found)):

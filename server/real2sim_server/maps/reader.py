@@ -1,4 +1,4 @@
-"""What readers of maps share: the protocol, errors, JSON and XML files, borders of lanes."""
+"""Shared code of map readers: protocol, errors, JSON and XML files, lane borders."""
 
 from __future__ import annotations
 

@@ -452,7 +452,7 @@ def _head(
 
 
 def _blind_spots(one: EpisodeResult) -> str:
-    """What the scores of an episode cannot see, to unfold."""
+    """Expandable list of the blind spots of an episode's scores."""
     if one.error is not None:
         return ""
     items = "".join(

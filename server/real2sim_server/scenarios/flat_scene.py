@@ -36,7 +36,7 @@ from . import ScenarioError
 
 
 class Recorded(Protocol):
-    """What is needed of a scene: a Scene, or the summary of one."""
+    """The required parts of a scene: a Scene, or its summary."""
 
     @property
     def ego(self) -> Trajectory: ...  # noqa: D102

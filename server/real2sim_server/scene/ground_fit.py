@@ -163,7 +163,7 @@ class Standing(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class GroundFit:
-    """What a fit finds.
+    """Result of a fit.
 
     Attributes:
         ground: for a scene: on the driven path it has the heights and slopes that were driven.
@@ -534,7 +534,7 @@ def _on_ground(points: Float, path: DrivenPath, level: Level, coarser: _Fitted |
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What is known of one level: points and bottoms of boxes that agree, and the path."""
+    """Data of one level: consistent points and bottoms of boxes, and the path."""
 
     points: Float
     bottoms: Float

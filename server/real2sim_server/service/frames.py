@@ -237,14 +237,14 @@ def placed_frame(frame: EncodedFrame, offset: int) -> EncodedFrame:
 
 @functools.cache
 def map_header(members: int) -> bytes:
-    """Of a msgpack map."""
+    """Header of a msgpack map."""
     header: bytes = msgpack.Packer().pack_map_header(members)
     return header
 
 
 @functools.cache
 def array_header(items: int) -> bytes:
-    """Of a msgpack array."""
+    """Header of a msgpack array."""
     header: bytes = msgpack.Packer().pack_array_header(items)
     return header
 

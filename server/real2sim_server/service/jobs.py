@@ -114,7 +114,7 @@ class JobResult:
 
 
 class JobContext:
-    """What a job's work uses to report progress and notice cancellation. Thread-safe."""
+    """Lets the work of a job report progress and notice cancellation. Thread-safe."""
 
     def __init__(self, folder: Path, report: Callable[[float, str], None]) -> None:
         self.folder = folder

@@ -36,7 +36,7 @@ class StreetSurfels:
 
 @dataclass(frozen=True, eq=False)
 class StreetScene:
-    """What street_scene() makes: drawn as ``rasterize(instances, ...)`` from ``camera``."""
+    """Result of street_scene(): rendered by ``rasterize(instances, ...)`` from ``camera``."""
 
     instances: list[Instance]
     sky: Sky

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from .._numba import kernel
+from ..geometry import MIN_OVERLAP
 from .path import Float
 
 
@@ -149,9 +150,6 @@ def heading(quaternion):
 
 WAY = 5
 """Columns of a box motion: fraction of the step, centre x, y [m], yaw [rad], bottom height [m]."""
-
-MIN_OVERLAP = 1e-9
-"""Maximum overlap of boxes that only touch [m]."""
 
 MAX_PIECES = 64
 """Maximum number of subdivisions of a segment for boxes that overlap in the plane but not in

@@ -106,7 +106,7 @@ def on_surface(
 
 
 def bodies_of(boxes: Sequence[ObjectBox]) -> Float:
-    """What kernels take of boxes, [K, BODY], see ``is_surface``."""
+    """Boxes as kernel arguments, [K, BODY], see ``is_surface``."""
     found = np.empty((len(boxes), BODY))
     for row, box in zip(found, boxes, strict=True):
         row[:] = body_of(box, box.T_world_object)

@@ -51,7 +51,7 @@ HOW = {
     "ego_future": "box: poses of the ego at the instants after, in the ego's frame",
     "ego": "map: speed of the drive; route and command along the recorded drive",
 }
-"""What each label is made from: ``rendered``, ``box`` (poses and sizes of the drive)."""
+"""Source of each label: ``rendered``, ``box`` (poses and sizes of the drive)."""
 
 
 MIN_BLOB_PIXELS = 8

@@ -101,7 +101,7 @@ def category_of(category: str) -> tuple[int, str]:
 
 
 class _Split:
-    """What is gathered of a split."""
+    """Collected annotations of a split."""
 
     def __init__(self, name: str) -> None:
         self.name = name

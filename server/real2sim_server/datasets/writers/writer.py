@@ -52,7 +52,7 @@ class DatasetWriter(Protocol):
     """Name of the format."""
 
     holds: str
-    """What is written, in one line."""
+    """Description of the output in one line."""
 
     def write(self, drive: LabelledDrive, folder: Path) -> None:
         """Fill the empty ``folder``: the same bytes for the same drive, whatever the machine, the

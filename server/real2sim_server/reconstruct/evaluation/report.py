@@ -150,7 +150,7 @@ figcaption{font-size:.8rem;color:#4a525c}
 
 @dataclass(frozen=True, eq=False)
 class _ReportContext:
-    """What the page is about."""
+    """Subject of the page."""
 
     scene: Scene
     log: DrivingLog

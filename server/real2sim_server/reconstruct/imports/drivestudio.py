@@ -259,8 +259,8 @@ def _read_drive(options: CheckpointOptions, frames: int, warnings: list[str]) ->
     times = np.rint(np.arange(frames) * 1e6 / options.frame_rate).astype(np.int64)
     if options.dataset is None:
         warnings.append(
-            "without the dataset folder there are no cameras and no path of the ego; one camera "
-            "stands where the drive began"
+            "without the dataset folder there are no cameras and no path of the ego; there is one "
+            "camera, at the start of the drive"
         )
         return _Drive(_default_rig(), times, np.stack([_start(options)] * frames))
     folder = Path(options.dataset)

@@ -457,7 +457,7 @@ glass.
 
 @dataclass(frozen=True, eq=False)
 class VehicleSurface:
-    """What cameras saw of one vehicle.
+    """Camera observations of one vehicle.
 
     Attributes:
         points: [N, 3] float32 in the frame of its box [m].

@@ -1,4 +1,4 @@
-"""What LiDARs see of a scene: a set of Gaussians made of the recorded sweeps."""
+"""LiDAR surfaces of a scene: Gaussians made from the recorded sweeps."""
 
 from .rays import RecordedRays, recorded_rays
 from .surfaces import SurfacesReport, fit_lidar_surfaces

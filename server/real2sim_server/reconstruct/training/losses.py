@@ -1,4 +1,4 @@
-"""What training makes small. Every function returns a scalar that carries gradients."""
+"""Training losses. Every function returns a scalar that carries gradients."""
 
 from __future__ import annotations
 

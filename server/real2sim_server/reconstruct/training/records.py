@@ -74,7 +74,7 @@ def write_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """What :func:`write_checkpoint` wrote.
+    """Read a checkpoint of :func:`write_checkpoint`.
 
     Raises:
         ReconstructError: nothing there, damaged, or of another version.

@@ -59,7 +59,7 @@ def one_torch_thread() -> Iterator[None]:
 # Box noise: added for tests, and smoothed away before initialisation.
 
 ACCELERATION, YAW_ACCELERATION = 2.0, 0.6
-"""What vehicles usually do: standard deviations [m/s^2] and [rad/s^2]."""
+"""Motion priors of vehicles: standard deviations [m/s^2] and [rad/s^2]."""
 MIN_NOISE, MIN_YAW_NOISE = 0.02, 0.005
 """Boxes with less noise do not change [m], [rad]."""
 MIN_POSES = 5

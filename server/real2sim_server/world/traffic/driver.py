@@ -483,7 +483,7 @@ STANDSTILL = 0.1
 """Desired speed below which an object is stationary [m/s]."""
 
 MIN_DESIRED_SPEED = 3.0
-"""Desired speed of objects that hardly moved in the recording [m/s]."""
+"""Minimum desired speed, for objects and drives that hardly moved in the recording [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)

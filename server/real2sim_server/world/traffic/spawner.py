@@ -20,7 +20,15 @@ from ...scene.scene import MAX_OBJECTS
 from ..agents import Agents
 from ..common import Draws, WorldError
 from ..path import LoggedPath
-from .driver import AgentDriver, Idm, Surroundings, highest_speed, level_quaternion, parallel_lane
+from .driver import (
+    MIN_DESIRED_SPEED,
+    AgentDriver,
+    Idm,
+    Surroundings,
+    highest_speed,
+    level_quaternion,
+    parallel_lane,
+)
 
 PREFIX = DRAWN_PREFIX
 """Prefix of the ids of spawned objects; ids on the wire have no colon, so it cannot clash."""
@@ -30,9 +38,6 @@ LOOKS = frozenset({"car", "vehicle", "van", "truck", "bus", "motorcycle"})
 
 SIDE = 0.3
 """Lateral clearance of a box that counts as blocked [m]."""
-
-MIN_DESIRED_SPEED = 3.0
-"""Minimum desired speed, for recorded drives that hardly moved [m/s]."""
 
 
 class Lane(NamedTuple):
