@@ -123,7 +123,7 @@ def echo_app(observation: bytes) -> ASGIApp:
     answers = dict(zip(ECHOED, (lambda _action: observation, read_and_packed), strict=True))
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        # A disconnecting client is no error.
+        # A disconnecting client is not an error.
         with contextlib.suppress(WebSocketDisconnect):
             await _echo(WebSocket(scope, receive, send), answers[scope["path"].strip("/")])
 

@@ -40,7 +40,7 @@ from real2sim_server.world.path import LoggedPath
 Figures = dict[str, Any]
 Report = Callable[[str, int, int], None]
 
-ALONE, WITH, TOLD = "path alone", "with recovery data", "told the route"
+ALONE, WITH, TOLD = "path alone", "with recovery data", "given the route"
 COPIES = 4
 """Perturbed copies of each clip."""
 CLIP_S, RECOVER_S = 1.0, 2.5
@@ -236,7 +236,7 @@ def displaced_worlds(scene: Scene, count: int, options: RecoveryBenchOptions) ->
         if len(found) == count:
             return found
     raise CommandError(
-        f"{len(found)} of {count} starts of {options.lateral:g} m beside the path of scene "
+        f"{len(found)} of {count} starts {options.lateral:g} m to the side of the path of scene "
         f"{scene.name!r} are free"
     )
 

@@ -205,7 +205,7 @@ def error_from_reply(reply: Reply) -> Real2SimError:
     retry_after = parse_retry_after(reply.headers.get("retry-after"))
     if not isinstance(problem, dict):
         text = reply.content[:200].decode("utf-8", "replace").strip() or "empty body"
-        detail = f"the answer has status {reply.status} and is no problem document: {text!r}"
+        detail = f"the answer has status {reply.status} and is not a problem document: {text!r}"
         return error_for(ErrorDetails(reply.status, "UNKNOWN", detail, retry_after=retry_after))
     return error_for(
         ErrorDetails(

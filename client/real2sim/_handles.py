@@ -163,7 +163,8 @@ class Objects(Mapping[str, H], Generic[H]):
         except KeyError:
             if not isinstance(object_id, str):
                 raise KeyError(
-                    f"{object_id!r} is no id; write list(scenario.objects.values())[{object_id!r}]"
+                    f"{object_id!r} is not an id; write "
+                    f"list(scenario.objects.values())[{object_id!r}]"
                 ) from None
             raise KeyError(
                 f"the scenario has no object {object_id!r} among {len(self)}; "

@@ -184,7 +184,7 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
     finally:
         os.close(file)
     if memory[: len(SHM_MAGIC)] != SHM_MAGIC:
-        raise OSError(f"{path} is no shared memory of a worker")
+        raise OSError(f"{path} is not shared memory of a worker")
     return memory
 
 

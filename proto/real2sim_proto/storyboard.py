@@ -418,7 +418,7 @@ def _check_names(board: Storyboard) -> None:
     if sum(e.kind == "ego" for e in board.entities) > 1:
         raise ValueError("at most one entity can be the ego")
     if unknown := sorted(set(board.distributions) - set(board.parameters)):
-        raise ValueError(f"distribution of {unknown[0]!r}, which is no parameter")
+        raise ValueError(f"distribution of {unknown[0]!r}, which is not a parameter")
     for part in (board.init, board.global_init, board.stories, board.stop):
         for name in entity_references(part):
             _check_entity(name, names)
@@ -481,7 +481,9 @@ def _check_magnitudes(part: Any, where: str) -> None:
 
 def _check_entity(name: str, names: Any) -> None:
     if name not in names and not name.startswith("$"):
-        raise ValueError(f"{name!r} is no entity; there are: {', '.join(sorted(names)) or 'none'}")
+        raise ValueError(
+            f"{name!r} is not an entity; there are: {', '.join(sorted(names)) or 'none'}"
+        )
 
 
 __all__ = [

@@ -214,7 +214,7 @@ class _Reader:
             return float(token)
         except ValueError:
             raise ValueError(
-                f"expression {self._text!r}: {token or 'its end'!r} is no number, parameter or "
+                f"expression {self._text!r}: {token or 'its end'!r} is not a number, parameter or "
                 f"function; functions are {', '.join(sorted(_FUNCTIONS))}"
             ) from None
 

@@ -166,8 +166,8 @@ def test_drive_asks_for_what_its_flags_say(run: Run, worker: FakeWorker) -> None
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
-        (("--spawn", "{"), "--spawn is no JSON"),
-        (("--randomization", "3"), "--randomization is no JSON object"),
+        (("--spawn", "{"), "--spawn is not JSON"),
+        (("--randomization", "3"), "--randomization is not a JSON object"),
         (("--reset", '{"horison": 3}'), "horison"),
         (("--beyond-log", "for ever"), "beyond_log"),
     ],

@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def warm_up(site: Site, attacks: dict[str, Attack], inputs: int) -> None:
-    """What is compiled or loaded at first use is no fault of an input."""
+    """What is compiled or loaded at first use is not a fault of an input."""
     for call in rest.described_calls(site):
         site.restore()
         rest.answered(site, call.data(), whole=True, rng=random.Random(1))

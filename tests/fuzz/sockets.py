@@ -348,7 +348,7 @@ class View:
                 return str(said["type"])
 
 
-# --- bytes that are no frames -----------------------------------------------------------------
+# --- bytes that are not frames -----------------------------------------------------------------
 
 
 def odd_frames(site: Site, rng: random.Random) -> str:

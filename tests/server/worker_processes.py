@@ -56,7 +56,7 @@ def start_real2sim(
     Args:
         arguments: of the command.
         log_file: what it prints is appended here.
-        environment: variables besides those of this process that are no settings.
+        environment: variables besides those of this process that are not settings.
         before: Python code that runs first, in the process.
     """
     kept = {k: v for k, v in os.environ.items() if not k.startswith("REAL2SIM_")}

@@ -47,9 +47,9 @@ def json_object(flag: str, text: str | None) -> dict[str, Any]:
     try:
         found = json.loads(text or "{}")
     except json.JSONDecodeError as error:
-        raise typer.BadParameter(f"{flag} is no JSON: {error}") from error
+        raise typer.BadParameter(f"{flag} is not JSON: {error}") from error
     if not isinstance(found, dict):
-        raise typer.BadParameter(f"{flag} is no JSON object, as {{}} is")
+        raise typer.BadParameter(f"{flag} is not a JSON object, as {{}} is")
     return found
 
 

@@ -254,7 +254,7 @@ class AlpasimDriver:
         try:
             return TrajectoryPlan(times_us=times, poses=poses, frame="world")
         except ValueError as error:
-            raise PeerError(f"{what} is no plan: {error}") from error
+            raise PeerError(f"{what} is not a plan: {error}") from error
 
     def _until_next(self, t_us: int) -> int:
         before, self._last_us = self._last_us, t_us

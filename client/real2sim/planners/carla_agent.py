@@ -295,7 +295,7 @@ def command_of(control: Any, speed: float) -> Control:
             float(getattr(control, n)) for n in ("throttle", "brake", "steer")
         )
     except (AttributeError, TypeError, ValueError) as error:
-        raise PeerError(f"run_step answers {control!r}, which is no VehicleControl") from error
+        raise PeerError(f"run_step answers {control!r}, which is not a VehicleControl") from error
     if not all(map(math.isfinite, (throttle, brake, steer))):
         raise PeerError(f"run_step answers throttle {throttle}, brake {brake}, steer {steer}")
     throttle, brake = min(max(throttle, 0.0), 1.0), min(max(brake, 0.0), 1.0)

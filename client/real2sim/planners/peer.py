@@ -69,7 +69,7 @@ def checked_points(answer: Any, *, columns: int, what: str) -> NDArray[np.float6
     try:
         points = np.asarray(answer, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise PeerError(f"{what} is no list of points: {error}") from error
+        raise PeerError(f"{what} is not a list of points: {error}") from error
     if points.ndim != 2 or points.shape[1] != columns or not len(points):
         raise PeerError(f"{what} has shape {list(points.shape)}, not [N, {columns}]")
     if not np.isfinite(points).all():

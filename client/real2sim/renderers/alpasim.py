@@ -433,7 +433,7 @@ def _end_of(pair: Any, what: str) -> Matrix:
     quaternion = np.array([q.w, q.x, q.y, q.z], dtype=np.float64)
     norm = float(np.linalg.norm(quaternion))
     if not (np.isfinite([v.x, v.y, v.z]).all() and 0.5 < norm < 2.0):
-        raise Refusal("INVALID_ARGUMENT", f"{what} is no pose: {quaternion.tolist()} wxyz")
+        raise Refusal("INVALID_ARGUMENT", f"{what} is not a pose: {quaternion.tolist()} wxyz")
     return pose_matrix((v.x, v.y, v.z), (quaternion / norm).tolist())
 
 

@@ -60,7 +60,7 @@ class SceneLink(BaseModel):
             R, last = np.array(rows)[:3, :3], rows[3]
             turns = np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
             if not turns or last != IDENTITY[3]:
-                raise ValueError("T_world_theirs is no rigid transform [4, 4]")
+                raise ValueError("T_world_theirs is not a rigid transform [4, 4]")
         return rows
 
 

@@ -271,7 +271,7 @@ def _track(actor: _Actor) -> ActorTrack:
 def _rigid(rows: Sequence[Any], what: str) -> Matrix:
     pose = np.array(rows, dtype=np.float64)
     if pose.shape != (4, 4) or np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > 1e-2:
-        raise ValueError(f"{what} is no rigid transform [4, 4]: {pose.tolist()}")
+        raise ValueError(f"{what} is not a rigid transform [4, 4]: {pose.tolist()}")
     return pose
 
 

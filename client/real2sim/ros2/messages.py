@@ -200,7 +200,7 @@ MIN_TURN_SPEED = 0.1
 
 
 class CommandError(Real2SimError):
-    """A message that is no plan."""
+    """A message that is not a plan."""
 
 
 def of_ackermann(message: Any, obs: Observation) -> Control:
@@ -244,7 +244,7 @@ def of_path(message: Any, obs: Observation) -> TrajectoryPlan:
             frame="vehicle" if frame == BASE else "world",
         )
     except ValueError as error:
-        raise CommandError(f"a path that is no plan: {error}") from error
+        raise CommandError(f"a path that is not a plan: {error}") from error
 
 
 def standing(action: str, obs: Observation) -> Control | TrajectoryPlan:

@@ -465,7 +465,7 @@ def _edited(scene: Scene, operations: Path | None, lookup: AssetLookup | None) -
     try:
         edits = TypeAdapter(list[Operation]).validate_python(_content(operations))
     except ValidationError as error:
-        raise CommandError(f"{operations}: is no list of edits ({error})") from error
+        raise CommandError(f"{operations}: is not a list of edits ({error})") from error
     return apply_operations(state, edits).state
 
 
@@ -475,7 +475,7 @@ def _content(operations: Path | None) -> Any:
     try:
         return json_module.loads(operations.read_bytes())
     except ValueError as error:
-        raise CommandError(f"{operations}: is no JSON file ({error})") from error
+        raise CommandError(f"{operations}: is not a JSON file ({error})") from error
 
 
 def _sweep(path: Path) -> DatasetSweep:
@@ -486,7 +486,7 @@ def _sweep(path: Path) -> DatasetSweep:
     try:
         return DatasetSweep.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
-        raise CommandError(f"{path}: is no sweep ({error})") from error
+        raise CommandError(f"{path}: is not a sweep ({error})") from error
 
 
 def _perturbation(text: str) -> Perturbation:
@@ -534,7 +534,7 @@ def _lidar(name: str | None) -> str | dict[str, Any] | None:
     try:
         values: dict[str, Any] = json_module.loads(Path(name).read_bytes())
     except (OSError, ValueError) as error:
-        raise CommandError(f"--lidar {name}: is no JSON file ({error})") from error
+        raise CommandError(f"--lidar {name}: is not a JSON file ({error})") from error
     return values
 
 

@@ -159,7 +159,7 @@ def values_of(given: list[str]) -> dict[str, PhysicsValues]:
             if not equals or name.strip() not in PhysicsValues.model_fields:
                 allowed = ", ".join(PhysicsValues.model_fields)
                 raise CommandError(
-                    f"--physics {text}: {pair.strip()!r} is no NAME=VALUE with a name out of "
+                    f"--physics {text}: {pair.strip()!r} is not a NAME=VALUE with a name out of "
                     f"{allowed}"
                 )
             own[name.strip()] = value.strip()
@@ -254,8 +254,8 @@ def calibrate(
     observed: Annotated[
         Path | None,
         typer.Option(
-            help="JSON of boxes, points and images, as of the REST job; images may be files beside "
-            "it. Default: the object's own recorded track.",
+            help="JSON file of boxes, points and images, as in the REST job. Image paths are "
+            "relative to it. Default: the object's own recorded track.",
             exists=True,
             dir_okay=False,
         ),

@@ -170,9 +170,9 @@ def _options(reset: str | None) -> dict[str, Any]:
     try:
         options = json.loads(reset or "{}")
     except ValueError as error:
-        raise CommandError(f"--reset is no JSON: {error}") from error
+        raise CommandError(f"--reset is not JSON: {error}") from error
     if not isinstance(options, dict):
-        raise CommandError("--reset is no JSON object of options")
+        raise CommandError("--reset is not a JSON object of options")
     return options
 
 

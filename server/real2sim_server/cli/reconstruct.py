@@ -243,20 +243,20 @@ def _table(result: Evaluation) -> dict[str, object]:
         "frames_per_second": result.frames_per_second,
     }
     for shift in result.shifted:
-        figures[f"psnr from {shift.shift_m:g} m beside [dB]"] = shift.psnr
+        figures[f"psnr at {shift.shift_m:g} m offset [dB]"] = shift.psnr
     for band in result.lane_band:
-        figures[f"road from {band.shift_m:g} m beside [dB]"] = band.psnr
-        figures["recorded images by the same, on the path [dB]"] = band.images_psnr
+        figures[f"road at {band.shift_m:g} m offset [dB]"] = band.psnr
+        figures["same measure, recorded images on the path [dB]"] = band.images_psnr
     if result.around is not None:
         figures |= {
             "vehicles' seen sides [dB]": result.around.psnr_seen,
             "vehicles' other sides [dB]": result.around.psnr_unseen,
-            "of these covered": result.around.coverage_unseen,
+            "share of other sides covered": result.around.coverage_unseen,
         }
     if result.uncertainty is not None:
         figures |= {
             "uncertainty against error, Spearman by pixel": result.uncertainty.spearman,
-            "of squares of 9 pixels": result.uncertainty.spearman_regions,
+            "the same by 9x9 squares": result.uncertainty.spearman_regions,
             "sparsification (0 best, 1 chance)": result.uncertainty.sparsification,
             "uncertainty, mean": result.uncertainty.uncertainty,
             "error, mean": result.uncertainty.error,
@@ -271,9 +271,9 @@ def _lidar_figures(score: LidarScore) -> dict[str, object]:
     figures: dict[str, object] = {
         "lidar against": score.against,
         "lidar range error, median [m]": mean.median_m,
-        "median squared [m2]": mean.median_squared_m2,
+        "median squared error [m2]": mean.median_squared_m2,
         "90th percentile [m]": mean.p90_m,
-        "of the expected range, median [m]": mean.expected_m,
+        "expected range, median error [m]": mean.expected_m,
         "chamfer [m2]": mean.chamfer_m2,
         "chamfer is the": score.chamfer,
         "F score at 5 cm": mean.f_score,

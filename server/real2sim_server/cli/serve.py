@@ -91,9 +91,9 @@ def _check_variables() -> None:
     for name, nearest in unknown_variables(os.environ).items():
         if nearest is not None:
             raise CommandError(
-                f"{name} is no setting; do you mean {nearest}? Correct it, or unset {name}"
+                f"{name} is not a setting; do you mean {nearest}? Correct it, or unset {name}"
             )
-        _warn(f"{name} is no setting of a worker, and is ignored")
+        _warn(f"{name} is not a setting and is ignored")
 
 
 def _said(error: Mapping[str, Any]) -> str:

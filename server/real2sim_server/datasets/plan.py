@@ -66,7 +66,7 @@ def read_rig(path: Path) -> dict[str, Any]:
         values = json.loads(path.read_bytes())
         Rig.model_validate(values)
     except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: is no rig file ({error})") from error
+        raise DatasetError(f"{path}: is not a rig file ({error})") from error
     return dict(values)
 
 
@@ -74,7 +74,7 @@ def cameras_of(values: Mapping[str, Any], rig: CameraRig) -> list[Camera]:
     """The cameras that a rig file names, in its order.
 
     Raises:
-        DatasetError: values that are no rig, a camera that the scene lacks, or the same name twice.
+        DatasetError: invalid values, an unknown camera, or a duplicate name.
     """
     try:
         asked = Rig.model_validate(values).cameras
@@ -310,7 +310,7 @@ def planned_lidar(plan: ExportPlan) -> Lidar | None:
     """The LiDAR of a plan, on the roof where it is not placed itself.
 
     Raises:
-        DatasetError: an unknown name, or values that are no sensor's.
+        DatasetError: an unknown name, or invalid values.
     """
     named = plan.lidar if plan.rig is None else plan.rig.get("lidar")
     if named is None:

@@ -196,9 +196,9 @@ def _place(log: DrivingLog) -> Iterator[str]:
     far = float(np.abs(log.ego.positions).max())
     if far > MAX_DISTANCE_M:
         yield (
-            f"log {log.name!r}: its drive lies {far / 1e3:,.0f} km from the world's zero, where "
-            f"Gaussians could only move by {float(np.spacing(np.float32(far))):.2g} m; subtract "
-            "the first pose's position from all poses and boxes"
+            f"log {log.name!r}: its drive is {far / 1e3:,.0f} km from the world's origin, where "
+            f"Gaussians could only move in steps of {float(np.spacing(np.float32(far))):.2g} m; "
+            "subtract the first pose's position from all poses and boxes"
         )
 
 
@@ -323,7 +323,7 @@ def _world(log: DrivingLog) -> list[str]:
     if far <= PRECISE_DISTANCE_M:
         return []
     return [
-        f"the drive lies {far / 1e3:,.0f} km from the world's zero, where single precision is "
+        f"the drive is {far / 1e3:,.0f} km from the world's origin, where single precision is "
         f"{float(np.spacing(np.float32(far))) * 1e3:.2g} mm: subtract the first pose's position "
         "from all poses and boxes"
     ]
@@ -507,7 +507,7 @@ def _standing(log: DrivingLog, sweeps: Mapping[int, LidarSweep]) -> list[str]:
         return []
     half = abs(bottom + height / 2) < 0.3
     why = "is their position on the road? It must be the box's centre" if half else "is z right?"
-    return [f"vehicles nearby stand {bottom:+.1f} m above the road: {why}"]
+    return [f"nearby vehicles are {bottom:+.1f} m above the road: {why}"]
 
 
 def _poses(log: DrivingLog, frame: int) -> list[tuple[ObjectTrack, Float]]:
@@ -523,7 +523,7 @@ def _intensity(sweeps: Mapping[int, LidarSweep]) -> list[str]:
     largest = max((float(s.intensity.max()) for s in sweeps.values() if len(s.points)), default=0.0)
     if largest <= 1.0:
         return []
-    return [f"LiDAR intensity goes up to {largest:.4g}: divide it so that it lies from 0 to 1"]
+    return [f"LiDAR intensity is up to {largest:.4g}: scale it to the range from 0 to 1"]
 
 
 def _ground(sweeps: Mapping[int, LidarSweep]) -> list[str]:
@@ -536,8 +536,8 @@ def _ground(sweeps: Mapping[int, LidarSweep]) -> list[str]:
     if not heights or abs(np.median(heights)) < 0.5:
         return []
     return [
-        f"the road near the vehicle lies {np.median(heights):+.1f} m from the vehicle frame's "
-        "zero: is the LiDAR's pose right?"
+        f"the road near the vehicle is at z = {np.median(heights):+.1f} m in the vehicle frame, "
+        "not at 0: is the LiDAR's pose right?"
     ]
 
 
@@ -564,7 +564,7 @@ def _registration(log: DrivingLog) -> list[str]:
     if backward < BETTER * min(given, still):
         return [
             f"sweeps of {between} fit best ({backward:.2f} m, as given {given:.2f} m) where the "
-            "ego goes the other way: are its poses inverted? They must be T_world_vehicle"
+            "ego moves backwards: are its poses inverted? They must be T_world_vehicle"
         ]
     if still < BETTER * given:
         return [

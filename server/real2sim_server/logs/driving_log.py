@@ -332,7 +332,7 @@ def _frames(log: DrivingLog, selection: LogSelection) -> range:
     if not 0 <= first < count or (stop is not None and not first < stop <= count):
         asked = f"{first}:{'' if stop is None else stop}"
         raise LogError(
-            f"frames {asked} are no part of log {log.name!r}, which has frames 0:{count}; a part "
+            f"frames {asked} are not part of log {log.name!r}, which has frames 0:{count}; a part "
             "is first:stop, from the first frame to the one before stop"
         )
     return range(first, count if stop is None else stop, selection.every)

@@ -89,7 +89,7 @@ def decode_image(data: bytes, where: str, size: tuple[int, int] | None = None) -
         return _decode_jpeg(data, where)
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        raise LogError(f"{where}: is no readable PNG or JPEG image ({len(data)} bytes)")
+        raise LogError(f"{where}: is not a readable PNG or JPEG image ({len(data)} bytes)")
     return np.ascontiguousarray(image[..., ::-1])
 
 

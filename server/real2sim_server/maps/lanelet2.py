@@ -166,7 +166,7 @@ def _value(text: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not abs(value) < 1e9:
-        raise MapError(f"{where}: {text[:60]!r} is no number")
+        raise MapError(f"{where}: {text[:60]!r} is not a number")
     return value
 
 

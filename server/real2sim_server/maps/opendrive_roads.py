@@ -214,7 +214,7 @@ def _param_poly3(element: ET.Element, length: float, where: str) -> Local:
         raise MapError(f"{where}: pRange {given!r}; allowed: {', '.join(ranges)}")
     curve = cubic(u, v, ranges[given], length)
     if not np.isfinite(curve(np.array([0.0, length]))).all():
-        raise MapError(f"{where}: paramPoly3 that is no curve: all of its coefficients are zero")
+        raise MapError(f"{where}: paramPoly3 that is not a curve: all of its coefficients are zero")
     return curve
 
 

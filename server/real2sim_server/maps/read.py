@@ -91,4 +91,4 @@ def _recognised(path: Path) -> MapReader:
         if reader.recognises(path):
             return reader
     expected = "; ".join(f"{reader.name}: {reader.expects}" for reader in MAP_READERS)
-    raise MapError(f"{path}: is no map that can be read. Known are {expected}")
+    raise MapError(f"{path}: is not a known map format. Known formats: {expected}")

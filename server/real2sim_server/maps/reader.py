@@ -84,7 +84,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        raise MapError(f"{path}: is no JSON file ({error})") from error
+        raise MapError(f"{path}: is not a JSON file ({error})") from error
     if not isinstance(content, dict):
         raise MapError(f"{path}: holds no JSON object")
     return content
@@ -117,7 +117,7 @@ def read_xml(path: Path, root: str) -> ET.Element:
     try:
         found = ET.fromstring(data)
     except (ET.ParseError, ValueError, LookupError) as error:
-        raise MapError(f"{path}: is no XML file ({error})") from error
+        raise MapError(f"{path}: is not an XML file ({error})") from error
     if found.tag != root:
         raise MapError(f"{path}: its root is <{found.tag}>, expected <{root}>")
     return found

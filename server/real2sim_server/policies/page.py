@@ -460,7 +460,7 @@ def _blind_spots(one: EpisodeResult) -> str:
         for name, score in one.scores().items()
         if score["cannot_see"]
     )
-    summary = f"what the scores of {escape(one.policy)} cannot see, seed {one.seed}"
+    summary = f"blind spots of the scores of {escape(one.policy)}, seed {one.seed}"
     return f"<details><summary>{summary}</summary><ul>{items}</ul></details>"
 
 

@@ -120,7 +120,7 @@ def load_suite(suite: str | Path) -> list[Case]:
         content = json.loads(path.read_text(encoding="utf-8"))
         return _checked([Case.model_validate(case) for case in content["cases"]])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CommandError(f"{path} is no suite: {_sentence(error)}") from error
+        raise CommandError(f"{path} is not a suite: {_sentence(error)}") from error
 
 
 def cases_as_recorded(
@@ -158,7 +158,7 @@ def _number_at(options: Mapping[str, Any], path: str) -> float:
     for part in path.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"jitter names {path!r}, which is no number in the reset of the case")
+        raise ValueError(f"jitter names {path!r}, which is not a number in the reset of the case")
     return float(value)
 
 

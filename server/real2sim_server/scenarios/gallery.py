@@ -109,7 +109,7 @@ MASSES = {
     "pedestrian": 75.0, "cyclist": 90.0, "van": 2200.0, "motorcycle": 280.0, "animal": 60.0,
     "obstacle": 20.0,
 }  # fmt: skip
-"""By category, where it is no car [kg]."""
+"""By category, where it is not a car [kg]."""
 
 EGO_WIDTH = 1.85
 """Width of the ego, for impact positions as a share of it [m]."""

@@ -91,7 +91,7 @@ class Trajectory:
         bad = np.flatnonzero(~are_rigid(t))
         if len(bad):
             raise SceneError(
-                f"{len(bad)} of {len(t)} poses are no rigid transforms, the first at index "
+                f"{len(bad)} of {len(t)} poses are not rigid transforms, the first at index "
                 f"{bad[0]}: {t[bad[0]].tolist()}"
             )
         return cls(np.asarray(times_us), t[:, :3, 3], matrix_to_quaternion(t[:, :3, :3]))

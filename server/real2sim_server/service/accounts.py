@@ -106,7 +106,7 @@ class _Strict(BaseModel):
 
 
 class TokenLimits(_Strict):
-    """Limits of a token's usage; None is no limit.
+    """Limits of a token's usage; None means no limit.
 
     Attributes:
         requests_per_second: requests and socket messages; bursts of one second's worth.
@@ -182,7 +182,7 @@ def read_token_file(path: Path) -> TokenFile:
         where = "/".join(str(part) for part in first["loc"])
         message = str(first["msg"]).removeprefix("Value error, ")
         raise TokenFileError(
-            f"{str(path)!r} is no file of tokens: {f'{where}: ' * bool(where)}{message}; "
+            f"{str(path)!r} is not a token file: {f'{where}: ' * bool(where)}{message}; "
             "`real2sim token` writes such files"
         ) from error
 

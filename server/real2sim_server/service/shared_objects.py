@@ -108,7 +108,7 @@ def open_objects(url: str) -> ObjectStore:
             raise ValueError(f"{sorted(unknown)} in {url!r}: only endpoint and region are known")
         return S3Objects(parts.netloc, parts.path.strip("/"), **options)
     raise ValueError(
-        f"{url!r} is no store of objects: give file:///folder, or "
+        f"{url!r} is not an object store: give file:///folder, or "
         "s3://bucket/prefix?endpoint=https://host&region=name"
     )
 
@@ -295,7 +295,7 @@ def _key(digest: str) -> str:
 
 def _checked(digest: str) -> str:
     if not DIGEST.fullmatch(digest):
-        raise ValueError(f"{digest!r} is no SHA-256 in lower case")
+        raise ValueError(f"{digest!r} is not an SHA-256 in lower case")
     return digest
 
 

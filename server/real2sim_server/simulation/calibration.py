@@ -391,7 +391,7 @@ def _decoded(seen: ObservedImage, k: int) -> NDArray[np.uint8]:
     try:
         data = base64.b64decode(seen.image, validate=True)
     except (binascii.Error, ValueError) as problem:
-        raise PhysicsError(f"image {k} is no base64: {problem}") from problem
+        raise PhysicsError(f"image {k} is not base64: {problem}") from problem
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
         raise PhysicsError(f"image {k} is neither PNG nor JPEG, or is damaged")

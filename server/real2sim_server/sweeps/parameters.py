@@ -94,7 +94,7 @@ def _parsed(expression: str) -> ast.Expression:
     try:
         return ast.parse(expression.strip(), mode="eval")
     except (SyntaxError, RecursionError, MemoryError) as error:
-        raise ValueError(f"{expression!r} is no expression: {error}") from error
+        raise ValueError(f"{expression!r} is not an expression: {error}") from error
 
 
 def _value(node: ast.expr, values: Mapping[str, float]) -> Any:
@@ -103,7 +103,7 @@ def _value(node: ast.expr, values: Mapping[str, float]) -> Any:
     if isinstance(node, ast.Name):
         if node.id not in values:
             known = ", ".join(sorted(values)) or "none"
-            raise ValueError(f"{node.id!r} is no parameter; there are {known}")
+            raise ValueError(f"{node.id!r} is not a parameter; there are {known}")
         return values[node.id]
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
         inner = _value(node.operand, values)
@@ -370,4 +370,4 @@ def _cut_density(x: Points, centre: float, width: float) -> Points:
 
 def _check_names(given: Sequence[str] | Mapping[str, object], drawn: Mapping[str, Drawn]) -> None:
     if unknown := sorted(set(given) - set(drawn)):
-        raise ValueError(f"{unknown[0]!r} is no drawn parameter; there are {', '.join(drawn)}")
+        raise ValueError(f"{unknown[0]!r} is not a drawn parameter; there are {', '.join(drawn)}")

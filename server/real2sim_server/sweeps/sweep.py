@@ -100,10 +100,10 @@ class Journal:
             first = file.readline(MAX_LINE)
             if not first.endswith(b"\n"):
                 if not (FORMAT.encode() + b"\n").startswith(first):
-                    raise ValueError(f"{self._path} is no journal of episodes")
+                    raise ValueError(f"{self._path} is not a journal of episodes")
                 return 0
             if first.rstrip(b"\n") != FORMAT.encode():
-                raise ValueError(f"{self._path} is no journal of episodes of this version")
+                raise ValueError(f"{self._path} is not a journal of episodes of this version")
             end = file.tell()
             while (line := file.readline(MAX_LINE)).endswith(b"\n"):
                 end = file.tell()
@@ -414,7 +414,7 @@ def _check(spec: SweepSpec, scene: Scene) -> None:
         raise CommandError(f"no score {unknown[0]!r}; there are {', '.join(sorted(known))}")
     if spec.rank_by not in column_types(spec):
         raise CommandError(
-            f"rank_by {spec.rank_by!r} is no column; there are {', '.join(column_types(spec))}"
+            f"rank_by {spec.rank_by!r} is not a column; there are {', '.join(column_types(spec))}"
         )
     taken = set(COLUMNS) | {"point", "planner", "seed", "weight", "episode"}
     if twice := sorted(taken & set(spec.parameters)):

@@ -109,7 +109,7 @@ def _clock(scene: Scene, spec: ResetSpec) -> EpisodeClock:
     if spec.warmup_us % spec.dt_us or spec.warmup_us > longest * spec.dt_us:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
-            f"warmup_us {spec.warmup_us} is no whole number of steps of {spec.dt_us} us within "
+            f"warmup_us {spec.warmup_us} is not a whole number of steps of {spec.dt_us} us within "
             f"the {longest} that are left of the log",
             hint="the warm-up follows the log in clock steps; choose a multiple of dt_us",
         )
@@ -140,7 +140,7 @@ def _check_sensor(scene: Scene, spec: ResetSpec, sensor: SensorSpec) -> None:
     if sensor.period_us is not None and sensor.period_us % spec.dt_us:
         raise WorldError(
             ErrorCode.INVALID_REQUEST,
-            f"period_us {sensor.period_us} of camera {sensor.camera!r} is no multiple of dt_us "
+            f"period_us {sensor.period_us} of camera {sensor.camera!r} is not a multiple of dt_us "
             f"{spec.dt_us}",
             hint="all sensors show committed instants; choose a period of whole clock steps",
         )

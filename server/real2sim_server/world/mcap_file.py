@@ -107,7 +107,7 @@ def _pose(kept: dict[str, Any]) -> dict[str, Any]:
     T_world_sensor = np.asarray(kept["T_world_sensor"], dtype=np.float64)
     T_vehicle_sensor = np.asarray(kept["T_vehicle_sensor"], dtype=np.float64)
     if not are_rigid(np.stack([T_world_sensor, T_vehicle_sensor])).all():
-        raise ValueError("its poses are no rigid transforms")
+        raise ValueError("its poses are not rigid transforms")
     pose = T_world_sensor
     if kept["frame"] == "vehicle":
         pose = T_world_sensor @ np.linalg.inv(T_vehicle_sensor)
@@ -186,7 +186,7 @@ def recording_in(path: Path) -> Recording:
             )
         # A damaged file can raise almost any error.
         except Exception as error:
-            raise RecordingError(f"{path} is no MCAP file, or is broken: {error}") from error
+            raise RecordingError(f"{path} is not an MCAP file, or is broken: {error}") from error
     if found is None:
         raise RecordingError(f"{path} holds no episode of this program")
     return recording_of_bytes(found, f"{path} ({ATTACHMENT})")

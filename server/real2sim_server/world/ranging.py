@@ -346,7 +346,7 @@ def _mounted_radar(spec: RadarSpec, dt_us: int) -> MountedRadar:
 def _check_period(what: str, period_us: int, dt_us: int) -> None:
     if period_us % dt_us:
         raise _refused(
-            f"period_us {period_us} of {what} is no multiple of dt_us {dt_us}",
+            f"period_us {period_us} of {what} is not a multiple of dt_us {dt_us}",
             hint="clouds are complete at committed instants; choose a period of whole clock steps",
         )
 

@@ -219,7 +219,7 @@ def _number(value: Any, what: str) -> None:
 
 def _integer(value: Any) -> int:
     if type(value) is not int or abs(value) > 1 << 62:
-        raise ValueError(f"{value!r} is no whole number of 63 bits")
+        raise ValueError(f"{value!r} is not a whole number of 63 bits")
     return value
 
 
@@ -452,7 +452,7 @@ def _read_recording(file: IO[bytes], where: str) -> Recording:
     # A damaged file can raise almost any error.
     except Exception as error:
         raise RecordingError(
-            f"{where} is no episode recording, or is broken: {error or type(error).__name__}"
+            f"{where} is not an episode recording, or is broken: {error or type(error).__name__}"
         ) from error
 
 

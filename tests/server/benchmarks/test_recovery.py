@@ -70,4 +70,4 @@ def test_both_are_taught_as_many_frames(tiny_scene):
 def test_recovery_data_lifts_the_success_of_displaced_starts():
     figures = recovery.run()
     assert figures["gain"] >= 0.15
-    assert figures["told the route"]["success"] > 0.9
+    assert figures["given the route"]["success"] > 0.9

@@ -80,7 +80,7 @@ def test_a_short_token_is_refused_without_showing_it(serve, folders):
 def test_a_misspelt_variable_is_refused_with_the_setting_that_is_meant(serve, folders):
     done = serve(TOKEN_FLIE="x", **folders)
     assert done.exit_code == 1
-    assert "REAL2SIM_TOKEN_FLIE is no setting; do you mean REAL2SIM_TOKEN_FILE?" in done.printed
+    assert "REAL2SIM_TOKEN_FLIE is not a setting; do you mean REAL2SIM_TOKEN_FILE?" in done.printed
 
 
 def test_other_unknown_variables_are_not_in_the_way():

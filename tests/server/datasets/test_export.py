@@ -152,7 +152,7 @@ def test_the_command_says_what_is_wrong_with_its_options(tiny_scene, tmp_path):
     (tmp_path / "edits.json").write_text("[{}]")
     with pytest.raises(CommandError, match="allowed are shares such as"):
         command.export_dataset(scene=tmp_path, out=tmp_path, format_=["coco"], splits="train")
-    with pytest.raises(CommandError, match="is no list of edits"):
+    with pytest.raises(CommandError, match="is not a list of edits"):
         command._edited(tiny_scene, tmp_path / "edits.json", None)
 
 

@@ -75,10 +75,10 @@ class Pretended(torch.Tensor):
         return f"Pretended({self.held})"
 
     def numpy(self, **_: Any) -> Any:
-        raise TypeError("a tensor on the pretended device is no NumPy array; copy it by cpu()")
+        raise TypeError("a tensor on the pretended device is not a NumPy array; copy it by cpu()")
 
     def __array__(self, *_: Any, **__: Any) -> Any:
-        raise TypeError("a tensor on the pretended device is no NumPy array; copy it by cpu()")
+        raise TypeError("a tensor on the pretended device is not a NumPy array; copy it by cpu()")
 
     def new_tensor(self, data: Any, **options: Any) -> torch.Tensor:
         return torch.tensor(data, **{"dtype": self.dtype, "device": self.device, **options})

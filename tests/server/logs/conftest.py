@@ -54,7 +54,7 @@ def written_waymo_v2(tiny_log: SyntheticLog, tmp_path_factory: pytest.TempPathFa
 
 
 def _layout(name: str) -> ModuleType:
-    """A module of ``layouts``; test folders are no packages."""
+    """A module of ``layouts``; test folders are not packages."""
     path = Path(__file__).parent / "layouts" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(f"log_layouts_{name}", path)
     assert spec is not None

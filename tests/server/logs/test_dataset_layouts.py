@@ -213,7 +213,7 @@ BAD_FOLDERS: dict[str, tuple[str, Callable[[Path], None], str]] = {
         r"tracklet_labels\.xml: declares entities",
     ),
     "tracklets cut": (
-        "kitti_raw", _cut(f"{DRIVE}/tracklet_labels.xml", 500), r"tracklet_labels\.xml: is no XML"
+        "kitti_raw", _cut(f"{DRIVE}/tracklet_labels.xml", 500), r"labels\.xml: is not an XML"
     ),
     "tracklet without size": (
         "kitti_raw",
@@ -249,7 +249,7 @@ BAD_FOLDERS: dict[str, tuple[str, Callable[[Path], None], str]] = {
         r"sample_annotation\.json: 'a0_.*': the box of .* needs a positive",
     ),
     "table no JSON": (
-        "nuscenes", _cut("v1.0-mini/instance.json", 20), r"instance\.json: is no JSON"
+        "nuscenes", _cut("v1.0-mini/instance.json", 20), r"instance\.json: is not JSON"
     ),
     "front image missing": (
         "nuscenes",

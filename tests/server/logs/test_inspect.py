@@ -90,7 +90,7 @@ def test_jumping_ego_is_found(tiny_log: SyntheticLog) -> None:
 
 def test_lidar_at_the_wrong_height_is_found(tiny_log: SyntheticLog) -> None:
     questions = inspect_log(_moved(tiny_log, 0, 0, 1.2)).questions
-    assert any(p.startswith("the road near the vehicle lies +1.2 m") for p in questions)
+    assert any(p.startswith("the road near the vehicle is at z = +1.2 m") for p in questions)
 
 
 def test_boxes_in_another_frame_are_found(tiny_log: SyntheticLog) -> None:

@@ -136,7 +136,7 @@ def test_bad_manifest_is_refused_by_name(native_folder: Path, case: str) -> None
 
 def test_broken_json_is_refused(native_folder: Path) -> None:
     (native_folder / "log.json").write_text('{"format": ')
-    with pytest.raises(LogError, match=r"log\.json: is no JSON file"):
+    with pytest.raises(LogError, match=r"log\.json: is not a JSON file"):
         open_log(native_folder)
 
 
@@ -164,7 +164,7 @@ def test_image_of_another_size_is_found(native_folder: Path, suffix: str) -> Non
 def test_cut_image_is_refused_when_asked_for(native_folder: Path) -> None:
     path = native_folder / "images/front/000001.png"
     path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(LogError, match=r"000001\.png: (is no readable|the image is cut off)"):
+    with pytest.raises(LogError, match=r"000001\.png: (is not a readable|the image is cut off)"):
         open_log(native_folder).image("front", 1)
 
 

@@ -58,8 +58,8 @@ def test_the_same_part_of_a_part_is_itself(tiny_log: SyntheticLog) -> None:
 @pytest.mark.parametrize(
     ("selection", "reason"),
     [
-        (LogSelection(first=3, stop=3), "frames 3:3 are no part"),
-        (LogSelection(first=-1), "frames -1: are no part"),
+        (LogSelection(first=3, stop=3), "frames 3:3 are not part"),
+        (LogSelection(first=-1), "frames -1: are not part"),
         (LogSelection(stop=10_000), "which has frames 0:"),
         (LogSelection(every=0), "every is at least 1"),
         (LogSelection(cameras=("roof",)), "has cameras"),

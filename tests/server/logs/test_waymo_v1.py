@@ -208,7 +208,7 @@ def test_other_file_is_named(folder: Path) -> None:
 
 
 def test_message_that_is_none_is_named() -> None:
-    with pytest.raises(LogError, match="here: is no protocol-buffer message"):
+    with pytest.raises(LogError, match="here: is not a protocol-buffer message"):
         ProtoMessage(b"\x0a\xff\x01", "here")
 
 

@@ -113,7 +113,7 @@ def test_a_face_inside_what_has_been_crushed_is_stopped():
 
 
 def test_what_slides_over_a_face_is_not_stopped_by_its_own_end():
-    """Near its end a body is all around a node yet ends to one side: that is no normal."""
+    """Near its end a body is all around a node yet ends to one side: that is not a normal."""
     dx = 0.2
     cell = dx**3
     face = np.array([0.0, 0.0, -0.03 * cell, 0.03 * cell])

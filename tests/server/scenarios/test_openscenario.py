@@ -46,8 +46,8 @@ def test_an_attribute_that_is_not_supported_is_refused_by_name_and_line():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<OpenSCENARIO>", "is no XML file"),
-        ('<?xml version="1.0" encoding="utf-0"?><OpenSCENARIO/>', "is no XML file.*utf-0"),
+        ("<OpenSCENARIO>", "is not an XML file"),
+        ('<?xml version="1.0" encoding="utf-0"?><OpenSCENARIO/>', "is not an XML file.*utf-0"),
         ("<OpenDRIVE/>", "expected <OpenSCENARIO>"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><OpenSCENARIO/>', "document type"),
         ("<a>" * 300, "nested deeper|no XML"),

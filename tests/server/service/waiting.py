@@ -49,7 +49,7 @@ def accepted(send: Callable[[], Any]) -> Any:
 
 
 def _if_over(job: dict) -> dict | None:
-    # An error document, where the store is in trouble, is no job.
+    # An error document, where the store is in trouble, is not a job.
     return job if "job_id" in job and JobInfo.model_validate(job).over else None
 
 

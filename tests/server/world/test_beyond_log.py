@@ -346,7 +346,7 @@ def test_a_struck_spawned_car_is_moved_by_physics(street):
 
 
 def test_a_look_that_does_not_exist_is_refused(street):
-    with pytest.raises(WorldError, match="'ghost', which is no object") as refused:
+    with pytest.raises(WorldError, match="'ghost', which is not an object") as refused:
         street(looks=["ghost"])
     assert refused.value.code == ErrorCode.UNKNOWN_OBJECT
 

@@ -102,7 +102,7 @@ def test_an_edit_of_its_trajectory_is_where_a_driver_begins_anew(driven, kind):
 
 
 def test_a_driver_of_nobody_is_refused(make_world, moving):
-    with pytest.raises(WorldError, match="'ghost', which is no object") as refused:
+    with pytest.raises(WorldError, match="'ghost', which is not an object") as refused:
         make_world(car=moving(30, 5), spec={"agents": {"drivers": {"ghost": {"kind": "idm"}}}})
     assert refused.value.code == ErrorCode.UNKNOWN_OBJECT
 

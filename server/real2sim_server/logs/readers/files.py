@@ -52,7 +52,7 @@ def read_json(path: Path) -> Any:
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        raise LogError(f"{path}: is no JSON file ({error})") from error
+        raise LogError(f"{path}: is not a JSON file ({error})") from error
 
 
 class Tables:
@@ -69,7 +69,7 @@ class Tables:
                 raise LogError(f"{self.path(name)}: expected a list of objects")
             rows = [_Row(r, self.path(name)) for r in content]
             if not all(isinstance(r["token"], str) for r in rows):
-                raise LogError(f"{self.path(name)}: a token is no text")
+                raise LogError(f"{self.path(name)}: a token is not text")
             self._rows[name] = rows
             self._by_token[name] = {r["token"]: r for r in rows}
 
@@ -292,7 +292,7 @@ def count_rows(path: Path, columns: int, hint: str = "is the file cut off?") -> 
     rows, rest = divmod(size, 4 * columns)
     if rest or not rows:
         raise LogError(
-            f"{path}: {size} bytes is no whole number of points ({columns} float32 each, "
+            f"{path}: {size} bytes is not a whole number of points ({columns} float32 each, "
             f"{4 * columns} bytes); {hint}"
         )
     return rows
@@ -363,7 +363,7 @@ def check_rigid(matrix: Float, where: str) -> Float:
     if not np.isfinite(matrix).all():
         raise LogError(f"{where}: holds a value that is not finite")
     if not is_rotation(matrix[:3, :3]):
-        raise LogError(f"{where}: its left 3x3 block is no rotation matrix")
+        raise LogError(f"{where}: its left 3x3 block is not a rotation matrix")
     return matrix
 
 

@@ -195,7 +195,7 @@ def _tracklet_items(path: Path) -> Sequence[ET.Element]:
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
-        raise LogError(f"{path}: is no XML file ({error})") from error
+        raise LogError(f"{path}: is not an XML file ({error})") from error
     tracklets = root.find("tracklets")
     if tracklets is None:
         raise LogError(f"{path}: has no element <tracklets>")

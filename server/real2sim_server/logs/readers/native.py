@@ -102,7 +102,7 @@ def _load(manifest: Path) -> dict[str, Any]:
     except OSError as error:
         raise LogError(f"{manifest}: cannot be read ({error.strerror})") from error
     except ValueError as error:
-        raise LogError(f"{manifest}: is no JSON file ({error})") from error
+        raise LogError(f"{manifest}: is not a JSON file ({error})") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise LogError(f'{manifest}: expected an object with "format": "{FORMAT}"')
     if content.get("version") != VERSION:

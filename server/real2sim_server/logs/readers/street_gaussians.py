@@ -101,7 +101,7 @@ def unpack_arrays(path: str, name: str, folder: str) -> list[int | str]:
     # Damaged files can raise almost any error.
     except Exception as error:
         raise LogError(
-            f"{path}: entry {name!r} is no pickled dictionary of arrays: {error}"
+            f"{path}: entry {name!r} is not a pickled dictionary of arrays: {error}"
         ) from error
     for number, array in enumerate(arrays.values()):
         np.save(Path(folder) / f"{number}.npy", array, allow_pickle=False)
@@ -256,7 +256,7 @@ def _numbers(array: Any) -> NDArray[Any]:
     if not all(type(n) is int and n >= 0 for n in shape):
         raise ValueError(f"the shape {shape} of an array holds no lengths")
     if not isinstance(data, bytes | bytearray):
-        raise ValueError("the values of an array are no bytes")
+        raise ValueError("the values of an array are not bytes")
     if len(data) != math.prod(shape) * dtype.itemsize:
         raise ValueError(f"{len(data)} bytes do not fit {dtype} of shape {shape}")
     # A copy is writable and in native byte order.

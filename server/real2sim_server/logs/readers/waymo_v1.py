@@ -87,7 +87,9 @@ def _record_at(path: Path, header: bytes, position: int, size: int) -> Record:
         raise LogError(f"{where}: the file is cut off inside a record's header")
     length, checksum = _HEADER.unpack(header)
     if masked_crc32c(header[:8]) != checksum:
-        raise LogError(f"{where}: a header's checksum is wrong; this is no TFRecord, or broken")
+        raise LogError(
+            f"{where}: a header's checksum is wrong; the file is damaged, or not a TFRecord"
+        )
     if position + _HEADER.size + length + 4 > size:
         raise LogError(
             f"{where}: a record of {length} bytes does not fit into the file's {size}; is it cut "
@@ -155,7 +157,7 @@ class ProtoMessage:
             for number, value in _split(data):
                 self._fields[number].append(value)
         except (IndexError, ValueError) as error:
-            raise LogError(f"{where}: is no protocol-buffer message ({error})") from error
+            raise LogError(f"{where}: is not a protocol-buffer message ({error})") from error
 
     def message(self, number: int, name: str) -> ProtoMessage:
         """The nested message of a field; an empty one if it is absent."""

@@ -104,7 +104,7 @@ def find_truth(log: DrivingLog) -> Truth:
         return Truth(log)
     values = log.provenance.get("config")
     if log.provenance.get("dataset") != "synthetic street" or not isinstance(values, dict):
-        return Truth(None, f"log {log.name!r} is no synthetic one, only its own images are known")
+        return Truth(None, f"log {log.name!r} is not synthetic: only its own images are known")
     try:
         street = generate_log(SyntheticConfig.from_values(values))
     except (TypeError, ValueError, KeyError) as error:

@@ -229,6 +229,6 @@ def _check(scene: Scene, log: DrivingLog, frames: Sequence[int]) -> None:
         for name in log.rig.names:
             if not scene.ego.covers(image_time(log, name, frame)):
                 raise ReconstructError(
-                    f"frame {frame} of log {log.name!r} lies outside the path of scene "
-                    f"{scene.name!r}; evaluate it on the log it was made of"
+                    f"frame {frame} of log {log.name!r} is outside the path of scene "
+                    f"{scene.name!r}; evaluate the scene on the log it was made from"
                 )

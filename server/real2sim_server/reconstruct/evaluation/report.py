@@ -241,21 +241,21 @@ def _figures(evaluation: Evaluation) -> str:
          _number(s.depth_error_m, 3), _number(s.depth_error_p90_m, 3))
         for name, s in (*scores, ("all", evaluation))
     ]  # fmt: skip
-    rate = f"<p>Drawn at {evaluation.frames_per_second:.1f} images per second.</p>"
+    rate = f"<p>Rendered at {evaluation.frames_per_second:.1f} images per second.</p>"
     return "<h2>Figures</h2>" + _table(head, rows) + rate
 
 
 def _shift_figures(evaluation: Evaluation) -> str:
     if not evaluation.shifted:
-        return f"<h2>Beside the recorded path</h2><p>{escape(evaluation.no_shifted)}</p>"
-    head = ("to both sides [m]", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]",
+        return f"<h2>Off the recorded path</h2><p>{escape(evaluation.no_shifted)}</p>"
+    head = ("offset to both sides [m]", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]",
             "depth error [m]", "views", "left out, inside a vehicle")  # fmt: skip
     rows = [
         (f"{s.shift_m:g}", _number(s.psnr), _number(s.ssim, 3), _number(s.psnr_objects),
          _number(s.depth_error_m, 3), str(s.views), str(s.views_in_objects))
         for s in evaluation.shifted
     ]  # fmt: skip
-    return "<h2>Beside the recorded path</h2>" + _table(head, rows)
+    return "<h2>Off the recorded path</h2>" + _table(head, rows)
 
 
 def _around_figures(evaluation: Evaluation) -> str:
@@ -277,7 +277,7 @@ def _uncertainty_figures(evaluation: Evaluation) -> str:
     score = evaluation.uncertainty
     if score is None:
         return ""
-    head = ("views", "Spearman by pixel", "of squares of 9 pixels",
+    head = ("views", "Spearman by pixel", "Spearman by 9x9 squares",
             "sparsification (0 best, 1 chance)", "mean", "mean error")  # fmt: skip
     figures = (score.spearman, score.spearman_regions, score.sparsification)
     means = (_number(100 * value) + " %" for value in (score.uncertainty, score.error))
@@ -288,7 +288,7 @@ def _uncertainty_figures(evaluation: Evaluation) -> str:
 def _view_figures(evaluation: Evaluation) -> str:
     head = ("view", "PSNR [dB]", "SSIM", "PSNR of moving objects [dB]",
             "LiDAR depth error, median [m]", "90th percentile [m]", "LiDAR points",
-            "of these missed [%]")  # fmt: skip
+            "LiDAR points missed [%]")  # fmt: skip
     rows = [
         (f"frame {v.frame}, {v.camera}", _number(v.psnr), _number(v.ssim, 3),
          _number(v.psnr_objects), _number(v.depth_error_m, 3), _number(v.depth_error_p90_m, 3),
@@ -328,7 +328,7 @@ def _objects(log: DrivingLog, camera: Camera, frame: int, image: Image, rendered
 
 def _beside(subject: _ReportContext, camera: Camera, frame: int) -> str:
     truth, t_us = subject.truth, image_time(subject.log, camera.name, frame)
-    parts = [f"<h2>Frame {frame} from {SHOWN_SHIFT:g} m beside the path</h2>"]
+    parts = [f"<h2>Frame {frame} at {SHOWN_SHIFT:g} m to the side of the path</h2>"]
     for left, side in ((SHOWN_SHIFT, "left"), (-SHOWN_SHIFT, "right")):
         view = render_view(subject.scene, camera, t_us, left=left, backend=subject.backend)
         shown = [_Figure(view.rgb, f"rendered, {side}")]

@@ -261,7 +261,7 @@ def _drawn_spacing(points: Float, normals: Float, parts: NDArray[np.uint8]) -> N
     unit = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
     cosine = (unit[near[:, 0]] * unit[near[:, 1]]).sum(1)
     unlike = (cosine < FLAT) | (parts[near[:, 0]] != parts[near[:, 1]])
-    # The other side of something thin is no edge.
+    # The other side of something thin is not an edge.
     unlike &= cosine > -0.5
     plain = np.ones(len(points), dtype=np.bool_)
     plain[near[unlike].ravel()] = False
@@ -292,7 +292,7 @@ def _outwards(shape: VehicleShape, points: Float, material: NDArray[np.int32]) -
     """Outward directions [N, 3] of the convex piece of each point; windings differ by piece."""
     length, width, height = shape.size
     centres = np.zeros_like(points)
-    # The shell is no convex piece, but nearly: from the line through its middle all of it is seen.
+    # The shell is nearly convex: all of it is visible from the line through its middle.
     centres[:, 0] = np.clip(points[:, 0], -0.35 * length, 0.35 * length)
     x, y = points[:, 0], np.sign(points[:, 1])
     axle = np.where(x > 0, shape.axles[1], shape.axles[0]) * length

@@ -220,7 +220,7 @@ def _poses(given: ArrayLike, lidar: Lidar, what: str) -> Float:
         )
     bad = int((~are_rigid(poses)).sum())
     if bad:
-        raise RenderError(f"{what}: {bad} of {count} poses are no rigid transforms")
+        raise RenderError(f"{what}: {bad} of {count} poses are not rigid transforms")
     return poses
 
 

@@ -270,7 +270,7 @@ def read_elements(data: bytes, file: str, leave_out: frozenset[str] = frozenset(
         raise
     except (xml.parsers.expat.ExpatError, LookupError, ValueError) as error:
         # The last two exceptions come from encodings that Python does not support.
-        raise ScenarioError(f"{file}: is no XML file ({error})") from error
+        raise ScenarioError(f"{file}: is not an XML file ({error})") from error
     if builder.root is None:
         raise ScenarioError(f"{file}: is empty")
     _take_out(builder.root, leave_out)
@@ -484,7 +484,7 @@ def typed(part: Part, value: Any, kind: str) -> Any:
     try:
         return float(value)
     except (TypeError, ValueError):
-        raise part.error(f"value {value!r} of a parameter of type {kind} is no number") from None
+        raise part.error(f"value {value!r} of a parameter of type {kind} is not a number") from None
 
 
 def check_constraints(part: Part, name: str, value: Any) -> None:

@@ -574,7 +574,7 @@ def stage_scene(source: Path, folder: Path, *, name: str, limits: StagingLimits)
     Raises:
         BundleTooLargeError: it takes more memory than the limits allow.
         BundleError: it cannot be read, or took too long.
-        SceneError: its values are no scene, or the bundle cannot be written.
+        SceneError: invalid values, or the bundle cannot be written.
     """
     _staged("read_and_save_scene", source, folder, limits, {"name": name})
 

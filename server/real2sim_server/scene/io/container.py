@@ -249,7 +249,7 @@ def _refuse_to_replace(path: Path, *, overwrite: bool) -> None:
     if not path.exists() and not path.is_symlink():
         return
     if not path.is_dir() or path.is_symlink():
-        raise BundleError(f"{path}: is no folder; a bundle is a folder, choose another path")
+        raise BundleError(f"{path}: is not a folder; a bundle is a folder, choose another path")
     if not any(path.iterdir()):
         return
     if not (path / DOCUMENT_NAME).is_file():
@@ -274,7 +274,7 @@ def _load_json(path: Path, file: Path) -> Any:
 
 
 def _refuse_constant(constant: str) -> float:
-    raise ValueError(f"{constant} is no number")
+    raise ValueError(f"{constant} is not a number")
 
 
 def _check_head(given: Any, file: Path, kind: str) -> None:

@@ -431,7 +431,7 @@ def unpack_lanes(
     """Inverse of :func:`pack_lanes`.
 
     Raises:
-        SceneError: lengths do not fit the arrays, or it is no graph.
+        SceneError: lengths do not fit the arrays, or it is not a graph.
     """
     taken = dict.fromkeys(arrays, 0)
 

@@ -214,7 +214,7 @@ class AntimatterSplat:
         nbytes = path.stat().st_size
         if nbytes % SPLAT_RECORD.itemsize:
             raise BundleError(
-                f"{path}: truncated or no .splat file: {nbytes} bytes are no multiple of "
+                f"{path}: truncated, or not a .splat file: {nbytes} bytes are not a multiple of "
                 f"{SPLAT_RECORD.itemsize}"
             )
         check_memory(path, nbytes // SPLAT_RECORD.itemsize, 1, max_bytes)

@@ -363,7 +363,7 @@ def _read_recording(text: str) -> Recording:
     try:
         data = base64.b64decode(text, validate=True)
     except ValueError as error:
-        raise RecordingError(f"recording: it is no base64 ({error})") from error
+        raise RecordingError(f"recording: it is not base64 ({error})") from error
     return recording_of_bytes(data, "recording")
 
 

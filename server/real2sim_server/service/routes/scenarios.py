@@ -364,7 +364,7 @@ def expected_revision(if_match: str | None) -> int | None:
     if match is None:
         raise ServiceError(
             ErrorCode.INVALID_REQUEST,
-            f'If-Match {if_match!r} is no revision of ours; it looks like "r41", quotes included',
+            f'If-Match {if_match!r} is not a revision; revisions look like "r41", with the quotes',
             hint="send the ETag of the last answer unchanged",
         )
     return int(match.group(1))

@@ -161,7 +161,7 @@ def _checked_schema(database: Path) -> int:
                 f"SELECT max(CAST(version_num AS INTEGER)) FROM {t.alembic_version.name}"
             ).fetchone()
         except sqlite3.Error as error:
-            raise BackupError(f"{database.name} is no store of a worker: {error}") from error
+            raise BackupError(f"{database.name} is not a worker's store: {error}") from error
     if state != "ok" or found is None:
         raise BackupError(f"{database.name} is damaged: {state}")
     return int(found)
@@ -179,7 +179,7 @@ def _unpacked(file: Path, beside: Path) -> Iterator[Path]:
             told = json.loads((folder / MANIFEST).read_text("utf-8"))
             info = BackupInfo(**told)
         except (tarfile.TarError, OSError, ValueError, TypeError) as error:
-            raise BackupError(f"{str(file)!r} is no backup of a worker: {error}") from error
+            raise BackupError(f"{str(file)!r} is not a worker's backup: {error}") from error
         if info.format != FORMAT:
             raise BackupError(
                 f"{str(file)!r} has format {info.format}, this program reads {FORMAT}; use "

@@ -208,7 +208,7 @@ def _known(state: ScenarioState, object_id: str, who: str) -> ObjectState:
     if object_id not in known:
         raise WorldError(
             ErrorCode.UNKNOWN_OBJECT,
-            f"{who} of the storyboard is {object_id!r}, which is no object of this world",
+            f"{who} of the storyboard is {object_id!r}, which is not an object of this world",
             hint=f"objects of this world: {', '.join(known) or 'none'}",
         )
     return known[object_id]

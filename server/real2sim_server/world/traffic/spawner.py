@@ -273,7 +273,7 @@ def _looks(spec: SpawnSpec, state: ScenarioState) -> tuple[ObjectState, ...]:
         if unknown:
             raise WorldError(
                 ErrorCode.UNKNOWN_OBJECT,
-                f"agents.spawn.looks names {unknown[0]!r}, which is no object of this world",
+                f"agents.spawn.looks names {unknown[0]!r}, which is not an object of this world",
                 hint=f"objects of this world: {', '.join(known) or 'none'}",
             )
         return tuple(known[name] for name in spec.looks)

@@ -141,7 +141,7 @@ class Traffic:
         if unknown:
             raise WorldError(
                 ErrorCode.UNKNOWN_OBJECT,
-                f"agents.drivers names {unknown[0]!r}, which is no object of this world",
+                f"agents.drivers names {unknown[0]!r}, which is not an object of this world",
                 hint="insert or duplicate it first; GET /v1/scenes/{scene} lists the objects",
             )
         _check_lanes(spec, surroundings)

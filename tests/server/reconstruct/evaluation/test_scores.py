@@ -174,7 +174,7 @@ def test_the_command_leaves_figures_and_a_page_that_loads_nothing(on_disk):
     assert [s["shift_m"] for s in values["shifted"]] == [1.0]
     assert "no_shifted" not in values
     assert [s["shift_m"] for s in values["lane_band"]] == [1.0]
-    assert "road from 1 m beside" in result.output
+    assert "road at 1 m offset" in result.output
     html = page.read_text()
     assert html.count("data:image/jpeg;base64,") >= 8
     assert not re.search(r"https?://|<script|<link", html)

@@ -268,7 +268,7 @@ def test_options_that_do_not_fit_are_refused(plain, tmp_path, change, reason):
 @pytest.mark.parametrize(
     ("name", "text", "reason"),
     [
-        ("timestamps.json", "{", "timestamps.json: is no JSON"),
+        ("timestamps.json", "{", "timestamps.json: is not JSON"),
         ("timestamps.json", "[]", "timestamps.json: must hold a JSON object"),
         ("timestamps.json", '{"FRAME": {"000010": 1}}', "FRAME must hold seconds .* '000011'"),
         ("ego_pose/000004.txt", "1 2 3", "000004.txt: must hold a rigid 4x4 transform"),

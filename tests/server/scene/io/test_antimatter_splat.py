@@ -36,8 +36,8 @@ def test_a_scale_of_zero_becomes_the_smallest_there_is(tmp_path):
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (record()[:-1], "truncated or no .splat file: 31 bytes are no multiple of 32"),
-        (record() * 2 + b"\0", "truncated or no .splat file: 65 bytes"),
+        (record()[:-1], "truncated, or not a .splat file: 31 bytes are not a multiple of 32"),
+        (record() * 2 + b"\0", "truncated, or not a .splat file: 65 bytes"),
         (record() + record(position=(0, float("nan"), 0)), "position is NaN.* in 1 of 2 .* at 1"),
         (record(position=(float("inf"), 0, 0)), "position is NaN, infinite"),
         (record(scale=(1, -1, 1)), "scale is NaN, infinite or negative in 1 of 1"),

@@ -30,7 +30,7 @@ def test_a_folder_with_other_things_is_never_replaced(scene, tmp_path):
 
 def test_a_file_is_never_replaced(scene, tmp_path):
     (tmp_path / "file").write_text("text")
-    with pytest.raises(BundleError, match="is no folder"):
+    with pytest.raises(BundleError, match="is not a folder"):
         save_scene(scene, tmp_path / "file", overwrite=True)
 
 

@@ -340,7 +340,7 @@ def unsupported(m, request, change: str):
         ("distortion", "UNIMPLEMENTED", "lens distortion is not drawn"),
         ("format", "UNIMPLEMENTED", "ask for PNG, JPEG or planar RGB"),
         ("mask", "INVALID_ARGUMENT", "there are no ego masks"),
-        ("pose", "INVALID_ARGUMENT", "sensor_pose is no pose"),
+        ("pose", "INVALID_ARGUMENT", "sensor_pose is not a pose"),
         ("scene", "NOT_FOUND", "no scene 'nowhere'; there are clip, elsewhere"),
     ],
 )

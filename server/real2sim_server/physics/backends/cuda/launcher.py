@@ -241,5 +241,5 @@ class CudaLauncher:
         from cuda.core import LEGACY_DEFAULT_STREAM, Stream
 
         handle = torch.cuda.current_stream(self.device).cuda_stream
-        # torch calls the default stream 0, and this is no valid handle.
+        # torch calls the default stream 0, and this is not a valid handle.
         return Stream.from_handle(handle) if handle else LEGACY_DEFAULT_STREAM

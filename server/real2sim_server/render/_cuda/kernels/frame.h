@@ -39,7 +39,7 @@ struct Object {
     uint16 instance;
     uint16 semantic;
 };
-static_assert(sizeof(Object) == 112, "Object differs from records.py");
+static_assert(sizeof(Object) == 112, "Object differs from launcher.py");
 
 // Pose of an object relative to a camera. Positions are relative to the camera, so single precision
 // suffices at any distance from the world origin.
@@ -50,7 +50,7 @@ struct Placement {
     float eye_rest[3];     // ... and its remainder beyond float32
     float unused;
 };
-static_assert(sizeof(Placement) == 96, "Placement differs from records.py");
+static_assert(sizeof(Placement) == 96, "Placement differs from launcher.py");
 
 struct Camera {
     const float* sky;      // [6, R, R, 3]; null if the background is used
@@ -67,7 +67,7 @@ struct Camera {
     uint32 first_pixel;
     uint32 behind;         // class of pixels whose transmittance stays above 0.5
 };
-static_assert(sizeof(Camera) == 120, "Camera differs from records.py");
+static_assert(sizeof(Camera) == 120, "Camera differs from launcher.py");
 
 enum Counter { SEEN, PAIRS, SEEN_WANTED, PAIRS_WANTED, TICKET, COUNTERS = 16 };
 
@@ -108,4 +108,4 @@ struct Frame {
     float eps2d;
     float radius_clip;
 };
-static_assert(sizeof(Frame) == 29 * 8 + 14 * 4, "Frame differs from records.py");
+static_assert(sizeof(Frame) == 29 * 8 + 14 * 4, "Frame differs from launcher.py");

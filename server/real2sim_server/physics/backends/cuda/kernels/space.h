@@ -1,4 +1,4 @@
-// All that the solver's kernels work on. records.py lays the same out as NumPy types; the sizes
+// All that the solver's kernels work on. launcher.py lays the same out as NumPy types; the sizes
 // below hold both to it. A kernel takes nothing but a Space and a number.
 #pragma once
 
@@ -19,7 +19,7 @@ constexpr uint32 AROUND = 27;         // blocks and fields around one, itself am
 constexpr uint32 MIDDLE = 13;
 constexpr int BODY_BITS = 12, COORDINATE_BITS = 17;
 constexpr int COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1);
-constexpr uint32 TOTALS = 8;          // of a contact, see base.TOTALS
+constexpr uint32 TOTALS = 8;          // of a contact, see model.TOTALS
 constexpr uint32 COLUMNS = 16;        // of a row of sums, see particle.py; the last is REACH
 constexpr uint32 REACH = 15;
 
@@ -45,7 +45,7 @@ struct Held {
     uint32 blocks, fields, groups, contacts, pairs, thins;
     uint32 unused[6];
 };
-static_assert(sizeof(Held) == 64, "Held differs from records.py");
+static_assert(sizeof(Held) == 64, "Held differs from launcher.py");
 
 struct Space {
     unsigned char* sets[2];  // keys [pitch], materials and origins, then the numbers above
@@ -93,7 +93,7 @@ struct Space {
     uint32 block_capacity, field_capacity, contact_capacity, pair_capacity, thin_capacity;
     uint32 unused;
 };
-static_assert(sizeof(Step) == 16 && sizeof(Space) == 416, "Space differs from records.py");
+static_assert(sizeof(Step) == 16 && sizeof(Space) == 416, "Space differs from launcher.py");
 
 // Particles of one set; number `c` of particle p is at(c, p).
 struct Particles {
